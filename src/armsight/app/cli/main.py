@@ -1,0 +1,66 @@
+"""The ``armsight`` command: the group, and how errors reach a person.
+
+Every command takes ``--json`` (machine-readable on stdout); progress and warnings go to stderr. A mistake in the input
+is one line on stderr and exit code 2; an interrupt is exit code 130.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+import click
+
+from armsight.errors import ArmsightError
+
+#: Command name -> module in this package that holds a click command called ``command``; loaded only when used.
+COMMANDS = {
+    "calibrate": "calibrate",
+    "cameras": "cameras",
+    "measure": "measure",
+    "record": "record",
+}
+
+
+class _Lazy(click.Group):
+    """A group that imports a command's module only when that command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"armsight.app.cli.{COMMANDS[cmd_name]}")
+        command: click.Command = module.command
+        return command
+
+
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="armsight")
+def group() -> None:
+    """Say where a robot arm's end-effector is, from two USB cameras, in millimetres and with an honest sigma."""
+
+
+def main() -> None:
+    """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 interrupted."""
+    try:
+        code = group.main(standalone_mode=False)
+        sys.stdout.flush()
+        sys.exit(code if isinstance(code, int) else 0)
+    except click.exceptions.Abort:
+        click.echo("armsight: interrupted", err=True)
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except ArmsightError as error:
+        click.echo(f"armsight: error: {error}", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        click.echo("armsight: interrupted", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)

@@ -1,0 +1,183 @@
+"""The frozen records that flow through armsight, in pipeline order.
+
+    camera --Shot--> markers --Detections--> match --Correspondences--> triangulate --Points--> locate --PoseEstimate-->
+
+Arrays in a record are read-only. Frames, units and the meaning of a covariance: docs/conventions.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+Image = NDArray[Any]
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A frozen record whose arrays are read-only views of what it was given."""
+
+    def __post_init__(self) -> None:
+        """Make every array field a read-only view."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                view = value.view()
+                view.flags.writeable = False
+                object.__setattr__(self, field.name, view)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot(Record):
+    """Two simultaneous images, or the reason there are none.
+
+    Attributes:
+        name: what the source calls it, unique in a run.
+        left: (H, W) grey or (H, W, 3) BGR image of the left camera, uint8 or uint16; None with a problem.
+        right: the same of the right camera.
+        t_s: time of the grab, s, on the source's clock; None where it has none.
+        problem: why the shot cannot be used; None when it can.
+    """
+
+    name: str
+    left: Image | None
+    right: Image | None
+    t_s: float | None = None
+    problem: str | None = None
+
+    def image(self, side: Side) -> Image | None:
+        """Return the image of one side."""
+        return self.left if side == "left" else self.right
+
+
+@dataclass(frozen=True, eq=False)
+class Body(Record):
+    """A rigid body: named points in its own frame.
+
+    Attributes:
+        name: what the body is called.
+        point_names: one name a point; "P1", "12", a board's corner number.
+        points: (M, 3) positions, m, body frame.
+    """
+
+    name: str
+    point_names: tuple[str, ...]
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Detections(Record):
+    """What one camera saw of one body.
+
+    Attributes:
+        ids: (N,) rows of the body's points, strictly increasing.
+        uv: (N, 2) their places, raw pixels.
+        cov_uv: (N, 2, 2) covariance of the places as far as the image itself tells it, px^2; zero where unknown.
+        problem: why nothing was found; None when something was.
+    """
+
+    ids: Ids
+    uv: Array
+    cov_uv: Array
+    problem: str | None = None
+
+    @staticmethod
+    def none(problem: str) -> Detections:
+        """Return empty detections with the reason."""
+        return Detections(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), problem)
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A point that was seen and not used, and why."""
+
+    point: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences(Record):
+    """What both cameras saw of one body in one shot; camera 0 is left, 1 right.
+
+    Attributes:
+        ids: (N,) rows of the body's points, strictly increasing, seen by at least one camera.
+        uv: (N, 2, 2) point, camera, raw pixel; NaN where that camera did not see the point.
+        cov_uv: (N, 2, 2, 2) covariance of each place, px^2.
+        dropped: what was thrown away, and why.
+    """
+
+    ids: Ids
+    uv: Array
+    cov_uv: Array
+    dropped: tuple[Dropped, ...] = ()
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N, 2) whether a camera saw a point."""
+        return np.asarray(np.isfinite(self.uv[..., 0]))
+
+    @property
+    def paired(self) -> NDArray[np.bool_]:
+        """(N,) whether both cameras saw a point."""
+        return np.asarray(self.seen.all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Points(Record):
+    """Triangulated points of one shot.
+
+    Attributes:
+        ids: (N,) rows of the body's points.
+        p_left: (N, 3) positions, m, left camera's frame.
+        cov: (N, 3, 3) covariance from the pixel noise alone, m^2.
+        calibration: (N, 3, P) derivative of each position by the rig's parameters: what a wrong calibration does to
+            all points together.
+        seen: the correspondences they came from, one-camera points included.
+        dropped: what was thrown away up to here, and why.
+    """
+
+    ids: Ids
+    p_left: Array
+    cov: Array
+    calibration: Array
+    seen: Correspondences
+    dropped: tuple[Dropped, ...] = ()
+
+
+@dataclass(frozen=True)
+class Missed:
+    """An expected miss: no measurement in this shot, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate(Record):
+    """Where a body is.
+
+    Attributes:
+        T_left_body: (4, 4) pose of the body in the left camera's frame.
+        cov: (6, 6) covariance of the tangent [translation m; rotation rad], perturbation on the right; pixel noise
+            and the rig's calibration together.
+        cov_noise: (6, 6) the same from the pixel noise alone.
+        residual_rms_m: RMS distance of the triangulated points from the fitted body.
+        reprojection_rms_px: RMS distance of the detections from the fitted body's projections.
+        points: the triangulated points that went in.
+        dropped: what was thrown away, and why.
+    """
+
+    T_left_body: Array
+    cov: Array
+    cov_noise: Array
+    residual_rms_m: float
+    reprojection_rms_px: float
+    points: Points
+    dropped: tuple[Dropped, ...] = ()

@@ -1,0 +1,23 @@
+"""The errors armsight raises: one root, few children.
+
+A message says what was given, what is allowed and what to do; the command line prints it as one line and exits with
+code 2. What is expected to go wrong now and then (a marker out of view) is a value, :class:`armsight.data.Missed`.
+"""
+
+from __future__ import annotations
+
+
+class ArmsightError(Exception):
+    """Anything a user can put right; the message is the one line they read."""
+
+
+class InputError(ArmsightError):
+    """A file, an option or an array is not what it must be."""
+
+
+class DeviceError(ArmsightError):
+    """A camera, a stream or a board does not answer as it must."""
+
+
+class CalibrationError(ArmsightError):
+    """The recordings do not determine what was asked for."""

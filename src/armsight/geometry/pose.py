@@ -1,0 +1,76 @@
+"""Poses as 4x4 matrices: ``T_a_b`` maps b's coordinates to a's, and inner letters cancel.
+
+A tangent vector is [translation; rotation] and perturbs on the right: ``T = T_hat @ exp_se3(xi)``. Formulas: Sola, "A
+micro Lie theory", 2018, section D.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.geometry.rotation import Array, exp_so3, log_so3, skew
+
+
+def pose(R: Array, t: Array) -> Array:
+    """Assemble a transform (4, 4) from a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def inverse(T: Array) -> Array:
+    """Invert transforms (..., 4, 4) in closed form."""
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def transform(T_a_b: Array, p_b: Array) -> Array:
+    """Map points (..., 3) from b to a: ``p_a = T_a_b @ p_b``; leading axes broadcast."""
+    return np.asarray((T_a_b[..., :3, :3] @ p_b[..., None])[..., 0] + T_a_b[..., :3, 3])
+
+
+def _left_jacobian(phi: Array) -> Array:
+    """Return V of (..., 3) rotation vectors: the translation of exp_se3 is V @ rho."""
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    S = skew(phi)
+    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + a * S + b * (S @ S))
+
+
+def exp_se3(xi: Array) -> Array:
+    """Turn tangent vectors (..., 6), [translation; rotation], into transforms (..., 4, 4)."""
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = exp_so3(xi[..., 3:])
+    T[..., :3, 3] = (_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def log_se3(T: Array) -> Array:
+    """Turn transforms (..., 4, 4) into tangent vectors (..., 6), [translation; rotation]."""
+    phi = log_so3(np.ascontiguousarray(T[..., :3, :3]))
+    rho = np.linalg.solve(_left_jacobian(phi), T[..., :3, 3, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def adjoint(T: Array) -> Array:
+    """Return the (6, 6) Ad with ``T @ exp_se3(xi) == exp_se3(Ad @ xi) @ T``."""
+    R, t = T[:3, :3], T[:3, 3]
+    Ad = np.zeros((6, 6))
+    Ad[:3, :3] = Ad[3:, 3:] = R
+    Ad[:3, 3:] = skew(t) @ R
+    return Ad
+
+
+def mean_pose(Ts: Array) -> Array:
+    """Return the mean (4, 4) of transforms (N, 4, 4): mean translation, chordal mean rotation."""
+    U, _, Vt = np.linalg.svd(Ts[:, :3, :3].sum(axis=0))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return pose(R, Ts[:, :3, 3].mean(axis=0))

@@ -1,0 +1,49 @@
+"""The rigid motion that best lays one set of points on another.
+
+Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4), 1991.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.geometry.pose import pose, transform
+from armsight.geometry.rotation import Array
+
+
+def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
+    """Fit ``T_a_b`` with ``p_a ~ T_a_b @ p_b`` in weighted least squares.
+
+    Args:
+        p_b: (N, 3) points in b, N >= 3, not all on one line.
+        p_a: (N, 3) the same points in a.
+        weights: (N,) non-negative weights, equal by default.
+
+    Returns:
+        (4, 4) T_a_b.
+
+    Raises:
+        InputError: fewer than three points.
+    """
+    if len(p_b) < 3 or len(p_b) != len(p_a):
+        raise InputError(f"a rigid fit needs 3 or more matched points, got {len(p_b)} and {len(p_a)}")
+    w = np.ones(len(p_b)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    mean_b, mean_a = w @ p_b, w @ p_a
+    U, _, Vt = np.linalg.svd((w[:, None] * (p_a - mean_a)).T @ (p_b - mean_b))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    return pose(R, mean_a - R @ mean_b)
+
+
+def rigid_residuals(p_b: Array, p_a: Array) -> Array:
+    """Return (N, 3) what is left of ``p_a`` after the best rigid motion of ``p_b``, in a's axes."""
+    return np.asarray(p_a - transform(fit_rigid(p_b, p_a), p_b))
+
+
+def fit_scale(p_b: Array, p_a: Array) -> float:
+    """Return how many times larger ``p_a`` (N, 3) is than ``p_b`` (N, 3), by their spread about a rigid fit."""
+    T = fit_rigid(p_b, p_a)
+    b = (p_b - p_b.mean(axis=0)) @ T[:3, :3].T
+    a = p_a - p_a.mean(axis=0)
+    return float(np.sum(a * b) / np.sum(b * b))

@@ -1,0 +1,76 @@
+"""Rotations: vectors, matrices, quaternions (wxyz) and the chapter's roll, pitch, yaw.
+
+Rotation matrices go in and out; scipy's Rotation does the conversions it has. Formulas: Sola, "A micro Lie theory",
+2018; roll, pitch, yaw: chapter equations 18.15 and 18.16.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+#: Below this cos(pitch) only roll -+ yaw is determined (18.16 is singular at +-90 degrees).
+SINGULAR_COS_PITCH = 1e-7
+
+
+def skew(v: Array) -> Array:
+    """Return the matrix of ``v x``.
+
+    Args:
+        v: (..., 3) vectors.
+
+    Returns:
+        (..., 3, 3) matrices with ``skew(v) @ w == cross(v, w)``.
+    """
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_so3(phi: Array) -> Array:
+    """Turn rotation vectors (..., 3), rad, into rotation matrices (..., 3, 3)."""
+    flat = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()
+    return np.asarray(flat.reshape((*phi.shape, 3)))
+
+
+def log_so3(R: Array) -> Array:
+    """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3), rad, of length at most pi."""
+    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(flat.reshape(R.shape[:-1]))
+
+
+def quaternion_wxyz(R: Array) -> Array:
+    """Turn a rotation matrix (3, 3) into a unit quaternion (4,), w x y z, with w >= 0."""
+    return np.asarray(np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1))
+
+
+def from_quaternion_wxyz(q: Array) -> Array:
+    """Turn a quaternion (4,), w x y z, of any length but zero, into a rotation matrix (3, 3)."""
+    return np.asarray(Rotation.from_quat(np.roll(q, -1)).as_matrix())
+
+
+def from_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Array:
+    """Return R_z(roll) R_y(pitch) R_x(yaw), chapter equation 18.15 (phi, theta, psi in its naming), rad."""
+    return np.asarray(Rotation.from_euler("ZYX", [roll, pitch, yaw]).as_matrix())
+
+
+def roll_pitch_yaw(R: Array) -> tuple[Array, bool]:
+    """Split a rotation into the chapter's roll, pitch, yaw (18.16 with atan2).
+
+    Args:
+        R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).
+
+    Returns:
+        (3,) roll, pitch, yaw in rad, and whether the pitch is singular (+-90 degrees): then yaw is set to zero and roll
+        carries what is determined, roll - yaw at +90 degrees, roll + yaw at -90.
+    """
+    cos_pitch = float(np.hypot(R[0, 0], R[1, 0]))
+    pitch = np.arctan2(-R[2, 0], cos_pitch)
+    if cos_pitch < SINGULAR_COS_PITCH:
+        return np.array([np.arctan2(-R[0, 1], R[1, 1]), pitch, 0.0]), True
+    return np.array([np.arctan2(R[1, 0], R[0, 0]), pitch, np.arctan2(R[2, 1], R[2, 2])]), False

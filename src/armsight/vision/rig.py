@@ -1,0 +1,177 @@
+"""StereoRig: two calibrated cameras, their relative pose, and how well all of it is known; load and save.
+
+A rig file is one JSON, described in docs/rig_file.md. Nothing is written before everything is checked, and a file is
+replaced in one step, so an interrupted save leaves the old one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import read_text, write_text
+from armsight.geometry.check import checked
+from armsight.geometry.pose import exp_se3
+from armsight.vision.camera import DISTORTION_MODELS, Camera
+
+FORMAT = "armsight-rig"
+VERSION = 1
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+TANGENT = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig(Record):
+    """Two cameras that see the same volume.
+
+    Attributes:
+        left: the left camera; its frame is the rig's.
+        right: the right camera.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame, m.
+        cov: (P, P) covariance of the rig's parameters: left intrinsics and distortion, right intrinsics and distortion,
+            and the tangent [translation m; rotation rad] of T_left_right (perturbation on the right). Zero where a
+            parameter was given and not estimated.
+        sigma_px: standard deviation of a detection, beyond what the image itself tells, px: what calibration found.
+        provenance: where the rig comes from: command, data, versions.
+    """
+
+    left: Camera
+    right: Camera
+    T_left_right: Array
+    cov: Array
+    sigma_px: float
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes and the rotation."""
+        super().__post_init__()
+        checked(self.T_left_right, (4, 4), "T_left_right")
+        R = self.T_left_right[:3, :3]
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+            raise InputError("T_left_right must hold a rotation: its upper left 3x3 block is not orthonormal")
+        checked(self.cov, (self.parameter_count, self.parameter_count), "rig covariance")
+        if not self.sigma_px >= 0:
+            raise InputError(f"sigma_px must be a number not below zero, got {self.sigma_px}")
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Left and right."""
+        return self.left, self.right
+
+    @property
+    def parameter_count(self) -> int:
+        """P, the length of the parameter vector."""
+        return self.left.parameters.size + self.right.parameters.size + 6
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """P names with units, in the order of ``cov``."""
+        names: list[str] = []
+        for side, camera in zip(("left", "right"), self.cameras, strict=True):
+            coefficients = COEFFICIENTS[:4] if camera.model != "fisheye" else ("k1", "k2", "k3", "k4")
+            if camera.model in ("brown5", "brown8"):
+                coefficients = COEFFICIENTS
+            names += [f"{side}.{n}" for n in ("fx_px", "fy_px", "cx_px", "cy_px", *coefficients[: camera.distortion.size])]
+        return (*names, *(f"T_left_right.{n}" for n in TANGENT))
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the two projection centres, m."""
+        return float(np.linalg.norm(self.T_left_right[:3, 3]))
+
+    @property
+    def convergence_deg(self) -> float:
+        """Angle between the two optical axes, degrees."""
+        return float(np.degrees(np.arccos(np.clip(self.T_left_right[2, 2], -1, 1))))
+
+    def perturbed(self, delta: Array) -> StereoRig:
+        """Return the rig moved by ``delta`` (P,) along its parameter vector; covariance and the rest unchanged."""
+        n_left, n = self.left.parameters.size, self.parameter_count - 6
+        return StereoRig(
+            self.left.with_parameters(self.left.parameters + delta[:n_left]),
+            self.right.with_parameters(self.right.parameters + delta[n_left:n]),
+            self.T_left_right @ exp_se3(delta[n:]),
+            self.cov,
+            self.sigma_px,
+            self.provenance,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the rig as JSON, in one step.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        cameras = {
+            side: {
+                "image_size_px": list(camera.image_size_px),
+                "distortion_model": camera.model,
+                "intrinsics_px": dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics.tolist(), strict=True)),
+                "distortion": camera.distortion.tolist(),
+            }
+            for side, camera in zip(("left", "right"), self.cameras, strict=True)
+        }
+        document = {
+            "format": FORMAT,
+            "version": VERSION,
+            **cameras,
+            "T_left_right_m": self.T_left_right.tolist(),
+            "sigma_px": self.sigma_px,
+            "parameters": list(self.parameter_names),
+            "covariance": self.cov.tolist(),
+            "provenance": dict(self.provenance),
+        }
+        write_text(path, json.dumps(document, indent=1) + "\n")
+
+    @staticmethod
+    def load(path: str | Path) -> StereoRig:
+        """Read a rig file.
+
+        Raises:
+            InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
+        """
+        try:
+            document = json.loads(read_text(path))
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}); expected a rig file") from None
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise InputError(f'{path}: not a rig file: expected "format": "{FORMAT}"; `armsight calibrate` writes one')
+        version = document.get("version")
+        if not isinstance(version, int) or version > VERSION:
+            raise InputError(f"{path}: rig file version {version}, this armsight reads up to {VERSION}: update armsight")
+        try:
+            left, right = (_camera(document[side]) for side in ("left", "right"))
+            count = left.parameters.size + right.parameters.size + 6
+            return StereoRig(
+                left,
+                right,
+                checked(document["T_left_right_m"], (4, 4), "T_left_right_m"),
+                checked(document["covariance"], (count, count), "covariance"),
+                float(document["sigma_px"]),
+                document.get("provenance", {}),
+            )
+        except KeyError as error:
+            raise InputError(f"{path}: the rig file has no {error.args[0]!r}") from None
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: damaged rig file: {error}") from None
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    """Build a camera from its entry in a rig file."""
+    model = str(entry["distortion_model"])
+    width, height = (int(n) for n in entry["image_size_px"])
+    return Camera(
+        (width, height),
+        model,
+        np.array([float(entry["intrinsics_px"][key]) for key in ("fx", "fy", "cx", "cy")]),
+        checked(entry["distortion"], (DISTORTION_MODELS.get(model),), "distortion").reshape(-1),
+    )
