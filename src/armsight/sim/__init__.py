@@ -1,0 +1,1 @@
+"""The world that stands in for the real one and knows the truth: rendered images and recordings."""

@@ -1,0 +1,233 @@
+"""What stands before the cameras: flat patterns on rigid bodies.
+
+A pattern is planar geometry and nothing else: a grid of rectangular cells, each of one reflectance, and discs painted
+over it. Its plane is z = 0 of its own frame, x right, y down and z away from the viewer when it is seen frontally, the
+frame the detectors' bodies use. Boards, tags and plates are all made of that, so the painter knows two shapes only.
+Reflectance is the grey a sensor of unit gain would read, 0 black to 1 white; more than 1 is a lamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+
+#: Reflectance of a cell where nothing is: what stands behind shows.
+CLEAR = -1.0
+BLACK, WHITE = 0.08, 0.85
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern(Record):
+    """One flat pattern; seen from its face only (the side its z axis points away from).
+
+    Attributes:
+        x_edges: (nx + 1,) rising borders of the cells' columns, m, pattern frame.
+        y_edges: (ny + 1,) rising borders of the cells' rows, m, pattern frame.
+        values: (ny, nx) reflectance of each cell; CLEAR lets the background through.
+        discs: (K, 4) centre x, y and radius, m, pattern frame, and reflectance; painted over the cells in this order.
+        T_body_pattern: (4, 4) where the pattern sits on its body.
+    """
+
+    x_edges: Array
+    y_edges: Array
+    values: Array
+    discs: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    T_body_pattern: Array = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self) -> None:
+        """Check shapes, and that borders rise."""
+        super().__post_init__()
+        checked(self.values, (self.y_edges.size - 1, self.x_edges.size - 1), "pattern values")
+        checked(self.discs, (None, 4), "pattern discs")
+        checked(self.T_body_pattern, (4, 4), "T_body_pattern")
+        if (np.diff(self.x_edges) <= 0).any() or (np.diff(self.y_edges) <= 0).any() or (self.discs[:, 2] <= 0).any():
+            raise InputError("a pattern's cell borders must rise and its disc radii must be above zero")
+
+    def on_body(self, T_body_pattern: Array) -> Pattern:
+        """Return the same pattern at another place (4, 4) on its body."""
+        return Pattern(self.x_edges, self.y_edges, self.values, self.discs, T_body_pattern)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed(Record):
+    """A rigid body in front of a camera.
+
+    Attributes:
+        patterns: what is on the body, painted in this order: a tag comes after the plate it is stuck on.
+        T_camera_body: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m.
+        twist: (6,) velocity [m/s; rad/s] in the body's axes: at time t the pose is T_camera_body @ exp_se3(t twist).
+    """
+
+    patterns: tuple[Pattern, ...]
+    T_camera_body: Array
+    twist: Array = field(default_factory=lambda: np.zeros(6))
+
+    def seen_from(self, T_other_camera: Array) -> Placed:
+        """Return the body in another camera's frame; the twist is the body's own and stays."""
+        return Placed(self.patterns, T_other_camera @ self.T_camera_body, self.twist)
+
+
+def plate(
+    width_m: float, height_m: float, value: float = WHITE, discs: Sequence[tuple[float, float, float, float]] = ()
+) -> Pattern:
+    """Return a plain rectangle about its origin with discs (x, y, radius, all m, and reflectance) on it."""
+    return Pattern(
+        np.array([-width_m / 2, width_m / 2]),
+        np.array([-height_m / 2, height_m / 2]),
+        np.array([[value]]),
+        np.array(discs, dtype=np.float64).reshape(-1, 4),
+    )
+
+
+def chessboard(
+    columns: int, rows: int, square_m: float, *, border: float = 1.0, black: float = BLACK, white: float = WHITE
+) -> Pattern:
+    """Return a chessboard; its origin is inner corner 0, whose square towards (-x, -y) is black.
+
+    Args:
+        columns: inner corners along x.
+        rows: inner corners along y.
+        square_m: side of a square, m.
+        border: width of the white margin, squares.
+        black: reflectance of the black squares.
+        white: reflectance of the white squares and the margin.
+    """
+    black_squares = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
+    return Pattern(
+        _with_margin(np.arange(-1.0, columns + 1), border) * square_m,
+        _with_margin(np.arange(-1.0, rows + 1), border) * square_m,
+        np.pad(np.where(black_squares, black, white), 1, constant_values=white),
+    )
+
+
+def circle_grid(
+    columns: int,
+    rows: int,
+    pitch_m: float,
+    *,
+    asymmetric: bool = False,
+    radius_m: float | None = None,
+    black: float = BLACK,
+    white: float = WHITE,
+) -> Pattern:
+    """Return a grid of dark discs on a white plate; its origin is the centre of disc 0.
+
+    Args:
+        columns: discs in a row.
+        rows: rows of discs.
+        pitch_m: step of the grid, m. In an asymmetric grid rows are this far apart, discs in a row twice as far, and
+            odd rows are shifted by it, as OpenCV has it.
+        asymmetric: whether odd rows are shifted.
+        radius_m: radius of a disc, a quarter of the distance to its nearest neighbour by default (m).
+        black: reflectance of the discs.
+        white: reflectance of the plate.
+    """
+    row, column = (index.ravel() for index in np.mgrid[:rows, :columns])
+    x = (2.0 * column + row % 2 if asymmetric else column) * pitch_m
+    y = row * pitch_m
+    radius = radius_m if radius_m is not None else pitch_m * (np.sqrt(2) if asymmetric else 1.0) / 4
+    margin = 1.5 * pitch_m
+    return Pattern(
+        np.array([-margin, x.max() + margin]),
+        np.array([-margin, y.max() + margin]),
+        np.array([[white]]),
+        np.stack([x, y, np.full(x.size, radius), np.full(x.size, black)], axis=1),
+    )
+
+
+def marker_bits(dictionary: str, marker: int) -> NDArray[np.bool_]:
+    """Return the cells (n, n) of an ArUco or AprilTag marker with its black rim; True is white.
+
+    Args:
+        dictionary: OpenCV's name, with or without DICT_ in front: "4X4_50", "APRILTAG_36h11".
+        marker: its number in the dictionary.
+
+    Raises:
+        InputError: no such dictionary, or no such marker in it.
+    """
+    name = dictionary if dictionary.startswith("DICT_") else f"DICT_{dictionary}"
+    if not hasattr(cv2.aruco, name):
+        raise InputError(
+            f"unknown marker dictionary {dictionary!r}; known are OpenCV's, such as APRILTAG_36h11, 4X4_50"
+        )
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    if not 0 <= marker < len(known.bytesList):
+        raise InputError(f"dictionary {dictionary} has markers 0 to {len(known.bytesList) - 1}, not {marker}")
+    cells = known.markerSize + 2
+    return np.asarray(cv2.aruco.generateImageMarker(known, marker, cells) > 127)
+
+
+def tag(
+    bits: NDArray[np.bool_], size_m: float, *, quiet: float = 1.0, black: float = BLACK, white: float = WHITE
+) -> Pattern:
+    """Return a tag; its origin is its centre.
+
+    Args:
+        bits: (n, n) cells, the black rim included; True is white.
+        size_m: side of the black rim's outer edge, m.
+        quiet: width of the white margin around it, cells.
+        black: reflectance of black cells.
+        white: reflectance of white cells and the margin.
+    """
+    edges = _with_margin(np.arange(len(bits) + 1.0) - len(bits) / 2, quiet) * (size_m / len(bits))
+    return Pattern(edges, edges, np.pad(np.where(bits, white, black), 1, constant_values=white))
+
+
+def charuco(
+    columns: int,
+    rows: int,
+    square_m: float,
+    marker_m: float,
+    dictionary: str,
+    *,
+    black: float = BLACK,
+    white: float = WHITE,
+) -> Pattern:
+    """Return a ChArUco board as OpenCV (4.6 and later) draws it, with a white margin of one square.
+
+    Args:
+        columns: squares along x.
+        rows: squares along y.
+        square_m: side of a square, m.
+        marker_m: side of a marker, m.
+        dictionary: OpenCV's name of the marker dictionary.
+        black: reflectance of black squares and cells.
+        white: reflectance of white squares and cells, and of the margin.
+
+    Returns:
+        The board; its origin is the outer corner of the square at the top left, which is black.
+    """
+    bits = [marker_bits(dictionary, k) for k in range(columns * rows // 2)]
+    cells = len(bits[0])
+    inside = (square_m - marker_m) / 2 + np.arange(cells + 1) * (marker_m / cells)
+    x_edges, y_edges = (
+        np.append(np.add.outer(np.arange(n) * square_m, np.append(0.0, inside)).ravel(), n * square_m)
+        for n in (columns, rows)
+    )
+    step = cells + 2
+    values = np.full((rows * step, columns * step), white)
+    marker = 0
+    for j in range(rows):
+        for i in range(columns):
+            square = values[j * step : (j + 1) * step, i * step : (i + 1) * step]
+            if (i + j) % 2 == 0:
+                square[:] = black
+            else:
+                square[1:-1, 1:-1] = np.where(bits[marker], white, black)
+                marker += 1
+    return Pattern(
+        _with_margin(x_edges, square_m), _with_margin(y_edges, square_m), np.pad(values, 1, constant_values=white)
+    )
+
+
+def _with_margin(edges: Array, margin: float) -> Array:
+    """Add a cell of width ``margin`` on both ends of rising borders (n,)."""
+    return np.concatenate([[edges[0] - margin], edges, [edges[-1] + margin]])
