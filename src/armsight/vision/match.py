@@ -1,0 +1,111 @@
+"""Which detection of the left camera and which of the right are the same point: identity, then the epipolar gate.
+
+Coded points (board corners, tags, named markers) carry their identity; the epipolar gate throws out what contradicts the
+rig, by name. Distances are measured in undistorted pixels of each camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
+from armsight.geometry.rotation import skew
+from armsight.vision.rig import StereoRig
+
+#: The gate in standard deviations of the epipolar distance, and the least it may be, px. A wrong identity is many
+#: pixels off; what is only noisier than expected stays and is judged against the body in locate.
+GATE_SIGMAS = 6.0
+GATE_PX = 2.0
+
+
+def join(left: Detections, right: Detections) -> Correspondences:
+    """Put the detections of both cameras side by side by identity, without any geometry."""
+    ids = np.union1d(left.ids, right.ids).astype(np.int64)
+    uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
+    for side, found in enumerate((left, right)):
+        rows = np.searchsorted(ids, found.ids)
+        uv[rows, side], cov[rows, side] = found.uv, found.cov_uv
+    return Correspondences(ids, uv, cov)
+
+
+def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
+    """Measure how far each point lies from the epipolar line of its partner.
+
+    Args:
+        rig: the calibrated pair.
+        uv_left: (N, 2) raw pixels.
+        uv_right: (N, 2) raw pixels of the same points.
+
+    Returns:
+        (N, 2) distance in the left and in the right image, undistorted px; NaN where a pixel has no ray.
+    """
+    x_left, x_right = rig.left.unproject(uv_left), rig.right.unproject(uv_right)
+    E = skew(rig.T_left_right[:3, 3]) @ rig.T_left_right[:3, :3]  # x_left^T E x_right = 0
+    out = np.empty((len(uv_left), 2))
+    pairs = ((x_left, x_right @ E.T, rig.left), (x_right, x_left @ E, rig.right))
+    for side, (x, line, camera) in enumerate(pairs):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gap = np.abs(np.einsum("ni,ni->n", x, line)) / np.abs(x[:, 2])
+            out[:, side] = gap / np.hypot(line[:, 0] / camera.intrinsics[0], line[:, 1] / camera.intrinsics[1])
+    return out
+
+
+def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
+    """Drop, in both cameras, the pairs that the rig's epipolar geometry contradicts.
+
+    Args:
+        rig: the calibrated pair.
+        body: names the points.
+        seen: correspondences by identity.
+
+    Returns:
+        What is left; every dropped point is named with its distance.
+    """
+    rows = np.flatnonzero(seen.paired)
+    if not len(rows):
+        return seen
+    distance = epipolar_distances(rig, seen.uv[rows, 0], seen.uv[rows, 1]).max(axis=1)
+    variance = np.trace(seen.cov_uv[rows], axis1=2, axis2=3).max(axis=1) / 2 + rig.sigma_px**2
+    limit = np.maximum(GATE_PX, GATE_SIGMAS * np.sqrt(2 * variance))
+    bad = ~(distance <= limit)
+    keep = np.ones(len(seen.ids), bool)
+    keep[rows[bad]] = False
+    dropped = tuple(
+        Dropped(body.point_names[i], f"{d:.1f} px off its epipolar line (gate {g:.1f} px)")
+        for i, d, g in zip(seen.ids[rows[bad]], distance[bad], limit[bad], strict=True)
+    )
+    return Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped)
+
+
+def match(
+    rig: StereoRig, body: Body, left: Detections, right: Detections, *, flips: tuple[Ids, ...] = ()
+) -> Correspondences:
+    """Match one shot's detections: identity, then the epipolar gate.
+
+    Args:
+        rig: the calibrated pair.
+        body: the body both detections speak of.
+        left: what the left camera saw.
+        right: what the right camera saw.
+        flips: other orders in which a symmetric board's points may have been named, each an (M,) permutation; the one
+            that agrees best with the rig is taken for the right camera.
+
+    Returns:
+        The correspondences; points seen by one camera only are kept for what they tell about the pose.
+    """
+    best = join(left, right)
+    if flips and best.paired.any():
+        candidates = [best, *(join(left, renamed(right, flip)) for flip in flips)]
+        scores = []
+        for candidate in candidates:
+            pair = candidate.uv[candidate.paired]
+            scores.append(np.nanmedian(epipolar_distances(rig, pair[:, 0], pair[:, 1])) if len(pair) else np.inf)
+        best = candidates[int(np.argmin(scores))]
+    return gate(rig, body, best)
+
+
+def renamed(detections: Detections, permutation: Ids) -> Detections:
+    """Return detections whose point ``i`` is called ``permutation[i]``."""
+    ids = permutation[detections.ids]
+    order = np.argsort(ids)
+    return Detections(ids[order], detections.uv[order], detections.cov_uv[order], detections.problem)

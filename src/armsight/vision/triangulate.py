@@ -1,0 +1,104 @@
+"""Where matched points are: optimal triangulation on raw pixels, through the distortion.
+
+Minimises the covariance-weighted pixel distance in both images (the maximum-likelihood point; Hartley and Sturm,
+"Triangulation", 1997, here by Gauss-Newton so that any distortion and any covariance is allowed).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array, Body, Correspondences, Dropped, Points
+from armsight.geometry.pose import inverse, transform
+from armsight.geometry.rotation import skew
+from armsight.vision.rig import StereoRig
+
+_STEPS = 10
+_DONE = 1e-12  # relative to the depth
+
+
+def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
+    """Return (N, 3) the points halfway between the two rays of raw pixels (N, 2), m, left frame; NaN if parallel."""
+    a, b = rig.left.unproject(uv_left), rig.right.unproject(uv_right) @ rig.T_left_right[:3, :3].T
+    t = rig.T_left_right[:3, 3]
+    ab = np.einsum("ni,ni->n", a, b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along_a = (a @ t - ab * (b @ t)) / (1 - ab**2)
+        along_b = (ab * (a @ t) - b @ t) / (1 - ab**2)
+    return np.asarray((along_a[:, None] * a + t + along_b[:, None] * b) / 2)
+
+
+def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Array, Array]:
+    """Triangulate pairs of raw pixels.
+
+    Args:
+        rig: the calibrated pair.
+        uv: (N, 2, 2) point, camera, raw pixel.
+        cov_uv: (N, 2, 2, 2) covariance of each pixel, px^2, positive definite.
+
+    Returns:
+        (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
+        pixel noise, m^2; (N, 3, P) derivative by the rig's parameters.
+    """
+    p = midpoints(rig, uv[:, 0], uv[:, 1])
+    weight = np.linalg.inv(cov_uv)
+    for _ in range(_STEPS):
+        residual, J, _ = _linearise(rig, p, uv)
+        JW = np.einsum("ncij,ncik->njck", J, weight).reshape(len(p), 3, 4)
+        H = JW @ J.reshape(len(p), 4, 3)
+        step = _solve(H, np.einsum("nij,nj->ni", JW, residual.reshape(len(p), 4)))
+        p = p + step
+        if not (np.abs(step) > _DONE * np.abs(p[:, 2:])).any():
+            break
+    _, J, J_rig = _linearise(rig, p, uv)
+    JW = np.einsum("ncij,ncik->njck", J, weight).reshape(len(p), 3, 4)
+    H = JW @ J.reshape(len(p), 4, 3)
+    good = np.isfinite(H).all(axis=(1, 2))
+    cov, by_rig = np.full((len(p), 3, 3), np.nan), np.full((len(p), 3, J_rig.shape[2]), np.nan)
+    cov[good] = np.linalg.inv(H[good])
+    by_rig[good] = -cov[good] @ JW[good] @ J_rig[good]
+    p[~good] = np.nan
+    return p, cov, by_rig
+
+
+def _solve(H: Array, g: Array) -> Array:
+    """Solve (N, 3, 3) systems; NaN where a point has left the cameras' view."""
+    step = np.full_like(g, np.nan)
+    good = np.isfinite(H).all(axis=(1, 2)) & np.isfinite(g).all(axis=1)
+    good[good] = np.linalg.cond(H[good]) < 1e15
+    step[good] = np.linalg.solve(H[good], g[good][..., None])[..., 0]
+    return step
+
+
+def _linearise(rig: StereoRig, p_left: Array, uv: Array) -> tuple[Array, Array, Array]:
+    """Return residuals (N, 2, 2), their Jacobian by the point (N, 2, 2, 3) and by the rig (N, 4, P)."""
+    T_right_left = inverse(rig.T_left_right)
+    p_right = transform(T_right_left, p_left)
+    uv_l, J_l, K_l = rig.left.project_jacobians(p_left)
+    uv_r, J_r, K_r = rig.right.project_jacobians(p_right)
+    n_left, n = K_l.shape[2], K_l.shape[2] + K_r.shape[2]
+    J_rig = np.zeros((len(p_left), 4, n + 6))
+    J_rig[:, :2, :n_left], J_rig[:, 2:, n_left:n] = K_l, K_r
+    J_rig[:, 2:, n:] = np.concatenate([-J_r, J_r @ skew(p_right)], axis=2)
+    return uv - np.stack([uv_l, uv_r], axis=1), np.stack([J_l, J_r @ T_right_left[:3, :3]], axis=1), J_rig
+
+
+def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
+    """Triangulate one shot's matched points.
+
+    Args:
+        rig: the calibrated pair; its ``sigma_px`` adds to what the image tells.
+        body: names the points.
+        seen: what both cameras saw, gated.
+
+    Returns:
+        The points with their covariance; what does not lie before both cameras is dropped by name.
+    """
+    rows = np.flatnonzero(seen.paired)
+    cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)
+    p, cov, by_rig = optimal_points(rig, seen.uv[rows], cov_uv)
+    good = np.isfinite(p).all(axis=1)
+    dropped = tuple(
+        Dropped(body.point_names[i], "its rays do not meet before both cameras") for i in seen.ids[rows[~good]]
+    )
+    return Points(seen.ids[rows[good]], p[good], cov[good], by_rig[good], seen, seen.dropped + dropped)
