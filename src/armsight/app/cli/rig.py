@@ -1,0 +1,143 @@
+"""``armsight rig``: look at a rig file, and carry rigs from and to other programs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.vision.rig import StereoRig
+from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
+from armsight.vision.rigfiles.rigfile import ASSUMED_SIGMA_PX
+
+_FORMAT = click.option("--format", "name", required=True, type=click.Choice(list(FORMATS)), help="The other program.")
+
+
+@click.group()
+def command() -> None:
+    """Look at a rig file, import a rig of another program, or export one.
+
+    Files of each format, in this order: opencv: intrinsics.yml extrinsics.yml (or one file with both); ros: left.yaml
+    right.yaml (camera_info); kalibr: camchain.yaml.
+    """
+
+
+@command.command()
+@click.argument("path", metavar="RIG.json")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def show(path: str, as_json: bool) -> None:
+    """Print what a rig file holds, with standard deviations where they are known."""
+    rig = StereoRig.load(path)
+    click.echo(json.dumps(_facts(path, rig)) if as_json else "\n".join(_lines(rig)))
+
+
+@command.command("import")
+@click.argument("files", nargs=-1, required=True)
+@click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
+@_FORMAT
+@click.option("--unit-m", type=float, help="Metres a unit of the file's translations; OpenCV files need it.")
+@click.option("--image-size", metavar="WxH", help="Image size in pixels; OpenCV files that hold none need it.")
+@click.option(
+    "--sigma-px", type=float, default=ASSUMED_SIGMA_PX, show_default=True, help="Standard deviation of a detection, px."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def import_(
+    files: tuple[str, ...],
+    output: str,
+    name: str,
+    unit_m: float | None,
+    image_size: str | None,
+    sigma_px: float,
+    as_json: bool,
+) -> None:
+    """Turn another program's calibration into a rig file. Its uncertainty is unknown, and the rig file says so."""
+    size = None if image_size is None else _image_size(image_size)
+    rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px)
+    rig.save(output)
+    for key in ("uncertainty", "sigma_px"):
+        click.echo(f"note: {key}: {rig.provenance[key]}", err=True)
+    for note in rig.provenance["notes"]:
+        click.echo(f"note: {note}", err=True)
+    click.echo(json.dumps(_facts(output, rig)) if as_json else f"{output}: baseline {rig.baseline_m * 1e3:.3f} mm")
+
+
+@command.command()
+@click.argument("path", metavar="RIG.json")
+@click.argument("more", nargs=-1, metavar="[OUT]...")
+@click.option("-o", "--output", multiple=True, required=True, metavar="OUT", help="File to write; may be repeated.")
+@_FORMAT
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
+    """Write a rig for another program, and say what its format cannot hold."""
+    paths = (*output, *more)
+    lost = export_rig(StereoRig.load(path), name, paths)
+    for what in lost:
+        click.echo(f"note: not in the {name} format: {what}", err=True)
+    click.echo(json.dumps({"rig": path, "format": name, "files": paths, "lost": lost}) if as_json else " ".join(paths))
+
+
+def _image_size(text: str) -> tuple[int, int]:
+    """Read WxH."""
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text.strip())
+    if match is None:
+        raise InputError(f"--image-size {text!r}: expected WIDTHxHEIGHT in pixels, such as 1280x720")
+    return int(match[1]), int(match[2])
+
+
+def _baseline_sigma_m(rig: StereoRig) -> float | None:
+    """Return the standard deviation of the baseline, m; None where the rig's uncertainty is unknown."""
+    along = rig.T_left_right[:3, :3].T @ (rig.T_left_right[:3, 3] / rig.baseline_m)  # d|t| by the tangent's translation
+    variance = float(along @ rig.cov[-6:-3, -6:-3] @ along)
+    return float(np.sqrt(variance)) if variance > 0 else None
+
+
+def _facts(path: str, rig: StereoRig) -> dict[str, Any]:
+    """Return the rig as one JSON object."""
+    sigmas = np.sqrt(np.clip(np.diag(rig.cov), 0, None)).tolist()
+    return {
+        "rig": str(Path(path)),
+        **{
+            side: {
+                "image_size_px": camera.image_size_px,
+                "distortion_model": camera.model,
+                "intrinsics_px": camera.intrinsics.tolist(),
+                "distortion": camera.distortion.tolist(),
+            }
+            for side, camera in zip(("left", "right"), rig.cameras, strict=True)
+        },
+        "T_left_right_m": rig.T_left_right.tolist(),
+        "baseline_m": rig.baseline_m,
+        "baseline_sigma_m": _baseline_sigma_m(rig),
+        "convergence_deg": rig.convergence_deg,
+        "sigma_px": rig.sigma_px,
+        "sigmas": {name: sigma or None for name, sigma in zip(rig.parameter_names, sigmas, strict=True)},
+        "provenance": dict(rig.provenance),
+    }
+
+
+def _lines(rig: StereoRig) -> list[str]:
+    """Return the rig as lines for people: mm, degrees, px."""
+    sigmas = dict(zip(rig.parameter_names, np.sqrt(np.clip(np.diag(rig.cov), 0, None)), strict=True))
+    sigma_baseline = _baseline_sigma_m(rig)
+    lines = []
+    for side, camera in zip(("left", "right"), rig.cameras, strict=True):
+        names = [name for name in rig.parameter_names if name.startswith(f"{side}.")]
+        lines.append(f"{side}: {camera.image_size_px[0]}x{camera.image_size_px[1]} px, distortion {camera.model}")
+        for name, value in zip(names, camera.parameters, strict=True):
+            sigma = f" +- {sigmas[name]:.2g}" if sigmas[name] > 0 else ""
+            lines.append(f"  {name.removeprefix(f'{side}.'):6} {value:.6g}{sigma}")
+    spread = f" +- {sigma_baseline * 1e3:.2g}" if sigma_baseline is not None else ""
+    x, y, z = rig.T_left_right[:3, 3] * 1e3
+    lines += [
+        f"baseline: {rig.baseline_m * 1e3:.3f}{spread} mm, right camera at ({x:.3f}, {y:.3f}, {z:.3f}) mm",
+        f"convergence: {rig.convergence_deg:.3f} deg",
+        f"detection sigma: {rig.sigma_px:.3g} px",
+    ]
+    if not rig.cov.any():
+        lines.append("uncertainty: unknown (no covariance in this rig file)")
+    return [*lines, *(f"{key}: {value}" for key, value in rig.provenance.items())]

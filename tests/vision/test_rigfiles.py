@@ -1,0 +1,570 @@
+"""Foreign rig files: exact round trips, OpenCV's own projection as the oracle of every import, every damage told."""
+
+import builtins
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from armsight.app.cli.rig import command
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.rig import StereoRig
+from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
+from strategies import CAMERAS, ordinary_rig
+
+FILES = {
+    "opencv": ["intrinsics.yml", "extrinsics.yml"],
+    "ros": ["left.yaml", "right.yaml"],
+    "kalibr": ["camchain.yaml"],
+}
+#: What each format can hold, and what comes back.
+HELD = {
+    "opencv": {model: model for model in CAMERAS},
+    "ros": {"none": "brown5", "brown4": "brown5", "brown5": "brown5", "brown8": "brown8", "fisheye": "fisheye"},
+    "kalibr": {"none": "none", "brown4": "brown4", "fisheye": "fisheye"},
+}
+R_GIVEN = exp_so3(np.array([0.02, 0.19, -0.011]))  # X_right = R X_left + T
+T_GIVEN = np.array([-0.214, 0.0031, 0.0177])
+
+
+def paths(tmp_path, name):
+    return [tmp_path / file for file in FILES[name]]
+
+
+def points():
+    rng = np.random.default_rng(21)
+    z = rng.uniform(0.4, 2.0, 60)
+    return np.column_stack([rng.uniform(-0.3, 0.3, 60) * z, rng.uniform(-0.25, 0.25, 60) * z, z])
+
+
+def oracle(K, d, R, t, fisheye=False):
+    """OpenCV's projection of the points (left frame) from original matrices, none of our code."""
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    rvec, _ = cv2.Rodrigues(R)
+    return project(points().reshape(-1, 1, 3), rvec, np.asarray(t, dtype=float), K, np.asarray(d, dtype=float))[0][:, 0]
+
+
+def assert_projects_like(rig, left, right, t=T_GIVEN, R=R_GIVEN, fisheye=False, atol=1e-9):
+    """Both cameras of a rig put the points where OpenCV puts them from (K, d) of each."""
+    p_right = transform(inverse(rig.T_left_right), points())
+    np.testing.assert_allclose(rig.left.project(points()), oracle(*left, np.eye(3), np.zeros(3), fisheye), atol=atol)
+    np.testing.assert_allclose(rig.right.project(p_right), oracle(*right, R, t, fisheye), atol=atol)
+
+
+def test_every_format_is_tried_here():
+    assert set(FILES) == set(HELD) == set(FORMATS)
+
+
+@pytest.mark.parametrize(("name", "model"), [(name, model) for name in HELD for model in HELD[name]])
+def test_round_trip(tmp_path, name, model):
+    rig = ordinary_rig(model)
+    lost = export_rig(rig, name, paths(tmp_path, name))
+    back = import_rig(name, paths(tmp_path, name))
+    for mine, other in zip(rig.cameras, back.cameras, strict=True):
+        assert other.image_size_px == mine.image_size_px
+        assert other.model == HELD[name][model]
+        np.testing.assert_array_equal(other.intrinsics, mine.intrinsics)
+        np.testing.assert_array_equal(other.distortion[: mine.distortion.size], mine.distortion)
+        assert not other.distortion[mine.distortion.size :].any()
+    # ROS holds the pose as a product of three matrices; the others print it, inverted once each way.
+    np.testing.assert_allclose(back.T_left_right, rig.T_left_right, rtol=0, atol=2e-15)
+    assert any("covariance" in line for line in lost)
+    assert any("sigma_px" in line for line in lost)
+    assert (model != HELD[name][model]) == any("plumb_bob" in line for line in lost)
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_uncertainty_of_an_import_is_unknown_and_says_so(tmp_path, name):
+    export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
+    rig = import_rig(name, paths(tmp_path, name))
+    assert not rig.cov.any()
+    assert "imported, uncertainty unknown" in rig.provenance["uncertainty"]
+    assert rig.sigma_px == 0.2
+    assert "assumed" in rig.provenance["sigma_px"]
+    rig.save(tmp_path / "rig.json")
+    assert StereoRig.load(tmp_path / "rig.json").provenance == rig.provenance
+    assert import_rig(name, paths(tmp_path, name), sigma_px=0.07).sigma_px == 0.07
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_missing_files_are_named(tmp_path, name):
+    with pytest.raises(InputError, match=f"{FILES[name][0]}: no such file"):
+        import_rig(name, paths(tmp_path, name), unit_m=1.0, image_size_px=(640, 480))
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_the_number_of_files_is_checked(tmp_path, name):
+    for given in ([], [tmp_path / "a"] * 3):
+        with pytest.raises(InputError, match=f"got {len(given)} file"):
+            import_rig(name, given)
+        with pytest.raises(InputError, match=f"got {len(given)} file"):
+            export_rig(ordinary_rig("brown4"), name, given)
+
+
+def test_unknown_format_lists_the_known():
+    with pytest.raises(InputError, match="unknown rig format 'matlab'; known are opencv, ros, kalibr"):
+        import_rig("matlab", ["a"])
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_an_export_that_cannot_be_written_leaves_nothing(tmp_path, name):
+    targets = [tmp_path / "nowhere" / path.name for path in paths(tmp_path, name)]
+    targets[0] = tmp_path / targets[0].name if len(targets) > 1 else targets[0]
+    with pytest.raises(InputError, match="cannot be written"):
+        export_rig(ordinary_rig("brown4"), name, targets)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_a_pair_in_the_wrong_order_is_remarked(tmp_path, name):
+    export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
+    rig = import_rig(name, paths(tmp_path, name))
+    assert not any("left of the first" in note for note in rig.provenance["notes"])
+    swapped = StereoRig(rig.right, rig.left, inverse(rig.T_left_right), rig.cov, 0.1)
+    export_rig(swapped, name, paths(tmp_path, name))
+    back = import_rig(name, paths(tmp_path, name))
+    np.testing.assert_allclose(back.T_left_right, inverse(rig.T_left_right), atol=2e-15)
+    assert any("left of the first" in note for note in back.provenance["notes"])
+
+
+def test_vertical_pairs_survive_rectification(tmp_path):
+    rig = ordinary_rig("brown5")
+    T = rig.T_left_right.copy()
+    T[:3, 3] = [0.004, 0.21, 0.01]
+    export_rig(StereoRig(rig.left, rig.right, T, rig.cov, 0.1), "ros", paths(tmp_path, "ros"))
+    np.testing.assert_allclose(import_rig("ros", paths(tmp_path, "ros")).T_left_right, T, atol=2e-15)
+
+
+# --- OpenCV ----------------------------------------------------------------------------------------------------------
+
+K_LEFT = np.array([[812.3, 0, 633.1], [0, 815.9, 352.7], [0, 0, 1]])
+K_RIGHT = np.array([[799.8, 0, 641.2], [0, 801.1, 366.4], [0, 0, 1]])
+D_LEFT, D_RIGHT = np.array([[-0.31, 0.11, 8e-4, -6e-4, -0.02]]), np.array([[-0.29, 0.1, -7e-4, 5e-4, -0.01]])
+
+
+def stereo_calib(tmp_path, header="%YAML:1.0", files=2, **changes):
+    """Files as OpenCV's sample writes them, from OpenCV's own writer; a value of None leaves an entry out."""
+    entries = {"M1": K_LEFT, "D1": D_LEFT, "M2": K_RIGHT, "D2": D_RIGHT, "R": R_GIVEN, "T": T_GIVEN.reshape(3, 1)}
+    entries |= {"R1": np.eye(3), "R2": np.eye(3), "P1": np.eye(3, 4), "P2": np.eye(3, 4), "Q": np.eye(4)} | changes
+    parts = [("M1", "D1", "M2", "D2"), None] if files == 2 else [None]
+    out, done = [], set()
+    for i, keys in enumerate(parts):
+        storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+        for key, value in entries.items():
+            if (keys is None or key in keys) and key not in done:
+                done.add(key)
+                if value is not None:
+                    storage.write(key, value)
+        text = storage.releaseAndGetString()
+        path = tmp_path / ["intrinsics.yml", "extrinsics.yml"][i]
+        path.write_text(header + text[text.index("\n") :])
+        out.append(path)
+    return out
+
+
+@pytest.mark.parametrize("header", ["%YAML:1.0", "%YAML 1.2"])  # OpenCV 4 and 5
+@pytest.mark.parametrize("files", [1, 2])
+def test_opencv_files_project_as_opencv_does(tmp_path, header, files):
+    given = stereo_calib(tmp_path, header, files)
+    rig = import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
+    assert_projects_like(rig, (K_LEFT, D_LEFT), (K_RIGHT, D_RIGHT))
+    assert rig.left.model == "brown5"
+    again = import_rig("opencv", given[::-1], unit_m=1.0, image_size_px=(1280, 720))
+    np.testing.assert_array_equal(again.T_left_right, rig.T_left_right)
+
+
+def test_opencv_translations_are_in_board_units(tmp_path):
+    given = stereo_calib(tmp_path, T=(T_GIVEN / 0.025).reshape(3, 1))  # squares counted as 1
+    rig = import_rig("opencv", given, unit_m=0.025, image_size_px=(1280, 720))
+    assert_projects_like(rig, (K_LEFT, D_LEFT), (K_RIGHT, D_RIGHT))
+    assert any("0.025 m" in note for note in rig.provenance["notes"])
+    with pytest.raises(InputError, match=r"unit the board was given in.*give unit_m"):
+        import_rig("opencv", given, image_size_px=(1280, 720))
+    for unit in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="unit_m must be a positive length"):
+            import_rig("opencv", given, unit_m=unit, image_size_px=(1280, 720))
+
+
+def test_opencv_files_hold_no_image_size(tmp_path):
+    with pytest.raises(InputError, match="holds no image size: give image_size_px"):
+        import_rig("opencv", stereo_calib(tmp_path), unit_m=1.0)
+    given = stereo_calib(tmp_path, image_width=1280, image_height=720)
+    assert import_rig("opencv", given, unit_m=1.0).left.image_size_px == (1280, 720)
+    with pytest.raises(InputError, match=r"1280.* which is not the 640 x 480 given"):
+        import_rig("opencv", given, unit_m=1.0, image_size_px=(640, 480))
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_opencv_distortion_vectors(tmp_path, count):
+    d = np.zeros(count)
+    d[: min(count, 8)] = [-0.3, 0.1, 1e-3, -1e-3, 0.02, 0.05, -0.01, 0.003][: min(count, 8)]
+    given = stereo_calib(tmp_path, D1=d.reshape(1, -1), D2=d.reshape(-1, 1))
+    rig = import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
+    assert rig.left.model == f"brown{min(count, 8)}"
+    assert_projects_like(rig, (K_LEFT, d), (K_RIGHT, d))
+
+
+def test_opencv_fisheye_is_read_where_it_is_named(tmp_path):
+    d = np.array([0.03, -0.01, 4e-3, -1e-3])
+    given = stereo_calib(tmp_path, D1=d.reshape(1, -1), D2=d.reshape(1, -1), distortion_model="fisheye")
+    rig = import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
+    assert_projects_like(rig, (K_LEFT, d), (K_RIGHT, d), fisheye=True)
+    bare = import_rig("opencv", stereo_calib(tmp_path, D1=d.reshape(1, -1)), unit_m=1.0, image_size_px=(1280, 720))
+    assert any("Brown-Conrady, was assumed" in note for note in bare.provenance["notes"])
+
+
+def test_opencv_reads_back_what_was_exported(tmp_path):
+    rig = ordinary_rig("brown5")
+    export_rig(rig, "opencv", [tmp_path / "both.yml"])
+    storage = cv2.FileStorage(str(tmp_path / "both.yml"), cv2.FILE_STORAGE_READ)
+    M1, D1, M2, D2, R, T, R1, P1, P2 = (
+        storage.getNode(k).mat() for k in ("M1", "D1", "M2", "D2", "R", "T", "R1", "P1", "P2")
+    )
+    storage.release()
+    assert_projects_like(rig, (M1, D1), (M2, D2), t=T.ravel(), R=R)
+    assert P2[0, 3] == pytest.approx(-P2[0, 0] * rig.baseline_m, rel=1e-12)
+    assert P1[0, 3] == 0
+    assert R1.shape == (3, 3)
+
+
+@pytest.mark.parametrize("key", ["M1", "D1", "M2", "D2", "R", "T"])
+def test_opencv_missing_entries(tmp_path, key):
+    with pytest.raises(InputError, match=f"has no '{key}'; expected intrinsics.yml"):
+        import_rig("opencv", stereo_calib(tmp_path, **{key: None}), unit_m=1.0, image_size_px=(1280, 720))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"M1": np.eye(2)}, "M1 has shape"),
+        ({"M1": np.array([[800.0, 1, 600], [0, 800, 300], [0, 0, 1]])}, "skew is not supported"),
+        ({"M2": np.full((3, 3), np.nan)}, "M2 contains NaN"),
+        ({"M1": np.diag([-1.0, 1, 1])}, "focal lengths must be positive"),
+        ({"M1": 3}, "M1"),
+        ({"D1": np.zeros((1, 6))}, "6 distortion coefficients"),
+        ({"D1": np.full((1, 12), 0.1)}, "thin-prism"),
+        ({"D2": np.full((1, 14), 0.1)}, "tilted-sensor"),
+        ({"D2": np.full((1, 5), np.nan)}, "D2 contains NaN"),
+        ({"D2": "none"}, "D2 must be numbers"),
+        ({"distortion_model": "omni"}, "unknown distortion_model 'omni'"),
+        ({"distortion_model": "fisheye"}, "fisheye camera has"),
+        ({"R": 2 * np.eye(3)}, "R is not a rotation"),
+        ({"R": np.diag([1.0, 1, -1])}, "R is not a rotation"),
+        ({"R": np.zeros((3, 1))}, "R has shape"),
+        ({"T": np.zeros((2, 1))}, "translation of R has shape"),
+        ({"T": np.zeros((3, 1))}, "baseline 0"),
+        ({"unit_m": -1.0}, "unit_m must be a positive number"),
+        ({"unit_m": "mm"}, "unit_m must be a positive number"),
+        ({"unit_m": 0.5}, "which is not the 1 given"),
+        ({"image_width": 0, "image_height": 3}, "whole pixels"),
+        ({"image_width": "wide", "image_height": 3}, "image size must be numbers"),
+    ],
+)
+def test_opencv_damage(tmp_path, changes, said):
+    given = stereo_calib(tmp_path, **changes)
+    size = None if "image_width" in changes else (1280, 720)
+    with pytest.raises(InputError, match=said) as caught:
+        import_rig("opencv", given, unit_m=1.0, image_size_px=size)
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "hello", "%YAML:1.0\n---\n- 1\n", "%YAML:1.0\n---\nM1: [1, 2", "\x00\x01"])
+def test_opencv_other_files(tmp_path, text):
+    path = tmp_path / "both.yml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"both\.yml: not an OpenCV FileStorage file") as caught:
+        import_rig("opencv", [path], unit_m=1.0, image_size_px=(1280, 720))
+    assert "\n" not in str(caught.value)
+
+
+def test_opencv_truncations_are_told(tmp_path):
+    (path,) = stereo_calib(tmp_path, files=1)
+    whole = path.read_text()
+    for length in range(0, whole.index("R1:") - 40, 61):
+        path.write_text(whole[:length])
+        with pytest.raises(InputError, match=r"intrinsics\.yml"):
+            import_rig("opencv", [path], unit_m=1.0, image_size_px=(1280, 720))
+
+
+# --- ROS -------------------------------------------------------------------------------------------------------------
+
+
+def camera_infos(tmp_path, digits=17, model="plumb_bob", d=(D_LEFT, D_RIGHT), left=None, right=None):
+    """A camera_info pair from OpenCV's own rectification, numbers printed to some digits; ... removes an entry."""
+    size = (1280, 720)
+    if model == "equidistant":
+        R1, R2, P1, P2, _ = cv2.fisheye.stereoRectify(
+            K_LEFT,
+            np.ravel(d[0]),
+            K_RIGHT,
+            np.ravel(d[1]),
+            size,
+            R_GIVEN,
+            T_GIVEN.reshape(3, 1),
+            flags=cv2.CALIB_ZERO_DISPARITY,
+        )
+    else:
+        R1, R2, P1, P2, *_ = cv2.stereoRectify(
+            K_LEFT, d[0], K_RIGHT, d[1], size, R_GIVEN, T_GIVEN.reshape(3, 1), alpha=0
+        )
+    out = []
+    for path, K, c, R, P, changes in zip(
+        paths(tmp_path, "ros"), (K_LEFT, K_RIGHT), d, (R1, R2), (P1, P2), (left or {}, right or {}), strict=True
+    ):
+        document = {"image_width": 1280, "image_height": 720, "camera_name": path.stem, "distortion_model": model}
+        for key, m in {
+            "camera_matrix": K,
+            "distortion_coefficients": np.reshape(c, (1, -1)),
+            "rectification_matrix": R,
+            "projection_matrix": P,
+        }.items():
+            data = [float(f"{x:.{digits}g}") for x in np.ravel(m)]
+            document[key] = {"rows": m.shape[0], "cols": m.shape[1], "data": data}
+        document |= changes
+        path.write_text(yaml.safe_dump({k: v for k, v in document.items() if v is not ...}))
+        out.append(path)
+    return out
+
+
+MODELS = {
+    "plumb_bob": (D_LEFT, D_RIGHT),
+    "rational_polynomial": (np.array([0.3, -0.1, 1e-3, -7e-4, 0.01, 0.6, -0.05, 0.02]),) * 2,
+    "equidistant": (np.array([0.03, -0.01, 4e-3, -1e-3]),) * 2,
+}
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_ros_files_project_as_opencv_does(tmp_path, model):
+    rig = import_rig("ros", camera_infos(tmp_path, model=model, d=MODELS[model]))
+    left, right = ((K, d) for K, d in zip((K_LEFT, K_RIGHT), MODELS[model], strict=True))
+    assert_projects_like(rig, left, right, fisheye=model == "equidistant")
+
+
+def test_ros_baseline_is_in_the_projection_matrix(tmp_path):
+    rig = import_rig("ros", camera_infos(tmp_path))
+    P = yaml.safe_load((tmp_path / "right.yaml").read_text())["projection_matrix"]["data"]
+    assert rig.baseline_m == pytest.approx(-P[3] / P[0], rel=1e-14)
+    assert rig.baseline_m == pytest.approx(np.linalg.norm(T_GIVEN), rel=1e-14)
+    halved = import_rig("ros", paths(tmp_path, "ros"), unit_m=0.5)
+    assert halved.baseline_m == pytest.approx(rig.baseline_m / 2, rel=1e-14)
+
+
+def test_ros_few_digits_are_mended_and_remarked(tmp_path):
+    rig = import_rig("ros", camera_infos(tmp_path, digits=6))
+    assert np.abs(rig.T_left_right[:3, :3] @ rig.T_left_right[:3, :3].T - np.eye(3)).max() < 1e-14
+    assert any("nearest rotation was taken" in note for note in rig.provenance["notes"])
+    # Six digits leave 5e-7 of a radian or of a length: half a thousandth of a pixel at these focal lengths.
+    assert_projects_like(rig, (K_LEFT, D_LEFT), (K_RIGHT, D_RIGHT), atol=5e-3)
+
+
+def test_ros_files_without_a_model_are_plumb_bob(tmp_path):
+    rig = import_rig("ros", camera_infos(tmp_path, left={"distortion_model": ...}))
+    assert rig.left.model == "brown5"
+    assert any("plumb_bob assumed" in note for note in rig.provenance["notes"])
+
+
+def data(*values):
+    return {"rows": 1, "cols": len(values), "data": list(values)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"image_width": ...}, "has no 'image_width'"),
+        ({"camera_matrix": ...}, "has no 'camera_matrix'"),
+        ({"distortion_coefficients": ...}, "has no 'distortion_coefficients'"),
+        ({"rectification_matrix": ...}, "has no 'rectification_matrix'"),
+        ({"projection_matrix": ...}, "has no 'projection_matrix'"),
+        ({"camera_matrix": {"rows": 3}}, "has no 'data'"),
+        ({"camera_matrix": 5}, "has no 'data'"),
+        ({"camera_matrix": data(1, 2)}, "camera_matrix.data must hold 3 x 3 numbers, got 2"),
+        ({"camera_matrix": data(*([0.0] * 9))}, "camera_matrix must be"),
+        ({"camera_matrix": data("a")}, "camera_matrix.data must be numbers"),
+        ({"distortion_model": "thin_prism_fisheye"}, "'thin_prism_fisheye' is not supported; supported are plumb_bob"),
+        ({"distortion_model": ["x"]}, "is not supported"),
+        ({"distortion_coefficients": data(1, 2, 3)}, "plumb_bob has 0 or 4 or 5 coefficients, got 3"),
+        ({"distortion_model": "rational_polynomial", "distortion_coefficients": data(*([0.1] * 12))}, "thin-prism"),
+        ({"rectification_matrix": data(*(2 * np.eye(3)).ravel().tolist())}, "rectification_matrix is not a rotation"),
+        ({"projection_matrix": data(*([0.0] * 12))}, "projection_matrix must be"),
+        ({"projection_matrix": data(*np.eye(3, 4).ravel().tolist())}, "holds no baseline"),
+        ({"image_width": 12.5}, "whole pixels"),
+        ({"image_width": None}, "image size"),
+    ],
+)
+def test_ros_damage(tmp_path, changes, said):
+    given = camera_infos(tmp_path, right=changes)
+    with pytest.raises(InputError, match=said) as caught:
+        import_rig("ros", given)
+    assert str(caught.value).startswith(str(given[1]))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "3", "- 1\n- 2\n", "a: [1, 2", "a: b: c", "\x00"])
+@pytest.mark.parametrize("name", ["ros", "kalibr"])
+def test_other_yaml_files(tmp_path, name, text):
+    for path in paths(tmp_path, name):
+        path.write_text(text)
+    with pytest.raises(InputError, match=r"(left|camchain)\.yaml: .*YAML") as caught:
+        import_rig(name, paths(tmp_path, name))
+    assert "\n" not in str(caught.value)
+
+
+# --- Kalibr ----------------------------------------------------------------------------------------------------------
+
+
+def camchain(tmp_path, cam0=None, cam1=None, more=None):
+    """A chain of two pinhole-radtan cameras as Kalibr prints it; ... removes an entry."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R_GIVEN, T_GIVEN
+    document = {}
+    for i, (K, d, changes) in enumerate(((K_LEFT, D_LEFT, cam0), (K_RIGHT, D_RIGHT, cam1))):
+        entry = {
+            "cam_overlaps": [1 - i],
+            "camera_model": "pinhole",
+            "distortion_coeffs": d.ravel()[:4].tolist(),
+            "distortion_model": "radtan",
+            "intrinsics": [float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])],
+            "resolution": [1280, 720],
+            "rostopic": f"/cam{i}/image_raw",
+        }
+        if i:
+            entry["T_cn_cnm1"] = T.tolist()
+        document[f"cam{i}"] = {k: v for k, v in (entry | (changes or {})).items() if v is not ...}
+    path = tmp_path / "camchain.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in (document | (more or {})).items() if v is not ...}))
+    return [path]
+
+
+@pytest.mark.parametrize("model", ["radtan", "equidistant", "none"])
+def test_kalibr_files_project_as_opencv_does(tmp_path, model):
+    d = {"radtan": D_LEFT.ravel()[:4], "equidistant": np.array([0.03, -0.01, 4e-3, -1e-3]), "none": np.zeros(0)}[model]
+    changes = {"distortion_model": model, "distortion_coeffs": d.tolist()}
+    rig = import_rig("kalibr", camchain(tmp_path, changes, changes))
+    d = d if d.size else np.zeros(4)
+    assert_projects_like(rig, (K_LEFT, d), (K_RIGHT, d), fisheye=model == "equidistant")
+
+
+def test_kalibr_says_what_it_leaves_behind(tmp_path):
+    rig = import_rig("kalibr", camchain(tmp_path, {"T_cam_imu": np.eye(4).tolist()}, more={"cam2": {}}))
+    assert "left behind: cam2" in rig.provenance["notes"]
+    assert "left behind: T_cam_imu, rostopic" in rig.provenance["notes"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"camera_model": "omni"}, "cam1: camera_model 'omni' is not supported"),
+        ({"camera_model": "eucm"}, "cam1: camera_model 'eucm' is not supported"),
+        ({"camera_model": ...}, "cam1: has no 'camera_model'"),
+        ({"distortion_model": [1]}, r"cam1: distortion_model .* is not supported"),
+        ({"distortion_model": "fov"}, "cam1: distortion_model 'fov' is not supported; supported are radtan"),
+        ({"distortion_model": ...}, "cam1: has no 'distortion_model'"),
+        ({"distortion_coeffs": ...}, "cam1: has no 'distortion_coeffs'"),
+        ({"distortion_coeffs": [0.1]}, "cam1: a brown4 camera has"),
+        ({"intrinsics": ...}, "cam1: has no 'intrinsics'"),
+        ({"intrinsics": [1, 2, 3]}, "cam1: intrinsics has shape"),
+        ({"intrinsics": ["a", 2, 3, 4]}, "cam1: intrinsics must be numbers"),
+        ({"resolution": ...}, "cam1: has no 'resolution'"),
+        ({"resolution": [640]}, "cam1: resolution has shape"),
+        ({"T_cn_cnm1": ...}, "cam1 has no 'T_cn_cnm1'"),
+        ({"T_cn_cnm1": np.eye(3).tolist()}, "T_cn_cnm1 has shape"),
+        ({"T_cn_cnm1": (2 * np.eye(4)).tolist()}, "not a rotation"),
+        ({"T_cn_cnm1": np.eye(4).tolist()}, "baseline 0"),
+    ],
+)
+def test_kalibr_damage(tmp_path, changes, said):
+    (path,) = camchain(tmp_path, cam1=changes)
+    with pytest.raises(InputError, match=said) as caught:
+        import_rig("kalibr", [path])
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [..., 3, None])
+def test_kalibr_needs_two_cameras(tmp_path, value):
+    with pytest.raises(InputError, match=r"camchain\.yaml: (cam1: )?has no '(cam1|camera_model)'"):
+        import_rig("kalibr", camchain(tmp_path, more={"cam1": value}))
+
+
+@pytest.mark.parametrize("model", ["brown5", "brown8"])
+def test_kalibr_cannot_hold_more_than_four_coefficients(tmp_path, model):
+    with pytest.raises(InputError, match="radtan holds k1 k2 p1 p2 only"):
+        export_rig(ordinary_rig(model), "kalibr", [tmp_path / "camchain.yaml"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["ros", "kalibr"])
+def test_without_pyyaml_the_error_says_what_to_install(tmp_path, monkeypatch, name):
+    export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
+    real = builtins.__import__
+
+    def absent(module, *args, **kwargs):
+        if module == "yaml":
+            raise ImportError(module)
+        return real(module, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", absent)
+    for act in (
+        lambda: import_rig(name, paths(tmp_path, name)),
+        lambda: export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name)),
+    ):
+        with pytest.raises(InputError, match=r'pip install "armsight\[formats\]"'):
+            act()
+
+
+# --- command line ----------------------------------------------------------------------------------------------------
+
+
+def run(*args):
+    """Run ``armsight rig``; an error comes back as the exception the main program turns into one line."""
+    return CliRunner().invoke(command, [str(a) for a in args], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_command_export_import_show(tmp_path, name):
+    rig, source, target = ordinary_rig("brown4"), tmp_path / "rig.json", tmp_path / "back.json"
+    rig.save(source)
+    first, *rest = paths(tmp_path, name)
+    out = run("export", source, "--format", name, "-o", first, *rest, "--json")
+    assert out.exit_code == 0
+    assert json.loads(out.stdout)["files"] == [str(first), *map(str, rest)]
+    assert "covariance" in out.stderr
+    out = run("import", first, *rest, "--format", name, "-o", target, "--json")
+    assert out.exit_code == 0
+    assert json.loads(out.stdout)["baseline_m"] == pytest.approx(rig.baseline_m, abs=1e-15)
+    assert "uncertainty unknown" in out.stderr
+    np.testing.assert_allclose(StereoRig.load(target).T_left_right, rig.T_left_right, atol=2e-15)
+    assert "uncertainty: unknown" in run("show", target).stdout
+    assert json.loads(run("show", target, "--json").stdout)["baseline_sigma_m"] is None
+
+
+def test_command_show_knows_the_sigmas(tmp_path):
+    rig, path = ordinary_rig(), tmp_path / "rig.json"
+    rig.save(path)
+    facts = json.loads(run("show", path, "--json").stdout)
+    assert facts["sigmas"]["left.fx_px"] == pytest.approx(rig.cov[0, 0] ** 0.5)
+    # The baseline's own variance, from many draws of the translation.
+    draws = np.random.default_rng(3).multivariate_normal(np.zeros(3), rig.cov[-6:-3, -6:-3], 100_000)
+    lengths = np.linalg.norm(rig.T_left_right[:3, 3] + draws @ rig.T_left_right[:3, :3].T, axis=1)
+    # 100 000 draws settle a standard deviation to 0.22 %; four of those, and the curvature of the length.
+    assert facts["baseline_sigma_m"] == pytest.approx(lengths.std(), rel=0.01)
+    text = run("show", path).stdout
+    assert "baseline: " in text
+    assert f"{rig.baseline_m * 1e3:.3f} +- " in text
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [("640", "expected WIDTHxHEIGHT"), ("0x480", "expected WIDTHxHEIGHT"), ("640x480", "cannot be|no such")],
+)
+def test_command_mistakes(tmp_path, size, said):
+    with pytest.raises(InputError, match=said):
+        run("import", tmp_path / "none.yml", "--format", "opencv", "-o", tmp_path / "r.json", "--image-size", size)
+    assert list(tmp_path.iterdir()) == []
+    assert run("import", "x", "--format", "matlab", "-o", "r").exit_code == 2
