@@ -1,0 +1,47 @@
+"""Where shots come from: one file a kind of source, behind the contract in source.py.
+
+``open_source`` turns what a user writes, ``KIND:...`` or the path of a folder, into a source.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+from armsight.errors import InputError
+from armsight.vision.sources.folder import FolderSource
+from armsight.vision.sources.pairs import PairsSource
+from armsight.vision.sources.source import Source
+from armsight.vision.sources.url import open_url
+from armsight.vision.sources.usb import open_usb
+from armsight.vision.sources.video import open_video
+
+__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "open_source"]
+
+#: Kind -> what opens the rest of the text; another kind of source is one line here.
+SOURCES: dict[str, Callable[[str], Source]] = {
+    "folder": FolderSource,
+    "video": open_video,
+    "url": open_url,
+    "usb": open_usb,
+}
+
+
+def open_source(spec: str) -> Source:
+    """Open a source.
+
+    Args:
+        spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``,
+            ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``; docs/sources.md.
+
+    Raises:
+        InputError: an unknown kind, or what is named is not there or not usable.
+        DeviceError: a camera does not answer.
+    """
+    kind, colon, rest = spec.partition(":")
+    if colon and kind in SOURCES:
+        return SOURCES[kind](rest)
+    if os.path.isdir(os.path.expanduser(spec)):
+        return FolderSource(spec)
+    known = ", ".join(f"{name}:..." for name in SOURCES)
+    raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")

@@ -1,0 +1,138 @@
+"""Pairs of image files: two globs, matched by sorted name.
+
+In: the file names of the left and of the right images. Out: one shot a pair. Names are sorted as a person would (left2
+before left10). The numbers in the names are compared too, so that a file missing on one side is an error and does not
+shift all later pairs by one.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from armsight.data import Shot
+from armsight.errors import InputError
+from armsight.vision.image import read_image
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Where one shot is stored; left and right are None where the recording says it has no images, and why."""
+
+    name: str
+    left: Path | None
+    right: Path | None
+    t_s: float | None = None
+    problem: str | None = None
+
+    def load(self) -> Shot:
+        """Read both images; one that cannot be read makes a shot with a problem."""
+        if self.left is None or self.right is None:
+            return Shot(self.name, None, None, self.t_s, self.problem)
+        try:
+            return Shot(self.name, read_image(self.left), read_image(self.right), self.t_s)
+        except InputError as error:
+            return Shot(self.name, None, None, self.t_s, str(error))
+
+
+class StoredSource:
+    """A source over pairs of image files, read one by one.
+
+    Attributes:
+        pairs: all of them, in the order they are read.
+    """
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = tuple(pairs)
+        self._rest = iter(self.pairs)
+
+    def read(self) -> Shot | None:
+        """Return the next shot, or None at the end."""
+        pair = next(self._rest, None)
+        return None if pair is None else pair.load()
+
+    def close(self) -> None:
+        """Hand out no more shots."""
+        self._rest = iter(())
+
+
+class PairsSource(StoredSource):
+    """The image files that two globs match, paired by sorted name; a shot is called after its left file."""
+
+    def __init__(self, left_glob: str, right_glob: str) -> None:
+        super().__init__(match(_files(left_glob), _files(right_glob), left_glob, right_glob))
+
+
+def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
+    """Return a sorting key under which numbers in a path count as numbers: left2 before left10."""
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part)
+
+
+def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_right: str) -> tuple[Pair, ...]:
+    """Pair left and right files by sorted name.
+
+    Args:
+        lefts: the left files.
+        rights: the right files.
+        said_left: what the user wrote for the left files, for the messages.
+        said_right: the same for the right files.
+
+    Raises:
+        InputError: no file, unequal counts, a file without a partner, or a file that stands on both sides.
+    """
+    left, right = (sorted(files, key=natural_key) for files in (lefts, rights))
+    for files, said in ((left, said_left), (right, said_right)):
+        if not files:
+            raise InputError(f"{said}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
+    both = {file.resolve() for file in left} & {file.resolve() for file in right}
+    if both:
+        raise InputError(f"{min(both)}: is both a left and a right image ({said_left} and {said_right})")
+    alone = _without_partner(left, right)
+    if alone is not None or len(left) != len(right):
+        raise InputError(
+            f"{said_left} and {said_right} do not pair up: {len(left)} left and {len(right)} right images; "
+            f"first without a partner: {alone or max(left, right, key=len)[min(len(left), len(right))]}"
+        )
+    return tuple(Pair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
+
+
+def _files(pattern: str) -> list[Path]:
+    """Return the files a glob matches."""
+    return [Path(name) for name in glob.glob(os.path.expanduser(pattern), recursive=True) if os.path.isfile(name)]
+
+
+def _without_partner(left: Sequence[Path], right: Sequence[Path]) -> Path | None:
+    """Return the first file whose numbers appear on its own side alone; None where numbers do not tell.
+
+    Only the places where a number varies within a side count: cam0_17 and cam1_17 are partners.
+    """
+    numbers = [[tuple(map(int, re.findall(r"\d+", file.stem))) for file in side] for side in (left, right)]
+    if len({len(n) for side in numbers for n in side}) != 1:
+        return None
+    varying = [i for i in range(len(numbers[0][0])) if any(len({n[i] for n in side}) > 1 for side in numbers)]
+    keys = [[tuple(n[i] for i in varying) for n in side] for side in numbers]
+    if any(len(set(side)) != len(side) for side in keys) or not set(keys[0]) & set(keys[1]):
+        return None
+    alone = set(keys[0]) ^ set(keys[1])
+    return next(
+        (
+            file
+            for side, ks in zip((left, right), keys, strict=True)
+            for file, k in zip(side, ks, strict=True)
+            if k in alone
+        ),
+        None,
+    )
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return a short unique name a file: its stem, with the folders below the common one where stems repeat."""
+    stems = [file.stem for file in files]
+    if len(set(stems)) == len(stems):
+        return stems
+    common = os.path.commonpath([file.parent for file in files])
+    return [os.path.relpath(file, common) for file in files]

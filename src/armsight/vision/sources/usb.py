@@ -1,0 +1,226 @@
+"""Two USB cameras: V4L2 through OpenCV.
+
+In: two devices and the settings asked for. Out: shots at the cameras' pace. Both cameras are grabbed before either
+image is decoded. The time stamp is the driver's, taken when the frame arrived (OpenCV hands it on; time.monotonic's
+clock), and where a driver has none, the time after the grab. Drivers queue frames, and not the same number while two
+cameras start: so old frames are passed over, and whichever camera is more than half a frame period behind is grabbed
+again until the two belong together.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import cv2
+
+from armsight.data import Image, Shot
+from armsight.errors import DeviceError, InputError
+from armsight.vision.sources.capture import open_capture
+from armsight.vision.sources.timing import Rhythm, allowed_skew
+
+STALL_S = 5.0  # without a frame for that long a camera has stalled
+_EXPOSURE_UNIT_MS = 0.1  # of V4L2's exposure_time_absolute
+_MANUAL, _AUTO = 1, 3  # of V4L2's auto_exposure: manual mode, aperture priority mode
+_QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
+_CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
+_FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]"
+
+#: OpenCV's property -> its name and value in messages and the value to set; in the order they must be set.
+Settings = dict[int, tuple[str, float]]
+
+
+class Capture(Protocol):
+    """What of cv2.VideoCapture is used; tests bring their own."""
+
+    def set(self, prop: int, value: float, /) -> bool:
+        """Set a property."""
+        ...
+
+    def get(self, prop: int, /) -> float:
+        """Read a property back."""
+        ...
+
+    def grab(self) -> bool:
+        """Take the next frame, undecoded; False when none came."""
+        ...
+
+    def retrieve(self) -> tuple[bool, Image]:
+        """Decode the grabbed frame."""
+        ...
+
+    def release(self) -> None:
+        """Close the device."""
+        ...
+
+
+class UsbCamera:
+    """One camera, set up, with its newest frame's time stamp."""
+
+    def __init__(self, device: str, settings: Settings, capture: Capture) -> None:
+        """Set everything asked for, and read it back.
+
+        Raises:
+            DeviceError: the camera did not take a value.
+        """
+        self.device, self.capture = device, capture
+        self.rhythm, self.t_s = Rhythm(), 0.0
+        for key, (_, value) in settings.items():
+            capture.set(key, value)
+        for key, (name, value) in settings.items():
+            got = capture.get(key)
+            if abs(got - value) > 0.5:  # rates come back as 30.00003; all else is whole numbers
+                said = int(got).to_bytes(4, "little").decode("latin1") if key == cv2.CAP_PROP_FOURCC else f"{got:g}"
+                raise DeviceError(
+                    f"{device}: did not take {name}, it says {said}; `armsight cameras` lists what it can do"
+                )
+        self._shape = (int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+
+    def grab(self, stall_s: float) -> None:
+        """Take the newest frame and its time stamp, and leave it undecoded.
+
+        Raises:
+            DeviceError: the camera is gone, or no frame came for ``stall_s``.
+        """
+        for _ in range(_QUEUE + 1):
+            age_s = self._grab(stall_s)
+            period_s = self.rhythm.period_s
+            if period_s is None or age_s < 2 * period_s:  # a frame is a period old when it has arrived whole
+                break
+
+    def _grab(self, stall_s: float) -> float:
+        """Take the next frame and return its age, s."""
+        start = time.monotonic()
+        while not self.capture.grab():
+            if not os.path.exists(self.device):
+                raise DeviceError(f"{self.device}: the camera is gone: unplugged, or its USB port was reset")
+            if time.monotonic() - start > stall_s:
+                raise DeviceError(
+                    f"{self.device}: no frame for {stall_s:g} s: stalled; two cameras may need two USB ports"
+                )
+            time.sleep(0.01)
+        now = time.monotonic()
+        stamp = self.capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        self.t_s = stamp if 0 <= now - stamp < 10 else now  # a driver without stamps says 0 or uses another clock
+        self.rhythm.tick(self.t_s)
+        return now - self.t_s
+
+    def image(self) -> Image | None:
+        """Decode the grabbed frame; None if that fails.
+
+        Raises:
+            DeviceError: it is not of the size agreed on.
+        """
+        ok, image = self.capture.retrieve()
+        if not ok or image is None or image.size == 0:
+            return None
+        if image.shape[:2] != self._shape:
+            (height, width), (h, w) = self._shape, image.shape[:2]
+            raise DeviceError(f"{self.device}: sends frames of {w}x{h} px, agreed on {width}x{height}")
+        return image
+
+
+class UsbSource:
+    """Two USB cameras."""
+
+    def __init__(self, left: UsbCamera, right: UsbCamera, stall_s: float = STALL_S) -> None:
+        self._left, self._right, self._stall_s = left, right, stall_s
+        self._shots = 0
+
+    def read(self) -> Shot | None:
+        """Return the next shot; its time is the mean of the two time stamps."""
+        left, right = self._left, self._right
+        left.grab(self._stall_s)
+        right.grab(self._stall_s)
+        for _ in range(_CATCH_UP):
+            if abs(left.t_s - right.t_s) <= allowed_skew(left.rhythm, right.rhythm):
+                break
+            min(left, right, key=lambda camera: camera.t_s).grab(self._stall_s)
+        else:
+            raise DeviceError(
+                f"{left.device} and {right.device}: frames stay {abs(left.t_s - right.t_s):.3f} s apart, more than "
+                "half a frame period: are both set to the same frame rate?"
+            )
+        name, t_s = f"{self._shots:06d}", (left.t_s + right.t_s) / 2
+        self._shots += 1
+        images = [left.image(), right.image()]
+        for camera, image in zip((left, right), images, strict=True):
+            if image is None:
+                return Shot(name, None, None, t_s, f"{camera.device}: the frame cannot be decoded")
+        return Shot(name, images[0], images[1], t_s)
+
+    def close(self) -> None:
+        """Let go of both cameras."""
+        self._left.capture.release()
+        self._right.capture.release()
+
+
+def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbSource:
+    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]``.
+
+    Args:
+        rest: two devices, a number N for /dev/videoN or a path, and the settings for both.
+        capture: opens a device; None is OpenCV's V4L2.
+
+    Raises:
+        InputError: the text is not of that form.
+        DeviceError: a device is missing, busy, or does not take a setting.
+    """
+    devices, settings = _parsed(rest)
+    cameras: list[UsbCamera] = []
+    opened: list[Capture] = []
+    try:
+        for device in devices:
+            opened.append((capture or _v4l2)(device))
+            cameras.append(UsbCamera(device, settings, opened[-1]))
+    except DeviceError:
+        for one in opened:
+            one.release()
+        raise
+    left, right = cameras
+    return UsbSource(left, right)
+
+
+def _parsed(rest: str) -> tuple[list[str], Settings]:
+    """Read the text after ``usb:``."""
+    form = re.fullmatch(r"([^,]+),([^,@]+)(?:@(\d+)x(\d+))?(?:@(\d+(?:\.\d+)?))?((?:,[a-z]+=[^,=]+)*)", rest)
+    named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}
+    asked = named.pop("exposure", None)
+    exposure = re.fullmatch(r"auto|(\d+(?:\.\d+)?)ms", asked or "auto")
+    fourcc = named.pop("format", "MJPG")
+    if form is None or exposure is None or len(fourcc) != 4 or named:
+        raise InputError(f"usb:{rest}: expected {_FORM}")
+    left, right, width, height, fps = form.groups()[:5]
+    devices = [f"/dev/video{device}" if device.isdecimal() else device for device in (left, right)]
+    if os.path.realpath(devices[0]) == os.path.realpath(devices[1]):
+        raise InputError(f"usb:{rest}: left and right are the same camera")
+    settings: Settings = {cv2.CAP_PROP_FOURCC: (f"format {fourcc}", cv2.VideoWriter.fourcc(*fourcc))}
+    if width:
+        settings[cv2.CAP_PROP_FRAME_WIDTH] = (f"width {width}", int(width))
+        settings[cv2.CAP_PROP_FRAME_HEIGHT] = (f"height {height}", int(height))
+    if fps:
+        settings[cv2.CAP_PROP_FPS] = (f"{fps} frames per second", float(fps))
+    if exposure[1]:
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({_MANUAL})", _MANUAL)
+        units = round(float(exposure[1]) / _EXPOSURE_UNIT_MS)
+        settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {_EXPOSURE_UNIT_MS} ms)", units)
+    elif asked:
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({_AUTO})", _AUTO)
+    return devices, settings
+
+
+def _v4l2(device: str) -> Capture:
+    """Open a device with OpenCV."""
+    if not os.path.exists(device):
+        raise DeviceError(f"{device}: no such camera; `armsight cameras` lists those attached")
+    if not os.access(device, os.R_OK | os.W_OK):
+        raise DeviceError(
+            f"{device}: no permission; join the group video: sudo usermod -aG video $USER, then log in again"
+        )
+    capture = open_capture(device, cv2.CAP_V4L2)
+    if capture is None:
+        raise DeviceError(f"{device}: cannot be opened: not a camera, or in use by another program")
+    return capture

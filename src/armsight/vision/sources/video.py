@@ -1,0 +1,127 @@
+"""Video files: one for each camera, or one with both pictures side by side.
+
+In: file names. Out: one shot a frame, with the file's own time stamps. Frames are paired by time stamp, so that a frame
+one recorder dropped costs one shot and does not shift the rest.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from armsight.data import Image, Shot
+from armsight.errors import InputError
+from armsight.vision.sources.capture import open_capture
+
+
+class VideoSource:
+    """Two video files, or one side-by-side file."""
+
+    def __init__(self, left: str | Path, right: str | Path | None = None) -> None:
+        """Open the files.
+
+        Args:
+            left: the left camera's file, or with no ``right`` the side-by-side file.
+            right: the right camera's file.
+
+        Raises:
+            InputError: a file is missing or not a video, both are the same, or a side-by-side frame has an odd width.
+        """
+        if right is not None and Path(left).resolve() == Path(right).resolve():
+            raise InputError(f"{left}: given as both left and right video; a side-by-side video is video:{left}")
+        self._files = [_File(path) for path in (left, right) if path is not None]
+        width = int(self._files[0].capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        if right is None and width % 2:
+            self.close()
+            raise InputError(f"{left}: a side-by-side video must have an even width, this one is {width} px wide")
+        self._shots = 0
+        self._ended = False
+
+    def read(self) -> Shot | None:
+        """Return the next shot, or None where the shorter file ends."""
+        if self._ended:
+            return None
+        name = f"{self._shots:06d}"
+        self._shots += 1
+        grabbed = [file.grab() for file in self._files]
+        if not all(grabbed):
+            self._ended = True
+            problem = self._unexpected_end(grabbed)
+            return Shot(name, None, None, None, problem) if problem else None
+        first, last = self._files[0], self._files[-1]
+        if abs(first.t_s - last.t_s) > first.period_s / 2:
+            early, late = sorted((first, last), key=lambda file: file.t_s)
+            late.held = True
+            problem = (
+                f"{late.path} has no frame for {early.path}'s at {early.t_s:.3f} s: its next is at {late.t_s:.3f} s"
+            )
+            return Shot(name, None, None, early.t_s, problem)
+        images = [file.image() for file in self._files]
+        for file, image in zip(self._files, images, strict=True):
+            if image is None:
+                return Shot(
+                    name, None, None, first.t_s, f"{file.path}: the frame at {file.t_s:.3f} s cannot be decoded"
+                )
+        left, right = images if len(images) == 2 else np.split(np.asarray(images[0]), 2, axis=1)
+        return Shot(name, left, right, first.t_s)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._ended = True
+        for file in self._files:
+            file.capture.release()
+
+    def _unexpected_end(self, grabbed: list[bool]) -> str | None:
+        """Say what is odd about the end of the files; None where nothing is."""
+        for file, ok in zip(self._files, grabbed, strict=True):
+            if not ok and file.frames < file.promised - 1:  # some containers only estimate the number: one less is fine
+                return f"{file.path} is damaged or cut short: it ends after {file.frames} of {file.promised} frames"
+        if any(grabbed):
+            short, long = sorted(self._files, key=lambda file: file.frames)
+            return f"{short.path} ends after {short.frames} frames, {long.path} goes on: stopped there"
+        return None
+
+
+class _File:
+    """One open video file and its current frame."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = str(path)
+        if not os.path.isfile(self.path):
+            raise InputError(f"{path}: no such file")
+        capture = open_capture(self.path)
+        if capture is None:
+            raise InputError(f"{path}: not a video file that OpenCV can read")
+        self.capture = capture
+        fps = self.capture.get(cv2.CAP_PROP_FPS)
+        self.period_s = 1 / fps if fps > 0 else np.inf
+        self.promised = int(self.capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.frames = 0
+        self.t_s = 0.0
+        self.held = False  # the current frame waits for a partner: the next grab keeps it
+
+    def grab(self) -> bool:
+        """Go to the next frame; False at the end."""
+        if not self.held:
+            if not self.capture.grab():
+                return False
+            self.frames += 1
+            self.t_s = self.capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        self.held = False
+        return True
+
+    def image(self) -> Image | None:
+        """Decode the current frame; None if that fails."""
+        ok, image = self.capture.retrieve()
+        return image if ok else None
+
+
+def open_video(rest: str) -> VideoSource:
+    """Open ``LEFT.mp4,RIGHT.mp4`` or ``SIDE_BY_SIDE.mp4``."""
+    names = [rest] if os.path.isfile(rest) else rest.split(",")
+    if len(names) > 2 or not all(names):
+        raise InputError(f"video:{rest}: expected video:LEFT.mp4,RIGHT.mp4 or video:SIDE_BY_SIDE.mp4")
+    return VideoSource(*names)

@@ -1,0 +1,171 @@
+"""Pairs of image files by two globs, and folders of them."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from armsight.errors import InputError
+from armsight.vision.sources import FolderSource, PairsSource, open_source
+from armsight.vision.sources.pairs import match, natural_key
+
+
+def shots(source):
+    found = []
+    while (shot := source.read()) is not None:
+        found.append(shot)
+    source.close()
+    assert source.read() is None
+    return found
+
+
+def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, told):
+    for k in (1, 2, 10):
+        store(tmp_path / f"left{k}.png", "left", k)
+        store(tmp_path / f"right{k}.png", "right", k)
+    found = shots(PairsSource(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png"))
+    assert [shot.name for shot in found] == ["left1", "left2", "left10"]
+    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in (1, 2, 10)]
+    assert all(shot.t_s is None and shot.problem is None for shot in found)
+
+
+def test_a_damaged_image_is_a_shot_with_a_problem_and_the_run_goes_on(tmp_path, store):
+    for k in range(3):
+        store(tmp_path / f"left{k}.png", "left", k)
+        store(tmp_path / f"right{k}.png", "right", k)
+    whole = (tmp_path / "right1.png").read_bytes()
+    (tmp_path / "right1.png").write_bytes(whole[: len(whole) // 2])
+    found = shots(open_source(str(tmp_path)))
+    assert [shot.problem is None for shot in found] == [True, False, True]
+    assert "right1.png" in found[1].problem
+    assert found[1].left is None
+    assert found[1].right is None
+
+
+def message(left, right):
+    with pytest.raises(InputError) as caught:
+        match([Path(name) for name in left], [Path(name) for name in right], "L*", "R*")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ([], ["r1"], "L*: no such file"),
+        (["l1"], [], "R*: no such file"),
+        (["l1", "l2", "l3"], ["r1", "r3"], "3 left and 2 right images; first without a partner: l2"),
+        (["l1", "l2"], ["r1", "r2", "r10", "r9"], "2 left and 4 right images; first without a partner: r9"),
+        # Equal counts, but a hole on each side: order alone would pair l3 with r4 without a word.
+        (["l1", "l3", "l4"], ["r1", "r4", "r5"], "3 left and 3 right images; first without a partner: l3"),
+        (["la", "lb"], ["ra"], "2 left and 1 right images; first without a partner: lb"),
+        (["a/1", "b/2"], ["b/2", "c/3"], "is both a left and a right image"),
+    ],
+)
+def test_what_does_not_pair_up_is_an_error_that_names_it(left, right, said):
+    assert said in message(left, right)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        (["cam0_8.png", "cam0_9.png", "cam0_10.png"], ["cam1_8.png", "cam1_9.png", "cam1_10.png"]),
+        (["2024-01-05_1_cam0", "2024-01-05_2_cam0"], ["2024-01-05_1_cam1", "2024-01-05_2_cam1"]),
+        (["l_1403636579763", "l_1403636579813"], ["r_1403636579764", "r_1403636579814"]),  # two clocks: by order
+        (["left.png"], ["right.png"]),
+        (["b_l", "a_l"], ["a_r", "b_r"]),
+    ],
+)
+def test_names_that_differ_in_more_than_left_and_right_pair_up(left, right):
+    pairs = match([Path(n) for n in left], [Path(n) for n in right], "L", "R")
+    order = (
+        [str(n) for n in sorted(map(Path, left), key=natural_key)],
+        [str(n) for n in sorted(map(Path, right), key=natural_key)],
+    )
+    assert [(str(pair.left), str(pair.right)) for pair in pairs] == list(zip(*order, strict=True))
+
+
+def test_names_stay_unique_where_stems_repeat():
+    left, right = ([Path(f"/d/{side}/{run}/1.png") for run in "ab"] for side in ("l", "r"))
+    assert [pair.name for pair in match(left, right, "L", "R")] == ["a/1.png", "b/1.png"]
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=20, unique=True), st.randoms())
+def test_numbers_sort_as_numbers_whatever_their_padding(numbers, random):
+    names = [Path(f"x{n:0{random.randint(1, 8)}d}_l.png") for n in numbers]
+    random.shuffle(names)
+    assert [int(p.stem[1:-2]) for p in sorted(names, key=natural_key)] == sorted(numbers)
+
+
+@given(st.sets(st.integers(0, 99), min_size=3, max_size=20), st.data())
+def test_a_hole_on_one_side_is_always_named(numbers, data):
+    gone = data.draw(st.sampled_from(sorted(numbers)))
+    left = [f"left{n}.png" for n in numbers]
+    right = [f"right{n}.png" for n in numbers - {gone}]
+    assert message(left, right).endswith(f"first without a partner: left{gone}.png")
+    assert message(right, left).endswith(f"first without a partner: left{gone}.png")
+
+
+def test_a_glob_that_matches_nothing_or_a_folder_says_so(tmp_path):
+    with pytest.raises(InputError, match=r"nothing\*.png: no such file"):
+        PairsSource(f"{tmp_path}/nothing*.png", f"{tmp_path}/*")
+    with pytest.raises(InputError, match="no such file"):
+        PairsSource(str(tmp_path), str(tmp_path))
+
+
+def test_a_folder_with_left_and_right_subfolders(tmp_path, store, told):
+    for k in (2, 10):
+        store(tmp_path / "left" / f"{k}.png", "left", k)
+        store(tmp_path / "right" / f"{k}.png", "right", k)
+    (tmp_path / "left" / "notes.txt").write_text("no image")
+    found = shots(open_source(f"folder:{tmp_path}"))
+    assert [(shot.name, told(shot.left)[1], told(shot.right)[1]) for shot in found] == [("2", 2, 2), ("10", 10, 10)]
+
+
+def test_a_folder_without_shots_or_none_at_all(tmp_path):
+    with pytest.raises(InputError, match=r"holds no shots: expected shots.csv, images left\* and right\*"):
+        FolderSource(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        open_source(f"folder:{tmp_path}/none")
+    (tmp_path / "left1.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"right\*: no such file"):
+        FolderSource(tmp_path)
+
+
+HEADER = "shot,t_s,left,right,problem\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "line 1: expected the columns shot,t_s,left,right,problem"),
+        ("a,b\n", "line 1: expected the columns"),
+        (HEADER, "holds no shots"),
+        (HEADER + "1,0.5,l,r\n", "line 2: expected 5 fields, found 4"),
+        (HEADER + "1,0.5,l,r,\n2,abc,l,r,\n", "line 3: t_s must be a number of seconds or empty, got 'abc'"),
+        (HEADER + "1,nan,l,r,\n", "line 2: t_s must be finite"),
+        (HEADER + "1,,l,r,\n1,,l,r,\n", "line 3: shot '1' a second time"),
+        (HEADER + "1,,l,,\n", "line 2: shot '1' has no images and no reason why"),
+        (HEADER + "1,,l,r," + "x" * 200_000, "field larger than field limit"),
+    ],
+)
+def test_a_damaged_index_is_named_with_its_line(tmp_path, text, said):
+    (tmp_path / "shots.csv").write_text(text)
+    with pytest.raises(InputError, match=f"{tmp_path}/shots.csv: .*{said}"):
+        FolderSource(tmp_path)
+
+
+def test_an_index_is_obeyed(tmp_path, store, told):
+    store(tmp_path / "b.png", "left", 3)
+    store(tmp_path / "a.png", "right", 3)
+    (tmp_path / "shots.csv").write_text(HEADER + "x,1.25,b.png,a.png,\ny,1.5,,,camera asleep\nz,,gone.png,a.png,\n")
+    x, y, z = shots(FolderSource(tmp_path))
+    assert (x.name, x.t_s, told(x.left), told(x.right)) == ("x", 1.25, ("left", 3), ("right", 3))
+    assert (y.name, y.t_s, y.problem, y.left) == ("y", 1.5, "camera asleep", None)
+    assert (z.t_s, z.problem) == (None, f"{tmp_path}/gone.png: no such file")
+
+
+@pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/place", "usbcam", ""])
+def test_an_unknown_source_lists_the_known_ones(spec):
+    with pytest.raises(InputError, match=r"not a source: known are folder:..., video:..., url:..., usb:..."):
+        open_source(spec)

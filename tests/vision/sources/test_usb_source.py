@@ -1,0 +1,269 @@
+"""Two USB cameras, played by a stand-in for OpenCV's capture with a queue as V4L2's and a clock of its own."""
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.errors import DeviceError, InputError
+from armsight.vision.sources import open_source, usb
+
+PERIOD = 1 / 30
+
+
+class Clock:
+    """Time that passes only when something waits."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+class FakeCapture:
+    """A camera that takes a frame every period once it streams; the driver queues four and then drops new ones."""
+
+    def __init__(self, clock, log, phase=0.0, period=PERIOD, stubborn=(), stamps=True, size=None):
+        self.clock, self.log, self.phase, self.period = clock, log, phase, period
+        self.stubborn, self.stamps, self.size = stubborn, stamps, size
+        self.props = {
+            cv2.CAP_PROP_FRAME_WIDTH: 640.0,
+            cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
+            cv2.CAP_PROP_FPS: 30.0,
+            cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
+            cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
+            cv2.CAP_PROP_EXPOSURE: 156.0,
+        }
+        self.queue, self.next, self.stamp = [], None, 0.0
+        self.dead = self.undecodable = False
+        self.released = 0
+
+    def set(self, prop, value):
+        if prop not in self.stubborn:
+            self.props[prop] = float(value)
+        return prop not in self.stubborn
+
+    def get(self, prop):
+        if prop == cv2.CAP_PROP_POS_MSEC:
+            return self.stamp * 1000 if self.stamps else 0.0
+        return self.props[prop]
+
+    def _stream(self):
+        if self.next is None:  # streaming starts with the first grab; the sensor needs a while
+            start = self.clock.now + 0.2 - self.phase
+            self.next = np.ceil(start / self.period) * self.period + self.phase
+        while self.next <= self.clock.now:
+            if len(self.queue) < 4:
+                self.queue.append(self.next)
+            self.next += self.period
+
+    def grab(self):
+        self.log.append("grab")
+        if self.dead:
+            self.clock.now += 2.0  # the time OpenCV waits in select()
+            return False
+        self._stream()
+        if not self.queue:
+            self.clock.now = self.next
+            self._stream()
+        self.stamp = self.queue.pop(0)
+        return True
+
+    def retrieve(self):
+        self.log.append("retrieve")
+        if self.undecodable:
+            return False, None
+        width, height = self.size or (
+            int(self.props[cv2.CAP_PROP_FRAME_WIDTH]),
+            int(self.props[cv2.CAP_PROP_FRAME_HEIGHT]),
+        )
+        return True, np.zeros((height, width, 3), np.uint8)
+
+    def release(self):
+        self.released += 1
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    """Open two cameras that are files here, and captures made to order."""
+
+    class Bench:
+        def __init__(self):
+            self.clock, self.log = Clock(), []
+            self.devices = [tmp_path / "cam0", tmp_path / "cam1"]
+            self.captures = []
+            for device in self.devices:
+                device.touch()
+
+        def open(self, tail="", left=None, right=None):
+            orders = iter([left or {}, right or {}])
+
+            def capture(_):
+                self.captures.append(FakeCapture(self.clock, self.log, **next(orders)))
+                return self.captures[-1]
+
+            return usb.open_usb(f"{self.devices[0]},{self.devices[1]}{tail}", capture)
+
+    made = Bench()
+    monkeypatch.setattr(usb, "time", made.clock)
+    return made
+
+
+def test_both_are_grabbed_before_either_is_decoded(bench):
+    source = bench.open()
+    source.read()
+    bench.log.clear()
+    shot = source.read()
+    assert bench.log == ["grab", "grab", "retrieve", "retrieve"]
+    assert shot.left.shape == shot.right.shape == (480, 640, 3)
+    assert shot.name == "000001"
+    source.close()
+    source.close()
+    assert all(capture.released for capture in bench.captures)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.004, 0.012, 0.02, 0.03])
+@pytest.mark.parametrize("pause", [0.0, 0.02, 0.05, 0.5])
+def test_shots_are_fresh_and_their_frames_belong_together(bench, phase, pause):
+    """However the two cameras' phases lie and however slow the user is; the queues of a start-up do not stay behind."""
+    source = bench.open(right={"phase": phase})
+    last_s = -np.inf
+    for _ in range(12):
+        shot = source.read()
+        left, right = (capture.stamp for capture in bench.captures)
+        assert abs(left - right) <= PERIOD / 2 + 1e-6
+        assert bench.clock.now - shot.t_s <= 2.5 * PERIOD  # two periods a frame, half of one between the cameras
+        assert shot.t_s == pytest.approx((left + right) / 2, abs=1e-6)
+        assert shot.t_s > last_s
+        last_s = shot.t_s
+        bench.clock.now += pause
+
+
+def test_a_driver_without_time_stamps_gets_the_time_after_the_grab(bench):
+    source = bench.open(left={"stamps": False}, right={"stamps": False})
+    shot = source.read()
+    assert shot.t_s == pytest.approx(bench.clock.now, abs=PERIOD)
+
+
+def test_cameras_of_rates_that_never_meet_are_told(bench):
+    source = bench.open(left={"period": PERIOD}, right={"period": PERIOD})
+    bench.captures[1].clock = Clock()  # the right one's stamps stand on a clock that stays behind
+    bench.captures[1].clock.now -= 5.0
+    with pytest.raises(
+        DeviceError, match=r"cam0 and .*cam1: frames stay \d\.\d+ s apart, more than half a frame period"
+    ):
+        source.read()
+
+
+def test_all_settings_arrive_at_both_cameras(bench):
+    bench.open("@1280x720@60,exposure=5ms,format=MJPG")
+    for capture in bench.captures:
+        assert capture.props[cv2.CAP_PROP_FOURCC] == cv2.VideoWriter.fourcc(*"MJPG")
+        assert capture.props[cv2.CAP_PROP_FRAME_WIDTH] == 1280
+        assert capture.props[cv2.CAP_PROP_FRAME_HEIGHT] == 720
+        assert capture.props[cv2.CAP_PROP_FPS] == 60
+        assert capture.props[cv2.CAP_PROP_AUTO_EXPOSURE] == 1
+        assert capture.props[cv2.CAP_PROP_EXPOSURE] == 50  # V4L2 counts in 0.1 ms
+
+
+def test_what_is_not_asked_for_stays(bench):
+    bench.open()
+    assert bench.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
+    assert bench.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
+    assert bench.captures[0].props[cv2.CAP_PROP_FRAME_WIDTH] == 640
+
+
+@pytest.mark.parametrize(
+    ("tail", "stubborn", "said"),
+    [
+        ("", cv2.CAP_PROP_FOURCC, "did not take format MJPG, it says YUYV"),
+        ("@1280x720", cv2.CAP_PROP_FRAME_WIDTH, "did not take width 1280, it says 640"),
+        ("@1280x720", cv2.CAP_PROP_FRAME_HEIGHT, "did not take height 720, it says 480"),
+        ("@60", cv2.CAP_PROP_FPS, "did not take 60 frames per second, it says 30"),
+        (",exposure=5ms", cv2.CAP_PROP_AUTO_EXPOSURE, "did not take manual exposure (1), it says 3"),
+        (",exposure=5ms", cv2.CAP_PROP_EXPOSURE, "did not take exposure 50 (x 0.1 ms), it says 156"),
+    ],
+)
+def test_a_setting_not_taken_is_named_and_both_cameras_let_go(bench, tail, stubborn, said):
+    with pytest.raises(DeviceError) as caught:
+        bench.open(tail, right={"stubborn": (stubborn,)})
+    assert str(caught.value) == f"{bench.devices[1]}: {said}; `armsight cameras` lists what it can do"
+    assert [capture.released for capture in bench.captures] == [1, 1]
+
+
+def test_exposure_can_be_set_back_to_automatic(bench):
+    bench.open(",exposure=auto")
+    assert bench.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
+    assert bench.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
+
+
+def test_a_stall_is_told_and_who_stalled(bench):
+    source = bench.open()
+    source.read()
+    bench.captures[1].dead = True
+    with pytest.raises(DeviceError) as caught:
+        source.read()
+    assert str(caught.value) == f"{bench.devices[1]}: no frame for 5 s: stalled; two cameras may need two USB ports"
+
+
+def test_an_unplugged_camera_is_told(bench):
+    source = bench.open()
+    source.read()
+    bench.captures[0].dead = True
+    bench.devices[0].unlink()
+    with pytest.raises(DeviceError, match=r"cam0: the camera is gone: unplugged"):
+        source.read()
+
+
+def test_a_hiccup_shorter_than_a_stall_is_waited_out(bench):
+    source = bench.open()
+    source.read()
+    grab, misses = bench.captures[0].grab, iter([False, False])
+    bench.captures[0].grab = lambda: next(misses, None) is None and grab()
+    assert source.read().problem is None
+
+
+def test_a_frame_that_does_not_decode_is_a_shot_with_a_problem(bench):
+    source = bench.open()
+    bench.captures[1].undecodable = True
+    shot = source.read()
+    assert (shot.left, shot.right) == (None, None)
+    assert shot.problem == f"{bench.devices[1]}: the frame cannot be decoded"
+    bench.captures[1].undecodable = False
+    assert source.read().problem is None
+
+
+def test_a_frame_of_another_size_is_told(bench):
+    source = bench.open("@1280x720", right={"size": (640, 480)})
+    with pytest.raises(DeviceError, match=r"cam1: sends frames of 640x480 px, agreed on 1280x720"):
+        source.read()
+
+
+@pytest.mark.parametrize(
+    "rest",
+    ["", "0", "0,", ",1", "0,1@", "0,1@640x480@", "0,1@640x480x3", "0,1,2", "0,1,exposure=5",
+     "0,1,exposure=5ms=6", "0,1,gain=3", "0,1,format=MJPEG", "0,1@30@640x480"],
+)  # fmt: skip
+def test_a_text_of_another_form_is_told(rest):
+    opened = []
+    with pytest.raises(InputError, match=r"expected usb:LEFT,RIGHT\[@WIDTHxHEIGHT\]"):
+        usb.open_usb(rest, opened.append)
+    assert opened == []
+
+
+def test_one_camera_twice_is_an_error(tmp_path):
+    (tmp_path / "by-id").symlink_to("/dev/video0")
+    for rest in ("0,0", "0,/dev/video0", f"0,{tmp_path}/by-id"):
+        with pytest.raises(InputError, match="left and right are the same camera"):
+            usb.open_usb(rest)
+
+
+def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
+    with pytest.raises(DeviceError, match=r"/dev/video97: no such camera; `armsight cameras` lists those attached"):
+        open_source("usb:97,98")
+    (tmp_path / "file").touch()
+    with pytest.raises(DeviceError, match="cannot be opened: not a camera, or in use by another program"):
+        open_source(f"usb:{tmp_path}/file,98")

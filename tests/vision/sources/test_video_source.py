@@ -1,0 +1,100 @@
+"""Video files: real AVI files, written by OpenCV with a frame number in the grey of each frame."""
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.vision.sources import open_source
+
+
+@pytest.fixture
+def film(tmp_path):
+    """Write a Motion-JPEG AVI of the given images."""
+
+    def write(name, images, fps=30.0):
+        path = tmp_path / name
+        height, width = images[0].shape[:2]
+        writer = cv2.VideoWriter(str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), fps, (width, height))
+        if not writer.isOpened():
+            pytest.skip("this OpenCV cannot write Motion-JPEG AVI files")
+        for image in images:
+            writer.write(image)
+        writer.release()
+        return path
+
+    return write
+
+
+def shots(spec):
+    source, found = open_source(spec), []
+    while (shot := source.read()) is not None:
+        found.append(shot)
+    source.close()
+    source.close()
+    assert source.read() is None
+    return found
+
+
+def test_two_files_frame_by_frame_with_the_files_times(film, picture, told):
+    left, right = (film(f"{side}.avi", [picture(side, k) for k in range(12)]) for side in ("left", "right"))
+    found = shots(f"video:{left},{right}")
+    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in range(12)]
+    assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in range(12)], abs=1e-6)
+    assert [shot.name for shot in found[:2]] == ["000000", "000001"]
+
+
+def test_unequal_lengths_stop_at_the_shorter_and_say_so(film, picture):
+    left = film("left.avi", [picture("left", k) for k in range(9)])
+    right = film("right.avi", [picture("right", k) for k in range(7)])
+    found = shots(f"video:{left},{right}")
+    assert [shot.problem is None for shot in found] == [True] * 7 + [False]
+    assert found[-1].problem == f"{right} ends after 7 frames, {left} goes on: stopped there"
+
+
+def test_frames_are_paired_by_time_and_those_without_a_partner_named(film, picture, told):
+    left = film("left.avi", [picture("left", k) for k in range(10)], fps=30)
+    right = film("right.avi", [picture("right", k) for k in range(5)], fps=15)
+    found = shots(f"video:{left},{right}")
+    pairs = [(told(shot.left)[1], told(shot.right)[1]) for shot in found if shot.problem is None]
+    assert pairs == [(2 * k, k) for k in range(5)]
+    alone = [shot for shot in found if shot.problem]
+    assert alone[0].problem == f"{right} has no frame for {left}'s at 0.033 s: its next is at 0.067 s"
+    assert alone[0].t_s == pytest.approx(1 / 30)
+
+
+def test_a_side_by_side_file_is_split_in_the_middle(film, picture, told):
+    images = [np.hstack([picture("left", k), picture("right", k)]) for k in range(5)]
+    found = shots(f"video:{film('both.avi', images)}")
+    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in range(5)]
+    assert found[0].left.shape == found[0].right.shape == (48, 64, 3)
+
+
+def test_a_file_that_is_cut_short_says_so(film, picture):
+    rng = np.random.default_rng(7)
+    noise = [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(20)]
+    path = film("both.avi", noise)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    found = shots(f"video:{path}")
+    assert 5 <= len(found) < 20
+    assert found[-1].problem == f"{path} is damaged or cut short: it ends after {len(found) - 1} of 20 frames"
+
+
+def test_what_is_no_video_is_named(film, picture, tmp_path, capfd):
+    odd = film("odd.avi", [picture("left", 1, (65, 48))])
+    good = film("good.avi", [picture("left", 1)])
+    text = tmp_path / "text.mp4"
+    text.write_text("hello")
+    for spec, said in (
+        (f"video:{odd}", f"{odd}: a side-by-side video must have an even width, this one is 65 px wide"),
+        (f"video:{good},{tmp_path}/none.avi", f"{tmp_path}/none.avi: no such file"),
+        (f"video:{text}", f"{text}: not a video file that OpenCV can read"),
+        (f"video:{good},{good}", f"{good}: given as both left and right video"),
+        (f"video:{good},{good},{good}", "expected video:LEFT.mp4,RIGHT.mp4 or video:SIDE_BY_SIDE.mp4"),
+        ("video:", "expected video:LEFT.mp4,RIGHT.mp4"),
+    ):
+        with pytest.raises(InputError) as caught:
+            open_source(spec)
+        assert said in str(caught.value)
+    assert capfd.readouterr().err == ""
