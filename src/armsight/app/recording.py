@@ -1,0 +1,162 @@
+"""Store the shots of a source in a folder that is a source itself.
+
+In: a source. Out: a folder with a left and a right PNG a shot, lossless, and the index ``shots.csv``, one line a shot.
+A line is added after both images are whole on disk: whatever stops the recording, all that the index names is readable.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from armsight.data import SIDES, Shot
+from armsight.errors import ArmsightError, InputError
+from armsight.files import replacing
+from armsight.vision.sources.folder import COLUMNS, INDEX
+from armsight.vision.sources.source import Source
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was stored.
+
+    Attributes:
+        directory: where.
+        shots: number of shots in the index.
+        problems: how many of them have no images, but the reason why.
+        stopped: what stopped the recording early; None when it ended as asked.
+        interrupted: whether that was an interrupt from the keyboard.
+    """
+
+    directory: Path
+    shots: int
+    problems: int
+    stopped: str | None = None
+    interrupted: bool = False
+
+
+def record(
+    source: Source,
+    directory: str | Path,
+    *,
+    shots: int | None = None,
+    seconds: float | None = None,
+    on_shot: Callable[[Shot], None] | None = None,
+) -> Recording:
+    """Store shots until the source ends, enough are stored, or something stops it.
+
+    Args:
+        source: where shots come from; stays open.
+        directory: a new or empty folder.
+        shots: stop after so many, those with a problem included; None is no limit.
+        seconds: stop at this age of the first shot by the shots' own time, or by the clock for a source without one.
+        on_shot: called after each shot is stored.
+
+    Returns:
+        How much is stored. An interrupt, a full disk or a camera that fails is no exception but told there.
+
+    Raises:
+        InputError: the folder cannot be made, is not empty, or holds a recording already.
+    """
+    folder = _made(Path(directory).expanduser())
+    writer = _Writer(folder)
+    stopped, interrupted = None, False
+    first: Shot | None = None
+    started_s = time.monotonic()
+    try:
+        while shots is None or writer.shots < shots:
+            shot = source.read()
+            if shot is None:
+                break
+            first = first or shot
+            if first.t_s is None:
+                age_s = time.monotonic() - started_s
+            else:
+                age_s = 0.0 if shot.t_s is None else shot.t_s - first.t_s
+            if seconds is not None and age_s >= seconds:
+                break
+            writer.add(shot)
+            if on_shot is not None:
+                on_shot(shot)
+    except KeyboardInterrupt:
+        stopped, interrupted = "interrupted", True
+    except ArmsightError as error:
+        stopped = str(error)
+    finally:
+        writer.close()
+    return Recording(folder, writer.shots, writer.problems, stopped, interrupted)
+
+
+def _made(folder: Path) -> Path:
+    """Make the folder, or check that it is empty."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / INDEX).exists():
+            raise InputError(f"{folder}: already holds a recording; record into a new folder")
+        if any(folder.iterdir()):
+            raise InputError(f"{folder}: is not empty; record into a new folder")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made a recording's folder: {error.strerror}") from None
+    return folder
+
+
+class _Writer:
+    """The folder being written."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.shots = 0
+        self.problems = 0
+        self._whole = 0  # bytes of the index that are good
+        try:
+            self._index = os.open(folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        except OSError as error:
+            raise InputError(f"{folder / INDEX}: cannot be written: {error.strerror}") from None
+
+    def add(self, shot: Shot) -> None:
+        """Store one shot, all of it or nothing."""
+        files: list[Path] = []
+        try:
+            if shot.problem is None:
+                for side in SIDES:
+                    files.append(self._folder / f"{side}{self.shots:06d}.png")
+                    _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
+                    with replacing(files[-1], "wb") as file:
+                        file.write(data)
+            names = [file.name for file in files] or ["", ""]
+            t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
+            self._append([shot.name, t_s, *names, " ".join((shot.problem or "").split())])
+        except BaseException:  # an interrupt too must not leave half a shot
+            os.ftruncate(self._index, self._whole)
+            for path in files:
+                path.unlink(missing_ok=True)
+            raise
+        self._whole = os.fstat(self._index).st_size
+        self.shots += 1
+        self.problems += shot.problem is not None
+
+    def close(self) -> None:
+        """Close the index, and take it away if it names no shot."""
+        os.close(self._index)
+        if self.shots == 0:
+            (self._folder / INDEX).unlink()
+
+    def _append(self, row: list[str]) -> None:
+        """Add a line to the index, the first time with the header above it, in one write."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([row] if self._whole else [COLUMNS, row])
+        data = text.getvalue().encode()
+        try:
+            if os.write(self._index, data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise InputError(f"{self._folder / INDEX}: cannot be written: {error.strerror}") from None

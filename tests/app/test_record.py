@@ -1,0 +1,266 @@
+"""Recording: what is stored comes back, and whatever stops it leaves a readable recording and says how much."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.app import recording
+from armsight.app.cli.main import main
+from armsight.app.recording import record
+from armsight.data import Shot
+from armsight.errors import DeviceError, InputError
+from armsight.vision.sources import FolderSource, open_source
+
+rng = np.random.default_rng(20240611)
+
+
+def noise(shape=(24, 32, 3), dtype=np.uint8):
+    return rng.integers(0, np.iinfo(dtype).max + 1, shape, dtype=dtype)
+
+
+class Played:
+    """A source that hands out a list; an exception in it is raised."""
+
+    def __init__(self, items):
+        self.items = list(items)
+
+    def read(self):
+        item = self.items.pop(0) if self.items else None
+        if isinstance(item, BaseException):
+            raise item
+        return item
+
+    def close(self):
+        self.items = []
+
+
+def some(count, shape=(24, 32, 3)):
+    return [Shot(f"{k:06d}", noise(shape), noise(shape), 5.0 + k / 30) for k in range(count)]
+
+
+def read_back(folder):
+    source, found = FolderSource(folder), []
+    while (shot := source.read()) is not None:
+        found.append(shot)
+    return found
+
+
+def assert_same(found, shots):
+    assert [shot.name for shot in found] == [shot.name for shot in shots]
+    for a, b in zip(found, shots, strict=True):
+        assert a.problem == b.problem
+        assert a.t_s == (None if b.t_s is None else pytest.approx(b.t_s, abs=5e-7))  # stored to the microsecond
+        for side in ("left", "right"):
+            x, y = a.image(side), b.image(side)
+            assert (x is None) == (y is None)
+            assert x is None or (x.dtype == y.dtype and np.array_equal(x, y))
+
+
+def assert_nothing_else(folder, shots):
+    """The folder holds the index and two files a shot with images, nothing half-written."""
+    assert len(list(folder.iterdir())) == 1 + 2 * sum(shot.problem is None for shot in shots)
+
+
+def test_what_was_recorded_comes_back_bit_by_bit(tmp_path):
+    shots = [
+        *some(2),
+        Shot("grey", noise((24, 32)), noise((24, 32)), 6.0),
+        Shot("deep", noise((24, 32), np.uint16), noise((24, 32, 3), np.uint16), 6.1),
+        Shot("bad, very", None, None, 6.2, 'left: "cut"\nshort'),
+        Shot("timeless", noise(), noise()),
+    ]
+    result = record(Played(shots), tmp_path / "new" / "folder")
+    assert (result.shots, result.problems, result.stopped) == (6, 1, None)
+    shots[4] = Shot("bad, very", None, None, 6.2, 'left: "cut" short')
+    assert_same(read_back(result.directory), shots)
+    assert_nothing_else(result.directory, shots)
+
+
+def test_a_recording_of_a_recording_is_the_same(tmp_path):
+    record(Played(some(3)), tmp_path / "a")
+    record(open_source(f"folder:{tmp_path / 'a'}"), tmp_path / "b")
+    assert (tmp_path / "a" / "shots.csv").read_text() == (tmp_path / "b" / "shots.csv").read_text()
+    assert_same(read_back(tmp_path / "b"), read_back(tmp_path / "a"))
+
+
+def test_it_stops_after_so_many_shots_or_seconds(tmp_path):
+    assert record(Played(some(9)), tmp_path / "a", shots=4).shots == 4
+    assert record(Played(some(9)), tmp_path / "b", seconds=0.1001).shots == 4  # at 0, 1/30, 2/30 and 3/30 s
+    assert record(Played(some(2)), tmp_path / "c", shots=4).shots == 2
+
+
+def test_seconds_of_a_source_without_time_are_the_clocks(tmp_path, monkeypatch):
+    now = iter(np.arange(100.0, 110.0, 0.5))
+    monkeypatch.setattr(recording, "time", type("Clock", (), {"monotonic": staticmethod(lambda: next(now))}))
+    timeless = [Shot(str(k), noise(), noise()) for k in range(9)]
+    assert record(Played(timeless), tmp_path / "a", seconds=1.9).shots == 3  # at 0.5, 1.0 and 1.5 s
+
+
+@pytest.mark.parametrize(
+    ("stop", "said", "interrupted"),
+    [(KeyboardInterrupt(), "interrupted", True), (DeviceError("/dev/video0: gone"), "/dev/video0: gone", False)],
+)
+def test_what_stops_the_source_leaves_what_was_stored(tmp_path, stop, said, interrupted):
+    shots = some(3)
+    result = record(Played([*shots, stop, *some(2)]), tmp_path / "a")
+    assert (result.shots, result.stopped, result.interrupted) == (3, said, interrupted)
+    assert_same(read_back(result.directory), shots)
+    assert_nothing_else(result.directory, shots)
+
+
+@pytest.mark.parametrize("moment", ["first image", "second image", "index"])
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, OSError])
+def test_a_shot_is_stored_whole_or_not_at_all(tmp_path, monkeypatch, moment, kind):
+    """Whenever an interrupt or a full disk hits: while a side is written, or the index."""
+    shots = some(4)
+    trigger = {"first image": "left000002", "second image": "right000002", "index": "shots.csv"}[moment]
+    error = KeyboardInterrupt() if kind is KeyboardInterrupt else OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    replacing, write, lines = recording.replacing, os.write, []
+
+    def failing_replacing(path, mode="w"):
+        if path.name.startswith(trigger):
+            if isinstance(error, OSError):
+                raise InputError(f"{path}: cannot be written: {error.strerror}")
+            raise error
+        return replacing(path, mode)
+
+    def failing_write(handle, data):
+        lines.append(data)
+        if trigger == "shots.csv" and len(lines) == 3:
+            write(handle, data[:7])  # half a line gets out
+            raise error
+        return write(handle, data)
+
+    monkeypatch.setattr(recording, "replacing", failing_replacing)
+    monkeypatch.setattr(recording.os, "write", failing_write)
+    result = record(Played(shots), tmp_path / "a")
+    assert result.shots == 2
+    assert result.interrupted == (kind is KeyboardInterrupt)
+    assert ("interrupted" if result.interrupted else "No space left on device") in result.stopped
+    assert_same(read_back(result.directory), shots[:2])
+    assert_nothing_else(result.directory, shots[:2])
+
+
+def test_a_full_disk_keeps_what_fitted(tmp_path):
+    disk = tmp_path / "small"
+    disk.mkdir()
+    if os.geteuid() != 0 or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "none", disk]).returncode:
+        pytest.skip("only root can mount a small disk; the same is tested with a failing write")
+    try:
+        shots = some(40, (64, 64, 3))  # two files of 12 kB each: about ten fit
+        result = record(Played(shots), disk / "a")
+        assert 5 <= result.shots < 11
+        assert result.stopped.endswith("cannot be written: No space left on device")
+        assert_same(read_back(result.directory), shots[: result.shots])
+        assert_nothing_else(result.directory, shots[: result.shots])
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_a_folder_in_use_is_not_touched(tmp_path):
+    record(Played(some(1)), tmp_path / "a")
+    before = {path: path.read_bytes() for path in (tmp_path / "a").iterdir()}
+    with pytest.raises(InputError, match="already holds a recording; record into a new folder"):
+        record(Played(some(1)), tmp_path / "a")
+    assert {path: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(InputError, match="is not empty; record into a new folder"):
+        record(Played(some(1)), tmp_path)
+    with pytest.raises(InputError, match="file: cannot be made a recording's folder: File exists"):
+        record(Played(some(1)), tmp_path / "file")
+
+
+def test_without_a_single_shot_there_is_no_recording(tmp_path):
+    result = record(Played([DeviceError("gone")]), tmp_path / "a")
+    assert (result.shots, result.stopped) == (0, "gone")
+    assert list((tmp_path / "a").iterdir()) == []
+    assert record(Played(some(1)), tmp_path / "a").shots == 1
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["armsight", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    out, err = capsys.readouterr()
+    return caught.value.code, out, err
+
+
+@pytest.fixture
+def stored(tmp_path):
+    record(Played([*some(2), Shot("2", None, None, 6.0, "left: cut short"), *some(5)[3:]]), tmp_path / "in")
+    return tmp_path / "in"
+
+
+def test_the_command_stores_and_says_so(monkeypatch, capsys, stored, tmp_path):
+    code, out, err = run(monkeypatch, capsys, "record", stored, "-o", tmp_path / "a")
+    assert (code, out) == (
+        0,
+        f"5 shots are stored in {tmp_path / 'a'}, 1 of them without images: shots.csv says why\n",
+    )
+    assert "Traceback" not in err
+    code, out, _ = run(monkeypatch, capsys, "record", stored, "-o", tmp_path / "b", "--shots", 2, "--json")
+    assert code == 0
+    assert json.loads(out) == {"directory": str(tmp_path / "b"), "shots": 2, "problems": 0, "stopped": None}
+
+
+def test_the_commands_mistakes_are_one_line_and_code_2(monkeypatch, capsys, stored, tmp_path):
+    for arguments, said in (
+        (("film:x", "-o", tmp_path / "a"), "film:x: not a source: known are folder:..., video:..., url:..., usb:..."),
+        ((stored, "-o", stored), f"{stored}: already holds a recording; record into a new folder"),
+        (("usb:97,98", "-o", tmp_path / "a"), "/dev/video97: no such camera; `armsight cameras` lists those attached"),
+    ):
+        code, out, err = run(monkeypatch, capsys, "record", *arguments)
+        assert (code, out) == (2, "")
+        assert [line for line in err.splitlines() if line.strip()][-1].startswith(f"armsight: error: {said}")
+    assert not (tmp_path / "a").exists()
+    code, _, err = run(monkeypatch, capsys, "record", stored, "-o", tmp_path / "a", "--shots", 0)
+    assert code == 2
+    assert "--shots" in err
+
+
+def test_a_stop_in_the_middle_is_a_partial_result_that_says_so(monkeypatch, capsys, tmp_path):
+    module = sys.modules.get("armsight.app.cli.record") or __import__("armsight.app.cli.record", fromlist=["command"])
+    for stop, expected, said in (
+        (DeviceError("/dev/video0: gone"), 2, "armsight: error: /dev/video0: gone; 3 shots are stored in"),
+        (KeyboardInterrupt(), 130, "armsight: interrupted; 3 shots are stored in"),
+    ):
+        monkeypatch.setattr(module, "open_source", lambda _, stop=stop: Played([*some(3), stop]))
+        folder = tmp_path / str(expected)
+        code, out, err = run(monkeypatch, capsys, "record", "any", "-o", folder, "--json")
+        assert code == expected
+        assert json.loads(out)["shots"] == 3
+        assert said in err.replace("\n", " ")
+        assert len(read_back(folder)) == 3
+
+
+def test_ctrl_c_in_a_real_process(tmp_path):
+    """A long recording of a video, interrupted as soon as some of it is stored."""
+    video = tmp_path / "both.avi"
+    writer = cv2.VideoWriter(str(video), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (640, 240))
+    for _ in range(300):
+        writer.write(noise((240, 640, 3)))
+    writer.release()
+    folder = tmp_path / "a"
+    command = [sys.executable, "-c", "from armsight.app.cli.main import main; main()", "record", f"video:{video}"]
+    process = subprocess.Popen(
+        [*command, "-o", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+    while process.poll() is None and not Path(folder, "right000004.png").exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    found = read_back(folder)
+    assert process.returncode == 130
+    assert f"armsight: interrupted; {len(found)} shots are stored in" in err
+    assert "Traceback" not in out + err
+    assert 4 <= len(found) < 300
+    assert_nothing_else(folder, found)
