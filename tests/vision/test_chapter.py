@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 
+from armsight.data import Body, Correspondences, PoseEstimate
 from armsight.errors import InputError
-from armsight.geometry.pose import inverse, transform
+from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.geometry.rotation import roll_pitch_yaw
+from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
 from armsight.vision.chapter import (
     T_world_camera,
     VergingRig,
@@ -22,8 +23,10 @@ from armsight.vision.chapter import (
     triangulate_parallel,
     triangulate_verging,
 )
+from armsight.vision.locate import locate
+from armsight.vision.triangulate import triangulate
 from asserts import assert_rotation
-from strategies import finite, poses, rotations, verging_rigs
+from strategies import finite, poses, rotation_vectors, rotations, verging_rigs
 
 PITCH, SIZE = 3e-6, (1280, 720)
 EXACT_M = 1e-9  # what the issue asks for
@@ -98,6 +101,35 @@ def test_the_two_rays_of_18_7(rig, P):
     scale = 1e-15 * 64 * (rig.F1 + rig.F2) * 4
     assert m1 * (X + rig.X01) + n1 * (Z - rig.Z01) == pytest.approx(u1 * rig.F1, abs=scale)
     assert m2 * (X - rig.X02) + n2 * (Z - rig.Z02) == pytest.approx(u2 * rig.F2, abs=scale)
+
+
+def correspondences(general, p_left):
+    """What both cameras see of points (N, 3) in the left frame, without noise."""
+    uv_right = general.right.project(transform(inverse(general.T_left_right), p_left))
+    uv = np.stack([general.left.project(p_left), uv_right], axis=1)
+    return Correspondences(np.arange(len(uv)), uv, np.zeros((len(uv), 2, 2, 2)))
+
+
+@given(verging_rigs(), st_points)
+def test_verging_agrees_with_the_general_triangulation(rig, P):
+    general = stereo_rig(rig, pitch=PITCH, image_size_px=SIZE)
+    seen = correspondences(general, transform(inverse(T_world_camera(rig, "left")), P)[None])
+    points = triangulate(general, Body("point", ("P",), np.zeros((1, 3))), seen)
+    (u1, v1), (u2, _) = (image_coordinates(seen.uv[:, i], pitch=PITCH, image_size_px=SIZE) for i in range(2))
+    closed = triangulate_verging(rig, u1, v1, u2)
+    assert points.dropped == ()
+    np.testing.assert_allclose(transform(T_world_camera(rig, "left"), points.p_left), closed, atol=EXACT_M)
+
+
+@given(finite(2e-3, 16e-3), finite(0.05, 0.5), st_points)
+def test_parallel_agrees_with_the_general_triangulation(F, B, P):
+    rig = VergingRig.symmetric(F, B)
+    general = stereo_rig(rig, pitch=PITCH, image_size_px=SIZE)
+    seen = correspondences(general, transform(inverse(T_world_camera(rig, "left")), P)[None])
+    points = triangulate(general, Body("point", ("P",), np.zeros((1, 3))), seen)
+    (u1, v1), (u2, _) = (image_coordinates(seen.uv[:, i], pitch=PITCH, image_size_px=SIZE) for i in range(2))
+    closed = triangulate_parallel(F, B, u1, v1, u2)
+    np.testing.assert_allclose(transform(T_world_camera(rig, "left"), points.p_left), closed, atol=EXACT_M)
 
 
 def test_many_points_at_once():
@@ -194,6 +226,18 @@ def test_orientation_of_an_isosceles_plate(T):
     np.testing.assert_allclose(found.R, T[:3, :3], atol=1e-13)
     np.testing.assert_allclose(found.R, fit_rigid(PLATE, transform(T, PLATE))[:3, :3], atol=EXACT_M)
     assert not found.orthonormalised
+
+
+@given(rotation_vectors(0.8))
+def test_orientation_agrees_with_locate(phi):
+    rig = VergingRig.symmetric(4e-3, 0.22, 0.1)
+    general = stereo_rig(rig, pitch=PITCH, image_size_px=SIZE)
+    plate = Body("plate", ("P1", "P2", "P3"), PLATE)
+    seen = correspondences(general, transform(pose(exp_so3(phi), np.array([0.1, 0.02, 0.8])), PLATE))
+    points = triangulate(general, plate, seen)
+    located = locate(general, plate, points)
+    assert isinstance(located, PoseEstimate)
+    np.testing.assert_allclose(orientation(*points.p_left).R, located.T_left_body[:3, :3], atol=1e-9)
 
 
 @given(rotations())

@@ -1,7 +1,10 @@
 """Foreign rig files: exact round trips, OpenCV's own projection as the oracle of every import, every damage told."""
 
 import builtins
+import errno
+import itertools
 import json
+import os
 
 import cv2
 import numpy as np
@@ -118,6 +121,45 @@ def test_an_export_that_cannot_be_written_leaves_nothing(tmp_path, name):
     with pytest.raises(InputError, match="cannot be written"):
         export_rig(ordinary_rig("brown4"), name, targets)
     assert list(tmp_path.iterdir()) == []
+
+
+class LateFullDisk:
+    """A file whose disk turns out to be full only when the buffer is written out."""
+
+    def __init__(self, file):
+        self.file = file
+
+    def write(self, text):
+        pass
+
+    def flush(self):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.file.close()
+        if exc[0] is None:
+            self.flush()
+
+
+@pytest.mark.parametrize("full", [0, 1])
+def test_a_full_disk_replaces_neither_file_of_a_pair(tmp_path, monkeypatch, full):
+    targets = paths(tmp_path, "ros")
+    export_rig(ordinary_rig("brown5"), "ros", targets)
+    before = [path.read_bytes() for path in targets]
+    real, count = os.fdopen, itertools.count()
+
+    def fdopen(*args, **kwargs):
+        file = real(*args, **kwargs)
+        return LateFullDisk(file) if next(count) == full else file
+
+    monkeypatch.setattr("armsight.files.os.fdopen", fdopen)
+    with pytest.raises(InputError, match=rf"{targets[full].name}: cannot be written: No space left"):
+        export_rig(ordinary_rig("brown5", seed=9), "ros", targets)
+    assert [path.read_bytes() for path in targets] == before
+    assert sorted(os.listdir(tmp_path)) == sorted(path.name for path in targets)
 
 
 @pytest.mark.parametrize("name", list(FORMATS))
@@ -272,6 +314,17 @@ def test_opencv_damage(tmp_path, changes, said):
         import_rig("opencv", given, unit_m=1.0, image_size_px=size)
     assert str(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_opencv_says_where_the_parser_stopped(tmp_path):
+    given = stereo_calib(tmp_path)
+    text = given[1].read_text()
+    given[1].write_text(text.replace("]", "", 1))
+    with pytest.raises(InputError, match=r"extrinsics\.yml: .*damaged one: line \d+: "):
+        import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
+    given[1].write_text(text.replace("rows: 3", "rows: 4", 1))
+    with pytest.raises(InputError, match=r"extrinsics\.yml: R is damaged"):
+        import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
 
 
 @pytest.mark.parametrize("text", ["", "hello", "%YAML:1.0\n---\n- 1\n", "%YAML:1.0\n---\nM1: [1, 2", "\x00\x01"])

@@ -8,6 +8,7 @@ vector of four coefficients is read as Brown's. R1 R2 P1 P2 Q follow from the re
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,6 +38,8 @@ from armsight.vision.rigfiles.rigfile import (
 )
 
 FILES = "intrinsics.yml and extrinsics.yml, or one file with both"
+NEEDED = ("M1", "D1", "M2", "D2", "R", "T")
+OPTIONAL = ("unit_m", "image_width", "image_height", "distortion_model")
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
@@ -46,7 +49,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     for path in paths:
         found.update({key: (value, path) for key, value in _load(path).items()})
     where = " or ".join(map(str, paths))
-    for key in ("M1", "D1", "M2", "D2", "R", "T"):
+    for key in NEEDED:
         if key not in found:
             raise InputError(f"{where}: has no {key!r}; expected {FILES}")
     unit, size = _unit_m(found, options, where), _size(found, options, where)
@@ -87,14 +90,27 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _load(path: Path) -> dict[str, Foreign]:
-    """Read every top-level entry of a FileStorage file that is a matrix, a number or a text."""
+    """Read those entries of a FileStorage file that make up a rig."""
     text = read_text(path)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        return {key: _value(storage.getNode(key)) for key in storage.root().keys()}  # noqa: SIM118 (a FileNode is no dict)
+        nodes = {key: storage.getNode(key) for key in (*NEEDED, *OPTIONAL)}
     except (cv2.error, SystemError) as error:  # the binding wraps a parser's error in a SystemError
-        problem = str(error.__cause__ or error).strip().rstrip("\n").split("error: ")[-1]
-        raise InputError(f"{path}: not an OpenCV FileStorage file, or a damaged one: {problem}") from None
+        raise InputError(f"{path}: not an OpenCV FileStorage file, or a damaged one{_line(error.__cause__)}") from None
+    found = {}
+    for key, node in nodes.items():
+        try:
+            if not node.empty():
+                found[key] = _value(node)
+        except cv2.error:
+            raise InputError(f"{path}: {key} is damaged: its numbers do not make the matrix it announces") from None
+    return found
+
+
+def _line(cause: BaseException | None) -> str:
+    """Return the line in which OpenCV's parser stopped, as it says in "(7): Missing , between the elements"."""
+    match = re.search(r"\((\d+)\): ([^']+)", str(cause))
+    return f": line {match[1]}: {match[2].strip()}" if match else ""
 
 
 def _value(node: cv2.FileNode) -> Foreign:

@@ -104,10 +104,10 @@ def dump_yaml(document: Mapping[str, Foreign]) -> str:
 def write_together(paths: Sequence[Path], texts: Sequence[str]) -> None:
     """Write several text files; none takes its place before all are written out."""
     with contextlib.ExitStack() as stack:
-        files = [stack.enter_context(replacing(path)) for path in paths]
-        for file, text in zip(files, texts, strict=True):
+        for path, text in zip(paths, texts, strict=True):
+            file = stack.enter_context(replacing(path))
             file.write(text)
-            file.flush()
+            file.flush()  # a full disk shows here, while every old file still stands
 
 
 def need(document: Foreign, key: str) -> Foreign:
