@@ -1,0 +1,50 @@
+"""Calibration boards by their spec, such as ``chessboard:9x6:25mm``.
+
+To add a kind of board: one file with a class that fulfils :class:`Board`, and one line in BOARDS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from armsight.data import Ids
+from armsight.errors import InputError
+from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.spec import Fields
+
+
+class Board(Target, Protocol):
+    """A flat target whose points lie in z = 0, the first at the origin, x along the columns."""
+
+    @property
+    def flips(self) -> tuple[Ids, ...]:
+        """Permutations (M,) under which the board looks the same, without identity: point i may as well be perm[i].
+
+        ``perm[ids]`` renames detections; empty for a board that shows which way up it is. One image cannot tell; left
+        and right of a pair together can.
+        """
+        ...
+
+
+#: Kind -> (form, maker).
+BOARDS: dict[str, tuple[str, Callable[[Fields], Board]]] = {
+    "chessboard": (Chessboard.form, Chessboard.from_fields),
+}
+
+
+def open_board(spec: str) -> Board:
+    """Make the board that a spec names.
+
+    Args:
+        spec: kind and fields, separated by colons; lengths carry a unit (mm, cm, m, in).
+
+    Raises:
+        InputError: unknown kind or malformed fields; the message shows the form and the known kinds.
+    """
+    kind, *values = spec.strip().split(":")
+    if kind not in BOARDS:
+        raise InputError(f"unknown board {spec!r}; known are {'; '.join(form for form, _ in BOARDS.values())}")
+    form, make = BOARDS[kind]
+    return make(Fields(spec, form, tuple(values)))

@@ -1,0 +1,153 @@
+"""Chessboards: ``chessboard:9x6:25mm``, inner corners columns x rows and the side of a square.
+
+OpenCV finds the grid, :mod:`~armsight.vision.markers.corner` places its corners. Their order is made canonical in each
+image by itself: right-handed as seen from the front (x along the columns, y along the rows, so z points into the
+board), and starting at the corner whose first square, the one between corners (0, 0) and (1, 1), is dark. Colours
+decide this unless columns + rows is even; what they leave open is in :attr:`Chessboard.flips`, the corner that lies
+most to the upper left in the image comes first, and whoever sees both images settles it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.vision.markers.corner import VERDICTS, CornerFits, refine_corners
+from armsight.vision.markers.grid import grid_points, local_squares, rotations
+from armsight.vision.markers.spec import Fields
+
+#: Above this many pixels a side the grid is looked for in a smaller copy first; corners are placed in the full image.
+SEARCH_SIDE_PX = 1600
+#: Fewer corners than this share of the board are not taken for the board.
+KEPT_SHARE = 0.5
+#: A residual this many times the median residual of the board's corners, both relative to the contrast, is not of a
+#: clean corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
+MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class Chessboard(Record):
+    """A chessboard; its points are the inner corners, row by row.
+
+    Attributes:
+        columns: inner corners along x.
+        rows: inner corners along y.
+        square_m: side of a square, m.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+
+    form = "chessboard:COLUMNSxROWS:SQUARE (inner corners), such as chessboard:9x6:25mm"
+
+    @staticmethod
+    def from_fields(fields: Fields) -> Chessboard:
+        """Build the board a spec names."""
+        columns, rows = fields.counts(0, least=3)
+        return Chessboard(columns, rows, fields.length_m(1))
+
+    @cached_property
+    def body(self) -> Body:
+        """The inner corners, m, z = 0, named by their number."""
+        points = grid_points(self.columns, self.rows, self.square_m)
+        name = f"chessboard:{self.columns}x{self.rows}:{self.square_m * 1e3:g}mm"
+        return Body(name, tuple(str(i) for i in range(len(points))), points)
+
+    @cached_property
+    def flips(self) -> tuple[Ids, ...]:
+        """Permutations (M,) under which the board looks the same, without identity: corner i may as well be perm[i]."""
+        return tuple(perm for turns, perm in rotations(self.body.points) if not self._colours_tell(turns))
+
+    def _colours_tell(self, turns: int) -> bool:
+        """Whether a rotation by so many quarter turns exchanges dark and bright."""
+        return (self.columns + self.rows if turns == 2 else self.columns) % 2 == 1
+
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
+        rough = find_grid(image, self.columns, self.rows)
+        if rough is None:
+            return Detections.none(f"no chessboard of {self.columns}x{self.rows} inner corners found")
+        first = _fit(image, rough)
+        fits = _fit(image, np.where(first.kept[:, None], first.uv, rough.reshape(-1, 2)).reshape(rough.shape))
+        kept = fits.kept & ~_misfits(fits) & self._colours_agree(fits)
+        if kept.sum() < max(4, KEPT_SHARE * kept.size):
+            return Detections.none(_why_not(fits, int(kept.sum())))
+        order = self._canonical_order(fits)
+        kept = kept[order]
+        return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
+
+    @property
+    def _parity(self) -> Array:
+        """(M,) +1 where the square right and below of a corner has the colour of the first square, else -1."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        return np.where((x + y) % 2 == 0, 1.0, -1.0).ravel()
+
+    def _colours_agree(self, fits: CornerFits) -> NDArray[np.bool_]:
+        """(M,) whether a corner's colours are those the other corners tell."""
+        colours = np.sign(fits.contrast * self._parity)
+        return np.asarray(colours == np.sign(np.sum(colours[fits.kept])))
+
+    def _canonical_order(self, fits: CornerFits) -> Ids:
+        """Return (M,) the permutation that brings fits into the board's order."""
+        here = np.arange(self.columns * self.rows)
+        first_is_dark = float(np.sum((np.sign(fits.contrast) * self._parity)[fits.kept])) < 0
+        turns = rotations(self.body.points)
+        orders = [here, *(perm for _, perm in turns)]
+        dark = [first_is_dark, *(first_is_dark != self._colours_tell(n) for n, _ in turns)]
+        if any(dark):
+            orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
+        uv = np.where(fits.kept[:, None], fits.uv, np.nan).reshape(self.rows, self.columns, 2)
+        rightwards = []
+        for order in orders:
+            step = np.nanmean(np.diff(uv.reshape(-1, 2)[order].reshape(uv.shape), axis=1), axis=(0, 1))
+            rightwards.append(step[0] / np.hypot(*step))
+        return np.asarray(orders[int(np.argmax(rightwards))])
+
+
+def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
+    """Find the inner corners of a chessboard roughly, (rows, columns, 2), px, right-handed; None where there is none.
+
+    The quadrangle finder takes low contrast and small squares, the saddle-point finder glints, blur and uneven light.
+    """
+    scale = min(1.0, SEARCH_SIDE_PX / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    size, flags = (columns, rows), cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(small, size, flags=flags)
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found and scale < 1:
+        scale = 1.0
+        found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        return None
+    uv = (corners.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
+    across, down = uv[:, -1] - uv[:, 0], uv[-1] - uv[0]
+    handed = np.sum(across[:, 0]) * np.sum(down[:, 1]) - np.sum(across[:, 1]) * np.sum(down[:, 0])
+    return uv if handed > 0 else np.ascontiguousarray(uv[:, ::-1])
+
+
+def _fit(image: NDArray[np.uint8], uv: Array) -> CornerFits:
+    """Fit the corners of a grid (rows, columns, 2), each window shaped by the neighbours."""
+    squares, bows = local_squares(uv)
+    return refine_corners(image, uv.reshape(-1, 2), squares.reshape(-1, 2, 2), bows.reshape(-1, 2, 2))
+
+
+def _misfits(fits: CornerFits) -> NDArray[np.bool_]:
+    """(N,) whether a corner's residual, relative to its contrast, is far off the others'."""
+    relative = fits.residual / np.maximum(np.abs(fits.contrast), 1e-9)
+    usual = float(np.median(relative[fits.kept])) if fits.kept.any() else 0.0
+    return np.asarray(relative > max(MISFIT_RATIO * usual, MISFIT_FLOOR))
+
+
+def _why_not(fits: CornerFits, kept: int) -> str:
+    """Say why a grid that was found is not used."""
+    counts = np.bincount(fits.verdict, minlength=len(VERDICTS))
+    worst = int(counts[1:].argmax()) + 1
+    reason = f", mostly: {VERDICTS[worst]}" if counts[worst] else ""
+    return f"a chessboard was found but only {kept} of {len(fits.uv)} corners fit{reason}"

@@ -1,0 +1,91 @@
+"""Normal equations of small least-squares fits, compiled: assemble, factor, solve, invert."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from armsight.data import Array
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
+    """Fill A = J J^T and g = J r."""
+    for i in range(len(J)):
+        for j in range(i + 1):
+            s = 0.0
+            for m in range(n):
+                s += J[i, m] * J[j, m]
+            A[i, j] = s
+            A[j, i] = s
+        s = 0.0
+        for m in range(n):
+            s += J[i, m] * r[m]
+        g[i] = s
+
+
+@numba.njit(cache=True, error_model="numpy")
+def factor(A: Array, damping: float, L: Array) -> bool:
+    """Cholesky-factor A with its diagonal raised by ``damping``; False where it is not positive definite."""
+    for i in range(len(A)):
+        for j in range(i + 1):
+            s = A[i, j]
+            if i == j:
+                s *= 1.0 + damping
+            for m in range(j):
+                s -= L[i, m] * L[j, m]
+            if i == j:
+                if not s > 1e-12 * A[i, i]:
+                    return False
+                L[i, i] = np.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    return True
+
+
+@numba.njit(cache=True, error_model="numpy")
+def solve(L: Array, g: Array, x: Array) -> None:
+    """Solve L L^T x = g."""
+    for i in range(len(L)):
+        s = g[i]
+        for m in range(i):
+            s -= L[i, m] * x[m]
+        x[i] = s / L[i, i]
+    for i in range(len(L) - 1, -1, -1):
+        s = x[i]
+        for m in range(i + 1, len(L)):
+            s -= L[m, i] * x[m]
+        x[i] = s / L[i, i]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def invert(L: Array, inverse: Array) -> None:
+    """Fill the inverse of L L^T."""
+    unit, x = np.zeros(len(L)), np.empty(len(L))
+    for i in range(len(L)):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        solve(L, unit, x)
+        inverse[i] = x
+
+
+@numba.njit(cache=True, error_model="numpy")
+def edge_noise(n: int, J: Array, r: Array, inverse: Array) -> float:
+    """Estimate the variance of the noise from residuals r (n,) where it matters to the first two parameters.
+
+    The mean squared residual, each divided by what the fit leaves of it (1 - leverage) and weighted by how much its
+    pixel says about the first two parameters: flat areas, saturated ones above all, must not speak for the edges. No
+    image is known better than its quantisation.
+    """
+    weight, power = 0.0, 0.0
+    for m in range(n):
+        leverage = 0.0
+        for i in range(len(J)):
+            s = 0.5 * inverse[i, i] * J[i, m]
+            for j in range(i):
+                s += inverse[i, j] * J[j, m]
+            leverage += 2.0 * s * J[i, m]
+        w = J[0, m] ** 2 + J[1, m] ** 2
+        weight += w * (1.0 - leverage)
+        power += w * r[m] ** 2
+    return float(max(power / weight, 1.0 / 12.0))
