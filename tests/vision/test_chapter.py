@@ -3,6 +3,10 @@
 A misprinted formula stands here as printed; the test asserts that it is wrong where ours is right.
 """
 
+import operator
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -12,6 +16,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
+from armsight.vision import chapter
 from armsight.vision.chapter import (
     T_world_camera,
     VergingRig,
@@ -320,3 +325,18 @@ def test_misprint_18_16_arctan_loses_the_quadrant(phi, theta, psi):
     printed_roll, printed_yaw = np.arctan(R[1, 0] / R[0, 0]), np.arctan(R[2, 1] / R[2, 2])
     assert (abs(printed_roll - phi) > 3) == (np.cos(phi) < 0)
     assert (abs(printed_yaw - psi) > 3) == (np.cos(psi) < 0)
+
+
+# --- the table in docs/chapter.md ------------------------------------------------------------------------------------
+
+
+def test_the_page_lists_every_number_and_names_what_stands():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "chapter.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| 18.") or line.startswith("| table")]
+    listed = {number for row in rows for number in re.findall(r"\b18\.\d+", row.split("|")[1])}
+    assert listed == {f"18.{n}" for n in range(1, 22)}
+    assert any(row.startswith("| table 18.1 ") for row in rows)
+    for name in re.findall(r"`(test_\w+)`", page):
+        assert name in globals(), f"docs/chapter.md names {name}, which is no test here"
+    for name in re.findall(r"`chapter\.([\w.]+)`", page):
+        assert operator.attrgetter(name)(chapter)

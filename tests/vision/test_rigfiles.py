@@ -220,6 +220,16 @@ def test_opencv_files_project_as_opencv_does(tmp_path, header, files):
     np.testing.assert_array_equal(again.T_left_right, rig.T_left_right)
 
 
+def test_opencv_xml_is_read_too(tmp_path):
+    storage = cv2.FileStorage(str(tmp_path / "both.xml"), cv2.FILE_STORAGE_WRITE)
+    entries = {"M1": K_LEFT, "D1": D_LEFT, "M2": K_RIGHT, "D2": D_RIGHT, "R": R_GIVEN, "T": T_GIVEN.reshape(3, 1)}
+    for key, value in entries.items():
+        storage.write(key, value)
+    storage.release()
+    rig = import_rig("opencv", [tmp_path / "both.xml"], unit_m=1.0, image_size_px=(1280, 720))
+    assert_projects_like(rig, (K_LEFT, D_LEFT), (K_RIGHT, D_RIGHT))
+
+
 def test_opencv_translations_are_in_board_units(tmp_path):
     given = stereo_calib(tmp_path, T=(T_GIVEN / 0.025).reshape(3, 1))  # squares counted as 1
     rig = import_rig("opencv", given, unit_m=0.025, image_size_px=(1280, 720))

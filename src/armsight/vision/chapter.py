@@ -216,18 +216,18 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
         InputError: a point is not three finite numbers, two points coincide, or all three lie on one line.
     """
     p1, p2, p3 = checked(P1, (3,), "P1"), checked(P2, (3,), "P2"), checked(P3, (3,), "P3")
-    x_b = _direction(p2 - p1, "P1 and P2 coincide: they fix no x axis")  # 18.11 to 18.13
+    x_b = _direction(p2 - p1, "P1 and P2 coincide: they fix no x axis")  # 18.11 to 18.14
     z_b = _direction(
         (p1 + p2) / 2 - p3, "P3 lies in the middle between P1 and P2: they fix no z axis"
-    )  # 18.11 to 18.13
+    )  # 18.11 to 18.14
     cosine = float(x_b @ z_b)
     square = z_b - cosine * x_b
     sine = float(np.linalg.norm(square))
     if sine < COLLINEAR_SINE:
         raise InputError("P1, P2 and P3 lie on one line: the turn about that line is not determined")
     z_b = square / sine
-    y_b = np.cross(z_b, x_b)  # 18.11 to 18.13
-    R = np.stack([x_b, y_b, z_b], axis=1)  # 18.14
+    y_b = np.cross(z_b, x_b)  # 18.11 to 18.14
+    R = np.stack([x_b, y_b, z_b], axis=1)  # 18.11 to 18.14
     angles, singular = roll_pitch_yaw(R)  # 18.16, with atan2
     return Orientation(R, angles, singular, float(np.arctan2(abs(cosine), sine)))
 
