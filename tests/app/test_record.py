@@ -175,14 +175,17 @@ def test_a_folder_in_use_is_not_touched(tmp_path):
     (tmp_path / "file").write_text("here")
     with pytest.raises(InputError, match="is not empty; record into a new folder"):
         record(Played(some(1)), tmp_path)
-    with pytest.raises(InputError, match="file: cannot be made a recording's folder: File exists"):
-        record(Played(some(1)), tmp_path / "file")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match=f"{place}: no recording can be made here: Not a directory"):
+            record(Played(some(1)), place)
+    result = record(Played(some(1)), "/proc/none")  # where nothing can be made, found out with the first shot
+    assert result.stopped == "/proc/none: no recording can be made here: No such file or directory"
 
 
 def test_without_a_single_shot_there_is_no_recording(tmp_path):
     result = record(Played([DeviceError("gone")]), tmp_path / "a")
     assert (result.shots, result.stopped) == (0, "gone")
-    assert list((tmp_path / "a").iterdir()) == []
+    assert not (tmp_path / "a").exists()
     assert record(Played(some(1)), tmp_path / "a").shots == 1
 
 

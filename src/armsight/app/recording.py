@@ -62,12 +62,12 @@ def record(
         on_shot: called after each shot is stored.
 
     Returns:
-        How much is stored. An interrupt, a full disk or a camera that fails is no exception but told there.
+        How much is stored; an interrupt, a full disk or a camera that fails is no exception but told there.
 
     Raises:
-        InputError: the folder cannot be made, is not empty, or holds a recording already.
+        InputError: the folder is not empty, or holds a recording already.
     """
-    folder = _made(Path(directory).expanduser())
+    folder = _unused(Path(directory).expanduser())
     writer = _Writer(folder)
     stopped, interrupted = None, False
     first: Shot | None = None
@@ -78,11 +78,7 @@ def record(
             if shot is None:
                 break
             first = first or shot
-            if first.t_s is None:
-                age_s = time.monotonic() - started_s
-            else:
-                age_s = 0.0 if shot.t_s is None else shot.t_s - first.t_s
-            if seconds is not None and age_s >= seconds:
+            if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
             writer.add(shot)
             if on_shot is not None:
@@ -96,34 +92,41 @@ def record(
     return Recording(folder, writer.shots, writer.problems, stopped, interrupted)
 
 
-def _made(folder: Path) -> Path:
-    """Make the folder, or check that it is empty."""
+def _age_s(shot: Shot, first: Shot, started_s: float) -> float:
+    """Return how much later than the first shot this one is, s; by the clock where the first has no time."""
+    if first.t_s is None:
+        return time.monotonic() - started_s
+    return 0.0 if shot.t_s is None else shot.t_s - first.t_s
+
+
+def _unused(folder: Path) -> Path:
+    """Check that a folder is new or empty."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / INDEX).exists():
-            raise InputError(f"{folder}: already holds a recording; record into a new folder")
-        if any(folder.iterdir()):
-            raise InputError(f"{folder}: is not empty; record into a new folder")
+        names = os.listdir(folder)
+    except FileNotFoundError:
+        names = []
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made a recording's folder: {error.strerror}") from None
+        raise InputError(f"{folder}: no recording can be made here: {error.strerror}") from None
+    if INDEX in names:
+        raise InputError(f"{folder}: already holds a recording; record into a new folder")
+    if names:
+        raise InputError(f"{folder}: is not empty; record into a new folder")
     return folder
 
 
 class _Writer:
-    """The folder being written."""
+    """The folder being written; made with the first shot."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._index: int | None = None
+        self._whole = 0  # bytes of the index that are good
         self.shots = 0
         self.problems = 0
-        self._whole = 0  # bytes of the index that are good
-        try:
-            self._index = os.open(folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-        except OSError as error:
-            raise InputError(f"{folder / INDEX}: cannot be written: {error.strerror}") from None
 
     def add(self, shot: Shot) -> None:
         """Store one shot, all of it or nothing."""
+        index = self._opened()
         files: list[Path] = []
         try:
             if shot.problem is None:
@@ -134,29 +137,40 @@ class _Writer:
                         file.write(data)
             names = [file.name for file in files] or ["", ""]
             t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
-            self._append([shot.name, t_s, *names, " ".join((shot.problem or "").split())])
+            self._append(index, [shot.name, t_s, *names, " ".join((shot.problem or "").split())])
         except BaseException:  # an interrupt too must not leave half a shot
-            os.ftruncate(self._index, self._whole)
+            os.ftruncate(index, self._whole)
             for path in files:
                 path.unlink(missing_ok=True)
             raise
-        self._whole = os.fstat(self._index).st_size
+        self._whole = os.fstat(index).st_size
         self.shots += 1
         self.problems += shot.problem is not None
 
     def close(self) -> None:
         """Close the index, and take it away if it names no shot."""
-        os.close(self._index)
-        if self.shots == 0:
-            (self._folder / INDEX).unlink()
+        if self._index is not None:
+            os.close(self._index)
+            if self._whole == 0:
+                (self._folder / INDEX).unlink()
 
-    def _append(self, row: list[str]) -> None:
+    def _opened(self) -> int:
+        """Return the open index; make folder and index the first time."""
+        if self._index is None:
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                self._index = os.open(self._folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            except OSError as error:
+                raise InputError(f"{self._folder}: no recording can be made here: {error.strerror}") from None
+        return self._index
+
+    def _append(self, index: int, row: list[str]) -> None:
         """Add a line to the index, the first time with the header above it, in one write."""
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([row] if self._whole else [COLUMNS, row])
         data = text.getvalue().encode()
         try:
-            if os.write(self._index, data) < len(data):
+            if os.write(index, data) < len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise InputError(f"{self._folder / INDEX}: cannot be written: {error.strerror}") from None

@@ -37,9 +37,10 @@ def command(
     Ctrl-C stops; what was stored until then stays and is readable.
     """  # noqa: D301 - click reads the backspace character
     columns = (TextColumn("recording"), BarColumn(), MofNCompleteColumn(), TextColumn("shots"), TimeElapsedColumn())
+    console = Console(stderr=True)
     with (
         contextlib.closing(open_source(source)) as opened,
-        Progress(*columns, console=Console(stderr=True), transient=True) as progress,
+        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
     ):
         task = progress.add_task("recording", total=shots)
         result = record(opened, out, shots=shots, seconds=seconds, on_shot=lambda _: progress.advance(task))
@@ -53,7 +54,7 @@ def command(
         click.echo(f"armsight: interrupted; {stored}", err=True)
         ctx.exit(130)
     if result.stopped:
-        raise ArmsightError(f"{result.stopped}; {stored}")
+        raise ArmsightError(f"{result.stopped}; {stored}" if result.shots else result.stopped)
     if not result.shots:
         raise ArmsightError(f"{source}: ended without a single shot")
     if not as_json:

@@ -117,16 +117,11 @@ def _without_partner(left: Sequence[Path], right: Sequence[Path]) -> Path | None
     keys = [[tuple(n[i] for i in varying) for n in side] for side in numbers]
     if any(len(set(side)) != len(side) for side in keys) or not set(keys[0]) & set(keys[1]):
         return None
+    files = {
+        key: file for ks, side in zip(keys, (left, right), strict=True) for key, file in zip(ks, side, strict=True)
+    }
     alone = set(keys[0]) ^ set(keys[1])
-    return next(
-        (
-            file
-            for side, ks in zip((left, right), keys, strict=True)
-            for file, k in zip(side, ks, strict=True)
-            if k in alone
-        ),
-        None,
-    )
+    return files[min(alone)] if alone else None
 
 
 def _names(files: Sequence[Path]) -> list[str]:

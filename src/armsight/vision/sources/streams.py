@@ -24,6 +24,7 @@ from armsight.errors import DeviceError
 from armsight.vision.sources.capture import open_capture
 
 TIMEOUT_S = 5.0  # without data for that long a stream has stalled
+_SETTLE_S = 1.0  # FFmpeg hands out what it collected while it looked at an RTSP stream in one burst: passed over
 _MAX_FRAME = 64 << 20  # bytes; beyond it the stream is not MJPEG
 
 #: Time of arrival, s, and a JPEG file or an image; None for a frame that cannot be decoded.
@@ -150,10 +151,13 @@ class RtspStream:
         if capture is None:
             raise DeviceError(f"{self.url}: no RTSP stream there, or no answer for {self._timeout_s:g} s")
         try:
+            live_s = time.monotonic() + _SETTLE_S
             while not self._stop.is_set():
                 if not capture.grab():
                     raise DeviceError(f"{self.url}: the stream ended, or no frame for {self._timeout_s:g} s")
                 t_s = time.monotonic()
+                if t_s < live_s:
+                    continue
                 ok, image = capture.retrieve()
                 yield t_s, image if ok else None
         finally:
