@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -117,37 +118,66 @@ def test_what_stops_the_source_leaves_what_was_stored(tmp_path, stop, said, inte
     assert_nothing_else(result.directory, shots)
 
 
-@pytest.mark.parametrize("moment", ["first image", "second image", "index"])
-@pytest.mark.parametrize("kind", [KeyboardInterrupt, OSError])
-def test_a_shot_is_stored_whole_or_not_at_all(tmp_path, monkeypatch, moment, kind):
-    """Whenever an interrupt or a full disk hits: while a side is written, or the index."""
-    shots = some(4)
-    trigger = {"first image": "left000002", "second image": "right000002", "index": "shots.csv"}[moment]
-    error = KeyboardInterrupt() if kind is KeyboardInterrupt else OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+MOMENTS = {"first image": "left000002", "second image": "right000002", "index": "shots.csv"}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, monkeypatch, moment):
+    shots, full = some(4), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     replacing, write, lines = recording.replacing, os.write, []
 
     def failing_replacing(path, mode="w"):
-        if path.name.startswith(trigger):
-            if isinstance(error, OSError):
-                raise InputError(f"{path}: cannot be written: {error.strerror}")
-            raise error
+        if path.name.startswith(MOMENTS[moment]):
+            raise InputError(f"{path}: cannot be written: {full.strerror}")
         return replacing(path, mode)
 
     def failing_write(handle, data):
         lines.append(data)
-        if trigger == "shots.csv" and len(lines) == 3:
-            write(handle, data[:7])  # half a line gets out
-            raise error
+        if moment == "index" and len(lines) == 3:
+            return write(handle, data[:7])  # half a line gets out
         return write(handle, data)
 
     monkeypatch.setattr(recording, "replacing", failing_replacing)
     monkeypatch.setattr(recording.os, "write", failing_write)
     result = record(Played(shots), tmp_path / "a")
     assert result.shots == 2
-    assert result.interrupted == (kind is KeyboardInterrupt)
-    assert ("interrupted" if result.interrupted else "No space left on device") in result.stopped
+    assert MOMENTS[moment] in result.stopped
+    assert result.stopped.endswith("cannot be written: No space left on device")
     assert_same(read_back(result.directory), shots[:2])
     assert_nothing_else(result.directory, shots[:2])
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_an_interrupt_within_a_shot_waits_until_it_is_stored(tmp_path, monkeypatch, moment):
+    shots, replacing, write, lines = some(5), recording.replacing, os.write, []
+
+    def interrupted_replacing(path, mode="w"):
+        if path.name.startswith(MOMENTS[moment]):
+            signal.raise_signal(signal.SIGINT)
+        return replacing(path, mode)
+
+    def interrupted_write(handle, data):
+        lines.append(data)
+        if moment == "index" and len(lines) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return write(handle, data)
+
+    monkeypatch.setattr(recording, "replacing", interrupted_replacing)
+    monkeypatch.setattr(recording.os, "write", interrupted_write)
+    before = signal.getsignal(signal.SIGINT)
+    result = record(Played(shots), tmp_path / "a")
+    assert signal.getsignal(signal.SIGINT) == before
+    assert (result.shots, result.stopped, result.interrupted) == (3, "interrupted", True)
+    assert_same(read_back(result.directory), shots[:3])
+    assert_nothing_else(result.directory, shots[:3])
+
+
+def test_another_thread_can_record(tmp_path):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(record(Played(some(2)), tmp_path / "a")))
+    thread.start()
+    thread.join()
+    assert results[0].shots == 2
 
 
 def test_a_full_disk_keeps_what_fitted(tmp_path):

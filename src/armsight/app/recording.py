@@ -6,12 +6,15 @@ A line is added after both images are whole on disk: whatever stops the recordin
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import errno
 import io
 import os
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,7 +83,8 @@ def record(
             first = first or shot
             if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
-            writer.add(shot)
+            with _undisturbed():
+                writer.add(shot)
             if on_shot is not None:
                 on_shot(shot)
     except KeyboardInterrupt:
@@ -90,6 +94,22 @@ def record(
     finally:
         writer.close()
     return Recording(folder, writer.shots, writer.problems, stopped, interrupted)
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Hold an interrupt from the keyboard back until the block is done, so that no shot is stored by half."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread is interrupted
+        yield
+        return
+    held: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt
 
 
 def _age_s(shot: Shot, first: Shot, started_s: float) -> float:
@@ -138,7 +158,7 @@ class _Writer:
             names = [file.name for file in files] or ["", ""]
             t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
             self._append(index, [shot.name, t_s, *names, " ".join((shot.problem or "").split())])
-        except BaseException:  # an interrupt too must not leave half a shot
+        except InputError:
             os.ftruncate(index, self._whole)
             for path in files:
                 path.unlink(missing_ok=True)
