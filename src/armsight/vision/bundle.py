@@ -23,7 +23,7 @@ from armsight.vision.camera import Camera
 #: a two-dimensional detection needs a little more).
 CAUCHY_SCALE = 3.0
 _MAX_STEPS = 60
-_RELATIVE_DECREASE = 1e-9
+_RELATIVE_DECREASE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +210,8 @@ class _Normal(Record):
         H = self.H_shared + np.diag(damping * np.diag(self.H_shared))
         Hp = self.H_poses + damping * self.H_poses * np.eye(6)
         gain = np.linalg.solve(Hp, self.H_cross)
-        S = H - np.einsum("sij,sik->jk", self.H_cross, gain)
-        g = self.g_shared - np.einsum("sij,si->j", gain, self.g_poses)
+        S = H - np.tensordot(self.H_cross, gain, axes=((0, 1), (0, 1)))
+        g = self.g_shared - np.tensordot(gain, self.g_poses, axes=((0, 1), (0, 1)))
         shared = solve_scaled(S, g)
         poses = np.linalg.solve(Hp, (self.g_poses - self.H_cross @ shared)[..., None])[..., 0]
         return shared, poses
@@ -219,7 +219,7 @@ class _Normal(Record):
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the poses marginalised."""
         gain = np.linalg.solve(self.H_poses, self.H_cross)
-        return np.asarray(self.H_shared - np.einsum("sij,sik->jk", self.H_cross, gain))
+        return np.asarray(self.H_shared - np.tensordot(self.H_cross, gain, axes=((0, 1), (0, 1))))
 
 
 def solve_scaled(H: Array, g: Array) -> Array:

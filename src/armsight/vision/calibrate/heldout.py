@@ -1,0 +1,161 @@
+"""Errors on pairs a rig was not fitted on: the only figures that tell whether its millimetres are right.
+
+K folds of pairs; each fold is measured with a rig fitted on the others, by the very functions that measure later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from armsight.data import Array, Correspondences
+from armsight.geometry.pose import transform
+from armsight.geometry.rigid import fit_rigid, fit_scale
+from armsight.geometry.rotation import skew
+from armsight.vision.bundle import Observations, Solution
+from armsight.vision.calibrate.result import HeldOut, PairErrors
+from armsight.vision.match import epipolar_distances
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import optimal_points
+
+_LEAST_SIGMA_PX = 1e-6
+
+
+def correspondences(observations: Observations, shot: int) -> Correspondences:
+    """Return one shot of flattened observations as correspondences."""
+    rows = observations.shot == shot
+    ids = np.unique(observations.point[rows])
+    uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
+    at = np.searchsorted(ids, observations.point[rows])
+    uv[at, observations.camera[rows]] = observations.uv[rows]
+    cov[at, observations.camera[rows]] = observations.cov_uv[rows]
+    return Correspondences(ids, uv, cov)
+
+
+def pair_errors(
+    rig: StereoRig, drawing: Array, observations: Observations, *, estimated: Array | None = None
+) -> PairErrors:
+    """Measure every pair of ``observations`` with a rig and compare with the perfect body.
+
+    Args:
+        rig: the calibrated pair.
+        drawing: (M, 3) points of the perfect body, m.
+        observations: detections of S shots.
+        estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is judged: how
+            a print differs from its drawing is no error of the cameras; the drawing by default.
+
+    Returns:
+        One row for each shot that has three or more matched points.
+    """
+    rows = []
+    for shot in range(observations.shot_count):
+        row = _pair_error(
+            rig, drawing, drawing if estimated is None else estimated, correspondences(observations, shot)
+        )
+        if row is not None:
+            rows.append((float(shot), *row))
+    return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
+
+
+def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences) -> tuple[float, ...] | None:
+    """Return epipolar px, rigid m, scale, weight, normalised of one shot; None where it has too little."""
+    seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
+    cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
+    p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
+    good = np.isfinite(p).all(axis=1)
+    if good.sum() < 3:
+        return None
+    board, found = drawing[seen.ids[good]], estimated[seen.ids[good]]
+    p, cov_p, by_rig = p[good], cov_p[good], by_rig[good]
+    T = fit_rigid(board, p)
+    gap = p - transform(T, board)
+    epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
+    return (
+        float(np.sqrt((epipolar**2).mean())),
+        float(np.sqrt((gap**2).sum(axis=1).mean())),
+        fit_scale(board, p),
+        float(good.sum()),
+        _normalised(transform(fit_rigid(found, p), found), p, cov_p, by_rig, rig.cov),
+    )
+
+
+def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> float:
+    """RMS of a rigid fit's residuals (N, 3) over their predicted sigma: pixel noise and calibration, less the fit."""
+    n, gap = len(p), p - fitted
+    full = block_diag(*cov) + np.einsum("nip,pq,mjq->nimj", by_rig, cov_rig, by_rig).reshape(3 * n, 3 * n)
+    A = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), -skew(fitted - fitted.mean(axis=0))], axis=2).reshape(3 * n, 6)
+    P = np.eye(3 * n) - A @ np.linalg.pinv(A)
+    variance = np.diag(P @ full @ P)
+    return float(np.sqrt((gap.ravel() ** 2 / variance).mean()))
+
+
+def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:
+    """Split ``count`` shots into folds of neighbours apart: shot j goes to fold j mod folds."""
+    return [np.flatnonzero(np.arange(count) % folds == k) for k in range(folds)]
+
+
+def cross_validate(
+    fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array]], drawing: Array, observations: Observations, folds: int
+) -> PairErrors:
+    """Fit on all folds but one and measure that one, for every fold.
+
+    Args:
+        fit: rows of the shots to use -> the rig they give and the body as they show it (M, 3), m.
+        drawing: (M, 3) points of the perfect body, m.
+        observations: all detections.
+        folds: number of folds, at most the number of shots.
+
+    Returns:
+        The held-out errors of every shot.
+    """
+    parts = []
+    for held in folds_of(observations.shot_count, folds):
+        rig, estimated = fit(np.setdiff1d(np.arange(observations.shot_count), held))
+        errors = pair_errors(rig, drawing, observations.shots(held), estimated=estimated)
+        fields = [getattr(errors, name) for name in _FIELDS]
+        parts.append(np.stack([held[errors.pair.astype(int)].astype(float), *fields]))
+    merged = np.concatenate(parts, axis=1)
+    return PairErrors(*merged[:, np.argsort(merged[0])])
+
+
+_FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised")
+
+
+def summary(errors: PairErrors, folds: int) -> HeldOut:
+    """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs."""
+    w = errors.weight / errors.weight.sum()
+    rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}
+    return HeldOut(
+        folds,
+        rms["epipolar_px"],
+        rms["rigid_m"],
+        float(errors.scale.mean() - 1),
+        rms["normalised"],
+    )
+
+
+def residual_epipolar_rms(rig: StereoRig, observations: Observations) -> float:
+    """RMS epipolar distance, px, of all matched detections."""
+    squares = []
+    for shot in range(observations.shot_count):
+        seen = correspondences(observations, shot)
+        uv = seen.uv[seen.paired]
+        squares.append(epipolar_distances(rig, uv[:, 0], uv[:, 1]).ravel() ** 2)
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
+def rig_of(solution: Solution, provenance: dict[str, object] | None = None) -> StereoRig:
+    """Return the rig of an adjusted state: its covariance is that of cameras and relative pose, the shape averaged over."""
+    cameras = solution.state.cameras
+    count = sum(camera.parameters.size for camera in cameras) + 6
+    return StereoRig(
+        cameras[0],
+        cameras[1],
+        solution.state.T_left_right,
+        solution.cov_shared[:count, :count],
+        solution.sigma_px,
+        provenance or {},
+    )

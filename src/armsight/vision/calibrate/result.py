@@ -1,0 +1,99 @@
+"""What a calibration says about itself: the rig, the errors on held-out pairs, what was thrown away, what is weak."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from armsight.data import Array, Body, Record
+from armsight.vision.bundle import Observations, Solution
+from armsight.vision.rig import StereoRig
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A pair that was not used, or not all of it, and why."""
+
+    pair: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class PairErrors(Record):
+    """Errors of pairs that a rig was not fitted on.
+
+    Attributes:
+        pair: (S,) rows of the pairs.
+        epipolar_px: (S,) RMS distance from the epipolar lines, both images, undistorted px.
+        rigid_m: (S,) RMS distance of the triangulated board from the perfect one after a rigid fit.
+        scale: (S,) how many times larger than the perfect board the triangulated one is.
+        weight: (S,) matched points of the pair.
+        normalised: (S,) RMS of the rigid residual over its predicted sigma.
+    """
+
+    pair: Array
+    epipolar_px: Array
+    rigid_m: Array
+    scale: Array
+    weight: Array
+    normalised: Array
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors on pairs left out of the fit, RMS over all their points.
+
+    Attributes:
+        folds: how many times the pairs were split.
+        epipolar_rms_px: distance from the epipolar line, undistorted px, both images.
+        rigid_rms_m: triangulated board against the perfect one, after a rigid fit, m.
+        scale_error: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%.
+        normalised_rms: rigid residual over its predicted sigma; 1 where the uncertainty is honest.
+    """
+
+    folds: int
+    epipolar_rms_px: float
+    rigid_rms_m: float
+    scale_error: float
+    normalised_rms: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(Record):
+    """A calibrated rig and everything that was learned on the way.
+
+    Attributes:
+        rig: the result.
+        body: the board or body as estimated, laid on its drawing.
+        deviation_m: RMS distance of the estimated body from its drawing, m; zero where it was held to it.
+        pairs: names of the pairs used, in the order of the observations' shots.
+        pairs_found: how many pairs were given.
+        observations: the detections that were fitted.
+        solution: the adjusted state and residuals.
+        epipolar_rms_px: epipolar RMS of the fit, px.
+        heldout: errors on held-out pairs.
+        errors: the same per pair.
+        models: held-out errors of every distortion model that was tried.
+        rejected: pairs thrown away, and why.
+        notes: what was mended or partly dropped, and why.
+        weaknesses: what is weak, and what to do about it.
+    """
+
+    rig: StereoRig
+    body: Body
+    deviation_m: float
+    pairs: tuple[str, ...]
+    pairs_found: int
+    observations: Observations
+    solution: Solution
+    epipolar_rms_px: float
+    heldout: HeldOut
+    errors: PairErrors
+    models: dict[str, HeldOut]
+    rejected: tuple[Rejected, ...]
+    notes: tuple[str, ...]
+    weaknesses: tuple[str, ...]
+
+    @property
+    def reprojection_rms_px(self) -> float:
+        """RMS distance of the fitted detections from their projections, px."""
+        return float((self.solution.residuals_px**2).sum(axis=1).mean() ** 0.5)

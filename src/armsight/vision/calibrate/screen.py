@@ -1,0 +1,198 @@
+"""Throwing out what would spoil a calibration: gross corner errors, bad pairs, boards named in another order.
+
+A robust adjustment comes first; the noise is read off its residuals, so no threshold is in pixels. Everything thrown
+away is named with its reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Ids, Record
+from armsight.geometry.pose import inverse, transform
+from armsight.vision.bundle import Model, Observations, Solution, State, minimise, whiteners
+from armsight.vision.calibrate.result import Rejected
+from armsight.vision.camera import Camera
+from armsight.vision.pnp import body_poses
+
+#: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.
+CORNER_SIGMAS = 6.0
+#: A pair whose typical corner is this many times the usual error is bad as a whole.
+PAIR_RATIO = 3.0
+#: A pair that loses more than this share of its corners is not trusted for the rest.
+LOST_SHARE = 0.25
+#: Fewest corners, seen by both cameras, that make a pair useful.
+LEAST_CORNERS = 6
+_ROUNDS = 6
+_MEDIAN_CHI2_2 = 1.3863  # median of the chi-square distribution of two degrees of freedom
+
+
+@dataclass(frozen=True, eq=False)
+class Screened(Record):
+    """What is left after screening.
+
+    Attributes:
+        observations: the good detections, shots renumbered.
+        kept: (S,) rows of the pairs that are left.
+        solution: the robust adjustment of what is left.
+        rejected: pairs thrown out, and why.
+        notes: pairs of which corners were dropped, and how many.
+    """
+
+    observations: Observations
+    kept: NDArray[np.int64]
+    solution: Solution
+    rejected: tuple[Rejected, ...]
+    notes: tuple[str, ...]
+
+
+def noise_px(solution: Solution, observations: Observations, free_count: float) -> float:
+    """Estimate a detection's standard deviation beyond its image covariance from the residuals, px.
+
+    Args:
+        solution: an adjustment without gross errors.
+        observations: what it was fitted to.
+        free_count: shared parameters that were estimated.
+
+    Returns:
+        The sigma under which the whitened residuals have the expected sum of squares; at least 1e-3 px.
+    """
+    d2 = (solution.residuals_px**2).sum(axis=1)
+    freedom = 2 * len(d2) - 6 * observations.shot_count - free_count
+    per_axis = d2.sum() / max(freedom, 1)
+    image = float(np.trace(observations.cov_uv, axis1=1, axis2=2).mean() / 2)
+    return float(np.sqrt(max(per_axis - image, 1e-6)))
+
+
+def robust_sigma(solution: Solution) -> float:
+    """Standard deviation of a detection by the median of the residuals' distances, px."""
+    return float(np.sqrt(np.median((solution.residuals_px**2).sum(axis=1)) / _MEDIAN_CHI2_2))
+
+
+def screen(model: Model, start: State, observations: Observations, names: tuple[str, ...]) -> Screened:
+    """Adjust robustly and throw out gross corners and bad pairs until nothing more stands out.
+
+    Args:
+        model: the board.
+        start: a start for all pairs.
+        observations: all detections.
+        names: (S,) names of the pairs.
+
+    Returns:
+        What is left.
+    """
+    rejected: list[Rejected] = []
+    kept = np.arange(observations.shot_count)
+    good = np.ones(len(observations.shot), bool)
+    state, sigma = start, 1.0
+    for _ in range(_ROUNDS):
+        rows = good & np.isin(observations.shot, kept)
+        now = _renumbered(observations, rows, kept)
+        solution = minimise(model, state, now, sigma)
+        new_sigma = robust_sigma(solution)
+        distance = np.full(len(good), np.nan)
+        distance[rows] = _whitened(solution, now, new_sigma)
+        good &= ~(distance > CORNER_SIGMAS)
+        bad = _bad_pairs(observations, kept, distance, good)
+        rejected += [Rejected(names[j], reason) for j, reason in bad.items()]
+        left = np.array([j for j in kept if j not in bad], dtype=np.int64)
+        state = State(
+            solution.state.cameras,
+            solution.state.T_left_right,
+            solution.state.Ts_left_body[np.isin(kept, left)],
+            solution.state.shape,
+        )
+        done = not bad and abs(new_sigma - sigma) < 0.02 * sigma and (good[rows]).all()
+        kept, sigma = left, new_sigma
+        if done:
+            break
+    final = _renumbered(observations, good & np.isin(observations.shot, kept), kept)
+    notes = []
+    for j in kept:
+        mine = observations.shot == j
+        if lost := int((mine & ~good).sum()):
+            notes.append(f"{names[j]}: {lost} of {mine.sum()} corners dropped as gross errors")
+    return Screened(final, kept, minimise(model, state, final, sigma), tuple(rejected), tuple(notes))
+
+
+def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArray[np.int64]) -> Observations:
+    """Return chosen rows of the kept shots, shots renumbered 0.. in the order of ``kept``."""
+    chosen = observations.select(rows)
+    return Observations(
+        np.searchsorted(kept, chosen.shot), chosen.camera, chosen.point, chosen.uv, chosen.cov_uv, len(kept)
+    )
+
+
+def _whitened(solution: Solution, observations: Observations, sigma_px: float) -> Array:
+    """(N,) whitened distance of every detection."""
+    r = (whiteners(observations, sigma_px) @ solution.residuals_px[..., None])[..., 0]
+    return np.asarray(np.linalg.norm(r, axis=1))
+
+
+def _bad_pairs(
+    observations: Observations, kept: NDArray[np.int64], distance: Array, good: NDArray[np.bool_]
+) -> dict[int, str]:
+    """Return the pairs to throw out now, with reasons; the worst ones first, so that they cannot spoil the others."""
+    level = {j: float(np.nanmedian(distance[observations.shot == j])) for j in kept}
+    usual = float(np.median(list(level.values())))
+    bad: dict[int, str] = {}
+    for j in kept:
+        mine = observations.shot == j
+        lost = 1 - good[mine].mean()
+        common = np.intersect1d(
+            observations.point[mine & good & (observations.camera == 0)],
+            observations.point[mine & good & (observations.camera == 1)],
+        )
+        if level[j] > PAIR_RATIO * usual:
+            bad[int(j)] = (
+                f"its corners are {level[j] / usual:.1f} times as far off as the other pairs': wrong corners, a board "
+                "that moved between the two images, or motion blur"
+            )
+        elif lost > LOST_SHARE:
+            bad[int(j)] = f"{100 * lost:.0f}% of its corners are gross errors"
+        elif len(common) < LEAST_CORNERS:
+            bad[int(j)] = f"only {len(common)} corners are good in both images, {LEAST_CORNERS} are needed"
+    worst = max(level.values(), default=0.0)
+    return {j: reason for j, reason in bad.items() if level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}
+
+
+def mend_flips(points: Array, state: State, observations: Observations, flips: tuple[Ids, ...]) -> dict[int, Ids]:
+    """Find pairs whose right image names the board's corners in another order than the left one.
+
+    Args:
+        points: (M, 3) points of the board, m.
+        state: cameras and relative pose that most pairs agree on.
+        observations: all detections.
+        flips: the orders in which a symmetric board may be named.
+
+    Returns:
+        Shot -> the permutation that brings its right detections into the left's order.
+    """
+    found: dict[int, Ids] = {}
+    T_right_left = inverse(state.T_left_right)
+    right = state.cameras[1]
+    for shot in range(observations.shot_count):
+        rows = [(observations.shot == shot) & (observations.camera == side) for side in (0, 1)]
+        uv = [observations.uv[r] for r in rows]
+        ids = [observations.point[r] for r in rows]
+        candidates = body_poses(points[ids[0]], state.cameras[0], uv[0])
+        scores = []
+        for order in (np.arange(len(points)), *flips):
+            renamed = points[order[ids[1]]]
+            errors = [
+                np.median(np.linalg.norm(_project(right, T_right_left @ T, renamed) - uv[1], axis=1))
+                for T, _ in candidates
+            ]
+            scores.append(min(errors, default=np.inf))
+        best = int(np.argmin(scores))
+        if best and scores[best] < 0.2 * scores[0]:
+            found[shot] = flips[best - 1]
+    return found
+
+
+def _project(camera: Camera, T_camera_body: Array, points: Array) -> Array:
+    """Project body points; far away where they are behind the camera."""
+    return np.nan_to_num(camera.project(transform(T_camera_body, points)), nan=1e6)

@@ -1,0 +1,135 @@
+"""What is weak in a calibration, in words, and what to do about it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.vision.calibrate.result import Calibration
+
+_LEAST_TILT_DEG = 15.0
+_GOOD_PAIRS = 12
+_COVERAGE_GRID = 4
+_LEAST_COVERED = 0.6
+_FOCUS_RATIO = 2.0
+_SCALE_SIGMAS = 4.0
+_REJECTED_SHARE = 0.2
+
+
+def weaknesses(calibration: Calibration) -> tuple[str, ...]:
+    """Judge a calibration.
+
+    Returns:
+        One sentence per weakness: what it is and what to do; empty where nothing stands out.
+    """
+    checks = (_pairs, _tilts, _coverage, _focus, _synchrony, _sides, _focal, _scale)
+    return tuple(message for check in checks if (message := check(calibration)) is not None)
+
+
+def _pairs(calibration: Calibration) -> str | None:
+    used, found = len(calibration.pairs), calibration.pairs_found
+    if used < _GOOD_PAIRS:
+        return f"only {used} pairs were used: take {_GOOD_PAIRS} or more, the board near and far and tilted every way"
+    if used < (1 - _REJECTED_SHARE) * found:
+        return f"{found - used} of {found} pairs were rejected: see the reasons; hold the board still for every shot"
+    return None
+
+
+def _tilts(calibration: Calibration) -> str | None:
+    """Tilt of the board's normal against the mean line of sight, by pair."""
+    Ts = calibration.solution.state.Ts_left_body
+    sight = Ts[:, :3, 3] / np.linalg.norm(Ts[:, :3, 3], axis=1, keepdims=True)
+    tilt = np.degrees(np.arccos(np.clip(np.abs(np.einsum("ni,ni->n", Ts[:, :3, 2], sight)), 0, 1)))
+    if np.quantile(tilt, 0.75) < _LEAST_TILT_DEG:
+        return (
+            f"too few tilts: three quarters of the boards are within {np.quantile(tilt, 0.75):.0f} degrees of facing the "
+            "cameras, so focal length and distance trade: tilt the board by 30 to 45 degrees, every way"
+        )
+    return None
+
+
+def _coverage(calibration: Calibration) -> str | None:
+    for side, name in enumerate(("left", "right")):
+        share = coverage(calibration, side, _COVERAGE_GRID)
+        if (share > 0).mean() < _LEAST_COVERED:
+            empty = 100 * (share == 0).mean()
+            return (
+                f"{empty:.0f}% of the {name} image never saw the board, so its distortion is unknown there: "
+                "move the board into the corners of both images"
+            )
+    return None
+
+
+def coverage(calibration: Calibration, side: int, cells: int) -> Array:
+    """Count detections in a grid over one image, (cells, cells), rows down."""
+    observations = calibration.observations
+    width, height = calibration.rig.cameras[side].image_size_px
+    uv = observations.uv[observations.camera == side]
+    counts, _, _ = np.histogram2d(uv[:, 1], uv[:, 0], bins=cells, range=((-0.5, height - 0.5), (-0.5, width - 0.5)))
+    return counts
+
+
+def _focus(calibration: Calibration) -> str | None:
+    observations = calibration.observations
+    image = np.trace(observations.cov_uv, axis1=1, axis2=2)
+    noise = [float(np.sqrt(np.median(image[observations.camera == side]))) for side in (0, 1)]
+    residual = [
+        float(np.sqrt(np.median((calibration.solution.residuals_px[observations.camera == side] ** 2).sum(axis=1))))
+        for side in (0, 1)
+    ]
+    for values in (noise, residual):
+        worse = int(np.argmax(values))
+        if min(values) > 0 and values[worse] > _FOCUS_RATIO * values[1 - worse]:
+            name = ("left", "right")[worse]
+            return (
+                f"the {name} camera's corners are {values[worse] / values[1 - worse]:.1f} times as uncertain as the "
+                "other's: out of focus, moving, or badly lit? Focus it on the working distance and lock the focus"
+            )
+    return None
+
+
+def _synchrony(calibration: Calibration) -> str | None:
+    """Pairs whose epipolar error stands out, although each image fits the board by itself."""
+    errors = calibration.errors
+    usual = float(np.median(errors.epipolar_px))
+    late = [calibration.pairs[int(j)] for j, e in zip(errors.pair, errors.epipolar_px, strict=True) if e > 2.5 * usual]
+    if late and usual > 0:
+        return (
+            f"{len(late)} pairs have an epipolar error over 2.5 times the usual {usual:.2f} px ({', '.join(late[:4])}): "
+            "unsynchronised cameras see a moving board at two places; hold it still, or trigger both cameras together"
+        )
+    return None
+
+
+def _sides(calibration: Calibration) -> str | None:
+    x, y, _ = calibration.rig.T_left_right[:3, 3]
+    if x < 0 and abs(x) > abs(y):
+        return (
+            "the camera given as right stands to the left of the other: are left and right swapped? (the result is "
+            "valid for the cameras as they were given)"
+        )
+    return None
+
+
+def _focal(calibration: Calibration) -> str | None:
+    sigma = np.sqrt(np.diag(calibration.rig.cov))
+    camera = calibration.rig.left
+    share = float(sigma[0] / camera.intrinsics[0])
+    if share > 0.005:
+        return (
+            f"the focal length is known to {100 * share:.1f}% only, and distances with it: add tilted boards at several "
+            "distances"
+        )
+    return None
+
+
+def _scale(calibration: Calibration) -> str | None:
+    scale = calibration.errors.scale
+    spread = float(np.std(scale, ddof=1) / np.sqrt(len(scale))) if len(scale) > 2 else np.inf
+    error = calibration.heldout.scale_error
+    if abs(error) > max(0.005, _SCALE_SIGMAS * spread):
+        return (
+            f"held-out boards come out {100 * error:+.2f}% too {'large' if error > 0 else 'small'}: the cameras do not fit "
+            "the board's proportions; is the square size right, and the board flat?"
+        )
+    return None
