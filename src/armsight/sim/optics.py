@@ -21,6 +21,9 @@ from armsight.sim.paint import SUB, Slots
 
 Radiance = NDArray[np.float32]
 
+#: An edge drawn in parts of a pixel is as wide as this variance already, px^2 (mean over where in a part it lies).
+_PARTS_VARIANCE = 1 / (6 * SUB**2)
+
 
 @dataclass(frozen=True)
 class Optics:
@@ -135,6 +138,7 @@ def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
     image: Radiance = coarse.astype(np.float32)
     if sigma <= 0:
         return image
+    sigma = math.sqrt(max(sigma**2 - _PARTS_VARIANCE, 0.5 * sigma**2))
     whole = psf_taps(sigma, 1)[0]
     image = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, whole, whole, borderType=cv2.BORDER_REPLICATE))
     _spread_parts(slot, fine, psf_taps(sigma, SUB), image)

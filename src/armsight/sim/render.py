@@ -17,7 +17,7 @@ import numpy as np
 from armsight.data import Array, Image
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
-from armsight.sim.paint import SUB, paint_cells, paint_disc
+from armsight.sim.paint import SUB, paint
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
@@ -98,18 +98,13 @@ class _Canvas:
             return
         Ms = np.asarray(np.linalg.inv(to_plane), dtype=np.float64)
         ends = Ts[[0, -1]] if len(Ts) > 1 else Ts
-        box = self._box(ends, _rectangle(pattern.x_edges, pattern.y_edges))
-        if box is not None:
-            values = np.pad(pattern.values, 1, constant_values=CLEAR)
-            x, y = np.array(pattern.x_edges), np.array(pattern.y_edges)
-            self.fine, self.count = paint_cells(
-                self.rays, Ms, box, x, y, values, self.coarse, self.slot, self.fine, self.count
-            )
-        for disc in pattern.discs:
-            box = self._box(ends, _circle(disc))
+        values = np.pad(pattern.values, 1, constant_values=CLEAR)
+        x, y = np.array(pattern.x_edges), np.array(pattern.y_edges)
+        for disc in (np.zeros(0), *pattern.discs):
+            box = self._box(ends, _circle(disc) if disc.size else _rectangle(x, y))
             if box is not None:
-                self.fine, self.count = paint_disc(
-                    self.rays, Ms, box, np.array(disc), self.coarse, self.slot, self.fine, self.count
+                self.fine, self.count = paint(
+                    self.rays, Ms, box, x, y, values, np.array(disc), self.coarse, self.slot, self.fine, self.count
                 )
 
     def _box(self, Ts: Array, outline: Array) -> tuple[int, int, int, int] | None:
