@@ -20,6 +20,9 @@ from armsight.vision.pnp import MIN_POINTS, body_poses
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)
 _STARTS_KEPT = 3
+#: Relative poses closer than this, rad or share of the distance, are one hypothesis.
+_SAME_POSE = 0.1
+_MOST_HYPOTHESES = 600
 
 
 def pinhole(image_size_px: tuple[int, int], focal_px: float, model: str) -> Camera:
@@ -52,10 +55,8 @@ def _focal_candidates(
     return [focal for _, focal in sorted(scores)[:_STARTS_KEPT]]
 
 
-def relative_pose(
-    left: list[list[Array]], right: list[list[Array]], scale_m: float
-) -> tuple[Array, list[Array | None]]:
-    """Choose the relative pose of two cameras that most shots agree on.
+def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: float) -> list[Array]:
+    """Return the relative poses of two cameras that most shots agree on.
 
     Args:
         left: per shot, candidate poses T_left_body.
@@ -63,39 +64,49 @@ def relative_pose(
         scale_m: typical distance of the body, m: makes rotations and translations comparable.
 
     Returns:
-        (4, 4) T_left_right, and per shot the T_left_body that agrees best with it (None where there is no candidate).
-
-    Raises:
-        CalibrationError: no shot has candidates in both cameras.
+        A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
+        in both cameras.
     """
     pairs = [
-        (j, Tl, Tl @ inverse(Tr))
+        (j, Tl @ inverse(Tr))
         for j, (ls, rs) in enumerate(zip(left, right, strict=True))
         for Tl, Tr in itertools.product(ls, rs)
     ]
     if not pairs:
-        raise CalibrationError("no pair shows enough of the body in both cameras to place one camera against the other")
+        return []
     weights = np.r_[np.ones(3) / scale_m, np.ones(3)]
-    shots = np.array([j for j, _, _ in pairs])
-    Ts = np.stack([T for _, _, T in pairs])
-    costs = np.empty(len(pairs))
-    distances = np.empty((len(pairs), len(pairs)))
-    for i, T in enumerate(Ts):
-        distances[i] = np.linalg.norm(log_se3(inverse(T) @ Ts) * weights, axis=1)
+    shots = np.array([j for j, _ in pairs])
+    Ts = np.stack([T for _, T in pairs])
+    tried = np.arange(len(Ts))
+    if len(tried) > _MOST_HYPOTHESES:
+        tried = np.random.default_rng(0).choice(tried, _MOST_HYPOTHESES, replace=False)
+    costs = []
+    for i in tried:
+        distance = np.linalg.norm(log_se3(inverse(Ts[i]) @ Ts) * weights, axis=1)
         best = np.full(len(left), np.inf)
-        np.minimum.at(best, shots, distances[i])
-        costs[i] = np.median(best[np.isfinite(best)]) + 1e-3 * np.minimum(best[np.isfinite(best)], 1.0).mean()
-    winner = int(np.argmin(costs))
-    chosen: list[Array | None] = []
-    for j in range(len(left)):
-        rows = np.flatnonzero(shots == j)
-        if len(rows):
-            chosen.append(pairs[rows[np.argmin(distances[winner, rows])]][1])
-        elif left[j]:
-            chosen.append(left[j][0])
-        else:
-            chosen.append(Ts[winner] @ right[j][0] if right[j] else None)
-    return Ts[winner], chosen
+        np.minimum.at(best, shots, distance)
+        best = best[np.isfinite(best)]
+        costs.append(np.median(best) + 1e-3 * np.minimum(best, 1.0).mean())
+    chosen: list[Array] = []
+    for i in tried[np.argsort(costs)]:
+        apart = [np.linalg.norm(log_se3(inverse(T) @ Ts[i]) * weights) for T in chosen]
+        if all(a > _SAME_POSE for a in apart):
+            chosen.append(Ts[i])
+        if len(chosen) == _STARTS_KEPT:
+            break
+    return chosen
+
+
+def _agreeing_poses(left: list[list[Array]], right: list[list[Array]], T_left_right: Array) -> list[Array] | None:
+    """Return per shot the T_left_body that agrees best with a relative pose; None where a shot has no candidate."""
+    chosen = []
+    for ls, rs in zip(left, right, strict=True):
+        from_right = [T_left_right @ T for T in rs]
+        pairs = [(np.linalg.norm(log_se3(inverse(a) @ b)), i) for i, a in enumerate(ls) for b in from_right]
+        if not (ls or rs):
+            return None
+        chosen.append(ls[min(pairs)[1]] if pairs else (ls or from_right)[0])
+    return chosen
 
 
 def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Observations) -> State | None:
@@ -109,12 +120,11 @@ def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Obser
             ]
         )
     depths = [T[2, 3] for views in candidates for view in views for T in view]
-    if not depths:
+    hypotheses = relative_poses(candidates[0], candidates[1], float(np.median(depths))) if depths else []
+    if not hypotheses:
         return None
-    T_left_right, poses = relative_pose(candidates[0], candidates[1], float(np.median(depths)))
-    if any(T is None for T in poses):
-        return None
-    return State(cameras, T_left_right, np.stack([T for T in poses if T is not None]), np.zeros(0))
+    poses = _agreeing_poses(candidates[0], candidates[1], hypotheses[0])
+    return None if poses is None else State(cameras, hypotheses[0], np.stack(poses), np.zeros(0))
 
 
 def start_board(

@@ -1,0 +1,138 @@
+"""Which detections belong to one body, where names do not settle it: two bodies of one kind in view, wrong names.
+
+Poses that several detections of one camera agree on are carried into the other camera, adjusted to both, and the one
+that explains most detections takes them; what is left may be another body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array, Correspondences, Detections, Ids
+from armsight.errors import CalibrationError
+from armsight.geometry.pose import inverse, transform
+from armsight.vision.bundle import Model, Observations, State, minimise
+from armsight.vision.camera import Camera
+from armsight.vision.detections import SeenShot
+from armsight.vision.match import join
+from armsight.vision.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
+
+#: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
+LEAST_DETECTIONS, LEAST_AMBIGUOUS = 4, 6
+_POLISH_SIGMA_PX = 2.0
+
+
+def plain(shot: SeenShot) -> Correspondences | None:
+    """Return a shot's correspondences by name, or None where a name stands twice in one image."""
+    if any(len(np.unique(ids)) < len(ids) for ids in shot.ids):
+        return None
+    return join(*(_detections(ids, uv) for ids, uv in zip(shot.ids, shot.uv, strict=True)))
+
+
+def _detections(ids: Ids, uv: Array) -> Detections:
+    """Sort named places into detections whose covariance is unknown."""
+    order = np.argsort(ids)
+    return Detections(ids[order], uv[order], np.zeros((len(ids), 2, 2)))
+
+
+def candidates(
+    points: Array, cameras: tuple[Camera, Camera], shot: SeenShot
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Return what each camera of one shot alone says about where bodies may be."""
+    left, right = (consensus_poses(points, camera, shot.ids[i], shot.uv[i]) for i, camera in enumerate(cameras))
+    return left, right
+
+
+def instances(
+    points: Array,
+    cameras: tuple[Camera, Camera],
+    T_left_right: Array,
+    shot: SeenShot,
+    found: tuple[list[Candidate], list[Candidate]],
+) -> list[tuple[Array, Correspondences]]:
+    """Find the bodies in one shot.
+
+    Args:
+        points: (M, 3) points of the body, m.
+        cameras: left and right.
+        T_left_right: (4, 4) their relative pose.
+        shot: what both cameras saw.
+        found: what each camera alone says, as :func:`candidates` returns.
+
+    Returns:
+        T_left_body (4, 4) and the correspondences of every body, the one with most detections first; no detection is
+        used twice.
+    """
+    starts = [c.T_camera_body for c in found[0]] + [T_left_right @ c.T_camera_body for c in found[1]]
+    poses = [_polished(points, cameras, T_left_right, shot, T) for T in starts]
+    free = tuple(np.ones(len(ids), bool) for ids in shot.ids)
+    least = LEAST_AMBIGUOUS if plain(shot) is None else LEAST_DETECTIONS
+    bodies: list[tuple[Array, Correspondences]] = []
+    while True:
+        best, best_rows, best_key = None, None, (0, 0.0)
+        for T in poses:
+            if T is None:
+                continue
+            rows, cost = _agreeing(points, cameras, T_left_right, shot, T, free)
+            key = (sum(len(r) for r in rows), -cost)
+            if key > best_key:
+                best, best_rows, best_key = T, rows, key
+        if best is None or best_rows is None or best_key[0] < least:
+            return bodies
+        seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(best_rows)))
+        bodies.append((best, seen))
+        for side, rows in enumerate(best_rows):
+            free[side][rows] = False
+
+
+def _agreeing(
+    points: Array,
+    cameras: tuple[Camera, Camera],
+    T_left_right: Array,
+    shot: SeenShot,
+    T_left_body: Array,
+    free: tuple[Array, ...],
+) -> tuple[list[Ids], float]:
+    """Return per camera the free detections that agree with a pose, and their summed squared distance, px^2."""
+    rows, cost = [], 0.0
+    for side, camera in enumerate(cameras):
+        T = T_left_body if side == 0 else inverse(T_left_right) @ T_left_body
+        projected = camera.project(transform(T, points))
+        if not np.isfinite(projected).all():
+            return [np.zeros(0, np.int64), np.zeros(0, np.int64)], np.inf
+        size = float(np.sqrt(((projected - projected.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        distance = np.linalg.norm(projected[shot.ids[side]] - shot.uv[side], axis=1)
+        near = np.flatnonzero((distance <= max(AGREE_PX, AGREE_SHARE * size)) & free[side])
+        near = near[np.argsort(distance[near], kind="stable")]
+        _, first = np.unique(shot.ids[side][near], return_index=True)
+        rows.append(near[first])
+        cost += float((distance[near[first]] ** 2).sum())
+    return rows, cost
+
+
+def _polished(
+    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shot: SeenShot, T: Array
+) -> Array | None:
+    """Adjust a pose to what agrees with it in both cameras, twice, for the first time only roughly."""
+    everything = tuple(np.ones(len(ids), bool) for ids in shot.ids)
+    model = Model(points, np.zeros((0, len(points), 3)), 1.0, False)
+    count = sum(camera.parameters.size for camera in cameras) + 6
+    for _ in range(2):
+        rows, _ = _agreeing(points, cameras, T_left_right, shot, T, everything)
+        if sum(len(r) for r in rows) < 3:
+            return None
+        seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(rows)))
+        state = State(cameras, T_left_right, T[None], np.zeros(0))
+        try:
+            solution = minimise(
+                model,
+                state,
+                Observations.from_shots([seen]),
+                _POLISH_SIGMA_PX,
+                free=np.zeros(count, bool),
+                max_steps=20,
+            )
+        except (CalibrationError, np.linalg.LinAlgError):
+            return None
+        T = solution.state.Ts_left_body[0]
+    return T

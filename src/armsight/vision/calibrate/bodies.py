@@ -1,0 +1,248 @@
+"""A known body moving in view of two cameras of known intrinsics: their relative pose, and the body made better.
+
+Per shot, every pose that one camera alone allows, mirror solutions included; the relative pose that most shots agree
+on; then the joint adjustment of relative pose, poses and (on request) the body's shape under a prior. The prior's sigma
+is stated and is judged on left-out shots: a looser body must lower the error of shots it was not fitted to. Rigid motion
+and size of the body are held, for the images cannot tell them from poses and baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Body, Correspondences, Ids
+from armsight.errors import CalibrationError
+from armsight.geometry.pose import inverse, log_se3, transform
+from armsight.geometry.rigid import fit_rigid
+from armsight.vision.assign import candidates, instances, plain
+from armsight.vision.bundle import Model, Observations, Solution, State, minimise
+from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, summary
+from armsight.vision.calibrate.result import Calibration, Rejected
+from armsight.vision.calibrate.screen import noise_px
+from armsight.vision.calibrate.start import relative_poses
+from armsight.vision.camera import Camera
+from armsight.vision.detections import SeenShot
+from armsight.vision.pnp import Candidate
+from armsight.vision.rig import StereoRig
+from armsight.vision.shape import every_point
+
+#: Tolerances of the body's points that are tried, m, per shape mode; the first is the drawing as it is.
+TOLERANCES_M = (0.0, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
+#: A looser body must lower the held-out error by this share.
+WORTH = 0.005
+_START_TOLERANCE_M = 1e-4
+LEAST_SHOTS = 5
+FOLDS = 5
+_START_SIGMA_PX = 2.0
+_START_SHOTS = 40
+Found = tuple[list[Candidate], list[Candidate]]
+Progress = Callable[[str], None]
+
+
+def calibrate_bodies(
+    body: Body,
+    shots: Sequence[SeenShot],
+    cameras: tuple[Camera, Camera],
+    *,
+    refine_body: bool = False,
+    folds: int = FOLDS,
+    progress: Progress = lambda message: None,
+) -> Calibration:
+    """Find the relative pose of two cameras from detections of a known body.
+
+    Args:
+        body: the body's points, m, as drawn.
+        shots: what both cameras saw in every shot.
+        cameras: the cameras with their known intrinsics.
+        refine_body: estimate how the body differs from its drawing.
+        folds: how many parts the shots are split into for the held-out errors.
+        progress: called with a line about what is being done.
+
+    Returns:
+        The rig, the body as estimated, held-out errors, and what was not used.
+
+    Raises:
+        CalibrationError: too few shots, or no relative pose that they agree on.
+    """
+    progress("looking for the body in every image")
+    found = [candidates(body.points, cameras, shot) for shot in shots]
+    progress("placing one camera against the other")
+    T_left_right, points = _start(body.points, cameras, shots, found), body.points
+    for tolerance in (0.0, 0.0, *((_START_TOLERANCE_M,) if refine_body else ())):
+        names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
+        if len(seen) < LEAST_SHOTS:
+            why = "; ".join(f"shot {r.pair}: {r.reason}" for r in rejected[:2])
+            raise CalibrationError(f"{len(seen)} of {len(shots)} shots are usable, {LEAST_SHOTS} are needed: {why}")
+        observations, model = Observations.from_shots(seen), _model(body.points, tolerance)
+        state = State(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
+        state = _adjusted(model, state, observations).state
+        T_left_right, points = state.T_left_right, model.body(state.shape)
+    names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
+    observations = Observations.from_shots(seen)
+    state = State(cameras, T_left_right, np.stack(poses), np.zeros(0))
+    trials = {}
+    for tolerance in TOLERANCES_M if refine_body else TOLERANCES_M[:1]:
+        progress(f"judging a body within {tolerance * 1e3:g} mm of its drawing on held-out shots")
+        model = _model(body.points, tolerance)
+        start = replace(state, shape=np.zeros(len(model.modes)))
+        solution = _adjusted(model, start, observations)
+        score = _heldout_cost(model, solution, observations, min(folds, len(seen)))
+        trials[tolerance] = (model, solution, score)
+    chosen = 0.0
+    for tolerance, (_, _, score) in trials.items():
+        if score < trials[chosen][2] * (1 - WORTH):
+            chosen = tolerance
+    model, solution, _ = trials[chosen]
+    return _result(body, model, solution, observations, names, len(shots), rejected, min(folds, len(seen)), chosen)
+
+
+def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> Array:
+    """Return the relative pose under which most detections belong to bodies."""
+    both = [j for j, (left, right) in enumerate(found) if left and right]
+    both = sorted(both, key=lambda j: -sum(len(side[0].rows) for side in found[j]))[:_START_SHOTS]
+    depths = [c.T_camera_body[2, 3] for j in both for side in found[j] for c in side]
+    if not depths:
+        raise CalibrationError("no shot shows three or more of the body's points in both cameras")
+    views = [[[c.T_camera_body for c in found[j][side]] for j in both] for side in (0, 1)]
+    best, most = None, -1
+    for T in relative_poses(views[0], views[1], float(np.median(depths))):
+        T = _refined(points, cameras, T, [shots[j] for j in both], [found[j] for j in both])
+        explained = sum(
+            sum(int(seen.seen.sum()) for _, seen in instances(points, cameras, T, shots[j], found[j])) for j in both
+        )
+        if explained > most:
+            best, most = T, explained
+    assert best is not None
+    return best
+
+
+def _refined(
+    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: list[SeenShot], found: list[Found]
+) -> Array:
+    """Adjust a hypothesis of the relative pose to the pairs of candidates that agree with it."""
+    seen, poses = [], []
+    for shot, (left, right) in zip(shots, found, strict=True):
+        pairs = [(a, b) for a in left for b in right]
+        gaps = [
+            np.linalg.norm(log_se3(inverse(T_left_right) @ a.T_camera_body @ inverse(b.T_camera_body)))
+            for a, b in pairs
+        ]
+        a, b = pairs[int(np.argmin(gaps))]
+        from_rows = SeenShot(
+            shot.name, (shot.ids[0][a.rows], shot.ids[1][b.rows]), (shot.uv[0][a.rows], shot.uv[1][b.rows])
+        )
+        joined = plain(from_rows)
+        assert joined is not None, "a candidate names every point once"
+        seen.append(joined)
+        poses.append(a.T_camera_body)
+    state = State(cameras, T_left_right, np.stack(poses), np.zeros(0))
+    try:
+        return minimise(_model(points, 0.0), state, Observations.from_shots(seen), _START_SIGMA_PX).state.T_left_right
+    except (CalibrationError, np.linalg.LinAlgError):
+        return T_left_right
+
+
+def _chosen(arrays: tuple[Array, Array], rows: tuple[Ids, Ids]) -> tuple[Array, Array]:
+    """Pick rows of each camera's array."""
+    return arrays[0][rows[0]], arrays[1][rows[1]]
+
+
+def _assigned(
+    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: Sequence[SeenShot], found: list[Found]
+) -> tuple[list[str], list[Correspondences], list[Array], list[Rejected]]:
+    """Give every shot its detections of the body and its pose, or the reason why it has none."""
+    names, seen, poses, rejected = [], [], [], []
+    for shot, candidates_of_shot in zip(shots, found, strict=True):
+        bodies = instances(points, cameras, T_left_right, shot, candidates_of_shot)
+        if not bodies:
+            count = sum(len(ids) for ids in shot.ids)
+            rejected.append(Rejected(shot.name, f"no pose of the body agrees with its {count} detections"))
+            continue
+        T, correspondences = bodies[0]
+        names.append(shot.name)
+        poses.append(T)
+        seen.append(correspondences)
+    return names, seen, poses, rejected
+
+
+def _model(points: Array, tolerance_m: float) -> Model:
+    """The body as drawn, or free within a tolerance."""
+    modes = every_point(points) if tolerance_m > 0 else np.zeros((0, len(points), 3))
+    return Model(points, modes, tolerance_m or 1.0, False)
+
+
+def _adjusted(model: Model, state: State, observations: Observations) -> Solution:
+    """Adjust with the noise that the residuals show."""
+    sigma = _START_SIGMA_PX
+    for _ in range(3):
+        solution = minimise(model, state, observations, sigma)
+        freed = 6.0
+        if len(model.modes):
+            posterior = np.diag(solution.cov_shared)[-len(model.modes) :]
+            freed += float(len(model.modes) - posterior.sum() / model.shape_sigma_m**2)
+        state, sigma = solution.state, noise_px(solution, observations, freed)
+    return minimise(model, state, observations, sigma)
+
+
+def _heldout_cost(model: Model, full: Solution, observations: Observations, folds: int) -> float:
+    """Mean squared pixel distance, px^2, of left-out shots from the body and rig that the others give."""
+    total, count = 0.0, 0
+    everyone = np.arange(observations.shot_count)
+    for k in range(folds):
+        held = everyone[everyone % folds == k]
+        rest = np.setdiff1d(everyone, held)
+        state = replace(full.state, Ts_left_body=full.state.Ts_left_body[rest])
+        fitted = minimise(model, state, observations.shots(rest), full.sigma_px).state
+        fixed = Model(model.body(fitted.shape), np.zeros((0, len(model.points), 3)), 1.0, False)
+        start = replace(fitted, Ts_left_body=full.state.Ts_left_body[held], shape=np.zeros(0))
+        nothing = np.zeros(sum(camera.parameters.size for camera in fitted.cameras) + 6, bool)
+        solution = minimise(fixed, start, observations.shots(held), full.sigma_px, free=nothing)
+        total += float((solution.residuals_px**2).sum())
+        count += len(solution.residuals_px)
+    return total / count
+
+
+def _result(
+    body: Body,
+    model: Model,
+    solution: Solution,
+    observations: Observations,
+    names: list[str],
+    given: int,
+    rejected: list[Rejected],
+    folds: int,
+    tolerance_m: float,
+) -> Calibration:
+    """Cross-validate the choice and put everything together."""
+
+    def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array]:
+        state = replace(solution.state, Ts_left_body=solution.state.Ts_left_body[rows])
+        part = minimise(model, state, observations.shots(rows), solution.sigma_px)
+        return rig_of(part), model.body(part.state.shape)
+
+    errors = cross_validate(fit, body.points, observations, folds)
+    heldout = summary(errors, folds)
+    found = model.body(solution.state.shape)
+    found = transform(fit_rigid(found, body.points), found)
+    rig = rig_of(solution)
+    notes = (f"body held to its drawing within {tolerance_m * 1e3:g} mm per point, judged on held-out shots",)
+    return Calibration(
+        rig,
+        replace(body, points=found),
+        float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean())),
+        tuple(names),
+        given,
+        observations,
+        solution,
+        residual_epipolar_rms(rig, observations),
+        heldout,
+        errors,
+        {rig.left.model: heldout},
+        tuple(rejected),
+        notes,
+        (),
+    )

@@ -1,0 +1,109 @@
+"""Detections from a file: one line per marker that one camera saw in one shot.
+
+    shot,camera,marker,u_px,v_px
+    1,left,9,944.5607,2691.2178
+
+``camera`` is left or right, pixels are raw, (0, 0) is the centre of the top-left pixel. A marker may stand twice in one
+image where two bodies of the same kind are in view. Any other columns are ignored.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from armsight.data import SIDES, Array, Body, Ids, Record
+from armsight.errors import InputError
+from armsight.files import read_text
+
+COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
+#: How many lines with the same mistake are named before the rest is counted.
+_NAMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SeenShot(Record):
+    """What both cameras saw in one shot, as it stands in the file.
+
+    Attributes:
+        name: the shot.
+        ids: per camera (N,) rows of the body's points, in the file's order; one may stand more than once.
+        uv: per camera (N, 2) raw pixels.
+    """
+
+    name: str
+    ids: tuple[Ids, Ids]
+    uv: tuple[Array, Array]
+
+
+def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
+    """Read a file of detections.
+
+    Args:
+        path: the CSV file.
+        body: names the points.
+
+    Returns:
+        One record per shot, in the file's order.
+
+    Raises:
+        InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
+            all; the message names file and line.
+    """
+    rows = list(csv.reader(io.StringIO(read_text(path))))
+    if not rows:
+        raise InputError(f"{path}: empty; expected a header {','.join(COLUMNS)}")
+    header = [name.strip() for name in rows[0]]
+    missing = [name for name in COLUMNS if name not in header]
+    if missing:
+        raise InputError(f"{path}: line 1: no column {', '.join(missing)}; expected a header {','.join(COLUMNS)}")
+    at = [header.index(name) for name in COLUMNS]
+    index = {name: i for i, name in enumerate(body.point_names)}
+    shots: dict[str, tuple[tuple[list[int], list[int]], tuple[list[Array], list[Array]]]] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise InputError(f"{path}: line {number}: {len(row)} fields, the header has {len(header)}")
+        shot, camera, marker, u, v = (row[i].strip() for i in at)
+        if camera not in SIDES:
+            raise InputError(f"{path}: line {number}: camera {camera!r}; it must be left or right")
+        if marker not in index:
+            raise InputError(
+                f"{path}: line {number}: unknown marker {marker!r}; body {body.name} has {_some(body.point_names)}"
+            )
+        uv = np.array([_number(cell, path, number, name) for cell, name in ((u, "u_px"), (v, "v_px"))])
+        ids, places = shots.setdefault(shot, (([], []), ([], [])))
+        side = SIDES.index(camera)
+        ids[side].append(index[marker])
+        places[side].append(uv)
+    if not shots:
+        raise InputError(f"{path}: no detections below the header")
+    return [
+        SeenShot(
+            name,
+            (np.array(ids[0], np.int64), np.array(ids[1], np.int64)),
+            (np.reshape(np.array(uv[0], float), (-1, 2)), np.reshape(np.array(uv[1], float), (-1, 2))),
+        )
+        for name, (ids, uv) in shots.items()
+    ]
+
+
+def _number(text: str, path: str | Path, line: int, column: str) -> float:
+    """Read one finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"{path}: line {line}: {column} is {text!r}, it must be a number") from None
+    if not np.isfinite(value):
+        raise InputError(f"{path}: line {line}: {column} is {text}, it must be a finite number of pixels")
+    return value
+
+
+def _some(names: tuple[str, ...]) -> str:
+    """List a few names."""
+    return ", ".join(names[:_NAMED]) + (f" ... {names[-1]}" if len(names) > _NAMED else "")
