@@ -170,6 +170,8 @@ class PoseEstimate(Record):
         cov_noise: (6, 6) the same from the pixel noise alone.
         residual_rms_m: RMS distance of the triangulated points from the fitted body.
         reprojection_rms_px: RMS distance of the detections from the fitted body's projections.
+        misfit: how many times larger than the pixel noise allows the residuals are; the covariance holds it. 1 where
+            they are within chance.
         points: the triangulated points that went in.
         dropped: what was thrown away, and why.
     """
@@ -179,5 +181,6 @@ class PoseEstimate(Record):
     cov_noise: Array
     residual_rms_m: float
     reprojection_rms_px: float
+    misfit: float
     points: Points
     dropped: tuple[Dropped, ...] = ()

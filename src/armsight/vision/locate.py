@@ -1,8 +1,10 @@
 """Where a body is and how it is turned: maximum likelihood over every detection, with covariance.
 
 The triangulated points give the start (rigid fit); the estimate minimises the covariance-weighted pixel distance of all
-detections, those of one camera only included. One bad point is found by a robust fit and dropped by name; the covariance
-is that of plain least squares on what is left, plus what the rig's own covariance does to all points together.
+detections, those of one camera included. One bad point is found by a robust fit and dropped by name; the covariance
+is that of plain least squares on what is left, plus what the rig's own covariance does to all points together. Where the
+body fits worse than the pixel noise allows (a print that is not its drawing, a body that moved between the two images)
+the noise is what the residuals show (Birge's ratio), and the estimate says by how much.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise, predict, whiteners
-from armsight.vision.pnp import body_poses
+from armsight.vision.pnp import consensus_poses
 from armsight.vision.rig import StereoRig
 
 #: A detection whose whitened squared distance from a robust fit is beyond this share of the chi-square distribution is
@@ -30,6 +32,8 @@ _AGREEING = 0.5
 #: tried too, mirror solutions among them.
 _SAFE_POINTS = 8
 _COLLINEAR = 1e-3
+#: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
+_MISFIT_QUANTILE = 0.999
 
 
 def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
@@ -88,7 +92,8 @@ def _starts(rig: StereoRig, body: Body, points: Points) -> list[Array]:
         for side, camera in enumerate(rig.cameras):
             rows = seen.seen[:, side]
             to_left = np.eye(4) if side == 0 else rig.T_left_right
-            starts += [to_left @ T for T, _ in body_poses(body.points[seen.ids[rows]], camera, seen.uv[rows, side])]
+            found = consensus_poses(body.points, camera, seen.ids[rows], seen.uv[rows, side])
+            starts += [to_left @ candidate.T_camera_body for candidate in found]
     return starts
 
 
@@ -122,7 +127,8 @@ def _without_outliers(
     limit = chi2.ppf(OUTLIER_QUANTILE, 2)
     for _ in range(3):
         r = np.einsum("nij,nj->ni", whiteners(observations, sigma), _residuals(model, solution.state, observations))
-        now = np.einsum("ni,ni->n", r, r) <= limit
+        d2 = np.einsum("ni,ni->n", r, r)
+        now = d2 <= limit * max(1.0, float(np.median(d2)) / chi2.ppf(0.5, 2))
         if now.sum() < max(3, _AGREEING * len(now)) or len(np.unique(observations.point[now])) < 3:
             return now, None
         if (now == good).all() and solution is not robust:
@@ -167,8 +173,11 @@ def _estimate(
     W = whiteners(used, solution.sigma_px)
     _, J_rig, J_pose = predict(model, solution.state, used)
     A, B = (W @ J_pose).reshape(-1, 6), (W @ J_rig).reshape(-1, rig.parameter_count)
-    noise = np.linalg.inv(A.T @ A)
-    gain = noise @ (A.T @ B)
+    residual = (W @ solution.residuals_px[..., None]).ravel()
+    freedom = len(residual) - 6
+    misfit = float(residual @ residual / freedom) if residual @ residual > chi2.ppf(_MISFIT_QUANTILE, freedom) else 1.0
+    noise = np.linalg.inv(A.T @ A) * misfit
+    gain = noise / misfit @ (A.T @ B)
     T = solution.state.Ts_left_body[0]
     rows = Observations.from_shots([points.seen])
     bad = np.unique(rows.point[~good])
@@ -181,6 +190,7 @@ def _estimate(
         noise,
         float(np.sqrt((gap**2).sum(axis=1).mean())) if len(gap) else float("nan"),
         float(np.sqrt((solution.residuals_px**2).sum(axis=1).mean())),
+        float(np.sqrt(misfit)),
         points,
         dropped,
     )

@@ -20,6 +20,7 @@ COMMANDS = {
     "cameras": "cameras",
     "measure": "measure",
     "record": "record",
+    "rig": "rig",
 }
 
 

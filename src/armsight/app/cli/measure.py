@@ -1,0 +1,137 @@
+"""``armsight measure``: where a target is and how it is turned, shot by shot."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from armsight.app.cli.progress import bar
+from armsight.app.poses import csv_text, pose_record
+from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, InputError
+from armsight.files import check_writable, write_text
+from armsight.vision.detections import read_detections
+from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.measure import measure, measure_seen, size_problem
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import PairsSource, Source, open_source
+
+#: Shot name, time, result.
+Result = tuple[str, float | None, PoseEstimate | Missed]
+
+
+@click.command("measure")
+@click.argument("rig", metavar="RIG.json", type=click.Path(path_type=Path))
+@click.option(
+    "--target", required=True, metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file."
+)
+@click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
+@click.option("--right", metavar="GLOB", help="Right images.")
+@click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
+@click.option("--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections instead of images.")
+@click.option("-o", "--out", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
+def command(
+    rig: Path,
+    target: str,
+    left: str | None,
+    right: str | None,
+    source: str | None,
+    detections: Path | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Say where a target is and how it is turned, in the left camera's frame, with its uncertainty.
+
+    Give the images as --left and --right, as --source, or what was detected in them as --detections. A shot that cannot
+    be read or does not show the target is a line that says why, and the run goes on.
+    """
+    given = [left is not None or right is not None, source is not None, detections is not None]
+    if sum(given) != 1 or (left is None) != (right is None):
+        raise InputError("give the shots one way: --left and --right, or --source, or --detections")
+    stereo = StereoRig.load(rig)
+    if out is not None:
+        check_writable(out)
+    records: list[dict[str, Any]] = []
+    started = time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        if detections is not None:
+            body = open_body(target)
+            shots = read_detections(detections, body)
+            results, total = ((s.name, None, measure_seen(stereo, body, s)) for s in shots), len(shots)
+        else:
+            found = open_target(target)
+            body = found.body
+            opened = PairsSource(left, right) if left is not None and right is not None else open_source(str(source))
+            stack.enter_context(contextlib.closing(opened))
+            results = ((s.name, s.t_s, measure(stereo, found, s)) for s in _shots(opened, stereo, rig))
+            total = len(getattr(opened, "pairs", ())) or None
+        try:
+            _run(results, total, body, records, as_json)
+        finally:
+            if out is not None and records:
+                write_text(out, csv_text(records))
+    _close(records, time.perf_counter() - started, out)
+
+
+def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
+    """Yield a source's shots; the first image that can be read must have the rig's size."""
+    checked = False
+    while (shot := source.read()) is not None:
+        if not checked and shot.left is not None and shot.right is not None:
+            checked = True
+            for side, camera, image in zip(SIDES, rig.cameras, (shot.left, shot.right), strict=True):
+                if (problem := size_problem(camera.image_size_px, image, side)) is not None:
+                    raise InputError(f"{path}: shot {shot.name}: {problem}")
+        yield shot
+
+
+def _run(
+    results: Iterator[Result], total: int | None, body: Body, records: list[dict[str, Any]], as_json: bool
+) -> None:
+    """Measure every shot, print its line and keep its record."""
+    with bar("measuring", total) as advance:
+        for name, t_s, result in results:
+            records.append(pose_record(name, t_s, body, result))
+            click.echo(json.dumps(records[-1]) if as_json else _line(records[-1]))
+            advance()
+
+
+def _line(record: dict[str, Any]) -> str:
+    """Format one shot for people: mm and degrees, one sigma."""
+    if record["status"] == "missed":
+        return f"{record['shot']}: missed: {record['reason']}"
+    sigma = np.sqrt(np.diag(record["covariance"]))
+    position = " ".join(
+        f"{axis} {1e3 * value:.3f} ± {1e3 * s:.3f}"
+        for axis, value, s in zip("xyz", record["position_m"], sigma[:3], strict=True)
+    )
+    angles = " ".join(
+        f"{n} {value:.3f}" for n, value in zip(("roll", "pitch", "yaw"), record["roll_pitch_yaw_deg"], strict=True)
+    )
+    turned = np.degrees(np.linalg.norm(sigma[3:]))
+    note = f", {len(record['dropped'])} points dropped" if record["dropped"] else ""
+    singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""
+    return f"{record['shot']}: {position} mm, {angles} deg ± {turned:.3f}{singular}, {len(record['points_m'])} points{note}"
+
+
+def _close(records: list[dict[str, Any]], seconds: float, out: Path | None) -> None:
+    """Say on stderr what was measured and missed; raise where nothing was."""
+    good = [r for r in records if r["status"] == "ok"]
+    missed = [r for r in records if r["status"] == "missed"]
+    if not records:
+        raise ArmsightError("the source ended without a single shot")
+    if not good:
+        raise ArmsightError(
+            f"none of {len(records)} shots could be measured; {missed[0]['shot']}: {missed[0]['reason']}"
+        )
+    summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
+    summary += f", {len(missed)} missed (their lines say why)" if missed else ""
+    click.echo(summary + (f"; written to {out}" if out is not None else ""), err=True)

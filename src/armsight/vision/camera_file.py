@@ -1,0 +1,69 @@
+"""The intrinsics of two cameras from a JSON file, as calibrate --cameras takes them.
+
+    {"image_size_px": [4000, 6000],
+     "left":  {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "distortion": [k1, k2, p1, p2, k3]},
+     "right": {"K": ..., "distortion": ..., "distortion_model": "fisheye"}}
+
+``distortion`` has 0, 4, 5 or 8 coefficients in OpenCV's order; ``"distortion_model": "fisheye"`` makes four of them
+Kannala-Brandt's. A camera may have its own ``image_size_px``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.data import SIDES
+from armsight.errors import InputError
+from armsight.files import read_text
+from armsight.geometry.check import checked
+from armsight.vision.camera import Camera
+
+_MODELS = {0: "none", 4: "brown4", 5: "brown5", 8: "brown8"}
+
+
+def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
+    """Read both cameras.
+
+    Raises:
+        InputError: missing, not JSON, or not two cameras; the message names the file and the entry.
+    """
+    try:
+        document = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
+    if not isinstance(document, dict) or not all(isinstance(document.get(side), dict) for side in SIDES):
+        raise InputError(f'{path}: expected an object with "left" and "right", each with "K" and "distortion"')
+    left, right = (_camera(path, document, side) for side in SIDES)
+    return left, right
+
+
+def _camera(path: str | Path, document: dict[str, Any], side: str) -> Camera:
+    """Build one camera from its entry."""
+    entry = document[side]
+    try:
+        K = checked(entry["K"], (3, 3), "K")
+        distortion = checked(entry["distortion"], (None,), "distortion")
+        width, height = (int(n) for n in entry.get("image_size_px", document.get("image_size_px")))
+    except KeyError as error:
+        raise InputError(f"{path}: camera {side} has no {error.args[0]!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f'{path}: camera {side} needs "image_size_px": [width, height]') from None
+    except InputError as error:
+        raise InputError(f"{path}: camera {side}: {error}") from None
+    if abs(K[0, 1]) > 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
+        raise InputError(
+            f"{path}: camera {side}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not modelled"
+        )
+    model = _MODELS.get(len(distortion))
+    if str(entry.get("distortion_model", "")).startswith("fisheye"):
+        model = "fisheye" if len(distortion) == 4 else None
+    if model is None:
+        raise InputError(f"{path}: camera {side}: {len(distortion)} distortion coefficients; known are 0, 4, 5 and 8")
+    try:
+        return Camera((width, height), model, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), distortion)
+    except InputError as error:
+        raise InputError(f"{path}: camera {side}: {error}") from None

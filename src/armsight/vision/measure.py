@@ -1,0 +1,94 @@
+"""One shot to where the body is: detect, match, triangulate, locate.
+
+from armsight import StereoRig, measure, open_source, open_target
+rig, target = StereoRig.load("rig.json"), open_target("chessboard:9x6:25mm")
+estimate = measure(rig, target, open_source("recording").read())
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
+from armsight.vision.assign import candidates, instances, plain
+from armsight.vision.detections import SeenShot
+from armsight.vision.image import grey
+from armsight.vision.locate import locate
+from armsight.vision.markers.marker import Target
+from armsight.vision.match import gate, join, match
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+
+#: Fewest common points on which exchanged cameras can be told from bad detections.
+_TELLING_POINTS = 4
+
+
+def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed:
+    """Measure one shot.
+
+    Args:
+        rig: the calibrated pair.
+        target: what to look for.
+        shot: two simultaneous images.
+
+    Returns:
+        The pose of the target's body in the left camera's frame, or why there is none.
+    """
+    if shot.problem is not None or shot.left is None or shot.right is None:
+        return Missed(shot.problem or "no image")
+    images = (shot.left, shot.right)
+    for side, camera, image in zip(SIDES, rig.cameras, images, strict=True):
+        if (problem := size_problem(camera.image_size_px, image, side)) is not None:
+            return Missed(problem)
+    found = tuple(target.detect(grey(image)) for image in images)
+    problems = [f"{side}: {d.problem}" for side, d in zip(SIDES, found, strict=True) if d.problem is not None]
+    if problems:
+        return Missed("; ".join(problems))
+    return measure_detections(rig, target.body, found[0], found[1], flips=getattr(target, "flips", ()))
+
+
+def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:
+    """Say that an image is not of the size a camera was calibrated at, or None."""
+    got = (image.shape[1], image.shape[0])
+    if got == tuple(size_px):
+        return None
+    return (
+        f"the {side} image is {got[0]}x{got[1]}, the rig was calibrated at {size_px[0]}x{size_px[1]}: measure at the size "
+        "the rig was calibrated at"
+    )
+
+
+def measure_detections(
+    rig: StereoRig, body: Body, left: Detections, right: Detections, *, flips: tuple[np.ndarray, ...] = ()
+) -> PoseEstimate | Missed:
+    """Measure a body from what each camera detected; ``flips`` as in :func:`~armsight.vision.match.match`."""
+    seen = match(rig, body, left, right, flips=flips)
+    result = locate(rig, body, triangulate(rig, body, seen))
+    if isinstance(result, Missed) and _exchanged(rig, body, left, right):
+        return Missed(f"left and right are exchanged: the images fit the rig the other way round ({result.reason})")
+    return result
+
+
+def _exchanged(rig: StereoRig, body: Body, left: Detections, right: Detections) -> bool:
+    """Whether the detections fit the rig only with the cameras exchanged."""
+    common = join(left, right)
+    if common.paired.sum() < _TELLING_POINTS:
+        return False
+    swapped = triangulate(rig, body, gate(rig, body, join(right, left)))
+    return len(swapped.ids) > 0.8 * common.paired.sum()
+
+
+def measure_seen(rig: StereoRig, body: Body, shot: SeenShot) -> PoseEstimate | Missed:
+    """Measure a body from detections of a file; where a name stands twice, the body with most detections is taken."""
+    seen = plain(shot)
+    if seen is None:
+        bodies = instances(body.points, rig.cameras, rig.T_left_right, shot, candidates(body.points, rig.cameras, shot))
+        if not bodies:
+            return Missed("markers stand twice in one image, and no pose of the body agrees with them")
+        seen = bodies[0][1]
+    return _located(rig, body, seen)
+
+
+def _located(rig: StereoRig, body: Body, seen: Correspondences) -> PoseEstimate | Missed:
+    """Gate, triangulate and locate correspondences."""
+    return locate(rig, body, triangulate(rig, body, gate(rig, body, seen)))
