@@ -54,6 +54,7 @@ _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 _P = 10  # c (2), edge angles (2), squared blurs (2), a, b, k (2)
 _STEPS = 25
 _STOP = 3e-4  # the fit has settled when a step would lower the cost by less than this share of one pixel's noise
+_STALL = 0.05  # the same, for a step that the cost's small kinks keep from lowering it
 _LAMBDA = 1e-2
 _BLUR2_MIN = 0.06  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
 #: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It decides
@@ -210,6 +211,7 @@ def _fit(n: int, px: Array, q: Array, sides: Array, bow: Array, J: Array, r: Arr
         gain = np.dot(x, g)  # how much lower the cost should get, or a little more
         done = damping <= 1.0 and gain < _STOP * cost / n
         new = _evaluate(n, px, trial, sides, bow, J, r)
+        done |= max(gain, abs(new - cost)) < _STALL * cost / n
         if new > cost and not done:
             damping = max(damping * 10.0, 1e-4)
             if damping > 1e8:
@@ -259,7 +261,7 @@ def _refine(
             continue
         uv[i] = q[:2]
         invert(L, inverse)
-        variance = edge_noise(n, J, r, inverse)
+        variance = edge_noise(n, J, r, inverse, 0, 1)
         cov[i] = variance * inverse[:2, :2]
         about[i, 1] = np.sqrt(variance)
         about[i, 0], about[i, 2], about[i, 3] = q[7], np.sqrt(q[4]), np.sqrt(q[5])

@@ -70,11 +70,11 @@ def invert(L: Array, inverse: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def edge_noise(n: int, J: Array, r: Array, inverse: Array) -> float:
-    """Estimate the variance of the noise from residuals r (n,) where it matters to the first two parameters.
+def edge_noise(n: int, J: Array, r: Array, inverse: Array, first: int, second: int) -> float:
+    """Estimate the variance of the noise from residuals r (n,) where it matters to two parameters, those of place.
 
     The mean squared residual, each divided by what the fit leaves of it (1 - leverage) and weighted by how much its
-    pixel says about the first two parameters: flat areas, saturated ones above all, must not speak for the edges. No
+    pixel says about the two parameters: flat areas, saturated ones above all, must not speak for the edges. No
     image is known better than its quantisation.
     """
     weight, power = 0.0, 0.0
@@ -85,7 +85,7 @@ def edge_noise(n: int, J: Array, r: Array, inverse: Array) -> float:
             for j in range(i):
                 s += inverse[i, j] * J[j, m]
             leverage += 2.0 * s * J[i, m]
-        w = J[0, m] ** 2 + J[1, m] ** 2
+        w = J[first, m] ** 2 + J[second, m] ** 2
         weight += w * (1.0 - leverage)
         power += w * r[m] ** 2
     return float(max(power / weight, 1.0 / 12.0))

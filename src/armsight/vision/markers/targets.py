@@ -1,17 +1,110 @@
-"""What the user names on the command line, a board's spec or a body's file, becomes a Target or a Body."""
+"""What a user names, a board's spec or a body's file, becomes a Target to detect or a Body to measure against."""
 
 from __future__ import annotations
 
-from armsight.data import Body
-from armsight.vision.markers.board import open_board
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Body, Detections, Record
+from armsight.errors import InputError
+from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.bodies import load_body_csv
+from armsight.vision.markers.body_file import Marker, read_body_file
 from armsight.vision.markers.marker import Target
+from armsight.vision.markers.tag import TagTarget
+
+#: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name.
+MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
+    "tag": TagTarget.from_markers,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Composite(Record):
+    """A body that carries markers of several kinds; its points are those of its parts, one part after the other.
+
+    Attributes:
+        name: what the body is called.
+        parts: one target for each kind of marker, all in the body's frame.
+    """
+
+    name: str
+    parts: tuple[Target, ...]
+
+    @cached_property
+    def body(self) -> Body:
+        """All parts' points."""
+        names = tuple(name for part in self.parts for name in part.body.point_names)
+        return Body(self.name, names, np.concatenate([part.body.points for part in self.parts]))
+
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find every part in one grey image."""
+        first, found, problems = 0, [], []
+        for part in self.parts:
+            seen = part.detect(image)
+            if seen.problem is None:
+                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv))
+            else:
+                problems.append(seen.problem)
+            first += len(part.body.point_names)
+        if not found:
+            return Detections.none("; ".join(problems))
+        ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
+        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
+
+
+def load_body_toml(path: str | Path) -> Target:
+    """Make the target that a body file describes.
+
+    Raises:
+        InputError: missing, malformed, or an unknown kind of marker; the message names file and entry.
+    """
+    name, markers = read_body_file(path, MARKERS)
+    parts = tuple(
+        make(name, chosen) for kind, make in MARKERS.items() if (chosen := [m for m in markers if m.kind == kind])
+    )
+    return parts[0] if len(parts) == 1 else Composite(name, parts)
 
 
 def open_target(spec: str) -> Target:
-    """Make the target of a board spec."""
-    return open_board(spec)
+    """Make a target that can be found in images.
+
+    Args:
+        spec: a board such as ``chessboard:9x6:25mm``, or a TOML body file.
+
+    Raises:
+        InputError: neither, malformed, or a CSV body, which has points but no looks.
+    """
+    kind = _kind(spec)
+    if kind == ".csv":
+        raise InputError(
+            f"{spec}: a CSV body has points but does not say how they look, so it cannot be found in images; give "
+            "--detections with it, or describe its markers in a TOML body file (docs/targets.md)"
+        )
+    return load_body_toml(spec) if kind == ".toml" else open_board(spec)
 
 
 def open_body(spec: str) -> Body:
-    """Return the body of a board spec."""
-    return open_target(spec).body
+    """Return the body that a board's spec, a TOML body file or a CSV of points describes.
+
+    Raises:
+        InputError: none of these, or malformed.
+    """
+    return load_body_csv(spec) if _kind(spec) == ".csv" else open_target(spec).body
+
+
+def _kind(spec: str) -> str:
+    """Return ``board``, ``.toml`` or ``.csv``."""
+    suffix = Path(spec).suffix.lower()
+    if spec.strip().split(":")[0] in BOARDS or (":" in spec and not Path(spec).exists()):
+        return "board"
+    if suffix in (".toml", ".csv"):
+        return suffix
+    raise InputError(
+        f"{spec!r} is no target: expected a board ({', '.join(BOARDS)}), a .toml body file or a .csv of points"
+    )

@@ -1,0 +1,171 @@
+"""Body files (TOML): which markers a body carries and where they sit on it. The form: docs/targets.md.
+
+This file reads what every kind of marker shares, name and place; what stands in a kind's own table is its family's
+business. Families register in ``targets.py``.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import read_text
+from armsight.geometry.check import checked
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import from_quaternion_wxyz, from_roll_pitch_yaw
+
+#: Ways to say how a marker is turned; one of them, or none where its kind needs none.
+TURNS = ("normal, x_axis", "quaternion_wxyz", "roll_pitch_yaw_deg")
+_PLACE = ("position_mm", "normal", "x_axis", "quaternion_wxyz", "roll_pitch_yaw_deg")
+
+
+@dataclass(frozen=True, eq=False)
+class Marker(Record):
+    """One ``[[markers]]`` entry of a body file.
+
+    Attributes:
+        where: file and entry, for messages.
+        name: its name.
+        kind: its family, the key of its own table.
+        fields: its own table.
+        position: (3,) where it sits on the body, m.
+        turn: what the file says about its direction: a subset of normal, x_axis, quaternion_wxyz, roll_pitch_yaw_deg.
+    """
+
+    where: str
+    name: str
+    kind: str
+    fields: Mapping[str, Any]
+    position: Array
+    turn: Mapping[str, Array]
+
+    def error(self, what: str) -> InputError:
+        """Return the error of an entry that ``what`` is wrong with."""
+        return InputError(f"{self.where}: {what}")
+
+    def check_keys(self, kind: str, required: Collection[str], optional: Collection[str] = ()) -> None:
+        """Raise InputError where a key of the kind's table is missing or unknown."""
+        for key in required:
+            if key not in self.fields:
+                raise self.error(f"{kind} has no {key}; it needs {', '.join(required)}")
+        for key in self.fields:
+            if key not in required and key not in optional:
+                raise self.error(f"{kind} has an unknown key {key!r}; known are {', '.join((*required, *optional))}")
+
+    def converted(self, key: str, convert: Callable[[str], str]) -> str:
+        """Return a text field through ``convert``, whose InputError then names the entry."""
+        if not isinstance(self.fields[key], str):
+            raise self.error(f"{key} must be a text in quotes, got {self.fields[key]!r}")
+        try:
+            return convert(self.fields[key])
+        except InputError as error:
+            raise self.error(str(error)) from None
+
+    def length_m(self, key: str) -> float:
+        """Return a length field that the file gives in mm, as m: above 0.01 mm and below 100 m."""
+        value = self.fields[key]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.01 <= value <= 1e5:
+            raise self.error(f"{key} must be a number of mm between 0.01 and 100000, got {value!r}")
+        return float(value) * 1e-3
+
+    def normal(self) -> Array | None:
+        """Return the unit vector out of the marker's face (3,), body frame, or None where the file says nothing."""
+        return -self.pose()[:3, 2] if set(self.turn) - {"normal"} else _unit(self, "normal") if self.turn else None
+
+    def pose(self) -> Array:
+        """Return T_body_marker (4, 4): x to the marker's right, y down, z into its face.
+
+        Raises:
+            InputError: the file does not say how the marker is turned, says it twice, or badly.
+        """
+        given = set(self.turn)
+        if given == {"normal", "x_axis"}:
+            x, z = _unit(self, "x_axis"), -_unit(self, "normal")
+            if abs(x @ z) > 1e-3:
+                raise self.error("x_axis must lie in the marker's face, square to its normal")
+            x = x - (x @ z) * z
+            x /= np.linalg.norm(x)
+            return pose(np.column_stack([x, np.cross(z, x), z]), self.position)
+        if given == {"quaternion_wxyz"}:
+            return pose(from_quaternion_wxyz(_unit(self, "quaternion_wxyz")), self.position)
+        if given == {"roll_pitch_yaw_deg"}:
+            return pose(from_roll_pitch_yaw(*np.radians(self.turn["roll_pitch_yaw_deg"])), self.position)
+        raise self.error(
+            f"say how it is turned by exactly one of: {'; '.join(TURNS)}; got {', '.join(given) or 'none'}"
+        )
+
+
+def _unit(marker: Marker, key: str) -> Array:
+    """Return a direction of the file at length one."""
+    norm = float(np.linalg.norm(marker.turn[key]))
+    if not norm > 1e-6:
+        raise marker.error(f"{key} must not be zero")
+    return np.asarray(marker.turn[key] / norm)
+
+
+def read_body_file(path: str | Path, kinds: Collection[str]) -> tuple[str, tuple[Marker, ...]]:
+    """Read a body file.
+
+    Args:
+        path: the TOML file.
+        kinds: the kinds of marker that are known.
+
+    Returns:
+        The body's name (the file's, where none is given) and its markers.
+
+    Raises:
+        InputError: missing, not TOML, or not a body; the message names the file and the entry.
+    """
+    try:
+        document = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from None
+    unknown = set(document) - {"name", "markers"}
+    if unknown:
+        raise InputError(f"{path}: unknown key {sorted(unknown)[0]!r}; a body file has name and [[markers]]")
+    entries = document.get("markers")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: a body file needs [[markers]] entries, one for each marker")
+    markers = tuple(_marker(f"{path}: marker {i + 1}", entry, kinds) for i, entry in enumerate(entries))
+    names = [marker.name for marker in markers]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise markers[i].error(f"the name {name!r} is marker {names.index(name) + 1}'s already")
+    name = document.get("name", Path(path).stem)
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{path}: name must be a text in quotes, got {name!r}")
+    return name, markers
+
+
+def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Marker:
+    """Read one entry."""
+    name = entry.get("name")
+    if not isinstance(name, str) or not name or "," in name:
+        raise InputError(f"{where}: needs a name, a text in quotes without commas, got {name!r}")
+    where = f"{where} ({name})"
+    own = [key for key in entry if key not in ("name", *_PLACE)]
+    known = ", ".join(sorted(kinds))
+    if len(own) != 1 or own[0] not in kinds:
+        raise InputError(
+            f"{where}: needs exactly one table that says its kind, of: {known}; got {', '.join(own) or 'none'}"
+        )
+    if not isinstance(entry[own[0]], dict):
+        raise InputError(f"{where}: {own[0]} must be a table, such as {own[0]} = {{ ... }}")
+    if "position_mm" not in entry:
+        raise InputError(f"{where}: has no position_mm = [x, y, z]")
+    numbers = {
+        key: checked(entry[key], (4 if key == "quaternion_wxyz" else 3,), f"{where}: {key}")
+        for key in _PLACE
+        if key in entry
+    }
+    position = numbers.pop("position_mm") * 1e-3
+    if np.abs(position).max() > 100.0:
+        raise InputError(f"{where}: position_mm is {position.max():g} m from the body's origin; is it in mm?")
+    return Marker(where, name, own[0], entry[own[0]], position, numbers)
