@@ -25,6 +25,16 @@ _LINES = 4  # scan lines through a part that a circle crosses
 _VERTICES = 12  # a square cut by two pairs of lines has at most 8 corners
 
 Slots = NDArray[np.int32]
+Box = tuple[int, int, int, int]
+Grid = tuple[Array, Array, Array]
+Span = tuple[int, int, int, int]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _copy(a: Array, i: int, b: Array, j: int) -> None:
+    """Copy row i of a into row j of b; plain loops compile to less and run faster than slices."""
+    for c in range(a.shape[1]):
+        b[j, c] = a[i, c]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -46,10 +56,10 @@ def _split(p: Array, n: int, axis: int, edge: float, low: Array, high: Array) ->
         g_i = p[i, axis] - edge * p[i, 4]
         g_j = p[j, axis] - edge * p[j, 4]
         if g_i < 0.0:
-            low[n_low] = p[i]
+            _copy(p, i, low, n_low)
             n_low += 1
         else:
-            high[n_high] = p[i]
+            _copy(p, i, high, n_high)
             n_high += 1
         if (g_i < 0.0) != (g_j < 0.0):
             t = g_i / (g_i - g_j)
@@ -73,18 +83,29 @@ def _cell(edges: Array, x: float, w: float, i: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _range(c: Array, xe: Array, ye: Array, i: int, j: int) -> tuple[int, int, int, int]:
-    """Return the cells (first and last column, first and last row) that four corners c (4, 3) of the plane span."""
-    i0, i1, j0, j1 = xe.size, 0, ye.size, 0
-    for n in range(4):
-        i, j = _cell(xe, c[n, 0], c[n, 2], i), _cell(ye, c[n, 1], c[n, 2], j)
-        i0, i1, j0, j1 = min(i0, i), max(i1, i), min(j0, j), max(j1, j)
-    return i0, i1, j0, j1
+def _cells(points: Array, n: int, xe: Array, ye: Array, out: Slots) -> None:
+    """Return in out (n, 2) the column and the row of the cell in which each of n homogeneous plane points lies."""
+    i = j = 0
+    for k in range(n):
+        i, j = _cell(xe, points[k, 0], points[k, 2], i), _cell(ye, points[k, 1], points[k, 2], j)
+        out[k, 0], out[k, 1] = i, j
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _uniform(values: Array, i0: int, i1: int, j0: int, j1: int) -> bool:
-    """Tell whether all cells of a range, ends included, have one value."""
+def _span(a: Slots, b: Slots, k: int) -> Span:
+    """Return the first and last column and row of the cells of points k and k + 1 of two lines a, b (n, 2)."""
+    return (
+        min(min(a[k, 0], a[k + 1, 0]), min(b[k, 0], b[k + 1, 0])),
+        max(max(a[k, 0], a[k + 1, 0]), max(b[k, 0], b[k + 1, 0])),
+        min(min(a[k, 1], a[k + 1, 1]), min(b[k, 1], b[k + 1, 1])),
+        max(max(a[k, 1], a[k + 1, 1]), max(b[k, 1], b[k + 1, 1])),
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _uniform(values: Array, span: Span) -> bool:
+    """Tell whether all cells of a span have one value."""
+    i0, i1, j0, j1 = span
     first = values[j0, i0]
     for j in range(j0, j1 + 1):
         for i in range(i0, i1 + 1):
@@ -94,33 +115,25 @@ def _uniform(values: Array, i0: int, i1: int, j0: int, j1: int) -> bool:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _clip(
-    quad: Array, xe: Array, ye: Array, values: Array, i0: int, i1: int, j0: int, j1: int, old: float, b: Array
-) -> float:
-    """Return the mean value over the unit square quad (4, 5): u v and homogeneous plane point; ``old`` where clear."""
-    total = 0.0
-    rest, n_rest = b[0], 4
-    rest[:4] = quad
-    spare = b[1]
+def _clip(c: Array, grid: Grid, span: Span, old: float, b: Array) -> float:
+    """Return the mean value over the area between corners c (4, 3) that spans several cells; ``old`` where clear."""
+    xe, ye, values = grid
+    i0, i1, j0, j1 = span
+    rest, spare, strip, spare_strip, piece = b[0], b[1], b[2], b[3], b[4]
+    for n in range(4):
+        # In the area's own square coordinates the corners are (0, 0), (1, 0), (1, 1), (0, 1).
+        rest[n, 0] = 1.0 if n in (1, 2) else 0.0
+        rest[n, 1] = 1.0 if n >= 2 else 0.0
+        for k in range(3):
+            rest[n, 2 + k] = c[n, k]
+    total, n_rest = 0.0, 4
     for i in range(i0, i1 + 1):
-        if i < i1:
-            n_strip, n_next = _split(rest, n_rest, 2, xe[i], b[2], spare)
-        else:
-            n_strip, n_next = n_rest, 0
-            b[2][:n_rest] = rest[:n_rest]
+        n_strip, n_rest = _split(rest, n_rest, 2, xe[i] if i < i1 else np.inf, strip, spare)
         rest, spare = spare, rest
-        n_rest = n_next
-        strip, spare_y, n = b[2], b[3], n_strip
         for j in range(j0, j1 + 1):
-            if j < j1:
-                n_piece, n_next = _split(strip, n, 3, ye[j], b[4], spare_y)
-                area = _area(b[4], n_piece)
-            else:
-                area, n_next = _area(strip, n), 0
-            value = values[j, i]
-            total += area * (value if value >= 0.0 else old)
-            strip, spare_y = spare_y, strip
-            n = n_next
+            n_piece, n_strip = _split(strip, n_strip, 3, ye[j] if j < j1 else np.inf, piece, spare_strip)
+            strip, spare_strip = spare_strip, strip
+            total += _area(piece, n_piece) * (values[j, i] if values[j, i] >= 0.0 else old)
     return total
 
 
@@ -174,11 +187,12 @@ def _circle_share(c: Array, disc: Array, p: Array, q: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _plane_row(rays: Array, M: Array, v: int, u0: int, u1: int, out: Array) -> None:
-    """Cast the pixel corners of row v from u0 to u1, ends included, onto the plane of M: out (n, 3) homogeneous."""
-    for u in range(u0, u1 + 1):
+def _plane_row(rays: Array, M: Array, v: int, u0: int, out: Array) -> None:
+    """Cast the pixel corners of row v from column u0 on to the plane of M: out (n, 3) homogeneous."""
+    for k in range(out.shape[0]):
+        x, y, z = rays[v, u0 + k, 0], rays[v, u0 + k, 1], rays[v, u0 + k, 2]
         for c in range(3):
-            out[u - u0, c] = M[c, 0] * rays[v, u, 0] + M[c, 1] * rays[v, u, 1] + M[c, 2] * rays[v, u, 2]
+            out[k, c] = M[c, 0] * x + M[c, 1] * y + M[c, 2] * z
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -193,7 +207,9 @@ def _open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: 
         s = count
         count += 1
         slot[v, u] = s
-        fine[s] = coarse[v, u]
+        for a in range(SUB):
+            for b in range(SUB):
+                fine[s, a, b] = coarse[v, u]
     return fine, s, count
 
 
@@ -211,51 +227,47 @@ def _part_corners(top: Array, bottom: Array, k: int, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _paint_parts(grid: Array, xe: Array, ye: Array, values: Array, disc: Array, parts: Array, buffer: Array) -> None:
-    """Repaint the parts (SUB, SUB) of a pixel whose part corners lie at grid (SUB + 1, SUB + 1, 3) of the plane."""
-    quad, p, q = buffer[5, :4], buffer[6, 0, :3], buffer[6, 1, :3]
-    quad[:, :2] = 0.0
-    quad[1, 0] = quad[2, 0] = quad[2, 1] = quad[3, 1] = 1.0
-    c = quad[:, 2:]
-    i = j = 0
+def _corners(top: Array, bottom: Array, k: int, c: Array) -> None:
+    """Gather c (4, 3), in turn around it, the corners of the area between points k and k + 1 of two lines (n, 3)."""
+    for n in range(3):
+        c[0, n], c[1, n], c[2, n], c[3, n] = top[k, n], top[k + 1, n], bottom[k + 1, n], bottom[k, n]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint_parts(fan: Array, cells: Slots, grid: Grid, disc: Array, parts: Array, buffer: Array) -> None:
+    """Repaint the parts (SUB, SUB) of a pixel whose part corners lie at fan (SUB + 1, SUB + 1, 3) of the plane."""
+    xe, ye, values = grid
+    c, p, q = buffer[5, :4, :3], buffer[6, 0], buffer[6, 1]
+    for a in range(SUB + 1):
+        if disc.size == 0:
+            _cells(fan[a], SUB + 1, xe, ye, cells[a])
     for a in range(SUB):
         for b in range(SUB):
-            c[0], c[1], c[2], c[3] = grid[a, b], grid[a, b + 1], grid[a + 1, b + 1], grid[a + 1, b]
             if disc.size > 0:
+                _corners(fan[a], fan[a + 1], b, c)
                 parts[a, b] += _circle_share(c, disc, p, q) * (disc[3] - parts[a, b])
                 continue
-            i, i1, j, j1 = _range(c, xe, ye, i, j)
-            if not _uniform(values, i, i1, j, j1):
-                parts[a, b] = _clip(quad, xe, ye, values, i, i1, j, j1, parts[a, b], buffer)
-            elif values[j, i] >= 0.0:
-                parts[a, b] = values[j, i]
+            span = _span(cells[a], cells[a + 1], b)
+            if not _uniform(values, span):
+                _corners(fan[a], fan[a + 1], b, c)
+                parts[a, b] = _clip(c, grid, span, parts[a, b], buffer)
+            elif values[span[2], span[0]] >= 0.0:
+                parts[a, b] = values[span[2], span[0]]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def paint(
-    rays: Array,
-    Ms: Array,
-    box: tuple[int, int, int, int],
-    xe: Array,
-    ye: Array,
-    values: Array,
-    disc: Array,
-    coarse: Array,
-    slot: Slots,
-    fine: Array,
-    count: int,
+    rays: Array, Ms: Array, box: Box, grid: Grid, disc: Array, coarse: Array, slot: Slots, fine: Array, count: int
 ) -> tuple[Array, int]:
     """Paint a grid of cells, or one disc.
 
     Args:
         rays: (H + 1, W + 1, 3) rays through the corners of the pixels, camera frame.
         Ms: (1 or H, 3, 3) from rays to homogeneous plane coordinates, for all rows or for each.
-        box: first column, first row, end column, end row of what may be covered.
-        xe: (nx + 1,) borders of the columns.
-        ye: (ny + 1,) borders of the rows.
-        values: (ny + 2, nx + 2) the cells' values with a clear rim; below zero is clear.
+        box: first column, first row, end column, end row of what may be covered, px.
+        grid: borders (nx + 1,), (ny + 1,) and values (ny + 2, nx + 2) of the cells; values have a clear rim.
         disc: (4,) centre x, y, radius and value of a disc to paint instead of the cells, or empty.
-        coarse: (H, W) pixel values, painted in place.
+        coarse: (H, W) pixel values, painted in place; a cell's value below zero is clear and leaves them.
         slot: (H, W) which row of ``fine`` holds a pixel's parts, -1 where it has one value.
         fine: (capacity, SUB, SUB) the parts.
         count: rows of ``fine`` in use.
@@ -263,31 +275,37 @@ def paint(
     Returns:
         ``fine`` (a larger one where it was full) and the new count.
     """
+    xe, ye, values = grid
     u0, v0, u1, v1 = box
-    top, bottom = np.empty((u1 - u0 + 1, 3)), np.empty((u1 - u0 + 1, 3))
-    c, grid = np.empty((4, 3)), np.empty((SUB + 1, SUB + 1, 3))
+    n = u1 - u0
+    top, bottom = np.empty((n + 1, 3)), np.empty((n + 1, 3))
+    top_cells, bottom_cells = np.zeros((n + 1, 2), np.int32), np.zeros((n + 1, 2), np.int32)
+    c, fan, fan_cells = np.empty((4, 3)), np.empty((SUB + 1, SUB + 1, 3)), np.zeros((SUB + 1, SUB + 1, 2), np.int32)
     buffer, nothing = np.empty((7, _VERTICES, 5)), np.empty(0)
-    i = j = 0
     for v in range(v0, v1):
-        M = Ms[min(v, Ms.shape[0] - 1)]  # each row of a rolling shutter sees its own plane
-        _plane_row(rays, M, v, u0, u1, top)
-        _plane_row(rays, M, v + 1, u0, u1, bottom)
-        for k in range(u1 - u0):
-            c[0], c[1], c[2], c[3] = top[k], top[k + 1], bottom[k + 1], bottom[k]
-            if not (c[0, 2] > 0.0 and c[1, 2] > 0.0 and c[2, 2] > 0.0 and c[3, 2] > 0.0):
+        M = Ms[min(v, Ms.shape[0] - 1)]
+        if v == v0 or Ms.shape[0] > 1:  # each row of a rolling shutter sees its own plane
+            _plane_row(rays, M, v, u0, bottom)
+            _cells(bottom, n + 1, xe, ye, bottom_cells)
+        top, bottom, top_cells, bottom_cells = bottom, top, bottom_cells, top_cells
+        _plane_row(rays, M, v + 1, u0, bottom)
+        _cells(bottom, n + 1, xe, ye, bottom_cells)
+        for k in range(n):
+            if not (top[k, 2] > 0.0 and top[k + 1, 2] > 0.0 and bottom[k, 2] > 0.0 and bottom[k + 1, 2] > 0.0):
                 continue
             if disc.size > 0:
+                _corners(top, bottom, k, c)
                 share = _circle_share(c, disc, nothing, nothing)
                 if share == 0.0:
                     continue
                 whole, value = share == 1.0, disc[3]
             else:
-                i, i1, j, j1 = _range(c, xe, ye, i, j)
-                whole, value = _uniform(values, i, i1, j, j1), values[j, i]
+                span = _span(top_cells, bottom_cells, k)
+                whole, value = _uniform(values, span), values[span[2], span[0]]
             if not whole:
                 fine, s, count = _open_parts(v, u0 + k, coarse, slot, fine, count)
-                _part_corners(top, bottom, k, grid)
-                _paint_parts(grid, xe, ye, values, disc, fine[s], buffer)
+                _part_corners(top, bottom, k, fan)
+                _paint_parts(fan, fan_cells, grid, disc, fine[s], buffer)
             elif value >= 0.0:
                 coarse[v, u0 + k] = value
                 slot[v, u0 + k] = -1

@@ -17,7 +17,7 @@ import numpy as np
 from armsight.data import Array, Image
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
-from armsight.sim.paint import SUB, paint
+from armsight.sim.paint import SUB, Box, paint
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
@@ -49,7 +49,7 @@ def _corner_rays(camera: Camera) -> Array:
     return rays.reshape(height + 1, width + 1, 3)
 
 
-def _covered(camera: Camera, T_camera_pattern: Array, outline: Array) -> tuple[int, int, int, int] | None:
+def _covered(camera: Camera, T_camera_pattern: Array, outline: Array) -> Box | None:
     """Bound in pixels (first column, first row, end column, end row) what an outline (N, 2) of a plane can cover."""
     width, height = camera.image_size_px
     p = transform(T_camera_pattern, np.column_stack([outline, np.zeros(len(outline))]))
@@ -98,16 +98,16 @@ class _Canvas:
             return
         Ms = np.asarray(np.linalg.inv(to_plane), dtype=np.float64)
         ends = Ts[[0, -1]] if len(Ts) > 1 else Ts
-        values = np.pad(pattern.values, 1, constant_values=CLEAR)
         x, y = np.array(pattern.x_edges), np.array(pattern.y_edges)
+        grid = (x, y, np.pad(pattern.values, 1, constant_values=CLEAR))
         for disc in (np.zeros(0), *pattern.discs):
             box = self._box(ends, _circle(disc) if disc.size else _rectangle(x, y))
             if box is not None:
                 self.fine, self.count = paint(
-                    self.rays, Ms, box, x, y, values, np.array(disc), self.coarse, self.slot, self.fine, self.count
+                    self.rays, Ms, box, grid, np.array(disc), self.coarse, self.slot, self.fine, self.count
                 )
 
-    def _box(self, Ts: Array, outline: Array) -> tuple[int, int, int, int] | None:
+    def _box(self, Ts: Array, outline: Array) -> Box | None:
         """Bound what an outline covers at any of a few poses."""
         boxes = [box for T in Ts if (box := _covered(self.camera, T, outline)) is not None]
         if not boxes:
