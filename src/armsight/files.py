@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from armsight.errors import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 
 def read_text(path: str | Path) -> str:
@@ -28,36 +32,94 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
+class _Named(io.FileIO):
+    """A new file whose errors all carry its name: the system leaves it out when a write or a close fails."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(os.fspath(path), "x")
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            error.filename = self.name
+            raise
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        with self._named():
+            return super().write(data)
+
+    def close(self) -> None:
+        with self._named():
+            super().close()
+
+    def abandon(self) -> None:
+        """Close without a word: the file is thrown away."""
+        with contextlib.suppress(OSError):
+            super().close()
+
+
 @contextlib.contextmanager
 def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a file for writing that takes the place of ``path`` only when the block ends well.
 
+    Blocks may be nested; an error is told of the file it happened to, and one of another file passes through.
+
     Args:
-        path: the file to be; its folder must exist.
+        path: the file to be, or a link to it; its folder must exist.
         mode: "w" for UTF-8 text, "wb" for bytes.
 
     Raises:
-        InputError: the folder is missing, is not writable, or the disk is full; what stood at ``path`` stays.
+        InputError: the folder is missing or not writable, ``path`` is no ordinary file, or the disk is full; what stood
+            at ``path`` stays.
     """
-    target = Path(path)
-    handle, temporary = -1, ""
+    target = Path(os.path.realpath(path))
+    if not os.path.isdir(target.parent):
+        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}; make it first")
+    if os.path.exists(target) and not os.path.isfile(target):
+        kind = "a folder" if os.path.isdir(target) else "a device"
+        raise InputError(f"{path}: cannot be written: it is {kind}; give the name of a file")
+    # The name is chosen first: whatever happens from here on, there is only one file to take away.
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    raw: _Named | None = None
     try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        os.fchmod(handle, 0o644)
-        with os.fdopen(handle, mode, encoding=None if "b" in mode else "utf-8") as file:
-            yield file
+        raw = _Named(temporary)
+        buffered = io.BufferedWriter(raw)
+        # A name that is not text (an undecodable file name) is written with escapes rather than not at all.
+        file = buffered if "b" in mode else io.TextIOWrapper(buffered, encoding="utf-8", errors="backslashreplace")
+        yield file
+        file.close()
         os.replace(temporary, target)
     except OSError as error:
-        if error.filename is not None and str(error.filename) not in (temporary, str(target), str(target.parent)):
-            if not str(error.filename).startswith(str(target.parent / f".{target.name}.")):
-                raise
+        if error.filename != os.fspath(temporary):
+            raise
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
+        try:
+            if raw is not None:
+                raw.abandon()  # below its buffers: what they still hold is not wanted any more
+        finally:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file in one step; errors as :func:`replacing`."""
     with replacing(path) as file:
         file.write(text)
+
+
+def check_writable(path: str | Path) -> None:
+    """Find out before long work whether a file can be written at ``path``.
+
+    Raises:
+        InputError: its folder is missing, or is not writable, or ``path`` is a folder.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise InputError(f"{path}: is a folder, expected the name of a file to write")
+    if not target.parent.is_dir():
+        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
+    if not os.access(target.parent, os.W_OK):
+        raise InputError(f"{path}: cannot be written: no permission to write in {target.parent}")

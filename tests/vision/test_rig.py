@@ -1,11 +1,18 @@
 """The rig and its file: exact round trips, every damage told, and no file lost to a full disk."""
 
-import errno
+import contextlib
+import functools
 import json
 import os
+import resource
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from armsight.errors import InputError
 from armsight.geometry.pose import log_se3
@@ -103,10 +110,20 @@ def test_a_missing_entry_is_named(tmp_path, key, said):
     [
         ({"format": "other"}, "not a rig file"),
         ({"format": ...}, "not a rig file"),
-        ({"version": ...}, "version None"),
+        ({"version": ...}, "version must be a positive whole number, got null"),
+        ({"version": "1"}, 'version must be a number, got the text "1"'),
+        ({"version": 0}, "version must be a positive whole number, got 0"),
+        ({"version": -1}, "version must be a positive whole number, got -1"),
+        ({"version": 1.0}, "version must be a positive whole number, got 1.0"),
+        ({"version": True}, "version must be a positive whole number, got true"),
         ({"left": 3}, "damaged"),
-        ({"left__image_size_px": [640]}, "damaged"),
-        ({"left__image_size_px": ["a", "b"]}, "damaged"),
+        ({"left__image_size_px": [640]}, r"image_size_px has shape \(1,\), must be \(2\)"),
+        ({"left__image_size_px": ["a", "b"]}, "image_size_px must be numbers"),
+        ({"left__image_size_px": [float("inf"), 480]}, "image_size_px contains NaN or infinity"),
+        ({"left__image_size_px": [640, -480]}, "image_size_px must be two positive whole numbers.*got 640 -480"),
+        ({"right__image_size_px": [0, 480]}, "image_size_px must be two positive whole numbers.*got 0 480"),
+        ({"right__image_size_px": [640.5, 480]}, "image_size_px must be two positive whole numbers.*got 640.5 480"),
+        ({"right__image_size_px": [10**400, 480]}, "damaged"),
         ({"left__distortion_model": "brown6"}, "unknown distortion model 'brown6'"),
         ({"left__distortion": [0.1, 0.2]}, "distortion has shape"),
         ({"left__distortion": [0.1, 0.2, 0.3, 0.4, "x"]}, "distortion must be numbers"),
@@ -118,10 +135,27 @@ def test_a_missing_entry_is_named(tmp_path, key, said):
         ({"T_left_right_m": (2 * np.eye(4)).tolist()}, "rotation"),
         ({"T_left_right_m": np.diag([1.0, 1, -1, 1]).tolist()}, "rotation"),
         ({"T_left_right_m": np.full((4, 4), np.nan).tolist()}, "NaN"),
+        (
+            {"T_left_right_m": [*np.eye(4)[:3].tolist(), [0, 0, 0, 2]]},
+            "last row of T_left_right must be 0 0 0 1, got 0 0 0 2",
+        ),
+        ({"T_left_right_m": [*np.eye(4)[:3].tolist(), [0.1, 0, 0, 1]]}, "last row of T_left_right .* got 0.1 0 0 1"),
         ({"covariance": [[1.0]]}, "covariance has shape"),
         ({"covariance": "none"}, "covariance"),
         ({"sigma_px": -0.1}, "sigma_px"),
-        ({"sigma_px": float("nan")}, "sigma_px"),
+        ({"sigma_px": float("nan")}, "sigma_px must be a finite number not below zero, got nan"),
+        ({"sigma_px": float("inf")}, "sigma_px must be a finite number not below zero, got inf"),
+        ({"sigma_px": 10**400}, "damaged"),
+        ({"provenance": None}, "provenance must be an object of names and values, got null"),
+        ({"provenance": [["a", 1]]}, r'provenance must be an object of names and values, got \[\["a", 1\]\]'),
+        (
+            {"covariance": np.diag([*np.ones(20), -1e-9, *np.ones(3)]).tolist()},
+            "variance of T_left_right.z_m is negative",
+        ),
+        (
+            {"covariance": (np.eye(24) + np.eye(24, k=1)).tolist()},
+            "not symmetric: left.fx_px with left.fy_px is 1 and 0",
+        ),
         ({"sigma_px": None}, "damaged"),
     ],
 )
@@ -131,6 +165,70 @@ def test_a_damaged_entry_is_told(tmp_path, changes, said):
         StereoRig.load(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_the_symmetry_asked_of_a_covariance_is_relative():
+    rig = ordinary_rig()
+    sigma = np.logspace(-12, 3, rig.parameter_count)  # from radians of a good rig to pixels of a bad one
+    C = np.outer(sigma, sigma) * (0.5 + 0.5 * np.eye(len(sigma)))
+    for off, refused in ((1e-6, False), (1e-4, True)):
+        for i, j in ((0, 1), (0, len(C) - 1), (len(C) - 2, len(C) - 1)):
+            cov = C.copy()
+            cov[i, j] *= 1 + off
+            with pytest.raises(InputError, match="not symmetric") if refused else contextlib.nullcontext():
+                replace(rig, cov=cov)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-3, 3) | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+PLACES = st.sampled_from(
+    [
+        *(["version"], ["left"], ["T_left_right_m"], ["T_left_right_m", 3], ["T_left_right_m", 1, 2], ["sigma_px"]),
+        *(["covariance"], ["covariance", 2], ["covariance", 2, 2], ["covariance", 2, 3], ["provenance"], ["format"]),
+        *(["right", key] for key in CAMERA_KEYS),
+        *(["right", "image_size_px", 0], ["right", "intrinsics_px", "fx"], ["right", "distortion", 1]),
+    ]
+)
+
+
+@settings(max_examples=300)
+@given(PLACES, JSON)
+def test_whatever_stands_in_a_rig_file_is_a_rig_or_one_clear_line(tmp_path_factory, place, value):
+    path = tmp_path_factory.getbasetemp() / "any_rig.json"
+    document = entry = json.loads(rig_text("brown4"))
+    *way, last = place
+    for key in way:
+        entry = entry[key]
+    entry[last] = value
+    path.write_text(json.dumps(document))
+    try:
+        rig = StereoRig.load(path)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = f"{path}: read"
+        rig.save(path)
+        assert StereoRig.load(path).parameter_names == rig.parameter_names
+    assert said.startswith(f"{path}: ")
+    assert len(said.splitlines()) == 1
+
+
+@functools.cache
+def rig_text(model):
+    with tempfile.TemporaryDirectory() as folder:
+        ordinary_rig(model).save(f"{folder}/rig.json")
+        return Path(f"{folder}/rig.json").read_text()
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": ' + "9" * 5000 + "}"])
+def test_monstrous_files_are_told(tmp_path, text):
+    path = tmp_path / "rig.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"rig\.json: not a rig file"):
+        StereoRig.load(path)
 
 
 def test_every_truncation_is_told(tmp_path):
@@ -160,30 +258,15 @@ def test_missing_files_and_folders_are_told(tmp_path):
         ordinary_rig().save(tmp_path / "nowhere" / "rig.json")
 
 
-class FullDisk:
-    """A file on a disk that holds a few bytes more."""
-
-    def __init__(self, file):
-        self.file = file
-
-    def write(self, text):
-        self.file.write(text[:100])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        self.file.close()
-
-
-def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_old_file(tmp_path):
     path = tmp_path / "rig.json"
     ordinary_rig(seed=1).save(path)
-    before = path.read_bytes()
-    real = os.fdopen
-    monkeypatch.setattr("armsight.files.os.fdopen", lambda *args, **kw: FullDisk(real(*args, **kw)))
-    with pytest.raises(InputError, match=r"rig\.json: cannot be written: No space left on device"):
-        ordinary_rig(seed=2).save(path)
+    before, limit = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+    try:
+        with pytest.raises(InputError, match=r"rig\.json: cannot be written: File too large"):
+            ordinary_rig(seed=2).save(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["rig.json"]

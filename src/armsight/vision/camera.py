@@ -19,7 +19,9 @@ from armsight.errors import InputError
 DISTORTION_MODELS = {"none": 0, "brown4": 4, "brown5": 5, "brown8": 8, "fisheye": 4}
 
 _NEWTON_STEPS = 30
-_CONVERGED = 1e-12  # squared step in the normalised image plane: 1e-6 of a focal length
+_CONVERGED = 1e-12  # Newton's last step, in focal lengths; the error is its square by then
+#: A fisheye sees all around but straight backwards: within this angle of that direction a point has no image, rad.
+_STRAIGHT_BACK = 1e-9
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -34,7 +36,7 @@ def _distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Arra
         t2 = th * th
         poly = 1.0 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3])))
         dpoly = 1.0 + t2 * (3 * d[0] + t2 * (5 * d[1] + t2 * (7 * d[2] + t2 * 9 * d[3])))
-        if rho < 1e-9 * np.abs(p[2]):
+        if rho < 1e-9 * p[2]:
             s = 1.0 / p[2]
             ds_rho, ds_z = 0.0, -s * s
         else:
@@ -78,11 +80,11 @@ def _distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Arra
 def _project(fisheye: bool, k: Array, d: Array, p: Array, uv: Array, J_p: Array, J_k: Array) -> None:
     """Project points p (N, 3) into uv (N, 2) with J_p (N, 2, 3) and J_k (N, 2, 12): fx fy cx cy and eight coefficients.
 
-    Points that are not in front of a Brown camera become NaN.
+    Points that are not in front of a Brown camera, or straight behind a fisheye, become NaN.
     """
     xy = np.empty(2)
     for n in range(p.shape[0]):
-        if p[n, 2] <= 0.0 and not (fisheye and (p[n, 0] != 0.0 or p[n, 1] != 0.0)):
+        if p[n, 2] <= 0.0 and not (fisheye and np.hypot(p[n, 0], p[n, 1]) > -_STRAIGHT_BACK * p[n, 2]):
             uv[n] = np.nan
             J_p[n] = np.nan
             J_k[n] = np.nan
@@ -169,6 +171,9 @@ class Camera(Record):
             )
         if not (np.isfinite(self.intrinsics).all() and np.isfinite(self.distortion).all()):
             raise InputError("camera intrinsics and distortion must be finite numbers")
+        if not all(n > 0 for n in self.image_size_px):
+            width, height = self.image_size_px
+            raise InputError(f"the image size must be positive, got {width} x {height} px")
         if not (self.intrinsics[:2] > 0).all():
             raise InputError(f"focal lengths must be positive, got fx {self.intrinsics[0]}, fy {self.intrinsics[1]}")
 

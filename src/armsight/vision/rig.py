@@ -24,6 +24,10 @@ from armsight.vision.camera import DISTORTION_MODELS, Camera
 FORMAT = "armsight-rig"
 VERSION = 1
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+#: How far a rotation may be from orthonormal, and the last row of a transform from 0 0 0 1.
+_ROTATION_TOLERANCE = 1e-6
+#: How far a covariance may be from symmetric, as a share of the two standard deviations.
+_SYMMETRY_TOLERANCE = 1e-5
 TANGENT = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 
 
@@ -54,11 +58,14 @@ class StereoRig(Record):
         super().__post_init__()
         checked(self.T_left_right, (4, 4), "T_left_right")
         R = self.T_left_right[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+        if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
             raise InputError("T_left_right must hold a rotation: its upper left 3x3 block is not orthonormal")
+        if np.abs(self.T_left_right[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
+            raise InputError(f"the last row of T_left_right must be 0 0 0 1, got {_row(self.T_left_right[3])}")
         checked(self.cov, (self.parameter_count, self.parameter_count), "rig covariance")
-        if not self.sigma_px >= 0:
-            raise InputError(f"sigma_px must be a number not below zero, got {self.sigma_px}")
+        _check_covariance(self.cov, self.parameter_names)
+        if not 0 <= self.sigma_px < np.inf:
+            raise InputError(f"sigma_px must be a finite number not below zero, got {self.sigma_px}")
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
@@ -75,10 +82,10 @@ class StereoRig(Record):
         """P names with units, in the order of ``cov``."""
         names: list[str] = []
         for side, camera in zip(("left", "right"), self.cameras, strict=True):
-            coefficients = COEFFICIENTS[:4] if camera.model != "fisheye" else ("k1", "k2", "k3", "k4")
-            if camera.model in ("brown5", "brown8"):
-                coefficients = COEFFICIENTS
-            names += [f"{side}.{n}" for n in ("fx_px", "fy_px", "cx_px", "cy_px", *coefficients[: camera.distortion.size])]
+            coefficients = ("k1", "k2", "k3", "k4") if camera.model == "fisheye" else COEFFICIENTS
+            names += [
+                f"{side}.{n}" for n in ("fx_px", "fy_px", "cx_px", "cy_px", *coefficients[: camera.distortion.size])
+            ]
         return (*names, *(f"T_left_right.{n}" for n in TANGENT))
 
     @property
@@ -137,15 +144,7 @@ class StereoRig(Record):
         Raises:
             InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
         """
-        try:
-            document = json.loads(read_text(path))
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}); expected a rig file") from None
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise InputError(f'{path}: not a rig file: expected "format": "{FORMAT}"; `armsight calibrate` writes one')
-        version = document.get("version")
-        if not isinstance(version, int) or version > VERSION:
-            raise InputError(f"{path}: rig file version {version}, this armsight reads up to {VERSION}: update armsight")
+        document = _document(path)
         try:
             left, right = (_camera(document[side]) for side in ("left", "right"))
             count = left.parameters.size + right.parameters.size + 6
@@ -155,22 +154,71 @@ class StereoRig(Record):
                 checked(document["T_left_right_m"], (4, 4), "T_left_right_m"),
                 checked(document["covariance"], (count, count), "covariance"),
                 float(document["sigma_px"]),
-                document.get("provenance", {}),
+                _provenance(document),
             )
         except KeyError as error:
             raise InputError(f"{path}: the rig file has no {error.args[0]!r}") from None
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{path}: damaged rig file: {error}") from None
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
 
+def _row(numbers: Array) -> str:
+    """Return numbers as people write them."""
+    return " ".join(f"{n:g}" for n in numbers)
+
+
+def _check_covariance(cov: Array, names: tuple[str, ...]) -> None:
+    """Refuse what cannot be a covariance (P, P) of the named parameters: negative variances, or no symmetry."""
+    variance = np.diag(cov)
+    if (variance < 0).any():
+        raise InputError(f"rig covariance: the variance of {names[int(np.argmin(variance))]} is negative")
+    sigma = np.sqrt(variance)
+    off = np.abs(cov - cov.T) > _SYMMETRY_TOLERANCE * np.outer(sigma, sigma)
+    if off.any():
+        i, j = np.argwhere(off)[0]
+        raise InputError(
+            f"rig covariance is not symmetric: {names[i]} with {names[j]} is {cov[i, j]:g} and {cov[j, i]:g}"
+        )
+
+
+def _document(path: str | Path) -> dict[str, Any]:
+    """Read the JSON object of a rig file of a version this program knows."""
+    try:
+        document = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}); expected a rig file") from None
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, thousands of brackets
+        raise InputError(f"{path}: not a rig file: {error}") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(f'{path}: not a rig file: expected "format": "{FORMAT}"; `armsight calibrate` writes one')
+    version = document.get("version")
+    if isinstance(version, str):
+        raise InputError(f"{path}: rig file version must be a number, got the text {json.dumps(version)}")
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise InputError(f"{path}: rig file version must be a positive whole number, got {json.dumps(version)[:40]}")
+    if version > VERSION:
+        raise InputError(f"{path}: rig file version {version}, this armsight reads up to {VERSION}: update armsight")
+    return document
+
+
+def _provenance(document: dict[str, Any]) -> dict[str, Any]:
+    """Return where the rig comes from."""
+    provenance = document.get("provenance", {})
+    if not isinstance(provenance, dict):
+        raise InputError(f"provenance must be an object of names and values, got {json.dumps(provenance)[:40]}")
+    return provenance
+
+
 def _camera(entry: dict[str, Any]) -> Camera:
     """Build a camera from its entry in a rig file."""
     model = str(entry["distortion_model"])
-    width, height = (int(n) for n in entry["image_size_px"])
+    size = checked(entry["image_size_px"], (2,), "image_size_px")
+    if not ((size >= 1) & (size == size.round())).all():
+        raise InputError(f"image_size_px must be two positive whole numbers, width and height, got {_row(size)}")
     return Camera(
-        (width, height),
+        (int(size[0]), int(size[1])),
         model,
         np.array([float(entry["intrinsics_px"][key]) for key in ("fx", "fy", "cx", "cy")]),
         checked(entry["distortion"], (DISTORTION_MODELS.get(model),), "distortion").reshape(-1),

@@ -1,0 +1,225 @@
+"""Files: either the old one or the whole new one, whatever goes wrong and whenever, and the error says which file."""
+
+import contextlib
+import errno
+import json
+import os
+import resource
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from armsight import files
+from armsight.errors import InputError
+from armsight.files import read_text, replacing, write_text
+
+SMALL, LARGE = "new\n", "new\n" * 100_000  # within one buffer, and many of them
+
+
+def write(contents, flush=False):
+    """Write several files, each open until all are written; an error among the texts is raised."""
+    with contextlib.ExitStack() as stack:
+        opened = [(stack.enter_context(replacing(path)), texts) for path, texts in contents.items()]
+        for file, texts in opened:
+            for text in texts:
+                if isinstance(text, Exception):
+                    raise text
+                file.write(text)
+                if flush:
+                    file.flush()
+
+
+@contextlib.contextmanager
+def room(size):
+    """Let no file grow beyond a size: the kernel refuses the write, as it does on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("mode", ["w", "wb"])
+@pytest.mark.parametrize("old", [None, "old\n"])
+@pytest.mark.parametrize("content", ["", SMALL, LARGE])
+def test_the_file_is_whole(tmp_path, mode, old, content):
+    path = tmp_path / "file.txt"
+    if old is not None:
+        path.write_text(old)
+    with replacing(path, mode) as file:
+        file.write(content if mode == "w" else content.encode())
+        assert path.exists() == (old is not None)
+    assert path.read_text() == content
+    assert os.listdir(tmp_path) == ["file.txt"]
+
+
+def test_text_is_utf8_and_names_that_are_no_text_are_escaped(tmp_path):
+    path = tmp_path / "µ.txt"
+    write_text(path, "0.1 µm \udce9\n")  # \udce9 is how Python holds a byte 0xe9 of a file name that is not UTF-8
+    assert path.read_bytes() == "0.1 µm \\udce9\n".encode()
+    assert read_text(path) == "0.1 µm \\udce9\n"
+
+
+def test_the_users_mask_sets_the_permissions(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "file", SMALL)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(os.stat(tmp_path / "file").st_mode) == 0o640
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there" / "file")
+    write_text(tmp_path / "link", SMALL)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "there" / "file").read_text() == SMALL
+    assert os.listdir(tmp_path / "there") == ["file"]
+
+
+@pytest.mark.parametrize("old", [None, "old\n"])
+@pytest.mark.parametrize("pieces", [1, 100])
+@pytest.mark.parametrize("size", [0, 3, 200_000])
+def test_a_disk_without_room_is_told_of_the_file_and_leaves_what_was(tmp_path, old, pieces, size):
+    path = tmp_path / "file.txt"
+    if old is not None:
+        path.write_text(old)
+    with room(size), pytest.raises(InputError) as caught:
+        write({path: [LARGE[: len(LARGE) // pieces]] * pieces})
+    assert str(caught.value) == f"{path}: cannot be written: File too large"
+    assert [p.read_text() for p in tmp_path.iterdir()] == ([] if old is None else [old])
+
+
+def test_no_space_is_told(tmp_path, monkeypatch):
+    def write(self, data):
+        with self._named():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files._Named, "write", write)
+    with pytest.raises(InputError) as caught:
+        write_text(tmp_path / "file", SMALL)
+    assert str(caught.value) == f"{tmp_path / 'file'}: cannot be written: No space left on device"
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("full", ["first", "second"])
+@pytest.mark.parametrize("content", [SMALL * 100, LARGE])
+@pytest.mark.parametrize("flush", [False, True])
+def test_nested_files_are_each_told_by_name(tmp_path, full, content, flush):
+    contents = {tmp_path / name: [content if name == full else SMALL] for name in ("first", "second")}
+    with room(300), pytest.raises(InputError, match=f"{full}: cannot be written: File too large"):
+        write(contents, flush)
+    # What is small and not flushed shows its trouble only on closing, when the second file is already in its place.
+    late = full == "first" and content != LARGE and not flush
+    assert os.listdir(tmp_path) == (["second"] if late else [])
+
+
+@pytest.mark.parametrize(
+    "error", [OSError("no name, no number"), OSError(errno.ENODEV, "gone"), ValueError("no number")]
+)
+def test_errors_of_other_things_pass_through(tmp_path, error):
+    with pytest.raises(type(error)) as caught:
+        write({tmp_path / "file": [SMALL, error]})
+    assert caught.value is error
+    assert os.listdir(tmp_path) == []
+
+
+def test_errors_of_other_files_keep_their_name(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "file"):
+        (tmp_path / "other").read_text()
+    assert caught.value.filename == str(tmp_path / "other")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("where", ["nowhere/file", "nowhere/deeper/file", "text/file"])
+def test_a_missing_folder_is_told(tmp_path, where):
+    (tmp_path / "text").write_text("no folder")
+    with pytest.raises(InputError) as caught:
+        write_text(tmp_path / where, SMALL)
+    folder = (tmp_path / where).parent
+    assert str(caught.value) == f"{tmp_path / where}: cannot be written: there is no folder {folder}; make it first"
+    assert os.listdir(tmp_path) == ["text"]
+
+
+def test_a_folder_or_a_device_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for name, kind in (("", "folder"), ("pipe", "device")):
+        with pytest.raises(InputError, match=f"cannot be written: it is a {kind}; give the name of a file"):
+            write_text(tmp_path / name, SMALL)
+    with pytest.raises(InputError, match="it is a device"):
+        write_text("/dev/null", SMALL)
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_name_that_is_too_long_is_told(tmp_path):
+    with pytest.raises(InputError, match="cannot be written: File name too long"):
+        write_text(tmp_path / ("x" * 256), SMALL)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(None, "no such file"), (b"\xff\xfe", "not a text file"), (..., "cannot be read: Is a dir")]
+)
+def test_reading_tells_what_is_wrong(tmp_path, content, said):
+    path = tmp_path / "file"
+    if content is ...:
+        path.mkdir()
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=f"file: {said}"):
+        read_text(path)
+
+
+def test_an_interrupt_anywhere_leaves_the_old_file_or_the_new_one(tmp_path):
+    """Raise KeyboardInterrupt at the first line of files.py that runs, then at the second, and so on to the last."""
+    path = tmp_path / "file.txt"
+    moments = 0
+    for moment in range(10**6):
+        path.write_text("old\n")
+        left = iter(range(moment, -1, -1))
+
+        def trace(frame, event, arg, left=left):
+            if frame.f_code.co_filename != files.__file__:
+                return None if event == "call" else trace
+            # In the clean-up of the clean-up one line is left that an interrupt must not hit.
+            if event == "line" and "os.unlink" not in line_of(frame) and next(left, None) == 0:
+                raise KeyboardInterrupt
+            return trace
+
+        sys.settrace(trace)
+        try:
+            write_text(path, LARGE)
+        except KeyboardInterrupt:
+            moments += 1
+            assert path.read_text() in ("old\n", LARGE)
+            assert os.listdir(tmp_path) == ["file.txt"]
+        else:
+            break
+        finally:
+            sys.settrace(None)
+    assert moments > 20
+    assert path.read_text() == LARGE
+
+
+def line_of(frame):
+    with open(files.__file__) as file:
+        return file.read().splitlines()[frame.f_lineno - 1]
+
+
+def test_a_real_full_disk(tmp_path):
+    disk = tmp_path / "small"
+    disk.mkdir()
+    if os.geteuid() != 0 or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", disk]).returncode:
+        pytest.skip("only root can mount a small disk; the same is tested with a failing write")
+    try:
+        write_text(disk / "rig.json", json.dumps("old"))
+        with pytest.raises(InputError) as caught:
+            write_text(disk / "rig.json", LARGE)
+        assert str(caught.value) == f"{disk / 'rig.json'}: cannot be written: No space left on device"
+        assert read_text(disk / "rig.json") == json.dumps("old")
+        assert os.listdir(disk) == ["rig.json"]
+    finally:
+        subprocess.run(["umount", disk], check=True)
