@@ -22,7 +22,6 @@ from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
 _OUTLINE = 16  # points along each side of a pattern whose projections bound it in the image
-_BLUR_STEP_PX = 0.5  # how far a moving body may go between two sub-exposures
 
 
 @dataclass(frozen=True)
@@ -116,19 +115,25 @@ class _Canvas:
         return int(low[0]), int(low[1]), int(high[2]), int(high[3])
 
 
-def _times(camera: Camera, bodies: Sequence[Placed], shutter: Shutter) -> Array:
-    """Return the middles of the sub-exposures (n,), s, fine enough for the fastest body."""
-    fastest = 0.0
+def _sub_exposures(camera: Camera, bodies: Sequence[Placed], exposure_s: float) -> list[tuple[float, float]]:
+    """Return the times (s, from the middle) and weights of the sub-exposures that make up one exposure.
+
+    They are Gauss and Legendre's: the blurred image of a moving edge is smooth over a pixel, so about one for each
+    pixel of the way is as good as very many evenly spaced.
+    """
+    way_px = 0.0
     for body in bodies:
-        speed = np.linalg.norm(body.twist[:3])
         for pattern in body.patterns:
             reach = np.linalg.norm(pattern.T_body_pattern[:3, 3]) + np.hypot(
                 np.abs(pattern.x_edges).max(), np.abs(pattern.y_edges).max()
             )
             depth = max(np.linalg.norm(body.T_camera_body[:3, 3]) - reach, 0.05)
-            fastest = max(fastest, (speed + np.linalg.norm(body.twist[3:]) * reach) / depth)
-    n = max(1, math.ceil(fastest * camera.intrinsics[:2].max() * shutter.exposure_s / _BLUR_STEP_PX))
-    return np.asarray(((np.arange(n) + 0.5) / n - 0.5) * shutter.exposure_s)
+            speed = np.linalg.norm(body.twist[:3]) + np.linalg.norm(body.twist[3:]) * reach
+            way_px = max(way_px, float(speed / depth * camera.intrinsics[:2].max() * exposure_s))
+    if way_px == 0:
+        return [(0.0, 1.0)]
+    nodes, weights = np.polynomial.legendre.leggauss(2 + math.ceil(way_px))
+    return [(0.5 * exposure_s * float(x), 0.5 * float(w)) for x, w in zip(nodes, weights, strict=True)]
 
 
 def _distance(body: Placed) -> float:
@@ -149,20 +154,17 @@ def radiance(
     shutter = shutter or Shutter()
     height = camera.image_size_px[1]
     rows = (np.arange(height) - (height - 1) / 2) * shutter.row_s if shutter.row_s else np.zeros(1)
-    times = _times(camera, bodies, shutter)
     ordered = sorted((body for body in bodies if body.patterns), key=_distance, reverse=True)
-    total: Radiance | None = None
-    for time in times:
+    total = np.zeros((height, camera.image_size_px[0]), np.float32)
+    for time, weight in _sub_exposures(camera, bodies, shutter.exposure_s):
         canvas = _Canvas(camera, background)
         for body in ordered:
             moving = shutter.row_s and body.twist.any()
             Ts = body.T_camera_body @ exp_se3(np.outer((rows if moving else np.zeros(1)) + time, body.twist))
             for pattern in body.patterns:
                 canvas.paint(pattern, Ts)
-        image = blurred(canvas.coarse, canvas.slot, canvas.fine[: max(canvas.count, 1)], psf_sigma_px)
-        total = image if total is None else total + image
-    assert total is not None  # there is at least one sub-exposure
-    return total if len(times) == 1 else np.asarray(total / np.float32(len(times)))
+        total += np.float32(weight) * blurred(canvas.coarse, canvas.slot, canvas.fine[: canvas.count], psf_sigma_px)
+    return total
 
 
 def render(
