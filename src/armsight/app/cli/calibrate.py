@@ -101,7 +101,7 @@ def command(
 
         write_report(calibration, report)
     if refine_body is not None:
-        save_body_csv(refine_body, calibration.body)
+        save_body_csv(calibration.body, refine_body)
     calibration.rig.save(out)
     if as_json:
         click.echo(json.dumps(_summary(calibration, out, report, time.perf_counter() - started)))
