@@ -1,0 +1,130 @@
+"""How the report's figures are drawn: style, canvas, arrows; matplotlib without a display, imported only when used."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 150
+WIDTH_IN = 10.0
+INK, MUTED, BLUE, ORANGE, RED, EMPTY = "#1f2933", "#616e7c", "#2b6cb0", "#dd7a1f", "#b83232", "#fbe3d6"
+STYLE: dict[str, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8.0,
+    "axes.edgecolor": "#9aa5b1",
+    "axes.labelcolor": MUTED,
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "figure.facecolor": "white",
+    "hatch.linewidth": 0.5,
+    "legend.frameon": False,
+}
+
+
+@contextlib.contextmanager
+def drawing() -> Iterator[None]:
+    """Draw in the report's own style, whatever the user's matplotlib settings, without a display.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    require_matplotlib()
+    import matplotlib
+
+    style: Any = STYLE
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # a pair's name in a script the font lacks
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(style)
+        yield
+
+
+def require_matplotlib() -> None:
+    """Raise an InputError that says what to install unless matplotlib can be imported."""
+    try:
+        importlib.import_module("matplotlib.figure")
+    except ImportError:
+        raise InputError(
+            'the report needs matplotlib, which is not installed: pip install "armsight[report]"'
+        ) from None
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
+
+
+def new_figure(height_in: float) -> Figure:
+    """Return an empty figure of the report's width on the Agg canvas."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """Render a figure."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+    return data.getvalue()
+
+
+def plain(name: str, most: int = 60) -> str:
+    """Return a name that can be printed anywhere: no broken Unicode, no control characters, shortened in its middle."""
+    name = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+    return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-(most // 2) :]}"
+
+
+def nice(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above ``value``."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
+
+
+def arrows(
+    axes: Axes,
+    at: Array,
+    vectors: Array,
+    enlarged: float,
+    colours: str | list[str],
+    width: float,
+    unit: str,
+    above: float,
+) -> None:
+    """Draw enlarged vectors in the units of the axes, and a scale arrow above their right end.
+
+    Args:
+        axes: where; its x axis must have its limits.
+        at: (N, 2) feet.
+        vectors: (N, 2) what to show.
+        enlarged: how many times.
+        colours: one, or one each.
+        width: of a shaft, as a share of the width of the axes.
+        unit: of the vectors, for the scale.
+        above: height of the scale above the axes, as a share of theirs.
+    """
+    low, high = axes.get_xlim()
+    scale = nice(0.09 * abs(high - low) / enlarged)
+    style: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / enlarged, "clip_on": False}
+    drawn = axes.quiver(*at.T, *vectors.T, color=colours, width=width, **style)
+    drawn.set_in_layout(False)
+    key: Any = {"labelpos": "E", "color": INK, "labelcolor": INK, "coordinates": "axes"}
+    axes.quiverkey(drawn, 0.87, 1 + above, scale, f"{scale:g} {unit}", **key)
