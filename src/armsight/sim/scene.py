@@ -143,26 +143,30 @@ def circle_grid(
     )
 
 
-def marker_bits(dictionary: str, marker: int) -> NDArray[np.bool_]:
-    """Return the cells (n, n) of an ArUco or AprilTag marker with its black rim; True is white.
+def marker_bits(family: str, marker: int, border: int = 1) -> NDArray[np.bool_]:
+    """Return the cells (n, n) of a marker with its dark border, upright; True is bright.
 
     Args:
-        dictionary: OpenCV's name, with or without DICT_ in front: "4X4_50", "APRILTAG_36h11".
-        marker: its number in the dictionary.
+        family: OpenCV's name of a dictionary, with or without DICT_ in front ("4X4_50", "APRILTAG_36h11"), or
+            AprilTag's own ("tag36h11"), whose upright is OpenCV's upside down.
+        marker: its number in the family.
+        border: width of the dark border, cells.
 
     Raises:
-        InputError: no such dictionary, or no such marker in it.
+        InputError: no such family, or no such marker in it.
     """
-    name = dictionary if dictionary.startswith("DICT_") else f"DICT_{dictionary}"
+    name = family.removeprefix("DICT_")
+    name = f"DICT_APRILTAG_{name.removeprefix('tag')}" if name.startswith("tag") else f"DICT_{name}"
     if not hasattr(cv2.aruco, name):
         raise InputError(
-            f"unknown marker dictionary {dictionary!r}; known are OpenCV's, such as APRILTAG_36h11, 4X4_50"
+            f"unknown marker family {family!r}; known are tag36h11 and the like, and OpenCV's: 4X4_50, ..."
         )
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     if not 0 <= marker < len(known.bytesList):
-        raise InputError(f"dictionary {dictionary} has markers 0 to {len(known.bytesList) - 1}, not {marker}")
-    cells = known.markerSize + 2
-    return np.asarray(cv2.aruco.generateImageMarker(known, marker, cells) > 127)
+        raise InputError(f"family {family} has markers 0 to {len(known.bytesList) - 1}, not {marker}")
+    cells = known.markerSize + 2 * border
+    bits = np.asarray(cv2.aruco.generateImageMarker(known, marker, cells, borderBits=border) > 127)
+    return np.rot90(bits, 2) if family.startswith("tag") else bits
 
 
 def tag(
@@ -186,7 +190,7 @@ def charuco(
     rows: int,
     square_m: float,
     marker_m: float,
-    dictionary: str,
+    family: str,
     *,
     black: float = BLACK,
     white: float = WHITE,
@@ -198,18 +202,18 @@ def charuco(
         rows: squares along y.
         square_m: side of a square, m.
         marker_m: side of a marker, m.
-        dictionary: OpenCV's name of the marker dictionary.
+        family: of the markers, as in :func:`marker_bits`.
         black: reflectance of black squares and cells.
         white: reflectance of white squares and cells, and of the margin.
 
     Returns:
-        The board; its origin is the outer corner of the square at the top left, which is black.
+        The board; its origin is the inner corner of the square at the upper left, which is black.
     """
-    bits = [marker_bits(dictionary, k) for k in range(columns * rows // 2)]
+    bits = [marker_bits(family, k) for k in range(columns * rows // 2)]
     cells = len(bits[0])
     inside = (square_m - marker_m) / 2 + np.arange(cells + 1) * (marker_m / cells)
     x_edges, y_edges = (
-        np.append(np.add.outer(np.arange(n) * square_m, np.append(0.0, inside)).ravel(), n * square_m)
+        np.append(np.add.outer(np.arange(-1, n - 1) * square_m, np.append(0.0, inside)).ravel(), (n - 1) * square_m)
         for n in (columns, rows)
     )
     step = cells + 2
@@ -225,6 +229,46 @@ def charuco(
                 marker += 1
     return Pattern(
         _with_margin(x_edges, square_m), _with_margin(y_edges, square_m), np.pad(values, 1, constant_values=white)
+    )
+
+
+def aprilgrid(
+    columns: int, rows: int, tag_m: float, spacing: float, *, black: float = BLACK, white: float = WHITE
+) -> Pattern:
+    """Return a grid of AprilTags as Kalibr prints it: tag36h11, dark border of two cells, a dark square between tags.
+
+    Args:
+        columns: tags along x.
+        rows: tags along y.
+        tag_m: side of a tag, m.
+        spacing: gap between tags as a share of their side.
+        black: reflectance of dark cells.
+        white: reflectance of bright cells and the margin.
+
+    Returns:
+        The grid on a body whose origin is the lower left corner of tag 0, at the lower left; the body's x runs to the
+        right, y up and z out of the board.
+    """
+    cells, gap = marker_bits("tag36h11", 0, 2).shape[0], spacing * tag_m
+    inside = gap + np.arange(cells + 1) * (tag_m / cells)
+    x_edges, y_edges = (
+        np.append(np.add.outer(np.arange(n) * (tag_m + gap), np.append(0.0, inside[:-1])).ravel(), n * (tag_m + gap))
+        for n in (columns, rows)
+    )
+    step = cells + 1
+    values = np.full((rows * step + 1, columns * step + 1), white)
+    values[::step, ::step] = black
+    for k in range(columns * rows):
+        row, column = rows - 1 - k // columns, k % columns
+        below, right = row * step + 1, column * step + 1
+        values[below : below + cells, right : right + cells] = np.where(marker_bits("tag36h11", k, 2), white, black)
+    T_body_pattern = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_body_pattern[:2, 3] = -gap, rows * (tag_m + gap)
+    return Pattern(
+        _with_margin(np.append(x_edges, x_edges[-1] + gap), gap),
+        _with_margin(np.append(y_edges, y_edges[-1] + gap), gap),
+        np.pad(values, 1, constant_values=white),
+        T_body_pattern=T_body_pattern,
     )
 
 
