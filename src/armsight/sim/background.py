@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,11 @@ from numpy.typing import NDArray
 Reflectance = NDArray[np.float32]
 
 _COARSEST_PX = 256  # size of the largest blobs of a texture
+
+
+def plain(image_size_px: tuple[int, int], rng: np.random.Generator) -> Reflectance:
+    """Return one value everywhere; nothing is drawn from ``rng``."""
+    return np.full(image_size_px[::-1], 0.4, np.float32)
 
 
 def textured(
@@ -110,3 +117,10 @@ def _print(
 
 _ITEMS = (_polygon, _box, _rod, _ellipse, _print)
 _SHARES = (0.25, 0.25, 0.2, 0.15, 0.15)
+
+#: Kind of background -> what makes one of (width, height) from a source of noise.
+BACKGROUNDS: dict[str, Callable[[tuple[int, int], np.random.Generator], Reflectance]] = {
+    "plain": plain,
+    "textured": textured,
+    "cluttered": cluttered,
+}

@@ -21,7 +21,8 @@ from armsight.sim.paint import SUB, Box, paint
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
-_OUTLINE = 16  # points along each side of a pattern whose projections bound it in the image
+#: Points along each side of a pattern whose projections bound it in the image.
+OUTLINE = 16
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,10 @@ def _corner_rays(camera: Camera) -> Array:
     return rays.reshape(height + 1, width + 1, 3)
 
 
-def _covered(camera: Camera, T_camera_pattern: Array, outline: Array) -> Box | None:
+def _covered(camera: Camera, T_camera_pattern: Array, points: Array) -> Box | None:
     """Bound in pixels (first column, first row, end column, end row) what an outline (N, 2) of a plane can cover."""
     width, height = camera.image_size_px
-    p = transform(T_camera_pattern, np.column_stack([outline, np.zeros(len(outline))]))
+    p = transform(T_camera_pattern, np.column_stack([points, np.zeros(len(points))]))
     uv = camera.project(p)
     rays = camera.unproject(uv)
     # Far off the axis a distortion polynomial folds back: a projection counts only where its ray leads to the point.
@@ -62,16 +63,17 @@ def _covered(camera: Camera, T_camera_pattern: Array, outline: Array) -> Box | N
     return None if (low >= high).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
-def _rectangle(x: Array, y: Array) -> Array:
-    """Return points (N, 2) around the rectangle that borders x and y span."""
-    t = np.linspace(0, 1, _OUTLINE)[:, None]
+def outline(pattern: Pattern) -> Array:
+    """Return points (4 * OUTLINE, 2) around the rectangle that a pattern's cells fill, m, pattern frame."""
+    x, y = pattern.x_edges, pattern.y_edges
+    t = np.linspace(0, 1, OUTLINE)[:, None]
     corners = np.array([[x[0], y[0]], [x[-1], y[0]], [x[-1], y[-1]], [x[0], y[-1]]])
     return np.concatenate([a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 def _circle(disc: Array) -> Array:
     """Return points (N, 2) around a disc (4,)."""
-    angle = np.arange(4 * _OUTLINE) * (math.tau / (4 * _OUTLINE))
+    angle = np.arange(4 * OUTLINE) * (math.tau / (4 * OUTLINE))
     return np.asarray(disc[:2] + disc[2] * 1.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
@@ -100,15 +102,15 @@ class _Canvas:
         x, y = np.array(pattern.x_edges), np.array(pattern.y_edges)
         grid = (x, y, np.pad(pattern.values, 1, constant_values=CLEAR))
         for disc in (np.zeros(0), *pattern.discs):
-            box = self._box(ends, _circle(disc) if disc.size else _rectangle(x, y))
+            box = self._box(ends, _circle(disc) if disc.size else outline(pattern))
             if box is not None:
                 self.fine, self.count = paint(
                     self.rays, Ms, box, grid, np.array(disc), self.coarse, self.slot, self.fine, self.count
                 )
 
-    def _box(self, Ts: Array, outline: Array) -> Box | None:
+    def _box(self, Ts: Array, points: Array) -> Box | None:
         """Bound what an outline covers at any of a few poses."""
-        boxes = [box for T in Ts if (box := _covered(self.camera, T, outline)) is not None]
+        boxes = [box for T in Ts if (box := _covered(self.camera, T, points)) is not None]
         if not boxes:
             return None
         low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
