@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import Array, Correspondences, Detections, Ids
-from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
-from armsight.vision.bundle import Model, Observations, State, minimise
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import join
 from armsight.vision.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
+from armsight.vision.posefit import Sightings, fit_pose
 
 #: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
 LEAST_DETECTIONS, LEAST_AMBIGUOUS = 4, 6
@@ -115,24 +114,13 @@ def _polished(
 ) -> Array | None:
     """Adjust a pose to what agrees with it in both cameras, twice, for the first time only roughly."""
     everything = tuple(np.ones(len(ids), bool) for ids in shot.ids)
-    model = Model(points, np.zeros((0, len(points), 3)), 1.0, False)
-    count = sum(camera.parameters.size for camera in cameras) + 6
     for _ in range(2):
         rows, _ = _agreeing(points, cameras, T_left_right, shot, T, everything)
         if sum(len(r) for r in rows) < 3:
             return None
         seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(rows)))
-        state = State(cameras, T_left_right, T[None], np.zeros(0))
-        try:
-            solution = minimise(
-                model,
-                state,
-                Observations.from_shots([seen]),
-                _POLISH_SIGMA_PX,
-                free=np.zeros(count, bool),
-                max_steps=20,
-            )
-        except (CalibrationError, np.linalg.LinAlgError):
+        fit = fit_pose(cameras, T_left_right, points, Sightings.of(seen, _POLISH_SIGMA_PX), T, robust=True)
+        if fit is None:
             return None
-        T = solution.state.Ts_left_body[0]
+        T = fit.T_left_body
     return T

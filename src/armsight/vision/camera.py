@@ -25,7 +25,7 @@ _STRAIGHT_BACK = 1e-9
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Array) -> None:
+def distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Array) -> None:
     """Distort one point p (3,) of the camera's frame into xy (2,), with Jacobians J_p (2, 3) and J_d (2, 8)."""
     J_d[:, :] = 0.0
     if fisheye:
@@ -89,7 +89,7 @@ def _project(fisheye: bool, k: Array, d: Array, p: Array, uv: Array, J_p: Array,
             J_p[n] = np.nan
             J_k[n] = np.nan
             continue
-        _distort(fisheye, d, p[n], xy, J_p[n], J_k[n, :, 4:])
+        distort(fisheye, d, p[n], xy, J_p[n], J_k[n, :, 4:])
         for i in range(2):
             uv[n, i] = k[i] * xy[i] + k[2 + i]
             for j in range(3):
@@ -128,7 +128,7 @@ def _unproject(fisheye: bool, k: Array, d: Array, uv: Array, rays: Array) -> Non
         ray[0], ray[1], ray[2] = u, v, 1.0
         done = False
         for _ in range(_NEWTON_STEPS):
-            _distort(False, d, ray, xy, J_p, J_d)
+            distort(False, d, ray, xy, J_p, J_d)
             ex, ey = u - xy[0], v - xy[1]
             det = J_p[0, 0] * J_p[1, 1] - J_p[0, 1] * J_p[1, 0]
             dx = (J_p[1, 1] * ex - J_p[0, 1] * ey) / det
@@ -192,7 +192,8 @@ class Camera(Record):
         """Return the same camera with other intrinsics and distortion (4 + n,)."""
         return Camera(self.image_size_px, self.model, parameters[:4].copy(), parameters[4:].copy())
 
-    def _kernel_arguments(self) -> tuple[bool, Array, Array]:
+    def kernel_arguments(self) -> tuple[bool, Array, Array]:
+        """Return what the compiled kernels take: fisheye or not, (4,) intrinsics, (8,) coefficients padded with zeros."""
         d = np.zeros(8)
         d[: self.distortion.size] = self.distortion
         return self.model == "fisheye", np.array(self.intrinsics), d
@@ -209,7 +210,7 @@ class Camera(Record):
         """
         p = np.ascontiguousarray(p, dtype=np.float64)
         uv, J_p, J_k = np.empty((len(p), 2)), np.empty((len(p), 2, 3)), np.empty((len(p), 2, 12))
-        _project(*self._kernel_arguments(), p, uv, J_p, J_k)
+        _project(*self.kernel_arguments(), p, uv, J_p, J_k)
         return uv, J_p, J_k[:, :, : 4 + self.distortion.size]
 
     def project(self, p: Array) -> Array:
@@ -219,5 +220,5 @@ class Camera(Record):
     def unproject(self, uv: Array) -> Array:
         """Turn raw pixels (N, 2) into unit rays (N, 3) of this camera's frame; NaN where distortion has no inverse."""
         rays = np.empty((len(uv), 3))
-        _unproject(*self._kernel_arguments(), np.ascontiguousarray(uv, dtype=np.float64), rays)
+        _unproject(*self.kernel_arguments(), np.ascontiguousarray(uv, dtype=np.float64), rays)
         return rays

@@ -9,23 +9,24 @@ the noise is what the residuals show (Birge's ratio), and the estimate says by h
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from armsight.data import Array, Body, Dropped, Missed, Points, PoseEstimate
-from armsight.errors import CalibrationError
+from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.vision.bundle import Model, Observations, Solution, State, minimise, predict, whiteners
+from armsight.vision.bundle import Model, Observations, State, predict
 from armsight.vision.pnp import consensus_poses
+from armsight.vision.posefit import PoseFit, Sightings, fit_pose
 from armsight.vision.rig import StereoRig
 
 #: A detection whose whitened squared distance from a robust fit is beyond this share of the chi-square distribution is
 #: no detection of the body.
 OUTLIER_QUANTILE = 1.0 - 1e-5
+_LIMIT, _MEDIAN = float(chi2.ppf(OUTLIER_QUANTILE, 2)), float(chi2.ppf(0.5, 2))
 #: A shot in which less than this share of the detections agrees with one pose is missed.
 _AGREEING = 0.5
 #: With this many matched points the rigid fit alone is a safe start; with fewer, every pose that one camera allows is
@@ -51,19 +52,18 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     reason = _unlocatable(body, points)
     if reason is not None:
         return Missed(reason)
-    observations = Observations.from_shots([points.seen])
-    model = Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False)
-    free = np.zeros(rig.parameter_count, bool)
-    sigma = max(rig.sigma_px, 1e-6)
-    best = _best(model, rig, _starts(rig, body, points), observations, sigma, free)
+    sightings = Sightings.of(points.seen, rig.sigma_px)
+    best: PoseFit | None = None
+    for start in _starts(rig, body, points):
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, start, robust=True)
+        if fit is not None and (best is None or fit.cost < best.cost):
+            best = fit
     if best is None:
         return Missed("no pose of the body fits the detections")
-    good, best = _without_outliers(model, best, observations, sigma, free)
-    if best is None:
+    good, fit = _without_outliers(rig, body, best, sightings)
+    if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    used = observations.select(good)
-    dropped = _dropped(body, observations, good, best, points)
-    return _estimate(rig, body, points, model, best, used, dropped, good)
+    return _estimate(rig, body, points, fit, sightings, good)
 
 
 def _unlocatable(body: Body, points: Points) -> str | None:
@@ -97,100 +97,74 @@ def _starts(rig: StereoRig, body: Body, points: Points) -> list[Array]:
     return starts
 
 
-def _best(
-    model: Model,
-    rig: StereoRig,
-    starts: list[Array],
-    observations: Observations,
-    sigma: float,
-    free: NDArray[np.bool_],
-) -> Solution | None:
-    """Minimise robustly from every start and return the lowest; None where no start leads anywhere."""
-    best: Solution | None = None
-    for start in starts:
-        state = State(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
-        try:
-            solution = minimise(model, state, observations, sigma, free=free)
-        except (CalibrationError, np.linalg.LinAlgError):
-            continue
-        if best is None or solution.cost < best.cost:
-            best = solution
-    return best
-
-
 def _without_outliers(
-    model: Model, robust: Solution, observations: Observations, sigma: float, free: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], Solution | None]:
+    rig: StereoRig, body: Body, robust: PoseFit, sightings: Sightings
+) -> tuple[NDArray[np.bool_], PoseFit | None]:
     """Drop what the robust fit leaves far off, and fit the rest by plain least squares."""
-    good = np.ones(len(observations.shot), bool)
-    solution: Solution = robust
-    limit = chi2.ppf(OUTLIER_QUANTILE, 2)
+    d2, T = robust.distance2, robust.T_left_body
+    good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
-        r = np.einsum("nij,nj->ni", whiteners(observations, sigma), _residuals(model, solution.state, observations))
-        d2 = np.einsum("ni,ni->n", r, r)
-        now = d2 <= limit * max(1.0, float(np.median(d2)) / chi2.ppf(0.5, 2))
-        if now.sum() < max(3, _AGREEING * len(now)) or len(np.unique(observations.point[now])) < 3:
+        now = d2 <= _LIMIT * max(1.0, float(np.median(d2)) / _MEDIAN)
+        if now.sum() < max(3, _AGREEING * len(now)) or len(np.unique(sightings.point[now])) < 3:
             return now, None
-        if (now == good).all() and solution is not robust:
+        if fit is not None and (now == good).all():
             break
         good = now
-        solution = minimise(model, solution.state, observations.select(good), sigma, robust=False, free=free)
-    return good, solution
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings.select(good), T, robust=False)
+        if fit is None:
+            return good, None
+        T = fit.T_left_body
+        d2 = _distances(rig, body, T, sightings)[1]
+    return good, fit
 
 
-def _residuals(model: Model, state: State, observations: Observations) -> Array:
-    """(N, 2) detection minus projection, px."""
-    return np.asarray(observations.uv - predict(model, state, observations)[0])
-
-
-def _dropped(
-    body: Body, observations: Observations, good: NDArray[np.bool_], solution: Solution, points: Points
-) -> tuple[Dropped, ...]:
-    """Name what was thrown away, with its distance."""
-    model = Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False)
-    distance = np.linalg.norm(_residuals(model, solution.state, observations), axis=1)
-    sides = ("left", "right")
-    return points.dropped + tuple(
-        Dropped(
-            body.point_names[observations.point[i]],
-            f"{distance[i]:.1f} px off the body in the {sides[observations.camera[i]]} image",
-        )
-        for i in np.flatnonzero(~good)
-    )
+def _distances(rig: StereoRig, body: Body, T: Array, sightings: Sightings) -> tuple[Array, Array]:
+    """Return (N,) distances of all sightings from a pose's projections, px, and their squares in standard deviations."""
+    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, T, robust=False, steps=0)
+    if fit is None:
+        return np.full(len(sightings.point), np.inf), np.full(len(sightings.point), np.inf)
+    return np.linalg.norm(fit.residuals_px, axis=1), fit.distance2
 
 
 def _estimate(
-    rig: StereoRig,
-    body: Body,
-    points: Points,
-    model: Model,
-    solution: Solution,
-    used: Observations,
-    dropped: tuple[Dropped, ...],
-    good: NDArray[np.bool_],
+    rig: StereoRig, body: Body, points: Points, fit: PoseFit, sightings: Sightings, good: NDArray[np.bool_]
 ) -> PoseEstimate:
     """Assemble the estimate with its covariance: pixel noise, and the rig's calibration through the same fit."""
-    W = whiteners(used, solution.sigma_px)
-    _, J_rig, J_pose = predict(model, solution.state, used)
-    A, B = (W @ J_pose).reshape(-1, 6), (W @ J_rig).reshape(-1, rig.parameter_count)
-    residual = (W @ solution.residuals_px[..., None]).ravel()
-    freedom = len(residual) - 6
-    misfit = float(residual @ residual / freedom) if residual @ residual > chi2.ppf(_MISFIT_QUANTILE, freedom) else 1.0
-    noise = np.linalg.inv(A.T @ A) * misfit
-    gain = noise / misfit @ (A.T @ B)
-    T = solution.state.Ts_left_body[0]
-    rows = Observations.from_shots([points.seen])
-    bad = np.unique(rows.point[~good])
-    kept = ~np.isin(points.ids, bad)
-    points = replace(points, **{k: getattr(points, k)[kept] for k in ("ids", "p_left", "cov", "calibration")})
+    used, T = sightings.select(good), fit.T_left_body
+    state = State(rig.cameras, rig.T_left_right, T[None], np.zeros(0))
+    rows = Observations(np.zeros(len(used.point), np.int64), used.camera, used.point, used.uv, used.cov_uv, 1)
+    _, J_rig, J_pose = predict(Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False), state, rows)
+    noise = np.linalg.inv(fit.information)
+    weighted = np.linalg.inv(used.cov_uv) @ J_pose
+    gain = noise @ np.tensordot(weighted, J_rig, axes=((0, 1), (0, 1)))
+    freedom = 2 * len(used.point) - 6
+    misfit = fit.cost / freedom if fit.cost > _misfit_limit(freedom) else 1.0
+    distance = _distances(rig, body, T, sightings)[0]
+    dropped = tuple(
+        Dropped(
+            body.point_names[sightings.point[i]],
+            f"{distance[i]:.1f} px off the body in the {SIDES[sightings.camera[i]]} image",
+        )
+        for i in np.flatnonzero(~good)
+    )
+    kept = ~np.isin(points.ids, sightings.point[~good])
+    points = Points(
+        points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept], points.seen, points.dropped
+    )
     gap = points.p_left - transform(T, body.points[points.ids])
     return PoseEstimate(
         T,
-        noise + gain @ rig.cov @ gain.T,
-        noise,
+        noise * misfit + gain @ rig.cov @ gain.T,
+        noise * misfit,
         float(np.sqrt((gap**2).sum(axis=1).mean())) if len(gap) else float("nan"),
-        float(np.sqrt((solution.residuals_px**2).sum(axis=1).mean())),
+        float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean())),
         float(np.sqrt(misfit)),
         points,
-        dropped,
+        points.dropped + dropped,
     )
+
+
+@lru_cache(maxsize=256)
+def _misfit_limit(freedom: int) -> float:
+    """Sum of squares beyond which residuals are a misfit, not chance."""
+    return float(chi2.ppf(_MISFIT_QUANTILE, freedom)) if freedom > 0 else np.inf

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from armsight.data import Array, Ids, Record
-from armsight.geometry.pose import exp_se3, pose, transform
-from armsight.geometry.rotation import exp_so3, log_so3, skew
+from armsight.geometry.pose import pose, transform
+from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.vision.camera import Camera
+from armsight.vision.posefit import Sightings, fit_pose
 
 MIN_POINTS = 4
 
@@ -148,21 +149,8 @@ def _agreeing(points: Array, camera: Camera, T: Array, ids: Ids, uv: Array) -> t
 
 
 def _polished(p: Array, camera: Camera, T: Array, uv: Array) -> Array:
-    """Minimise one camera's pixel distance from a good start (Gauss-Newton with Marquardt's damping)."""
-    damping, cost = 1e-3, np.inf
-    for _ in range(_POLISH_STEPS):
-        projected, J_p, _ = camera.project_jacobians(transform(T, p))
-        r = (uv - projected).ravel()
-        cost = float(r @ r)
-        by_body = J_p @ T[:3, :3]
-        J = np.concatenate([by_body, -by_body @ skew(p)], axis=2).reshape(-1, 6)
-        H = J.T @ J
-        trial = T @ exp_se3(np.linalg.lstsq(H + damping * np.diag(np.diag(H)), J.T @ r, rcond=None)[0])
-        new = ((uv - camera.project(transform(trial, p))) ** 2).sum()
-        if new < cost:
-            T, damping = trial, damping / 10
-            if cost - new < 1e-6 * cost:
-                break
-        else:
-            damping *= 10
-    return T
+    """Minimise one camera's pixel distance from a good start."""
+    n = len(p)
+    sightings = Sightings(np.zeros(n, np.int64), np.arange(n), uv, np.tile(np.eye(2), (n, 1, 1)))
+    fit = fit_pose((camera, camera), np.eye(4), p, sightings, T, robust=False, steps=_POLISH_STEPS)
+    return T if fit is None else fit.T_left_body

@@ -1,0 +1,203 @@
+"""The pose of a body from detections of two known cameras: one compiled Levenberg-Marquardt.
+
+The same cost as :mod:`~armsight.vision.bundle` with everything but one pose held, for the places that solve it thousands
+of times: locating, trying mirror solutions, telling bodies apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Correspondences, Ids, Record
+from armsight.geometry.pose import inverse
+from armsight.vision.bundle import CAUCHY_SCALE
+from armsight.vision.camera import Camera, distort
+
+_STEPS = 40
+_DONE = 1e-8  # relative decrease of the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings(Record):
+    """Detections of one body in one shot, one row each.
+
+    Attributes:
+        camera: (N,) 0 left, 1 right.
+        point: (N,) row of the body's points.
+        uv: (N, 2) raw pixels.
+        cov_uv: (N, 2, 2) their covariance, px^2, positive definite.
+    """
+
+    camera: Ids
+    point: Ids
+    uv: Array
+    cov_uv: Array
+
+    @staticmethod
+    def of(seen: Correspondences, sigma_px: float) -> Sightings:
+        """Flatten a shot's correspondences; ``sigma_px`` adds to what the image tells."""
+        rows, sides = np.nonzero(seen.seen)
+        cov = seen.cov_uv[rows, sides] + max(sigma_px, 1e-6) ** 2 * np.eye(2)
+        return Sightings(sides.astype(np.int64), seen.ids[rows], seen.uv[rows, sides], cov)
+
+    def select(self, keep: NDArray[np.bool_]) -> Sightings:
+        """Return the rows where ``keep`` (N,) is true."""
+        return Sightings(self.camera[keep], self.point[keep], self.uv[keep], self.cov_uv[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit(Record):
+    """A minimum.
+
+    Attributes:
+        T_left_body: (4, 4) the pose.
+        residuals_px: (N, 2) detection minus projection.
+        distance2: (N,) squared distance in standard deviations.
+        information: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right.
+        cost: what was minimised: the sum of the squared distances, or their Cauchy loss.
+    """
+
+    T_left_body: Array
+    residuals_px: Array
+    distance2: Array
+    information: Array
+    cost: float
+
+
+def fit_pose(
+    cameras: tuple[Camera, Camera],
+    T_left_right: Array,
+    points: Array,
+    sightings: Sightings,
+    start: Array,
+    *,
+    robust: bool,
+    steps: int = _STEPS,
+) -> PoseFit | None:
+    """Minimise the whitened pixel distance of all sightings over the pose of the body.
+
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame.
+        points: (M, 3) points of the body, m.
+        sightings: N detections.
+        start: (4, 4) T_left_body to begin with.
+        robust: Cauchy loss as in bundle adjustment, else plain least squares.
+        steps: iterations at the most.
+
+    Returns:
+        The minimum next to the start, or None where the start puts a point behind its camera or the
+        sightings do not determine a pose.
+    """
+    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
+    T, p = np.array(start), np.ascontiguousarray(points[sightings.point])
+    n = len(p)
+    weight = np.linalg.inv(sightings.cov_uv)
+    residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
+    arguments = (
+        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), inverse(T_left_right), p,
+        np.array(sightings.camera), np.array(sightings.uv), weight, T, robust, steps, residuals, d2, H,
+    )  # fmt: skip
+    try:
+        cost = _fit(*arguments)
+    except np.linalg.LinAlgError:
+        return None
+    return PoseFit(T, residuals, d2, H, cost) if np.isfinite(cost) else None
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _assemble(
+    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array, T: Array,
+    robust: bool, residuals: Array, d2: Array, H: Array, g: Array,
+) -> float:  # fmt: skip
+    """Fill residuals, squared distances, normal equations; return the cost, infinite behind a camera."""
+    H[:, :] = 0.0
+    g[:] = 0.0
+    cost, c2 = 0.0, CAUCHY_SCALE * CAUCHY_SCALE
+    xy, J_p, J_d, M = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty((4, 4))
+    q, J = np.empty(3), np.empty((2, 6))
+    T_right = T_right_left @ T
+    for n in range(p.shape[0]):
+        c = camera[n]
+        M[:, :] = T_right if c == 1 else T
+        for i in range(3):
+            q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
+        if q[2] <= 0.0:
+            return np.inf
+        distort(fisheye[c], d[c], q, xy, J_p, J_d)
+        for i in range(2):
+            residuals[n, i] = uv[n, i] - k[c, i] * xy[i] - k[c, 2 + i]
+            for j in range(3):
+                J[i, j] = k[c, i] * (J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j])
+            J[i, 3] = J[i, 2] * p[n, 1] - J[i, 1] * p[n, 2]
+            J[i, 4] = J[i, 0] * p[n, 2] - J[i, 2] * p[n, 0]
+            J[i, 5] = J[i, 1] * p[n, 0] - J[i, 0] * p[n, 1]
+        r0, r1 = residuals[n, 0], residuals[n, 1]
+        w00, w01, w11 = weight[n, 0, 0], weight[n, 0, 1], weight[n, 1, 1]
+        d2[n] = w00 * r0 * r0 + 2 * w01 * r0 * r1 + w11 * r1 * r1
+        s = 1.0 / (1.0 + d2[n] / c2) if robust else 1.0
+        cost += c2 * np.log1p(d2[n] / c2) if robust else d2[n]
+        for i in range(6):
+            a0 = s * (w00 * J[0, i] + w01 * J[1, i])
+            a1 = s * (w01 * J[0, i] + w11 * J[1, i])
+            g[i] += a0 * r0 + a1 * r1
+            for j in range(i + 1):
+                H[i, j] += a0 * J[0, j] + a1 * J[1, j]
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return cost
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moved(T: Array, xi: Array, out: Array) -> None:
+    """Move a pose by a tangent, on the right; to first order T exp(xi), and a pose exactly."""
+    angle = np.sqrt(xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5])
+    a = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-4 else 0.5
+    x, y, z = xi[3], xi[4], xi[5]
+    E = np.array(
+        [
+            [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+        ]
+    )
+    for i in range(3):
+        out[i, 3] = T[i, 3] + T[i, 0] * xi[0] + T[i, 1] * xi[1] + T[i, 2] * xi[2]
+        for j in range(3):
+            out[i, j] = T[i, 0] * E[0, j] + T[i, 1] * E[1, j] + T[i, 2] * E[2, j]
+    out[3, :] = T[3, :]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fit(
+    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array, T: Array,
+    robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
+) -> float:  # fmt: skip
+    """Levenberg-Marquardt on T in place; residuals, distances and information are those of the result."""
+    g, damped, trial = np.empty(6), np.empty((6, 6)), np.empty((4, 4))
+    new_H, new_g, new_r, new_d2 = np.empty((6, 6)), np.empty(6), np.empty_like(residuals), np.empty_like(d2)
+    cost = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, T, robust, residuals, d2, H, g)
+    damping = 1e-4
+    for _ in range(steps):
+        if not np.isfinite(cost) or damping > 1e12:
+            break
+        damped[:, :] = H
+        for i in range(6):
+            damped[i, i] += damping * H[i, i] + 1e-300
+        _moved(T, np.linalg.solve(damped, g), trial)
+        new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
+        if new <= cost:
+            done = cost - new <= _DONE * new
+            T[:, :], residuals[:, :], d2[:], H[:, :], g[:] = trial, new_r, new_d2, new_H, new_g
+            cost, damping = new, max(damping / 10, 1e-12)
+            if done:
+                break
+        else:
+            damping *= 10
+    return cost
