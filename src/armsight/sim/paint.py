@@ -31,13 +31,6 @@ Span = tuple[int, int, int, int]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _copy(a: Array, i: int, b: Array, j: int) -> None:
-    """Copy row i of a into row j of b; plain loops compile to less and run faster than slices."""
-    for c in range(a.shape[1]):
-        b[j, c] = a[i, c]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _area(p: Array, n: int) -> float:
     """Return the area of the polygon p (n, 5) in its first two columns."""
     twice = 0.0
@@ -55,12 +48,12 @@ def _split(p: Array, n: int, axis: int, edge: float, low: Array, high: Array) ->
         j = i + 1 if i + 1 < n else 0
         g_i = p[i, axis] - edge * p[i, 4]
         g_j = p[j, axis] - edge * p[j, 4]
-        if g_i < 0.0:
-            _copy(p, i, low, n_low)
-            n_low += 1
-        else:
-            _copy(p, i, high, n_high)
-            n_high += 1
+        for c in range(5):
+            if g_i < 0.0:
+                low[n_low, c] = p[i, c]
+            else:
+                high[n_high, c] = p[i, c]
+        n_low, n_high = n_low + int(g_i < 0.0), n_high + int(not g_i < 0.0)
         if (g_i < 0.0) != (g_j < 0.0):
             t = g_i / (g_i - g_j)
             for c in range(5):
@@ -153,10 +146,10 @@ def _inside_line(p: Array, q: Array, x: float, y: float, radius: float) -> float
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _circle_share(c: Array, disc: Array, p: Array, q: Array) -> float:
+def _circle_share(c: Array, disc: Array, lines: int, buffer: Array) -> float:
     """Return which share of the area between four corners c (4, 3), in turn around it, a disc covers.
 
-    Without room for scan lines (p and q empty) an area on the rim is told by 0.5.
+    Found with so many scan lines; with none, an area on the rim is told by 0.5.
     """
     x, y, radius = disc[0], disc[1], disc[2]
     mx = my = reach = 0.0
@@ -166,24 +159,22 @@ def _circle_share(c: Array, disc: Array, p: Array, q: Array) -> float:
     for n in range(4):
         reach = max(reach, np.hypot(c[n, 0] / c[n, 2] - x - mx, c[n, 1] / c[n, 2] - y - my))
     distance = np.hypot(mx, my)
-    if distance - reach >= radius:
-        return 0.0
-    if distance + reach <= radius:
-        return 1.0
-    if p.size == 0:
+    if distance - reach >= radius or distance + reach <= radius:
+        return 1.0 if distance < radius else 0.0
+    if lines == 0:
         return 0.5
     # Scan lines run across the rim: along whichever side of the area points more nearly to the disc's centre.
     along_u = abs((c[1, 0] - c[0, 0]) * mx + (c[1, 1] - c[0, 1]) * my)
     along_v = abs((c[3, 0] - c[0, 0]) * mx + (c[3, 1] - c[0, 1]) * my)
     near, far = (3, 1) if along_u > along_v else (1, 3)
-    share = 0.0
-    for line in range(_LINES):
-        t = (line + 0.5) / _LINES
+    p, q, share = buffer[6, 0], buffer[6, 1], 0.0
+    for line in range(lines):
+        t = (line + 0.5) / lines
         for k in range(3):
             p[k] = c[0, k] + t * (c[near, k] - c[0, k])
             q[k] = c[far, k] + t * (c[2, k] - c[far, k])
         share += _inside_line(p, q, x, y, radius)
-    return share / _LINES
+    return share / lines
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -198,19 +189,15 @@ def _plane_row(rays: Array, M: Array, v: int, u0: int, out: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: int) -> tuple[Array, int, int]:
     """Return the parts of a pixel, making them from its one value where it has none yet: parts, slot, count."""
-    s = slot[v, u]
-    if s < 0:
-        if count == fine.shape[0]:
-            grown = np.empty((2 * count, SUB, SUB))
-            grown[:count] = fine
-            fine = grown
-        s = count
-        count += 1
-        slot[v, u] = s
-        for a in range(SUB):
-            for b in range(SUB):
-                fine[s, a, b] = coarse[v, u]
-    return fine, s, count
+    if slot[v, u] >= 0:
+        return fine, slot[v, u], count
+    if count == fine.shape[0]:
+        grown = np.empty((2 * count, SUB, SUB))
+        grown[:count] = fine
+        fine = grown
+    fine[count] = coarse[v, u]
+    slot[v, u] = count
+    return fine, count, count + 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -237,7 +224,7 @@ def _corners(top: Array, bottom: Array, k: int, c: Array) -> None:
 def _paint_parts(fan: Array, cells: Slots, grid: Grid, disc: Array, parts: Array, buffer: Array) -> None:
     """Repaint the parts (SUB, SUB) of a pixel whose part corners lie at fan (SUB + 1, SUB + 1, 3) of the plane."""
     xe, ye, values = grid
-    c, p, q = buffer[5, :4, :3], buffer[6, 0], buffer[6, 1]
+    c = buffer[5, :4, :3]
     for a in range(SUB + 1):
         if disc.size == 0:
             _cells(fan[a], SUB + 1, xe, ye, cells[a])
@@ -245,7 +232,7 @@ def _paint_parts(fan: Array, cells: Slots, grid: Grid, disc: Array, parts: Array
         for b in range(SUB):
             if disc.size > 0:
                 _corners(fan[a], fan[a + 1], b, c)
-                parts[a, b] += _circle_share(c, disc, p, q) * (disc[3] - parts[a, b])
+                parts[a, b] += _circle_share(c, disc, _LINES, buffer) * (disc[3] - parts[a, b])
                 continue
             span = _span(cells[a], cells[a + 1], b)
             if not _uniform(values, span):
@@ -281,7 +268,7 @@ def paint(
     top, bottom = np.empty((n + 1, 3)), np.empty((n + 1, 3))
     top_cells, bottom_cells = np.zeros((n + 1, 2), np.int32), np.zeros((n + 1, 2), np.int32)
     c, fan, fan_cells = np.empty((4, 3)), np.empty((SUB + 1, SUB + 1, 3)), np.zeros((SUB + 1, SUB + 1, 2), np.int32)
-    buffer, nothing = np.empty((7, _VERTICES, 5)), np.empty(0)
+    buffer = np.empty((7, _VERTICES, 5))
     for v in range(v0, v1):
         M = Ms[min(v, Ms.shape[0] - 1)]
         if v == v0 or Ms.shape[0] > 1:  # each row of a rolling shutter sees its own plane
@@ -295,7 +282,7 @@ def paint(
                 continue
             if disc.size > 0:
                 _corners(top, bottom, k, c)
-                share = _circle_share(c, disc, nothing, nothing)
+                share = _circle_share(c, disc, 0, buffer)
                 if share == 0.0:
                     continue
                 whole, value = share == 1.0, disc[3]
