@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 PAGE = "index.html"
 #: Name -> how it is drawn (None where there is nothing to draw) and what it shows, for who cannot see it.
 FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
-    "coverage": (coverage_figure, "Maps of both images: how many corners were in which part"),
-    "residuals": (residuals_figure, "Residual vectors over both images, every corner and averaged by region"),
+    "coverage": (coverage_figure, "Maps of both images: how many points were seen in which part"),
+    "residuals": (residuals_figure, "Residual vectors over both images, every point and averaged by region"),
     "pairs": (pairs_figure, "Bars: held-out epipolar and rigid error of every pair"),
     "volume": (volume_figure, "Maps of the predicted depth and lateral sigma over a slice of the volume"),
     "board": (board_figure, "Map of the board's deviation from its drawing"),
@@ -60,10 +60,12 @@ thead th { color: var(--muted); font-weight: 500; } tbody th { font-weight: 550;
 table.headline td:nth-child(-n+4), table.headline th { white-space: nowrap; }
 table.headline td { font-variant-numeric: tabular-nums; } table.headline td:last-child { color: var(--muted); }
 table.headline { font-weight: 400; font-size: .95rem; }
+table.words th { font-weight: 400; } table.words td { min-width: 18rem; }
 table.numbers tbody th { white-space: nowrap; } table.numbers td { font-variant-numeric: tabular-nums; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
+@media (max-width: 48rem) { table { display: block; overflow-x: auto; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } figure { break-inside: avoid; } }
 """
 

@@ -89,7 +89,7 @@ def png(figure: Figure) -> bytes:
 
 def plain(name: str, most: int = 60) -> str:
     """Return a name that can be printed anywhere: no broken Unicode, no control characters, shortened in its middle."""
-    name = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+    name = "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in name)
     return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-(most // 2) :]}"
 
 

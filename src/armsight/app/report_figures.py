@@ -5,6 +5,7 @@ Every function takes the calibration and returns a matplotlib Figure.
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,9 @@ _LEAST_IN_CELL, STANDS_OUT = 5, 4.0
 _ARROW_SHARE = 0.035
 #: More pairs than this are not drawn one by one: the worst are.
 MOST_BARS = 60
+#: More residuals than this are not drawn one by one: a random choice is.
+MOST_ARROWS = 3000
+_MOST_LETTERS = 50
 #: A pair whose error is this many times the median stands out.
 OUTSTANDING = 2.5
 
@@ -76,7 +80,7 @@ def coverage_figure(calibration: Calibration) -> Figure:
         )
         uv, _ = corners(calibration, side)
         axes.plot(*uv.T, ".", color=INK, markersize=1.2, alpha=0.45)
-    bar = figure.colorbar(mesh, ax=panels, label="corners in a cell", shrink=0.8, aspect=25)
+    bar = figure.colorbar(mesh, ax=panels, label="points in a cell", shrink=0.8, aspect=25)
     bar.ax.set_ylim(1, max(most, 2))
     bar.outline.set_visible(False)
     return figure
@@ -110,8 +114,10 @@ def residuals_figure(calibration: Calibration) -> Figure:
     for side, name in enumerate(SIDES):
         uv, residuals = every[side]
         rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
-        _image_axes(panels[0, side], calibration, side, f"{name}, every corner, x{enlarged:g} (RMS {rms:.3f} px)")
-        arrows(panels[0, side], uv, residuals, enlarged, BLUE, 0.0016, "px", 0.045)
+        shown = np.random.default_rng(0).permutation(len(uv))[:MOST_ARROWS]
+        which = "every point" if len(shown) == len(uv) else f"{MOST_ARROWS} points"
+        _image_axes(panels[0, side], calibration, side, f"{name}, {which}, x{enlarged:g} (RMS {rms:.3f} px)")
+        arrows(panels[0, side], uv[shown], residuals[shown], enlarged, BLUE, 0.0016, "px", 0.045)
         uv, mean, errors = means[side]
         out = errors > STANDS_OUT
         title = f"{name}, regional mean, x{enlarged_mean:g} ({out.sum()} of {len(out)} stand out)"
@@ -145,7 +151,8 @@ def pairs_figure(calibration: Calibration) -> Figure:
         usual = float(np.median(value))
         colours = [ORANGE if v > OUTSTANDING * usual else BLUE for v in value[order]]
         axes.barh(range(len(names)), value[order], color=colours, height=0.7)
-        axes.axvline(mean, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.plot([mean, mean], [-0.6, len(names) - 0.4], color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.set_xlim(0, 1.06 * max(value.max(), mean))
         axes.set_title(f"held-out {label} (dashed: RMS of all, {mean:.3g})")
         axes.tick_params(axis="y", length=0)
         axes.grid(axis="x", color="#e4e7eb", linewidth=0.7)
@@ -153,10 +160,10 @@ def pairs_figure(calibration: Calibration) -> Figure:
         axes.spines["left"].set_visible(False)
     for k, pair in enumerate(rejected, start=len(names)):
         for axes in panels:
-            axes.axhspan(k - 0.45, k + 0.45, color=EMPTY, linewidth=0, zorder=3)
+            axes.axhspan(k - 0.45, k + 0.45, color=EMPTY, linewidth=0)
         transform = panels[0].get_yaxis_transform()
-        reason = f"not used: {plain(pair.reason, 60)}"
-        panels[0].text(0.01, k, reason, va="center", transform=transform, color=RED, parse_math=False, zorder=4)
+        reason = "not used: " + textwrap.shorten(plain(pair.reason, 500), _MOST_LETTERS, placeholder=" ...")
+        panels[0].text(0.01, k, reason, va="center", transform=transform, color=RED, fontsize=8, parse_math=False)
     names += [plain(pair.pair, 28) for pair in rejected]
     panels[0].set_yticks(range(count), names, parse_math=False)
     panels[0].set_ylim(count - 0.4, -0.6)

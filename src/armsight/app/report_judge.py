@@ -12,19 +12,25 @@ from typing import Literal
 import numpy as np
 
 from armsight.app.report_volume import board_points
+from armsight.data import Array
+from armsight.errors import InputError
 from armsight.vision.calibrate.result import Calibration
+from armsight.vision.markers.board import open_board
 
 Grade = Literal["good", "fair", "poor"]
 
 #: Up to the first a figure is good, up to the second fair. Epipolar error: sharp corners of a still board give 0.05 to
-#: 0.3 px; beyond 1 px something is wrong with the images, not with the noise.
-EPIPOLAR_PX = (0.3, 1.0)
+#: 0.3 px; beyond 1 px something is wrong with the images, not with the noise. In proportion where the image's longer
+#: side is more than that many pixels, for such images are rarely sharp to the pixel.
+EPIPOLAR_PX, LARGE_PX = (0.3, 1.0), 1280
 #: Held-out over fitted epipolar RMS: how much the fit has learned its own pairs by heart.
 OVERFIT = (1.25, 2.0)
 #: Relative error of size, either sign.
 SCALE = (0.001, 0.005)
 #: Residual over predicted sigma, or its inverse: 1 is honest.
 HONESTY = (1.25, 2.0)
+#: A board or body that differs from its drawing by less was held to it, m.
+HELD_M = 1e-8
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,20 @@ class Judged:
     advice: str = ""
 
 
+def board_drawing(calibration: Calibration) -> Array | None:
+    """Return (M, 3) the drawing of the calibration board, m; None where the calibration is from a body of markers."""
+    try:
+        points = open_board(calibration.body.name).body.points
+    except InputError:
+        return None
+    return points if points.shape == calibration.body.points.shape else None
+
+
+def target(calibration: Calibration) -> str:
+    """Return what the cameras were shown, in a word."""
+    return "body" if board_drawing(calibration) is None else "board"
+
+
 def distance_m(calibration: Calibration) -> float:
     """Return the median distance of the boards from the left camera, m."""
     return float(np.median(np.linalg.norm(board_points(calibration).mean(axis=1), axis=1)))
@@ -63,7 +83,9 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
 def judged(calibration: Calibration) -> tuple[Judged, ...]:
     """Judge the held-out figures of a calibration, the most telling first."""
     h, fit = calibration.heldout, calibration.epipolar_rms_px
-    distance = distance_m(calibration)
+    distance, what = distance_m(calibration), target(calibration)
+    large = max(1.0, max(max(camera.image_size_px) for camera in calibration.rig.cameras) / LARGE_PX)
+    epipolar = (large * EPIPOLAR_PX[0], large * EPIPOLAR_PX[1])
     overfit = h.epipolar_rms_px / fit if fit > 0 else 1.0
     honesty = max(h.normalised_rms, 1 / h.normalised_rms) if h.normalised_rms > 0 else math.inf
     rows = (
@@ -71,7 +93,7 @@ def judged(calibration: Calibration) -> tuple[Judged, ...]:
             "rigid RMS",
             f"{1e3 * h.rigid_rms_m:.3g} mm",
             "–",
-            "How far triangulated points lie from where the perfect board or body has them: the error of a measured "
+            f"How far triangulated points lie from where the perfect {what} has them: the error of a measured "
             f"shape, {100 * h.rigid_rms_m / distance:.2g}% of the distance of {1e3 * distance:.0f} mm. "
             f"{_print(calibration)}Compare it with what your task needs.",
         ),
@@ -80,17 +102,17 @@ def judged(calibration: Calibration) -> tuple[Judged, ...]:
             f"{100 * h.scale_error:+.3f} %",
             "–",
             f"Whether lengths come out too long or too short; good within {100 * SCALE[0]:g}%. An error of the size you "
-            "gave for the board itself does not show here.",
+            f"gave for the {what} itself does not show here.",
             _grade(abs(h.scale_error), SCALE),
-            "measured lengths are off: check the size given for the board, and show it tilted at several distances",
+            f"measured lengths are off: check the size given for the {what}, and show it tilted at several distances",
         ),
         Judged(
             "epipolar RMS",
             f"{h.epipolar_rms_px:.3g} px",
             f"{fit:.3g} px",
-            f"Whether the two cameras agree on a point; good up to {EPIPOLAR_PX[0]:g} px for sharp corners.",
-            _grade(h.epipolar_rms_px, EPIPOLAR_PX),
-            "the two cameras disagree: hold the board still, take both images at the same moment, check that the pairs "
+            f"Whether the two cameras agree on a point; good up to {epipolar[0]:.2g} px for images of this size.",
+            _grade(h.epipolar_rms_px, epipolar),
+            f"the two cameras disagree: hold the {what} still, take both images at the same moment, check that the pairs "
             "belong together and that both images are sharp",
         ),
         Judged(
@@ -123,7 +145,7 @@ def _print(calibration: Calibration) -> str:
     deviation_mm = 1e3 * calibration.deviation_m
     if deviation_mm < 0.01:
         return ""
-    return f"It includes the {deviation_mm:.2g} mm by which the board itself differs from its drawing. "
+    return f"It includes the {deviation_mm:.2g} mm by which the {target(calibration)} itself differs from its drawing. "
 
 
 def _rescaled(calibration: Calibration) -> str:

@@ -8,11 +8,10 @@ import numpy as np
 from scipy.interpolate import griddata
 
 from armsight.app.report_draw import INK, MUTED, WIDTH_IN, arrows, new_figure, nice
+from armsight.app.report_judge import HELD_M, board_drawing
 from armsight.app.report_volume import SHARES, Slice, board_points, volume_slice
 from armsight.data import Array
-from armsight.errors import InputError
 from armsight.vision.calibrate.result import Calibration
-from armsight.vision.markers.board import open_board
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +25,8 @@ _LEAST_MM = 1e-4
 _FINE = 150
 #: Colours do not tell shares apart that are less than one part in this of the least sigma of all.
 _HARDLY = 20.0
+#: Over a greater range than this only the powers of ten are marked.
+_MANY = 500.0
 
 
 def volume_figure(calibration: Calibration) -> Figure:
@@ -35,7 +36,7 @@ def volume_figure(calibration: Calibration) -> Figure:
     boards = boards[:: len(boards) // _MOST_DOTS + 1]
     left, right, near, far = _limits(calibration, shown)
     shape = (far - near) / (right - left)
-    figure = new_figure(float(np.clip(0.56 * WIDTH_IN * shape, 4.0, 11.0)) + 1.3)
+    figure = new_figure(float(np.clip(0.56 * WIDTH_IN * shape, 2.0, 11.0)) + 1.3)
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
     panels[0, 0].set(xlim=(left, right), ylim=(near, far))
     for row, (kind, sigma) in enumerate((("depth", shown.sigma_depth_m), ("lateral", shown.sigma_lateral_m))):
@@ -47,9 +48,10 @@ def volume_figure(calibration: Calibration) -> Figure:
             _scene(axes, calibration, shown, boards)
             axes.set_title(f"{kind} sigma: {share}")
             if row == 1:
-                axes.set_xlabel(f"{'XY'[shown.axis]} of the left camera, mm")
+                axes.set_xlabel(f"{'XY'[shown.axis]}, mm")
+            axes.locator_params(axis="x", nbins=5)
             if column == 0:
-                axes.set_ylabel("Z of the left camera, mm")
+                axes.set_ylabel("Z, mm")
         bar = figure.colorbar(filled, ax=panels[row], ticks=round_steps(low, high), format="%g", aspect=18, pad=0.01)
         bar.set_label(f"{kind} sigma, mm")
         bar.minorticks_off()
@@ -92,9 +94,10 @@ def _contours(axes: Axes, shown: Slice, millimetres: Array, low: float, high: fl
 
 
 def round_steps(low: float, high: float) -> list[float]:
-    """Return the values 1, 2, 5 times a power of ten from ``low`` to ``high``."""
+    """Return the values 1, 2, 5 times a power of ten from ``low`` to ``high``; of many, the powers of ten alone."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    return [m * 10.0**k for k in powers for m in (1, 2, 5) if low <= m * 10.0**k <= high]
+    factors = (1, 2, 5) if high < _MANY * low else (1,)
+    return [m * 10.0**k for k in powers for m in factors if low <= m * 10.0**k <= high]
 
 
 def _scene(axes: Axes, calibration: Calibration, shown: Slice, boards: Array) -> None:
@@ -109,21 +112,10 @@ def _scene(axes: Axes, calibration: Calibration, shown: Slice, boards: Array) ->
     axes.set_aspect("equal")
 
 
-def drawn_board(calibration: Calibration) -> Array | None:
-    """Return (M, 3) the drawing of the board that was estimated, m; None where it was held fixed or is no board."""
-    if not calibration.deviation_m > 0:
-        return None
-    try:
-        points = open_board(calibration.body.name).body.points
-    except InputError:
-        return None  # a body of markers, not a board
-    return points if points.shape == calibration.body.points.shape else None
-
-
 def board_figure(calibration: Calibration) -> Figure | None:
     """How the board as estimated differs from its drawing: colour out of the plane, arrows within it, mm; None without."""
-    drawing = drawn_board(calibration)
-    if drawing is None:
+    drawing = board_drawing(calibration)
+    if drawing is None or calibration.deviation_m < HELD_M:
         return None
     at, off = 1e3 * drawing[:, :2], 1e3 * (calibration.body.points - drawing)
     extent = np.ptp(at, axis=0)

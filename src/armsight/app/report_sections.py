@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from armsight.app.report_figures import MOST_BARS, OUTSTANDING, STANDS_OUT
-from armsight.app.report_judge import advice, verdict
+from armsight.app.report_judge import advice, target, verdict
 from armsight.app.report_tables import (
     bullets,
     cameras_table,
@@ -51,7 +51,10 @@ def result(calibration: Calibration, figures: Figures) -> str:
     used, found = len(calibration.pairs), calibration.pairs_found
     parts.append("<h3>Pairs that were not used</h3>\n")
     if calibration.rejected:
-        rows = [(text(pair.pair), text(pair.reason)) for pair in calibration.rejected]
+        reasons: dict[str, list[str]] = {}
+        for pair in calibration.rejected:
+            reasons.setdefault(pair.reason, []).append(pair.pair)
+        rows = [(", ".join(text(name) for name in names), text(reason)) for reason, names in reasons.items()]
         parts.append(f"<p>{used} of {found} pairs were used.</p>\n" + table(("pair", "why not"), rows, "words"))
     else:
         parts.append(f"<p>None: all {used} pairs were used.</p>\n")
@@ -62,11 +65,13 @@ def result(calibration: Calibration, figures: Figures) -> str:
 
 def coverage(calibration: Calibration, figures: Figures) -> str:
     """Return the coverage maps."""
-    see = "corners (dots) in nearly all cells of both images, right into the corners of the images. Colour counts them."
+    what = target(calibration)
+    see = (
+        f"points of the {what} (dots) in nearly all cells of both images, right into their corners. Colour counts them."
+    )
     bad = (
-        "hatched cells where you want to measure: no corner was ever there, so the lens is only guessed at. Take more "
-        "pairs with the board there, also when a part of it leaves the other image, if the board allows it. (The dark "
-        "rim around the picture of a fisheye stays empty.)"
+        "hatched cells where you want to measure: nothing was ever seen there, so the lens is only guessed at. Take more "
+        f"pairs with the {what} there. (The dark rim around the picture of a fisheye stays empty.)"
     )
     return _figure(figures, "coverage", see, bad)
 
@@ -75,14 +80,14 @@ def residuals(calibration: Calibration, figures: Figures) -> str:
     """Return the residual vectors."""
     sigma = np.sqrt(corner_variance_px2(calibration))
     see = (
-        "above, short arrows in all directions, alike in both images, as noise is: one sigma of a corner along u or v is "
-        f"{sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without order. Mind the scale over each "
-        "panel."
+        "above, short arrows in all directions, alike in both images, as noise is: one sigma of a point along u or v is "
+        f"taken to be {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without order. Mind the scale "
+        "over each panel."
     )
     bad = (
         "neighbours that point the same way, or a whirl or a star below: the lens differs from its model there, or the "
-        f"board from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. Longer arrows in "
-        "one image than in the other: that camera is out of focus, moves or is badly lit."
+        f"{target(calibration)} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
+        "Longer arrows in one image than in the other: that camera is out of focus, moves or is badly lit."
     )
     return _figure(figures, "residuals", see, bad)
 
@@ -93,6 +98,7 @@ def pairs(calibration: Calibration, figures: Figures) -> str:
     shown = len(calibration.errors.pair)
     if shown > MOST_BARS:
         see += f" Of {shown} pairs the {MOST_BARS} with the largest rigid error are shown."
+    see += " Pairs that were not used are named below them." if calibration.rejected else ""
     bad = (
         f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
         "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
@@ -102,11 +108,12 @@ def pairs(calibration: Calibration, figures: Figures) -> str:
 
 
 def volume(calibration: Calibration, figures: Figures) -> str:
-    """Return the predicted sigma over the volume, and at the boards."""
+    """Return the predicted sigma over the volume, and where the board was."""
+    what = target(calibration)
     see = (
-        "one sigma of a triangulated point, in a slice through the middle of the boards (dots): of 100 measurements of a "
-        "point, 95 are off by less than two sigma. Depth is along the line of sight, and its sigma grows with the square "
-        "of the distance; lateral is across it, in the worse direction."
+        f"one sigma of a triangulated point, in a slice through the middle of where the {what} was (dots): of 100 "
+        "measurements of a point, 95 are off by less than two sigma. Depth is along the line of sight, and its sigma grows "
+        "with the square of the distance; lateral is across it, in the worse direction. The axes are the left camera's."
     )
     bad = (
         "a calibration's share above that of the pixel noise where you measure: more and better pairs help there, while "
@@ -115,8 +122,8 @@ def volume(calibration: Calibration, figures: Figures) -> str:
     )
     known = (
         "<p>The calibration's share is common to all points and all shots: averaging does not lessen it, but it largely "
-        "cancels between places close to each other. The noise is that of a typical corner of these images. The slice "
-        f"reaches {100 * BEYOND:.0f}% beyond the nearest and the farthest corner. An error in the size given for the board "
+        "cancels between places close to each other. The noise is that of a typical point of these images. The slice "
+        f"reaches {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the size given for the {what} "
         "comes on top.</p>\n"
     )
     if not calibration.rig.cov.any():
@@ -148,7 +155,7 @@ def numbers(calibration: Calibration, figures: Figures) -> str:
         pose_table(rig),
         "<p>± is one sigma. T_left_right is the pose of the right camera in the left camera's frame: X right, Y down, Z "
         "forward. Parameters vary together, so a single sigma may look large while what is measured is well known; the "
-        f"rig file holds the whole covariance. Noise of a corner beyond what its image tells: {rig.sigma_px:.3g} px.</p>\n",
+        f"rig file holds the whole covariance. Noise of a point beyond what the image tells: {rig.sigma_px:.3g} px.</p>\n",
     ]
     if calibration.models:
         parts.append("<h3>Distortion models tried</h3>\n" + models_table(calibration))
@@ -166,7 +173,7 @@ def provenance(calibration: Calibration, figures: Figures) -> str:
 #: Anchor -> title and text, in the page's order; a section without text is left out.
 SECTIONS: dict[str, tuple[str, Section]] = {
     "result": ("Is it good?", result),
-    "coverage": ("Where the corners were", coverage),
+    "coverage": ("What the cameras have seen", coverage),
     "residuals": ("Residuals of the fit", residuals),
     "pairs": ("Held-out errors by pair", pairs),
     "volume": ("What to expect of a measurement", volume),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.report_draw import plain
-from armsight.app.report_judge import judged
+from armsight.app.report_judge import judged, target
 from armsight.app.report_volume import SHARES, board_points, corner_variance_px2, predicted_sigmas
 from armsight.data import Array
 from armsight.geometry.pose import exp_se3
@@ -19,6 +19,7 @@ from armsight.vision.calibrate.result import Calibration, HeldOut
 from armsight.vision.rig import StereoRig
 
 _STEP_RAD = 1e-6
+_ROUNDING = 1e-12
 
 
 def text(value: object) -> str:
@@ -54,7 +55,7 @@ def headline_table(calibration: Calibration) -> str:
         for row in judged(calibration)
     ]
     fit = f"{calibration.reprojection_rms_px:.3g} px"
-    meaning = "How well the fitted model reproduces the corners it was fitted to. It says nothing about millimetres."
+    meaning = "How well the fitted model reproduces the points it was fitted to. It says nothing about millimetres."
     rows.append(("reprojection RMS", "–", fit, "", meaning))
     head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "what it tells")
     return table(head, rows, "headline")
@@ -74,7 +75,7 @@ def models_table(calibration: Calibration) -> str:
 
 def _with_sigma(value: float, sigma: float, unit: str = "") -> str:
     """Return a value to the digits its sigma allows, with the sigma; "given" where it was not estimated."""
-    if not sigma > 0:
+    if not sigma > _ROUNDING * max(abs(value), 1.0):
         return f"{value:.6g}{unit} <i>given</i>"
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
     return f"{value:.{digits}f} ± {sigma:.{digits}f}{unit}"
@@ -122,10 +123,10 @@ def sigma_table(calibration: Calibration) -> str:
     order = np.argsort(middle[:, 2])
     chosen: Array = middle[order[[0, len(order) // 2, -1]]]
     depth, lateral = predicted_sigmas(calibration.rig, chosen, corner_variance_px2(calibration))
-    rows = []
+    rows, what = [], target(calibration)
     for k, name in enumerate(("nearest", "middle", "farthest")):
         figures = [f"{1e3 * s[k]:.2g}" if np.isfinite(s[k]) else "not seen by both" for s in (*depth, *lateral)]
-        rows.append((f"{name} board, Z {1e3 * chosen[k, 2]:.0f} mm", *figures))
+        rows.append((f"{name} {what}, Z {1e3 * chosen[k, 2]:.0f} mm", *figures))
     head = ("sigma, mm", *(f"{kind}: {share}" for kind in ("depth", "lateral") for share in SHARES))
     return table(head, rows, "numbers")
 

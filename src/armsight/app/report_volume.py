@@ -18,8 +18,9 @@ from armsight.vision.triangulate import optimal_points
 
 #: What a predicted sigma is made of, in the order of the first axis of every array here.
 SHARES = ("pixel noise", "calibration", "both together")
-#: The slice goes this much nearer and farther than the boards were.
-BEYOND = 0.15
+#: The slice goes this much nearer and farther than the boards were, and beyond them to both sides by this share of their
+#: extent, as far as both cameras see.
+BEYOND, BESIDE = 0.15, 0.5
 _DEEP, _WIDE = 80, 120
 _WIDEST_TANGENT = 3.0  # of half the field of view: a fisheye's slice would else be infinitely wide
 _FINDS_BACK = (
@@ -117,7 +118,11 @@ def volume_slice(calibration: Calibration) -> Slice:
     middle = boards.mean(axis=1)
     slope = float(np.median(middle[:, 1 - axis] / middle[:, 2]))
     low, high = _view(rig, axis)
-    sideways = depth[-1] * np.linspace(low, high, _WIDE)
+    across = boards[..., axis]
+    margin = BESIDE * float(np.ptp(across))
+    sideways = np.linspace(
+        max(depth[-1] * low, float(across.min()) - margin), min(depth[-1] * high, float(across.max()) + margin), _WIDE
+    )
     p = np.empty((_DEEP, _WIDE, 3))
     p[..., axis], p[..., 1 - axis], p[..., 2] = sideways, (slope * depth)[:, None], depth[:, None]
     along, across = predicted_sigmas(rig, p.reshape(-1, 3), corner_variance_px2(calibration))
