@@ -8,7 +8,9 @@ the two, which is why the name says whose upright is meant.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,8 +73,26 @@ def _detector(family: str, perimeter_share: float, border: int) -> cv2.aruco.Aru
     return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
 
 
+def detect_markers(
+    image: NDArray[np.uint8], family: str, border: int = 1
+) -> tuple[Sequence[NDArray[Any]], NDArray[Any]]:
+    """Find the markers of a family as OpenCV gives them.
+
+    Args:
+        image: (H, W) grey image.
+        family: a name of FAMILIES.
+        border: width of the markers' dark border, cells.
+
+    Returns:
+        (1, 4, 2) corners of each marker, in OpenCV's order whatever the family; (n, 1) identities.
+    """
+    share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
+    corners, identities, _ = _detector(family, share, border).detectMarkers(image)
+    return corners, np.zeros((0, 1), np.int32) if identities is None else np.asarray(identities).reshape(-1, 1)
+
+
 def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list[tuple[int, Array]]:
-    """Find the markers of a family.
+    """Find the markers of a family, upright as its name has it.
 
     Args:
         image: (H, W) grey image.
@@ -83,12 +103,19 @@ def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list
         Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
         left of the upright marker.
     """
-    share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
-    corners, identities, _ = _detector(family, share, border).detectMarkers(image)
-    if identities is None:
-        return []
     turn = 2 if family in APRILTAGS else 0
+    corners, identities = detect_markers(image, family, border)
     return [
         (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -turn, axis=0))
-        for identity, found in zip(np.ravel(identities), corners, strict=True)
+        for identity, found in zip(identities[:, 0], corners, strict=True)
     ]
+
+
+@lru_cache(maxsize=64)
+def charuco_detector(
+    size: tuple[int, int], square_m: float, marker_m: float, family: str, legacy: bool
+) -> cv2.aruco.CharucoDetector:
+    """Make OpenCV's detector of a charuco board: squares columns x rows, and whether the layout is that before 4.6."""
+    board = cv2.aruco.CharucoBoard(size, square_m, marker_m, _dictionary(family))
+    board.setLegacyPattern(legacy)
+    return cv2.aruco.CharucoDetector(board)

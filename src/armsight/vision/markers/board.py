@@ -10,7 +10,10 @@ from typing import Protocol
 
 from armsight.data import Ids
 from armsight.errors import InputError
+from armsight.vision.markers.aprilgrid import AprilGrid
+from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.markers.circles import CircleGrid
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
@@ -31,6 +34,10 @@ class Board(Target, Protocol):
 #: Kind -> (form, maker).
 BOARDS: dict[str, tuple[str, Callable[[Fields], Board]]] = {
     "chessboard": (Chessboard.form, Chessboard.from_fields),
+    "charuco": (Charuco.form, Charuco.from_fields),
+    "circles": (CircleGrid.form, CircleGrid.from_fields),
+    "acircles": (CircleGrid.staggered_form, CircleGrid.staggered_from_fields),
+    "aprilgrid": (AprilGrid.form, AprilGrid.from_fields),
 }
 
 

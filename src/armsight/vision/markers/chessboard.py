@@ -73,9 +73,8 @@ class Chessboard(Record):
         rough = find_grid(image, self.columns, self.rows)
         if rough is None:
             return Detections.none(f"no chessboard of {self.columns}x{self.rows} inner corners found")
-        first = _fit(image, rough)
-        fits = _fit(image, np.where(first.kept[:, None], first.uv, rough.reshape(-1, 2)).reshape(rough.shape))
-        kept = fits.kept & ~_misfits(fits) & self._colours_agree(fits)
+        fits = fit_grid(image, rough)
+        kept = fits.kept & ~misfits(fits) & self._colours_agree(fits)
         if kept.sum() < max(4, KEPT_SHARE * kept.size):
             return Detections.none(_why_not(fits, int(kept.sum())))
         order = self._canonical_order(fits)
@@ -132,13 +131,26 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     return uv if handed > 0 else np.ascontiguousarray(uv[:, ::-1])
 
 
-def _fit(image: NDArray[np.uint8], uv: Array) -> CornerFits:
-    """Fit the corners of a grid (rows, columns, 2), each window shaped by the neighbours."""
-    squares, bows = local_squares(uv)
-    return refine_corners(image, uv.reshape(-1, 2), squares.reshape(-1, 2, 2), bows.reshape(-1, 2, 2))
+def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> CornerFits:
+    """Fit the corners of a grid, each window shaped by its neighbours: roughly first, then by what that found.
+
+    Args:
+        image: (H, W) grey image.
+        rough: (rows, columns, 2) rough places, px; NaN where there is none.
+        arm: as :func:`~armsight.vision.markers.corner.refine_corners` takes it.
+
+    Returns:
+        The fits row by row; one without a rough place is not kept.
+    """
+    uv = rough
+    for first in (True, False):
+        squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv))
+        fits = refine_corners(image, uv.reshape(-1, 2), squares, None if first else bows, arm=arm, rough=first)
+        uv = np.where(fits.kept[:, None], fits.uv, rough.reshape(-1, 2)).reshape(rough.shape)
+    return fits
 
 
-def _misfits(fits: CornerFits) -> NDArray[np.bool_]:
+def misfits(fits: CornerFits) -> NDArray[np.bool_]:
     """(N,) whether a corner's residual, relative to its contrast, is far off the others'."""
     relative = fits.residual / np.maximum(np.abs(fits.contrast), 1e-9)
     usual = float(np.median(relative[fits.kept])) if fits.kept.any() else 0.0

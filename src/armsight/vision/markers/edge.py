@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from scipy.special import erf
 
-_TABLE_STEP, REACH = 1.0 / 256.0, 5.0
+_TABLE_STEP, REACH = 1.0 / 256.0, 4.0
 _z = np.arange(0.0, REACH + 2 * _TABLE_STEP, _TABLE_STEP)
 #: erf(z / sqrt 2) and the normal density over z >= 0; linear interpolation is good to 1e-6.
 _ERF, _PHI = erf(_z / np.sqrt(2.0)), np.exp(-0.5 * _z * _z) / np.sqrt(2.0 * np.pi)

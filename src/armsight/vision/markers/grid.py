@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 from armsight.data import Array, Ids
@@ -66,7 +67,7 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
             bend = after - before
             bend -= (bend * unit).sum(axis=-1, keepdims=True) * unit
             bow = bend / (np.linalg.norm(steps, axis=-1) ** 2).sum(axis=0)[..., None]
-        bows[..., side, :] = _extended(bow, axis)
+        bows[..., side, :] = _smoothed(_extended(bow, axis))
     missing = ~np.isfinite(squares).all(axis=(-1, -2)) & np.isfinite(uv[..., 0])
     if missing.any():
         squares[missing] = _homography_squares(uv, missing)
@@ -74,11 +75,20 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
 
 
 def _extended(bow: Array, axis: int) -> Array:
-    """Give the ends of each line the bow of the point beside them, and zero where none is known."""
+    """Give the ends of each line the bow of the point beside them."""
     bow = np.array(np.moveaxis(bow, axis, 0))
     if len(bow) >= 3:
         bow[0], bow[-1] = bow[1], bow[-2]
-    return np.moveaxis(np.nan_to_num(bow, nan=0.0), 0, axis)
+    return np.moveaxis(bow, 0, axis)
+
+
+def _smoothed(bow: Array) -> Array:
+    """Average bow (rows, columns, 2) over each point and its known neighbours: lenses bow lines slowly over the image."""
+    known = np.isfinite(bow[..., :1]).astype(np.float64)
+    total, count = (
+        uniform_filter(array, size=(3, 3, 1), mode="constant") for array in (np.nan_to_num(bow, nan=0.0), known)
+    )
+    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 1e-9))
 
 
 def _homography_squares(uv: Array, where: NDArray[np.bool_]) -> Array:

@@ -69,23 +69,23 @@ def invert(L: Array, inverse: Array) -> None:
         inverse[i] = x
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
 def edge_noise(n: int, J: Array, r: Array, inverse: Array, first: int, second: int) -> float:
     """Estimate the variance of the noise from residuals r (n,) where it matters to two parameters, those of place.
 
     The mean squared residual, each divided by what the fit leaves of it (1 - leverage) and weighted by how much its
-    pixel says about the two parameters: flat areas, saturated ones above all, must not speak for the edges. No
-    image is known better than its quantisation.
+    pixel says about the two parameters: flat areas, saturated ones above all, must not speak for the edges. No image is
+    known better than its quantisation.
     """
+    leverage = np.zeros(n)
+    for i in range(len(J)):
+        for j in range(i + 1):
+            share = inverse[i, i] if i == j else 2.0 * inverse[i, j]
+            for m in range(n):
+                leverage[m] += share * J[i, m] * J[j, m]
     weight, power = 0.0, 0.0
     for m in range(n):
-        leverage = 0.0
-        for i in range(len(J)):
-            s = 0.5 * inverse[i, i] * J[i, m]
-            for j in range(i):
-                s += inverse[i, j] * J[j, m]
-            leverage += 2.0 * s * J[i, m]
         w = J[first, m] ** 2 + J[second, m] ** 2
-        weight += w * (1.0 - leverage)
+        weight += w * (1.0 - leverage[m])
         power += w * r[m] ** 2
     return float(max(power / weight, 1.0 / 12.0))

@@ -64,13 +64,16 @@ class SquareFit(Record):
     problem: str | None
 
 
-def place_square(image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8]) -> SquareFit:
+def place_square(
+    image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8], diagonal: int | None = None
+) -> SquareFit:
     """Fit one marker.
 
     Args:
         image: (H, W) grey image.
         corners: (4, 2) rough corners, raw pixels: those of the cells' upper left, upper right, lower right, lower left.
         cells: (N, N) the marker's cells, its dark border included: 1 bright, -1 dark.
+        diagonal: what meets the marker at its corners, as a cell's colour; unknown by default, and then not looked at.
 
     Returns:
         The placed corners, or why they cannot be.
@@ -78,7 +81,7 @@ def place_square(image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int
     cell = float(np.mean(np.linalg.norm(np.diff(corners, axis=0, append=corners[:1]), axis=1))) / len(cells)
     here, blur, pixels = corners, START_BLUR_CELLS * cell, PIXELS_FIRST
     for _ in range(_ROUNDS):
-        fit = _fit_from(image, here, cells, max(1.0, blur), pixels)
+        fit = _fit_from(image, here, cells, diagonal, max(1.0, blur), pixels)
         if fit.problem is not None:
             return fit
         moved = np.linalg.norm(fit.uv - here, axis=1).max()
@@ -90,11 +93,13 @@ def place_square(image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int
     return _bad(corners, "no convergence")
 
 
-def _fit_from(image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8], blur: float, pixels: int) -> SquareFit:
+def _fit_from(
+    image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8], diagonal: int | None, blur: float, pixels: int
+) -> SquareFit:
     """Fit one marker's field over the homography of given corners, starting at a blur in px."""
     size = len(cells)
     H: Array = cv2.getPerspectiveTransform(corners.astype(np.float32), _CORNERS.astype(np.float32)).astype(np.float64)
-    px = _gather(image, corners, H, size, pixels)
+    px = _gather(image, corners, H, size, diagonal is not None, pixels)
     if px is None or px.shape[1] < 3 * PARAMETERS:
         return _bad(corners, "too small or too near the image border")
     low, high = np.percentile(px[0], (5, 95))
@@ -104,7 +109,9 @@ def _fit_from(image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8],
     prior[8:FIELD, 1] = (_PRIOR_NOISE * 0.5 / (_BOW_PER_PX * side)) ** 2
     prior[FIELD] = _BLUR2_PRIOR[0], _BLUR2_PRIOR[1] ** -2
     prior[FIELD + 2, 1] = (_PRIOR_NOISE / (_BLEED_SHARE * max(q[FIELD + 1], 1.0))) ** 2
-    variance = fit_pattern(px.shape[1], px, np.pad(cells.astype(np.float64), 2, constant_values=1.0), prior, q, inverse)
+    grid = np.pad(cells.astype(np.float64), 2, constant_values=1.0)
+    grid[np.ix_((0, 1, -2, -1), (0, 1, -2, -1))] = 1.0 if diagonal is None else diagonal
+    variance = fit_pattern(px.shape[1], px, grid, prior, q, inverse)
     if variance < 0.0:
         return _bad(corners, "no convergence")
     if not np.sqrt(variance) <= MISFIT_MAX * q[FIELD + 1]:
@@ -118,7 +125,7 @@ def _bad(corners: Array, problem: str) -> SquareFit:
     return SquareFit(corners, np.zeros((4, 2, 2)), problem)
 
 
-def _gather(image: NDArray[np.uint8], corners: Array, H: Array, size: int, pixels: int) -> Array | None:
+def _gather(image: NDArray[np.uint8], corners: Array, H: Array, size: int, whole: bool, pixels: int) -> Array | None:
     """Collect the pixels of a marker and its margin, (8, n) as ``fit_pattern`` takes them."""
     cell = float(np.sqrt(abs(cv2.contourArea(corners.astype(np.float32))))) / size
     margin = np.clip(1.0 - MARGIN_GAP_PX / max(cell, 1e-9), *MARGIN_CELLS)
@@ -131,8 +138,8 @@ def _gather(image: NDArray[np.uint8], corners: Array, H: Array, size: int, pixel
     v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
     p = H / (H[2] @ [*corners.mean(axis=0), 1.0]) @ np.stack([u, v, np.ones(len(u))])  # positive before the horizon
     xy = p[:2] / p[2]
-    outside = np.abs(xy) > 1.0
-    inside = (p[2] > 0) & (np.abs(xy) <= reach).all(axis=0) & ~outside.all(axis=0)  # diagonal neighbours are unknown
+    beyond = (np.abs(xy) > 1.0).all(axis=0)  # what meets the marker at its corners
+    inside = (p[2] > 0) & (np.abs(xy) <= reach).all(axis=0) & (whole | ~beyond)
     chosen = np.flatnonzero(inside)
     if len(chosen) > pixels:
         chosen = chosen[np.linspace(0, len(chosen) - 1, pixels).astype(int)]

@@ -1,0 +1,119 @@
+"""Kalibr's grids of AprilTags: ``aprilgrid:6x6:88mm:0.3``, tags columns x rows, side of a tag, gap as a share of the side.
+
+As Kalibr prints and counts them: family 36h11 with a dark border of two cells, tags numbered row by row from the lower
+left, a small dark square where four tags meet. Points are all tags' corners, row by row from the lower left; x runs
+along the columns to the right, y up, z out of the board. Every tag says who it is, so no order is ambiguous and part of
+the board will do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.vision.markers.aruco import cells, family_size, find_squares
+from armsight.vision.markers.spec import Fields
+from armsight.vision.markers.square import SquareFit, place_square
+
+FAMILY = "tag36h11"
+#: Widths of the dark border, cells, in the order they are tried: Kalibr's own, then that of single AprilTags.
+BORDERS = (2, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class AprilGrid(Record):
+    """A grid of AprilTags.
+
+    Attributes:
+        columns: tags along x.
+        rows: tags along y.
+        tag_m: side of a tag, m.
+        spacing: gap between tags as a share of their side.
+    """
+
+    columns: int
+    rows: int
+    tag_m: float
+    spacing: float
+
+    form = "aprilgrid:COLUMNSxROWS:TAG:SPACING (tags; gap as a share of the tag), such as aprilgrid:6x6:88mm:0.3"
+    flips: tuple[Ids, ...] = ()
+
+    @staticmethod
+    def from_fields(fields: Fields) -> AprilGrid:
+        """Build the board a spec names."""
+        columns, rows = fields.counts(0, least=1)
+        if columns * rows > family_size(FAMILY):
+            raise fields.error(f"has {columns * rows} tags, and {FAMILY} has {family_size(FAMILY)}")
+        return AprilGrid(columns, rows, fields.length_m(1), fields.ratio(2))
+
+    @cached_property
+    def body(self) -> Body:
+        """The corners of all tags, m, z = 0, named by their number."""
+        steps = [
+            (np.arange(count)[:, None] * (1.0 + self.spacing) + np.array([0.0, 1.0])).ravel() * self.tag_m
+            for count in (self.columns, self.rows)
+        ]
+        y, x = np.meshgrid(steps[1], steps[0], indexing="ij")
+        points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        name = f"aprilgrid:{self.columns}x{self.rows}:{self.tag_m * 1e3:g}mm:{self.spacing:g}"
+        return Body(name, tuple(str(i) for i in range(len(points))), points)
+
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
+        found: list[tuple[int, Array]] = []
+        border = BORDERS[0]
+        for border in BORDERS:
+            found = [tag for tag in find_squares(image, FAMILY, border) if tag[0] < self.columns * self.rows]
+            if found:
+                break
+        identities = [identity for identity, _ in found]
+        placed: dict[int, SquareFit] = {}
+        for identity, corners in found:
+            if identities.count(identity) == 1:
+                self._place(image, identity, corners, border, placed)
+        for identity, corners in self._overlooked(placed, image.shape):
+            self._place(image, identity, corners, border, placed)
+        if not placed:
+            return Detections.none(f"no tag of {self.body.name} found")
+        ids = np.concatenate([self._corner_ids(identity) for identity in placed])
+        order = np.argsort(ids)
+        uv, cov = (np.concatenate([getattr(fit, key) for fit in placed.values()])[order] for key in ("uv", "cov_uv"))
+        return Detections(ids[order], uv, cov)
+
+    def _place(
+        self, image: NDArray[np.uint8], identity: int, corners: Array, border: int, placed: dict[int, SquareFit]
+    ) -> None:
+        """Fit one tag and add it to those placed if it is good."""
+        fit = place_square(image, corners, cells(FAMILY, identity, border), diagonal=-1)
+        if fit.problem is None:
+            placed[identity] = fit
+
+    def _overlooked(self, placed: dict[int, SquareFit], shape: tuple[int, ...]) -> list[tuple[int, Array]]:
+        """Say where tags must be that were not found, if they are in the image: dark squares that touch hide outlines."""
+        missing = [identity for identity in range(self.columns * self.rows) if identity not in placed]
+        if not placed or not missing:
+            return []
+        seen = np.concatenate([self.body.points[self._corner_ids(identity), :2] for identity in placed])
+        H, _ = cv2.findHomography(seen, np.concatenate([fit.uv for fit in placed.values()]))
+        if H is None:
+            return []
+        out = []
+        for identity in missing:
+            p = np.column_stack([self.body.points[self._corner_ids(identity), :2], np.ones(4)]) @ H.T.astype(np.float64)
+            corners: Array = p[:, :2] / p[:, 2:]
+            if (p[:, 2] > 0).all() and (corners > 0).all() and (corners < np.array(shape[1::-1]) - 1).all():
+                out.append((identity, corners))
+        return out
+
+    def _corner_ids(self, identity: int) -> Ids:
+        """Return (4,) the points that are a tag's upper left, upper right, lower right and lower left corner."""
+        row, column = divmod(identity, self.columns)
+        low = 2 * row * 2 * self.columns + 2 * column
+        high = low + 2 * self.columns
+        return np.array([high, high + 1, low + 1, low])
