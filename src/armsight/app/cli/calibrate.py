@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from armsight.app.cli.progress import bar, steps
+from armsight.app.report import report_folder, write_report
 from armsight.data import SIDES, Detections
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -82,6 +83,8 @@ def command(
         raise InputError("--refine-body goes with --detections; a board in images is estimated by itself")
     for path in (out, *([refine_body] if refine_body else [])):
         check_writable(path)
+    if report is not None:
+        report_folder(report)
     started = time.perf_counter()
     if left is not None and right is not None and board is not None:
         models = MODELS if model is None else (model,)
@@ -96,13 +99,11 @@ def command(
             )
         said = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
     calibration = replace(calibration, rig=replace(calibration.rig, provenance=_provenance(said, calibration)))
-    if report is not None:
-        from armsight.app.report import write_report
-
-        write_report(calibration, report)
     if refine_body is not None:
         save_body_csv(calibration.body, refine_body)
     calibration.rig.save(out)
+    if report is not None:
+        write_report(calibration, report)
     if as_json:
         click.echo(json.dumps(_summary(calibration, out, report, time.perf_counter() - started)))
     else:

@@ -18,6 +18,7 @@ from armsight.errors import ArmsightError
 COMMANDS = {
     "calibrate": "calibrate",
     "cameras": "cameras",
+    "demo": "demo",
     "measure": "measure",
     "record": "record",
     "rig": "rig",

@@ -36,7 +36,7 @@ from armsight.vision.shape import smooth
 MODELS = ("brown4", "brown5", "brown8", "fisheye")
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which no other program takes for
 #: an ordinary lens, by more.
-WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.01, "fisheye": 0.05}
+WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
 #: Degree of the polynomials in which a printed board may differ from its drawing.
 BOARD_DEGREE = 4
 #: How far a board is thought to differ from its drawing at first, RMS of one mode, as a share of its diagonal, and the

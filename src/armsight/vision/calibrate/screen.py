@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, transform
-from armsight.vision.bundle import Model, Observations, Solution, State, minimise, whiteners
+from armsight.vision.bundle import Model, Observations, Solution, State, minimise
 from armsight.vision.calibrate.result import Rejected
 from armsight.vision.camera import Camera
 from armsight.vision.pnp import body_poses
@@ -94,7 +94,7 @@ def screen(model: Model, start: State, observations: Observations, names: tuple[
         solution = minimise(model, state, now, sigma)
         new_sigma = robust_sigma(solution)
         distance = np.full(len(good), np.nan)
-        distance[rows] = _whitened(solution, now, new_sigma)
+        distance[rows] = _whitened(solution, now)
         good &= ~(distance > CORNER_SIGMAS)
         bad = _bad_pairs(observations, kept, distance, good)
         rejected += [Rejected(names[j], reason) for j, reason in bad.items()]
@@ -126,10 +126,11 @@ def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArr
     )
 
 
-def _whitened(solution: Solution, observations: Observations, sigma_px: float) -> Array:
-    """(N,) whitened distance of every detection."""
-    r = (whiteners(observations, sigma_px) @ solution.residuals_px[..., None])[..., 0]
-    return np.asarray(np.linalg.norm(r, axis=1))
+def _whitened(solution: Solution, observations: Observations) -> Array:
+    """(N,) distance of every detection in standard deviations of its own camera, one of which may be the noisier."""
+    distance = np.linalg.norm(solution.residuals_px, axis=1)
+    sigma = [np.sqrt(np.median(distance[observations.camera == side] ** 2) / _MEDIAN_CHI2_2) for side in (0, 1)]
+    return np.asarray(distance / np.maximum(np.array(sigma)[observations.camera], 1e-9))
 
 
 def _bad_pairs(

@@ -9,7 +9,7 @@ from armsight.vision.calibrate.result import Calibration
 
 _LEAST_TILT_DEG = 15.0
 _GOOD_PAIRS = 12
-_COVERAGE_GRID = 4
+_COVERAGE_GRID = 8
 _LEAST_COVERED = 0.6
 _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
