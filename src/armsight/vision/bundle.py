@@ -22,8 +22,24 @@ from armsight.vision.camera import Camera
 #: Whitened distance at which the Cauchy loss begins to discount a detection (2.385 is 95% efficient for one residual;
 #: a two-dimensional detection needs a little more).
 CAUCHY_SCALE = 3.0
-_MAX_STEPS = 60
-_RELATIVE_DECREASE = 1e-8
+#: Rational distortion makes long curved valleys: from a rough start a hundred steps are needed now and then.
+_MAX_STEPS = 200
+_RELATIVE_DECREASE = 1e-7
+
+
+def _robust_excess() -> float:
+    """Tell how many times the inverse of the reweighted information exceeds a robust fit's covariance, noise being clean.
+
+    For an M-estimator with weight w(d^2) the covariance is E[psi^2] / E[psi']^2 times that of unit information (Huber,
+    "Robust statistics", 1981, section 6.3); for the Cauchy loss in two dimensions psi' averages to w^2. The inverse of
+    the reweighted information is 1 / E[w]. Half of d^2 is exponentially distributed: Gauss-Laguerre quadrature.
+    """
+    half_d2, density = np.polynomial.laguerre.laggauss(40)
+    w = 1.0 / (1.0 + 2 * half_d2 / CAUCHY_SCALE**2)
+    return float((density @ w**2) ** 2 / ((density @ (half_d2 * w**2)) * (density @ w)))
+
+
+_ROBUST_EXCESS = _robust_excess()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +77,8 @@ class Observations(Record):
 
     def select(self, keep: NDArray[np.bool_]) -> Observations:
         """Return the rows where ``keep`` (N,) is true; shots keep their numbers."""
-        fields = (self.shot, self.camera, self.point, self.uv, self.cov_uv)
-        return Observations(*(f[keep] for f in fields), self.shot_count)
+        shot, camera, point = self.shot[keep], self.camera[keep], self.point[keep]
+        return Observations(shot, camera, point, self.uv[keep], self.cov_uv[keep], self.shot_count)
 
     def shots(self, rows: NDArray[np.intp] | list[int]) -> Observations:
         """Return only the shots in ``rows``, renumbered in ascending order."""
@@ -214,7 +230,7 @@ class _Normal(Record):
         g = self.g_shared - np.tensordot(gain, self.g_poses, axes=((0, 1), (0, 1)))
         shared = solve_scaled(S, g)
         poses = np.linalg.solve(Hp, (self.g_poses - self.H_cross @ shared)[..., None])[..., 0]
-        return shared, poses
+        return shared, np.asarray(poses, np.float64)
 
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the poses marginalised."""
@@ -239,13 +255,13 @@ def _normal(
     r = (W @ residuals[..., None])[..., 0]
     d2 = np.einsum("ni,ni->n", r, r)
     if not np.isfinite(d2).all():
-        return _Normal(*(np.zeros(0) for _ in range(5)), cost=np.inf), residuals
+        nothing = np.zeros(0)
+        return _Normal(nothing, nothing, nothing, nothing, nothing, np.inf), residuals
     c2 = CAUCHY_SCALE**2
     weight = 1.0 / (1.0 + d2 / c2) if robust else np.ones(len(d2))
-    shape_prior = np.zeros(J_shared.shape[2])
-    shape_prior[J_shared.shape[2] - len(state.shape) :] = 1.0 / model.shape_sigma_m**2
+    prior = _prior(model, J_shared.shape[2])
     shape = np.concatenate([np.zeros(J_shared.shape[2] - len(state.shape)), state.shape])
-    cost = float((c2 * np.log1p(d2 / c2)).sum() if robust else d2.sum()) + float(shape_prior @ shape**2)
+    cost = float((c2 * np.log1p(d2 / c2)).sum() if robust else d2.sum()) + float(prior @ shape**2)
     root = np.sqrt(weight)[:, None]
     r = r * root
     A = (root[..., None] * W) @ J_shared[:, :, free]
@@ -259,15 +275,29 @@ def _normal(
         a, b, e = A[rows].reshape(m, q), B[rows].reshape(m, 6), r[rows].reshape(m)
         H_cross[j], H_poses[j], g_poses[j] = b.T @ a, b.T @ b, b.T @ e
     flat = A.reshape(2 * len(A), q)
-    H_shared = flat.T @ flat + np.diag(shape_prior[free])
-    g_shared = flat.T @ r.reshape(-1) - (shape_prior * shape)[free]
+    H_shared = flat.T @ flat + np.diag(prior[free])
+    g_shared = flat.T @ r.reshape(-1) - (prior * shape)[free]
     return _Normal(H_shared, H_cross, H_poses, g_shared, g_poses, cost), residuals
+
+
+def _prior(model: Model, count: int) -> Array:
+    """(Q,) information about each of ``count`` shared parameters before any image: the shape's."""
+    return np.concatenate([np.zeros(count - len(model.modes)), np.full(len(model.modes), 1.0 / model.shape_sigma_m**2)])
+
+
+def _covariance(normal: _Normal, prior: Array, robust: bool) -> Array:
+    """(q, q) covariance of the free shared parameters, given their prior information (q,)."""
+    S = normal.schur()
+    if robust:
+        S = _ROBUST_EXCESS * (S - np.diag(prior)) + np.diag(prior)
+    d = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    return np.asarray(d[:, None] * np.linalg.pinv(d[:, None] * S * d, rcond=1e-14, hermitian=True) * d)
 
 
 def free_parameters(model: Model, state: State) -> NDArray[np.bool_]:
     """(Q,) which shared parameters are estimated."""
     n_cameras = sum(camera.parameters.size for camera in state.cameras)
-    return np.r_[np.full(n_cameras, model.free_cameras), np.ones(6 + len(model.modes), bool)]
+    return np.concatenate([np.full(n_cameras, model.free_cameras), np.ones(6 + len(model.modes), bool)])
 
 
 def minimise(
@@ -295,8 +325,11 @@ def minimise(
         The minimum with its covariance.
 
     Raises:
-        CalibrationError: the start puts a detection behind its camera.
+        CalibrationError: the start puts a detection behind its camera, or a shot has no detections.
     """
+    empty = np.flatnonzero(np.bincount(observations.shot, minlength=observations.shot_count) == 0)
+    if len(empty):
+        raise CalibrationError(f"shot {empty[0]} of {observations.shot_count} in the adjustment has no detections")
     W = whiteners(observations, sigma_px)
     free = free_parameters(model, start) if free is None else free
     state, damping, steps = start, 1e-4, 0
@@ -320,9 +353,7 @@ def minimise(
         damping *= 10
     cov = np.zeros((len(free), len(free)))
     if free.any():
-        S = normal.schur()
-        d = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-        cov[np.ix_(free, free)] = d[:, None] * np.linalg.pinv(d[:, None] * S * d, rcond=1e-14, hermitian=True) * d
+        cov[np.ix_(free, free)] = _covariance(normal, _prior(model, len(free))[free], robust)
     return Solution(state, residuals, sigma_px, cov, normal.cost, steps)
 
 

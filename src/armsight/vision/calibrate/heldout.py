@@ -85,7 +85,8 @@ def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspo
 def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> float:
     """RMS of a rigid fit's residuals (N, 3) over their predicted sigma: pixel noise and calibration, less the fit."""
     n, gap = len(p), p - fitted
-    full = block_diag(*cov) + np.einsum("nip,pq,mjq->nimj", by_rig, cov_rig, by_rig).reshape(3 * n, 3 * n)
+    G = by_rig.reshape(3 * n, -1)
+    full = block_diag(*cov) + G @ cov_rig @ G.T
     A = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), -skew(fitted - fitted.mean(axis=0))], axis=2).reshape(3 * n, 6)
     P = np.eye(3 * n) - A @ np.linalg.pinv(A)
     variance = np.diag(P @ full @ P)

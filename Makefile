@@ -1,0 +1,32 @@
+# Two commands set everything up on a machine with Python 3.11 or newer and make: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint bench clean
+
+demo: $(VENV)/.armsight  ## calibrate and measure a rendered recording, and print the error against its truth
+	$(BIN)/armsight demo -o demo
+
+test: $(VENV)/.armsight-test lint  ## everything that must hold
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.armsight-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.armsight-test  ## ours beside OpenCV; real recordings are looked for at ARMSIGHT_DATA
+	cd benchmarks && ../$(BIN)/python calibration.py
+
+$(VENV)/.armsight: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[all]"
+	touch $@
+
+$(VENV)/.armsight-test: $(VENV)/.armsight
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo build .pytest_cache .mypy_cache .ruff_cache .hypothesis
