@@ -129,6 +129,17 @@ def test_a_straight_edge_has_its_closed_form():
             np.testing.assert_allclose(light, 0.1 + 0.8 * np.array(share), atol=LEVEL)
 
 
+def test_a_disc_has_its_area_and_its_middle():
+    cam = Camera((40, 40), "none", np.array([100.0, 100.0, 19.3, 20.1]), np.zeros(0))
+    v, u = np.mgrid[:40, :40]
+    for x, y in np.random.default_rng(0).uniform(-0.005, 0.005, (10, 2)):
+        wall = Pattern(np.array([-1.0, 1.0]), np.array([-1.0, 1.0]), np.array([[0.1]]), np.array([[x, y, 0.033, 0.9]]))
+        light = radiance(cam, [Placed((wall,), place(0, 0, 1.0))], psf_sigma_px=0.7).astype(float) - 0.1
+        assert light.sum() == pytest.approx(0.8 * np.pi * 3.3**2, rel=1e-4)
+        middle = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
+        np.testing.assert_allclose(middle, [19.3 + 100 * x, 20.1 + 100 * y], atol=3e-4)
+
+
 def test_the_nearer_body_covers_and_the_order_of_the_list_does_not_matter():
     cam = camera(size=(60, 40), focal=60.0)
     near, far = Placed((plate(0.1, 0.1, 0.8),), place(0, 0, 0.3)), Placed((plate(0.4, 0.4, 0.2),), place(0, 0, 0.6))
