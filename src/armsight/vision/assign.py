@@ -80,8 +80,8 @@ def instances(
             return bodies
         seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(best_rows)))
         bodies.append((best, seen))
-        for side, rows in enumerate(best_rows):
-            free[side][rows] = False
+        for side, taken in enumerate(best_rows):
+            free[side][taken] = False
 
 
 def _agreeing(

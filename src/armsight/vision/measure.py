@@ -75,7 +75,7 @@ def _exchanged(rig: StereoRig, body: Body, left: Detections, right: Detections) 
     if common.paired.sum() < _TELLING_POINTS:
         return False
     swapped = triangulate(rig, body, gate(rig, body, join(right, left)))
-    return len(swapped.ids) > 0.8 * common.paired.sum()
+    return len(swapped.ids) > 0.8 * int(common.paired.sum())
 
 
 def measure_seen(rig: StereoRig, body: Body, shot: SeenShot) -> PoseEstimate | Missed:

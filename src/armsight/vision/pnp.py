@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import pose, transform
@@ -46,13 +48,18 @@ def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, fl
             _, rotations, translations, _ = cv2.solvePnPGeneric(p, xy[:, None], np.eye(3), None, flags=flag)
         except cv2.error:
             continue
-        found += [pose(exp_so3(r.ravel()), t.ravel()) for r, t in zip(rotations, translations, strict=True)]
+        found += [_pose(r, t) for r, t in zip(rotations, translations, strict=True)]
     scored = []
     for T in found:
         error = camera.project(transform(T, points)) - uv
         if np.isfinite(error).all():
             scored.append((T, float(np.sqrt((error**2).sum(axis=1).mean()))))
     return sorted(scored, key=lambda candidate: candidate[1])
+
+
+def _pose(rotation: NDArray[Any], translation: NDArray[Any]) -> Array:
+    """Return OpenCV's rotation vector and translation as a pose."""
+    return pose(exp_so3(np.asarray(rotation, np.float64).ravel()), np.asarray(translation, np.float64).ravel())
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +111,7 @@ def consensus_poses(points: Array, camera: Camera, ids: Ids, uv: Array) -> list[
         if np.linalg.norm(np.cross(p[1] - p[0], p[2] - p[0])) < 1e-3 * np.ptp(points, axis=0).max() ** 2:
             continue
         _, rotations, translations = cv2.solveP3P(p, xy[triple][:, None], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
-        hypotheses += [pose(exp_so3(r.ravel()), t.ravel()) for r, t in zip(rotations, translations, strict=True)]
+        hypotheses += [_pose(r, t) for r, t in zip(rotations, translations, strict=True)]
     scored = []
     for T in hypotheses:
         rows, rms = _agreeing(points, camera, T, ids, uv)

@@ -7,6 +7,7 @@ of times: locating, trying mirror solutions, telling bodies apart.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -98,7 +99,7 @@ def fit_pose(
     n = len(p)
     weight = np.linalg.inv(sightings.cov_uv)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
-    arguments = (
+    arguments: tuple[Any, ...] = (
         np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), inverse(T_left_right), p,
         np.array(sightings.camera), np.array(sightings.uv), weight, T, robust, steps, residuals, d2, H,
     )  # fmt: skip
@@ -190,7 +191,8 @@ def _fit(
         damped[:, :] = H
         for i in range(6):
             damped[i, i] += damping * H[i, i] + 1e-300
-        _moved(T, np.linalg.solve(damped, g), trial)
+        xi: Array = np.linalg.solve(damped, g)
+        _moved(T, xi, trial)
         new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
         if new <= cost:
             done = cost - new <= _DONE * new

@@ -132,7 +132,7 @@ def _from_images(left: str, right: str, board: Board, models: tuple[str, ...], f
         return calibrate_boards(board, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
 
 
-def _same(sizes: Sizes | None, now: Sizes, left: Path, right: Path) -> Sizes:
+def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None) -> Sizes:
     """Hold every image to the size of the first one."""
     for side, path in enumerate((left, right)):
         if sizes is not None and sizes[side] != now[side]:

@@ -61,6 +61,8 @@ def command(
         check_writable(out)
     records: list[dict[str, Any]] = []
     started = time.perf_counter()
+    results: Iterator[Result]
+    total: int | None
     with contextlib.ExitStack() as stack:
         if detections is not None:
             body = open_body(target)

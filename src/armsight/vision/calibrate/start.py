@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import CalibrationError
@@ -32,7 +33,7 @@ def pinhole(image_size_px: tuple[int, int], focal_px: float, model: str) -> Came
     return Camera(image_size_px, model, intrinsics, np.zeros(DISTORTION_MODELS[model]))
 
 
-def _views(observations: Observations, side: int) -> list[Array]:
+def _views(observations: Observations, side: int) -> list[NDArray[np.intp]]:
     """Return per shot the rows of one camera's detections."""
     return [
         np.flatnonzero((observations.shot == j) & (observations.camera == side)) for j in range(observations.shot_count)

@@ -66,7 +66,7 @@ def coverage(calibration: Calibration, side: int, cells: int) -> Array:
     width, height = calibration.rig.cameras[side].image_size_px
     uv = observations.uv[observations.camera == side]
     counts, _, _ = np.histogram2d(uv[:, 1], uv[:, 0], bins=cells, range=((-0.5, height - 0.5), (-0.5, width - 0.5)))
-    return counts
+    return np.asarray(counts)
 
 
 def _focus(calibration: Calibration) -> str | None:
