@@ -99,7 +99,9 @@ def match(
         scores = []
         for candidate in candidates:
             pair = candidate.uv[candidate.paired]
-            scores.append(np.nanmedian(epipolar_distances(rig, pair[:, 0], pair[:, 1])) if len(pair) else np.inf)
+            distance = epipolar_distances(rig, pair[:, 0], pair[:, 1])
+            told = distance[np.isfinite(distance).all(axis=1)]
+            scores.append(np.median(told) if len(told) else np.inf)
         best = candidates[int(np.argmin(scores))]
     return gate(rig, body, best)
 
