@@ -73,4 +73,8 @@ def roll_pitch_yaw(R: Array) -> tuple[Array, bool]:
     pitch = np.arctan2(-R[2, 0], cos_pitch)
     if cos_pitch < SINGULAR_COS_PITCH:
         return np.array([np.arctan2(-R[0, 1], R[1, 1]), pitch, 0.0]), True
-    return np.array([np.arctan2(R[1, 0], R[0, 0]), pitch, np.arctan2(R[2, 1], R[2, 2])]), False
+    roll = np.arctan2(R[1, 0], R[0, 0])
+    # atan2(R21, R22) near +-90 degrees would not fit this roll; after taking the roll off, it does.
+    s, c = np.sin(roll), np.cos(roll)
+    yaw = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw]), False

@@ -134,7 +134,7 @@ def _estimate(
     state = State(rig.cameras, rig.T_left_right, T[None], np.zeros(0))
     rows = Observations(np.zeros(len(used.point), np.int64), used.camera, used.point, used.uv, used.cov_uv, 1)
     _, J_rig, J_pose = predict(Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False), state, rows)
-    noise: Array = np.linalg.inv(fit.information)
+    noise = np.linalg.inv(fit.information).astype(np.float64)
     weighted = np.linalg.inv(used.cov_uv) @ J_pose
     gain = noise @ np.tensordot(weighted, J_rig, axes=((0, 1), (0, 1)))
     freedom = 2 * len(used.point) - 6

@@ -191,7 +191,7 @@ def _fit(
         damped[:, :] = H
         for i in range(6):
             damped[i, i] += damping * H[i, i] + 1e-300
-        xi: Array = np.linalg.solve(damped, g)
+        xi = np.linalg.solve(damped, g).astype(np.float64)
         _moved(T, xi, trial)
         new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
         if new <= cost:
