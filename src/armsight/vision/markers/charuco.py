@@ -19,7 +19,7 @@ from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.errors import InputError
 from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size
 from armsight.vision.markers.chessboard import fit_grid, misfits
-from armsight.vision.markers.grid import grid_points
+from armsight.vision.markers.grid import completed, grid_points
 from armsight.vision.markers.spec import Fields
 
 
@@ -75,7 +75,7 @@ class Charuco(Record):
         if np.isfinite(rough[..., 0]).sum() < 4:
             return Detections.none(f"no {self.body.name} found, or fewer than 4 of its corners")
         plain = 0.5 * (1.0 - self.marker_m / self.square_m)
-        fits = fit_grid(image, rough, arm=plain)
+        fits = fit_grid(image, completed(rough), arm=plain)  # a marker that was not read hides corners that are there
         y, x = np.mgrid[: self.rows - 1, : self.columns - 1]
         colours = np.sign(fits.contrast) * np.where((x + y) % 2 == 0, 1.0, -1.0).ravel()
         agree = colours == np.sign(np.sum(colours[fits.kept]))

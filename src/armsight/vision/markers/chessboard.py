@@ -23,6 +23,8 @@ from armsight.vision.markers.spec import Fields
 
 #: Above this many pixels a side the grid is looked for in a smaller copy first; corners are placed in the full image.
 SEARCH_SIDE_PX = 1600
+#: OpenCV's finders raise errors on images smaller than their filters.
+IMAGE_SIDE_MIN_PX = 32
 #: Fewer corners than this share of the board are not taken for the board.
 KEPT_SHARE = 0.5
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, is not of a
@@ -114,6 +116,8 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
 
     The quadrangle finder takes low contrast and small squares, the saddle-point finder glints, blur and uneven light.
     """
+    if min(image.shape) < IMAGE_SIDE_MIN_PX:
+        return None
     scale = min(1.0, SEARCH_SIDE_PX / max(image.shape))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
     size, flags = (columns, rows), cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE

@@ -91,18 +91,38 @@ def _smoothed(bow: Array) -> Array:
     return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 1e-9))
 
 
+def completed(uv: Array) -> Array:
+    """Fill the unknown points of a seen grid (rows, columns, 2), NaN, where a homography of the known ones puts them."""
+    H = _homography(uv)
+    unknown = ~np.isfinite(uv[..., 0])
+    if H is None or not unknown.any():
+        return uv
+    rows, columns = np.nonzero(unknown)
+    p = np.column_stack([columns, rows, np.ones(len(rows))]) @ H.T
+    out = uv.copy()
+    out[unknown] = np.where(p[:, 2:] > 0, p[:, :2] / p[:, 2:], np.nan)
+    return out
+
+
+def _homography(uv: Array) -> Array | None:
+    """Return the homography (3, 3) from column, row to the known points of a seen grid, positive before the horizon."""
+    rows, columns = np.nonzero(np.isfinite(uv[..., 0]))
+    if len(rows) < 4:
+        return None
+    H, _ = cv2.findHomography(np.stack([columns, rows], axis=1).astype(np.float64), uv[rows, columns])
+    if H is None:
+        return None
+    return np.asarray(H * np.sign(H[2] @ [columns[0], rows[0], 1.0]), np.float64)
+
+
 def _homography_squares(uv: Array, where: NDArray[np.bool_]) -> Array:
     """Return (n, 2, 2) the square's sides at the points ``where`` by the homography that fits all known points."""
-    rows, columns = np.nonzero(np.isfinite(uv[..., 0]))
     wanted = np.argwhere(where)
-    H = None
-    if len(rows) >= 4:
-        H, _ = cv2.findHomography(np.stack([columns, rows], axis=1).astype(np.float64), uv[rows, columns])
+    H = _homography(uv)
     if H is None:
         return np.full((len(wanted), 2, 2), np.nan)
-    here = np.column_stack([wanted[:, 1], wanted[:, 0], np.ones(len(wanted))])
+    p = np.column_stack([wanted[:, 1], wanted[:, 0], np.ones(len(wanted))]) @ H.T
     out = np.empty((len(wanted), 2, 2))
-    p = here @ H.T
     for side in range(2):
         out[:, side] = (H[:2, side] - (p[:, :2] / p[:, 2:]) * H[2, side]) / p[:, 2:]
     return out
