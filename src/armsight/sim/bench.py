@@ -86,6 +86,12 @@ def in_view(rig: StereoRig, T_left_pattern: Array, pattern: Pattern) -> bool:
     return True
 
 
+def _between(rig: StereoRig, distance_m: float) -> Array:
+    """Return the point (3,) between both optical axes at a distance from the cameras, m, left camera's frame."""
+    ahead = np.array([0.0, 0.0, distance_m, 1.0])
+    return np.asarray(0.5 * (ahead[:3] + (rig.T_left_right @ ahead)[:3]))
+
+
 def board_poses(
     rng: np.random.Generator,
     rig: StereoRig,
@@ -114,7 +120,6 @@ def board_poses(
     width, height = rig.left.image_size_px
     corners = outline(pattern)
     diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
     p_middle = np.append((corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0)
     cells = rng.permutation(count)
     poses = []
@@ -123,10 +128,10 @@ def board_poses(
             # The image is cut into 4 x 3 places that take turns; where one cannot be had, the next best is nearer in.
             cell = np.array([cells[n] % 4, cells[n] // 4 % 3])
             uv = (cell + rng.uniform(0, 1, 2)) / (4, 3) * (width, height)
-            uv = middle + (1 - 0.9 * attempt / _TRIES) * (uv - middle)
-            side = n % 2
             distance = float(rig.left.intrinsics[0] * diagonal / (rng.uniform(*fill) * height))
+            side = n % 2
             p = transform(rig.T_left_right if side else np.eye(4), distance * rig.cameras[side].unproject(uv[None])[0])
+            p += attempt / _TRIES * (_between(rig, distance) - p)
             about, tilt = rng.uniform(0, 2 * np.pi), np.radians(tilt_deg) * np.sqrt(rng.uniform(0, 1))
             R = exp_so3(np.array([0.0, 0.0, rng.uniform(-0.4, 0.4)])) @ exp_so3(
                 tilt * np.array([np.cos(about), np.sin(about), 0.0])
@@ -160,7 +165,7 @@ def path(
     Raises:
         InputError: the target is not in view even at rest in the middle.
     """
-    middle = 0.5 * distance_m * (np.array([0.0, 0.0, 1.0]) + rig.T_left_right[:3, 2]) + 0.5 * rig.T_left_right[:3, 3]
+    middle = _between(rig, distance_m)
     rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])
     phases = np.array([0.0, 0.4, 1.0, 0.2, 1.7, 2.5])
     ranges = np.array([0.35 * distance_m, 0.2 * distance_m, 0.2 * distance_m, 0.5, 0.5, 0.4])
