@@ -18,6 +18,8 @@ _STEPS = 10
 _DONE = 1e-12  # relative to the depth
 #: A minimum is reached when one more step would gain less than this, in units of chi-square.
 _REACHED = 1e-6
+#: Cosine of the angle, 8 degrees, within which a point must lie of the ray of its pixel.
+_LOOKING = 0.99
 
 
 def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
@@ -72,11 +74,12 @@ def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Arr
 
 
 def _ahead(rig: StereoRig, p_left: Array, uv: Array) -> NDArray[np.bool_]:
-    """(N,) whether points lie before both cameras, a fisheye's view past 90 degrees included: on the pixels' side."""
+    """(N,) whether points lie where their pixels look, and not behind a camera or where the distortion folds back."""
     p_right = transform(inverse(rig.T_left_right), p_left)
-    along_left = np.einsum("ni,ni->n", rig.left.unproject(uv[:, 0]), p_left)
-    along_right = np.einsum("ni,ni->n", rig.right.unproject(uv[:, 1]), p_right)
-    return np.asarray((along_left > 0) & (along_right > 0))
+    rays_left, rays_right = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
+    along_left, along_right = np.einsum("ni,ni->n", rays_left, p_left), np.einsum("ni,ni->n", rays_right, p_right)
+    left = along_left > _LOOKING * np.linalg.norm(p_left, axis=1)
+    return np.asarray(left & (along_right > _LOOKING * np.linalg.norm(p_right, axis=1)))
 
 
 def _normal(rig: StereoRig, p: Array, uv: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
