@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from render_oracle import brute, displacement_px
 
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render import Shutter, radiance, render, render_pair
@@ -211,3 +212,8 @@ def test_the_same_seed_gives_the_same_image():
     first, second = (render(cam, [body], rng=np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert first.dtype == np.uint8
+
+
+def test_a_background_of_another_size_is_refused():
+    with pytest.raises(InputError, match=r"must be a number or \(60, 80\)"):
+        render(camera(size=(80, 60), focal=80.0), [], np.zeros((80, 60)))

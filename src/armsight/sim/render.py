@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from armsight.data import Array, Image
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
 from armsight.sim.paint import SUB, Box, paint
@@ -84,6 +85,8 @@ class _Canvas:
         width, height = camera.image_size_px
         self.camera = camera
         self.rays = _corner_rays(camera)
+        if np.shape(background) not in ((), (height, width)):
+            raise InputError(f"the background is {np.shape(background)}, must be a number or ({height}, {width})")
         self.coarse = np.empty((height, width))
         self.coarse[:] = background
         self.slot = np.full((height, width), -1, np.int32)
@@ -192,6 +195,9 @@ def render(
 
     Returns:
         (H, W) uint8; pixel (0, 0) is the centre of the top-left one.
+
+    Raises:
+        InputError: the background is of another size than the camera's image.
     """
     optics = optics or Optics()
     light = radiance(camera, bodies, background, psf_sigma_px=optics.psf_sigma_px, shutter=shutter)
