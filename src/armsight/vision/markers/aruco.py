@@ -68,6 +68,8 @@ def _detector(family: str, perimeter_share: float, border: int) -> cv2.aruco.Aru
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = perimeter_share
     parameters.perspectiveRemovePixelPerCell = 8  # small markers are read from more samples a cell than by default
+    # A marker on a card of its own has the card's outline close around it; OpenCV would keep only the larger of the two.
+    parameters.minMarkerDistanceRate = 0.01
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     parameters.markerBorderBits = border
     return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
@@ -88,7 +90,23 @@ def detect_markers(
     """
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     corners, identities, _ = _detector(family, share, border).detectMarkers(image)
-    return corners, np.zeros((0, 1), np.int32) if identities is None else np.asarray(identities).reshape(-1, 1)
+    if identities is None:
+        return (), np.zeros((0, 1), np.int32)
+    identities = np.asarray(identities).reshape(-1, 1)
+    kept = _without_repeats(np.reshape(corners, (-1, 4, 2)), identities[:, 0])
+    return [corners[i] for i in kept], identities[kept]
+
+
+def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
+    """Return the rows (n,) of corners (n, 4, 2) that are markers of their own: one outline is found once or more."""
+    kept: list[int] = []
+    sides = np.linalg.norm(np.diff(corners, axis=1, append=corners[:, :1]), axis=2).mean(axis=1)
+    middles = corners.mean(axis=1)
+    for i in np.argsort(-sides).tolist():
+        same = [k for k in kept if identities[k] == identities[i]]
+        if all(np.linalg.norm(middles[k] - middles[i]) > 0.5 * sides[i] for k in same):
+            kept.append(i)
+    return sorted(kept)
 
 
 def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list[tuple[int, Array]]:

@@ -1,0 +1,121 @@
+"""Reading image files: what is whole is read as stored, what is damaged is refused with the file's name."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.vision.image import grey, read_image
+
+RNG = np.random.default_rng(0)
+GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)
+COLOUR = cv2.resize(RNG.integers(0, 256, (10, 15, 3), dtype=np.uint8), (60, 40))
+
+
+def stored(tmp_path, name, image):
+    path = tmp_path / name
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif", "pgm"])
+def test_grey_comes_back_as_it_was(tmp_path, suffix):
+    np.testing.assert_array_equal(read_image(stored(tmp_path, f"a.{suffix}", GREY)), GREY)
+
+
+def test_sixteen_bits_and_colour_come_back_as_they_were(tmp_path):
+    deep = GREY.astype(np.uint16) * 257
+    np.testing.assert_array_equal(read_image(stored(tmp_path, "a.png", deep)), deep)
+    np.testing.assert_array_equal(read_image(stored(tmp_path, "b.png", COLOUR)), COLOUR)
+    alpha = np.dstack([COLOUR, np.full((40, 60), 9, np.uint8)])
+    np.testing.assert_array_equal(read_image(stored(tmp_path, "c.png", alpha)), COLOUR)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(tmp_path, suffix, share, capfd):
+    path = stored(tmp_path, f"a.{suffix}", COLOUR)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=rf"a\.{suffix}.*truncated"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("padding", [b"\x00" * 5000, b"\r\n", b"camera maker's notes" * 400])
+def test_padding_after_the_end_is_tolerated(tmp_path, suffix, padding):
+    path = stored(tmp_path, f"a.{suffix}", COLOUR)
+    whole = read_image(path)
+    path.write_bytes(path.read_bytes() + padding)
+    np.testing.assert_array_equal(read_image(path), whole)
+
+
+def with_exif(jpeg, orientation, thumbnail=b""):
+    """Put an EXIF segment with an orientation, and a thumbnail behind it, into JPEG data."""
+    tiff = b"II*\x00" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, orientation, 0)
+    body = b"Exif\x00\x00" + tiff + thumbnail
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+def test_exif_orientation_is_ignored(tmp_path):
+    path = stored(tmp_path, "a.jpg", COLOUR)
+    plain = read_image(path)
+    path.write_bytes(with_exif(path.read_bytes(), 6))
+    np.testing.assert_array_equal(read_image(path), plain)
+
+
+def test_a_thumbnail_end_is_not_the_end(tmp_path):
+    path = stored(tmp_path, "a.jpg", COLOUR)
+    data = with_exif(path.read_bytes(), 1, thumbnail=path.read_bytes())
+    path.write_bytes(data[:-300])
+    with pytest.raises(InputError, match="truncated"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("data", [b"", b"shot,camera,marker\n", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"])
+def test_what_is_no_image_is_refused(tmp_path, data):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.png: "):
+        read_image(path)
+
+
+def test_damaged_png_data_is_refused(tmp_path, capfd):
+    chunk = b"IDAT" + b"not deflated"
+    path = tmp_path / "a.png"
+    data = stored(tmp_path, "b.png", GREY).read_bytes()
+    idat = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    path.write_bytes(data[:33] + idat + data[-12:])
+    with pytest.raises(InputError, match=r"a\.png"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_missing_files_and_folders_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"none\.png: no such file"):
+        read_image(tmp_path / "none.png")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_image(tmp_path)
+
+
+def test_grey_of_every_kind_of_image():
+    np.testing.assert_array_equal(grey(GREY), GREY)
+    np.testing.assert_array_equal(grey(GREY[:, :, None]), GREY)
+    np.testing.assert_array_equal(grey(GREY.astype(np.uint16) * 257), GREY)
+    expected = cv2.cvtColor(COLOUR, cv2.COLOR_BGR2GRAY)
+    np.testing.assert_array_equal(grey(COLOUR), expected)
+    np.testing.assert_array_equal(grey(np.dstack([COLOUR, GREY])), expected)
+    assert np.abs(grey(COLOUR.astype(np.uint16) * 257).astype(int) - expected).max() <= 1
+    assert grey(COLOUR[::2, ::2]).flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "image", [GREY.astype(float), np.zeros((3, 4, 5), np.uint8), np.zeros((0, 4), np.uint8), GREY[0]]
+)
+def test_grey_of_anything_else_is_refused(image):
+    with pytest.raises(InputError, match="image"):
+        grey(image)
