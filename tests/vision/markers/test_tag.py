@@ -181,5 +181,5 @@ def test_photographs_agree_with_the_apriltag_library(data_dir):
     assert np.median(np.abs(ours)) < 0.3
     assert np.median(np.abs(ours)) < 0.6 * np.median(np.abs(rough))
     assert (
-        np.abs(np.median(np.mean(ours, axis=1), axis=0)).max() < 0.15
+        np.abs(np.median(np.mean(ours, axis=1), axis=0)).max() < 0.25
     )  # half a pixel, had the conventions been mixed up
