@@ -16,6 +16,8 @@ from armsight.vision.rig import StereoRig
 #: pixels off; what is only noisier than expected stays and is judged against the body in locate.
 GATE_SIGMAS = 6.0
 GATE_PX = 2.0
+#: Epipolar distance beyond which a pair says nothing in favour of an order of a board's names, px.
+FLIP_PX = 20.0
 
 
 def join(left: Detections, right: Detections) -> Correspondences:
@@ -88,7 +90,7 @@ def match(
         left: what the left camera saw.
         right: what the right camera saw.
         flips: other orders in which a symmetric board's points may have been named, each an (M,) permutation; the one
-            that agrees best with the rig is taken for the right camera.
+            on which most pairs agree with the rig is taken for the right camera.
 
     Returns:
         The correspondences; points seen by one camera only are kept for what they tell about the pose.
@@ -96,14 +98,18 @@ def match(
     best = join(left, right)
     if flips and best.paired.any():
         candidates = [best, *(join(left, renamed(right, flip)) for flip in flips)]
-        scores = []
-        for candidate in candidates:
-            pair = candidate.uv[candidate.paired]
-            distance = epipolar_distances(rig, pair[:, 0], pair[:, 1])
-            told = distance[np.isfinite(distance).all(axis=1)]
-            scores.append(np.median(told) if len(told) else np.inf)
-        best = candidates[int(np.argmin(scores))]
+        best = max(candidates, key=lambda candidate: _agreement(rig, candidate))
     return gate(rig, body, best)
+
+
+def _agreement(rig: StereoRig, seen: Correspondences) -> float:
+    """Tell how well names agree with the rig: the sum, over pairs, of how much nearer to its line one is than FLIP_PX.
+
+    Not the mean: the middle of a board keeps its name when the board is turned, and may be the only pair left then.
+    """
+    pair = seen.uv[seen.paired]
+    distance = epipolar_distances(rig, pair[:, 0], pair[:, 1]).max(axis=1)
+    return float(np.maximum(FLIP_PX - distance[np.isfinite(distance)], 0.0).sum())
 
 
 def renamed(detections: Detections, permutation: Ids) -> Detections:
