@@ -21,7 +21,6 @@ from armsight.vision.markers.bodies import load_body_csv
 from armsight.vision.match import gate
 from armsight.vision.measure import measure_seen
 from armsight.vision.triangulate import triangulate
-
 from real_sets import DATA
 
 FOLDER = DATA / "arm" / "motoman"
@@ -45,7 +44,9 @@ def scatter_deg(Ts) -> float:
 
 
 def tracker() -> None:
-    print("\n4. Motoman right_hand_6x6x6: fitted on even shots, the odd ones of the 43 measured, tracker registered on even ones")
+    print(
+        "\n4. Motoman right_hand_6x6x6: fitted on even shots, the odd ones of the 43 measured, tracker registered on even ones"
+    )
     body, shots, cameras, truth = read("right_hand_6x6x6")
     judged = [s for s in shots if common(s) >= 3]
     for label, train in (
@@ -113,7 +114,10 @@ def two_arms(name: str) -> None:
             continue
         T, reflector = register([fits[n].T_left_body for n in names[0]], np.array([truth[n] for n in names[0]]))
         e = [
-            1e3 * np.linalg.norm(transform(T, fits[n].T_left_body[:3, :3] @ reflector + fits[n].T_left_body[:3, 3]) - truth[n])
+            1e3
+            * np.linalg.norm(
+                transform(T, fits[n].T_left_body[:3, :3] @ reflector + fits[n].T_left_body[:3, 3]) - truth[n]
+            )
             for n in names[1]
         ]
         out.append(f"{('left', 'right')[which]} ball {np.mean(e):.2f} mm mean over {len(e)} odd shots")

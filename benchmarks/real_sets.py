@@ -155,7 +155,8 @@ def half_subsets(count: int = 40) -> None:
             half = calibrate_boards(s.board, [s.pairs[i] for i in sorted(rows)], (s.size, s.size), models=("brown5",))
             ratio.append(half.reprojection_rms_px / full.reprojection_rms_px)
             focal += [
-                abs(h.intrinsics[0] / f.intrinsics[0] - 1) for h, f in zip(half.rig.cameras, full.rig.cameras, strict=True)
+                abs(h.intrinsics[0] / f.intrinsics[0] - 1)
+                for h, f in zip(half.rig.cameras, full.rig.cameras, strict=True)
             ]
             wrong += ratio[-1] > 1.5 or max(focal[-2:]) > 0.05
         print(

@@ -79,7 +79,9 @@ def point_sigma(trials: int = 100, pairs: int = 14) -> None:
         light.append([radiance(camera, [view], 0.4) for camera, view in zip(rig.cameras, views, strict=True)])
     grid = np.stack(np.meshgrid([-0.05, 0.1, 0.25], [-0.1, 0.1], [0.5, 0.7, 0.9]), axis=-1).reshape(-1, 3)
     T_right_left = inverse(rig.T_left_right)
-    uv = np.stack([rig.left.project(grid), rig.right.project(grid @ T_right_left[:3, :3].T + T_right_left[:3, 3])], axis=1)
+    uv = np.stack(
+        [rig.left.project(grid), rig.right.project(grid @ T_right_left[:3, :3].T + T_right_left[:3, 3])], axis=1
+    )
     noise = 0.03
     cov_uv = np.tile(noise**2 * np.eye(2), (len(grid), 2, 1, 1))
     found, predicted, share = [], [], []
@@ -185,7 +187,8 @@ def time_beside_opencv(count: int = 200) -> None:
     for name, function in originals.items():
         setattr(cv2, name, function)
     finder, ours = in_finder[0], total - in_finder[0]
-    print(f"\n6. {count} HD pairs, one thread: OpenCV's corner finder {1e3 * finder / count:.1f} ms a pair, our stages "
-          f"{1e3 * ours / count:.1f} ms (corners {1e3 * (detecting - finder) / count:.1f}, match to pose "
-          f"{1e3 * (total - detecting) / count:.1f}): ratio {ours / finder:.2f}")
-
+    print(
+        f"\n6. {count} HD pairs, one thread: OpenCV's corner finder {1e3 * finder / count:.1f} ms a pair, our stages "
+        f"{1e3 * ours / count:.1f} ms (corners {1e3 * (detecting - finder) / count:.1f}, match to pose "
+        f"{1e3 * (total - detecting) / count:.1f}): ratio {ours / finder:.2f}"
+    )
