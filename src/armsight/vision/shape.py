@@ -20,12 +20,14 @@ def without_gauge(points: Array, modes: Array) -> Array:
         modes: (K, M, 3) displacement fields.
 
     Returns:
-        (L, M, 3) orthogonal modes of an RMS displacement of one over all points, L <= K - 7 where the modes held them.
+        (L, M, 3) orthogonal modes of an RMS displacement of one over all points; where the given modes held the seven
+        freedoms, L is K - 7 or, if they were not independent, less.
     """
     centred = points - points.mean(axis=0)
     generators = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
     generators += [centred @ skew(axis).T for axis in np.eye(3)] + [centred]
-    Q = np.linalg.svd(np.stack([g.ravel() for g in generators]), full_matrices=False)[2]
+    _, sizes, Q = np.linalg.svd(np.stack([g.ravel() for g in generators]), full_matrices=False)
+    Q = Q[sizes > 1e-9 * sizes[0]]  # points on one line have six freedoms: turning about it moves none
     flat = modes.reshape(len(modes), -1)
     flat = flat - (flat @ Q.T) @ Q
     _, sizes, basis = np.linalg.svd(flat, full_matrices=False)
