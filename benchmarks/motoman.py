@@ -44,9 +44,7 @@ def scatter_deg(Ts) -> float:
 
 
 def tracker() -> None:
-    print(
-        "\n4. Motoman right_hand_6x6x6: fitted on even shots, the odd ones of the 43 measured, tracker registered on even ones"
-    )
+    print("\n4. Motoman right_hand_6x6x6: even shots fitted and registered to the tracker, odd ones of the 43 measured")
     body, shots, cameras, truth = read("right_hand_6x6x6")
     judged = [s for s in shots if common(s) >= 3]
     for label, train in (
@@ -65,9 +63,11 @@ def tracker() -> None:
             predicted = [np.degrees(np.sqrt(np.trace(results[n].cov[3:, 3:]))) for n in odd]
             print(
                 f"  {label}, {'refined' if refine else 'nominal'} body: {len(odd)} odd shots measured, missed "
-                f"{missed or 'none'}: mean {e.mean():.3f} mm, RMS {np.sqrt((e**2).mean()):.3f}, max {e.max():.2f}; orientation "
-                f"scatter {scatter_deg([Ts[n] for n in odd]):.3f} deg RMS (predicted {np.sqrt(np.mean(np.square(predicted))):.3f}); "
-                f"scale against the tracker {100 * (scale - 1):+.2f}%; epipolar {c.epipolar_rms_px:.2f} px; {'; '.join(c.notes)}"
+                f"{missed or 'none'}: mean {e.mean():.3f} mm, RMS {np.sqrt((e**2).mean()):.3f}, max {e.max():.2f}; "
+                f"orientation scatter {scatter_deg([Ts[n] for n in odd]):.3f} deg RMS (predicted "
+                f"{np.sqrt(np.mean(np.square(predicted))):.3f}); "
+                f"scale against the tracker {100 * (scale - 1):+.2f}%; epipolar {c.epipolar_rms_px:.2f} px; "
+                f"{'; '.join(c.notes)}"
             )
     for name in ("self_lower1_4x4", "self_lower2_4x4", "self_upper1_4x4", "self_upper2_4x4"):
         two_arms(name)
@@ -113,13 +113,8 @@ def two_arms(name: str) -> None:
         if min(map(len, names)) < 4:
             continue
         T, reflector = register([fits[n].T_left_body for n in names[0]], np.array([truth[n] for n in names[0]]))
-        e = [
-            1e3
-            * np.linalg.norm(
-                transform(T, fits[n].T_left_body[:3, :3] @ reflector + fits[n].T_left_body[:3, 3]) - truth[n]
-            )
-            for n in names[1]
-        ]
+        tips = {n: fits[n].T_left_body[:3, :3] @ reflector + fits[n].T_left_body[:3, 3] for n in names[1]}
+        e = [1e3 * np.linalg.norm(transform(T, tips[n]) - truth[n]) for n in names[1]]
         out.append(f"{('left', 'right')[which]} ball {np.mean(e):.2f} mm mean over {len(e)} odd shots")
     print(f"  {name} (two balls in view): epipolar {c.epipolar_rms_px:.2f} px; against the tracker: {'; '.join(out)}")
 

@@ -160,8 +160,8 @@ def half_subsets(count: int = 40) -> None:
             ]
             wrong += ratio[-1] > 1.5 or max(focal[-2:]) > 0.05
         print(
-            f"  {name}: {wrong} in a wrong minimum; fit over the full set's at most {max(ratio):.2f}, focal length off by at "
-            f"most {100 * max(focal):.2f}%"
+            f"  {name}: {wrong} in a wrong minimum; fit over the full set's at most {max(ratio):.2f}, focal length off "
+            f"by at most {100 * max(focal):.2f}%"
         )
 
 
@@ -174,7 +174,5 @@ def normalised_residuals() -> None:
         points = s.board.body.points
         everything = errors_on(ours.rig, points, list(shots.values()), ours.body.points).normalised_rms
         good = [c for k, c in shots.items() if k not in s.bad]
-        print(
-            f"  {name}: {everything:.3f} on all odd pairs, "
-            f"{errors_on(ours.rig, points, good, ours.body.points).normalised_rms:.3f} without those a person would throw out"
-        )
+        chosen = errors_on(ours.rig, points, good, ours.body.points).normalised_rms
+        print(f"  {name}: {everything:.3f} on all odd pairs, {chosen:.3f} without those a person would throw out")

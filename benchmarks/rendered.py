@@ -104,7 +104,7 @@ def point_sigma(trials: int = 100, pairs: int = 14) -> None:
     print(f"\n3a. Rendered: {trials} calibrations of {pairs} pairs each, {len(grid)} points triangulated with each")
     print(
         f"  predicted sigma over Monte Carlo: lateral {ratio[:, :2].mean():.3f}, depth {ratio[:, 2].mean():.3f}, all "
-        f"{ratio.mean():.3f} (single values {ratio.min():.2f} to {ratio.max():.2f}; Monte Carlo itself is good to {sem:.2f})"
+        f"{ratio.mean():.3f} (single values {ratio.min():.2f} to {ratio.max():.2f}; Monte Carlo is good to {sem:.2f})"
     )
     print(
         f"  mean predicted sigma: lateral {1e3 * np.sqrt(np.mean(predicted, axis=0)[:, :2].mean()):.4f} mm, depth "
