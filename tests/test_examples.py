@@ -1,0 +1,48 @@
+"""The examples run as they are printed, and what they print is right."""
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armsight import StereoRig
+from armsight.sim.recording import Truth
+
+EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
+
+
+def run(number: str, folder: Path) -> None:
+    """Run the example of a number in a folder."""
+    (path,) = [path for path in EXAMPLES if path.name.startswith(number)]
+    runpy.run_path(str(path))["main"](folder)
+
+
+def test_examples_are_numbered_and_tried_here():
+    tried = re.findall(r'run\("(\d\d)"', Path(__file__).read_text(encoding="utf-8"))
+    assert [path.name[:2] for path in EXAMPLES] == sorted(set(tried))
+
+
+def test_measure_a_board(tmp_path, capsys):
+    run("01", tmp_path)
+    found = re.findall(r"^\d+: .* sigma ([\d.]+) mm, error ([\d.]+) mm$", capsys.readouterr().out, re.MULTILINE)
+    assert len(found) == 5
+    # |error|^2 is at most chi-square of three degrees of freedom times the largest variance, which the trace bounds:
+    # 5.54^2 is its quantile 1 - 1e-6. Both figures are printed to 0.0005 mm.
+    for sigma, error in np.array(found, float):
+        assert error <= 5.54 * (sigma + 5e-4) + 5e-4
+
+
+def test_calibrate_in_python(tmp_path, capsys):
+    run("02", tmp_path)
+    rig, truth = StereoRig.load(tmp_path / "rig.json"), Truth.load(tmp_path / "board").rig
+    # The baseline's direction in the right camera's axes, along which the tangent's first three numbers point.
+    along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
+    sigma = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along))
+    assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5 * sigma)
+    printed = re.search(r"baseline ([\d.]+) mm, truth ([\d.]+) mm", capsys.readouterr().out)
+    assert printed is not None
+    assert [float(text) for text in printed.groups()] == pytest.approx(
+        [1e3 * rig.baseline_m, 1e3 * truth.baseline_m], abs=5.1e-4
+    )
