@@ -1,0 +1,150 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board_views import SIZES, bench, board_pairs, detections, rig_error
+from scipy.stats import chi2
+
+from armsight.data import Detections
+from armsight.errors import CalibrationError
+from armsight.geometry.pose import transform
+from armsight.geometry.rigid import fit_rigid, fit_scale
+from armsight.vision.calibrate.boards import LEAST_PAIRS, MODELS, Pair, calibrate_boards
+from armsight.vision.match import renamed
+
+
+@pytest.mark.parametrize("flat", [True, False], ids=["drawing", "estimated board"])
+def test_the_true_rig_is_found_within_its_covariance(flat):
+    true, board, Ts = bench()
+    c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), flat=flat, folds=4)
+    error = rig_error(c.rig, true)
+    assert (np.abs(error) < 4 * np.sqrt(np.diag(c.rig.cov))).all(), error / np.sqrt(np.diag(c.rig.cov))
+    scale = 1 / np.sqrt(np.diag(c.rig.cov))
+    correlation, e = c.rig.cov * np.outer(scale, scale), error * scale
+    assert e @ np.linalg.solve(correlation, e) < chi2.ppf(0.9999, len(e))
+    # 20 pairs of 54 corners of both cameras tell the noise to sqrt(1 / (2 * 4320)), 1.1%; four times that, and what
+    # the held-out pairs say of it (a fifth as many, so twice as vague), is allowed.
+    assert c.rig.sigma_px == pytest.approx(0.1, rel=0.12)
+    assert c.reprojection_rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.06)
+    assert 0.9 < c.heldout.normalised_rms < 1.1
+    assert c.pairs == tuple(f"p{n:02d}" for n in range(len(Ts)))
+    assert not c.rejected
+    assert (c.deviation_m < 1e-15) == flat
+
+
+def test_a_perfect_board_stays_perfect():
+    true, board, Ts = bench()
+    c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), folds=3)
+    # One corner is triangulated from twenty pairs to 0.1 px * 0.6 m / 450 px / sqrt(40) = 0.02 mm at best.
+    assert c.deviation_m < 2e-5
+
+
+def bowed(points):
+    """Return the board stretched by 0.2% along its rows and bowed by half a millimetre."""
+    xy = points[:, :2] - points[:, :2].mean(axis=0)
+    r2 = (xy**2).sum(axis=1) / (xy**2).sum(axis=1).max()
+    return points + np.column_stack([0.002 * xy[:, 0], np.zeros(len(points)), 5e-4 * (1 - r2)])
+
+
+def test_a_bowed_board_is_found_and_taken_out_of_the_cameras():
+    true, board, Ts = bench()
+    drawn = board.body.points
+    printed = bowed(drawn)
+    pairs = board_pairs(true, printed, Ts, sigma=0.01)
+    flat, shaped = (
+        calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=flat, folds=4) for flat in (True, False)
+    )
+    assert shaped.heldout.epipolar_rms_px < 0.8 * flat.heldout.epipolar_rms_px
+    assert np.linalg.norm(rig_error(shaped.rig, true)[:4]) < 0.3 * np.linalg.norm(rig_error(flat.rig, true)[:4])
+    # Size cannot be told from the distance of the cameras: shapes are compared at the same size.
+    size = fit_scale(printed, shaped.body.points)
+    found = shaped.body.points / size
+    gap = np.linalg.norm(transform(fit_rigid(found, printed), found) - printed, axis=1)
+    whole = np.linalg.norm(transform(fit_rigid(drawn, printed), drawn) - printed, axis=1)
+    assert np.sqrt((gap**2).mean()) < 0.15 * np.sqrt((whole**2).mean())
+    assert shaped.deviation_m == pytest.approx(np.sqrt((whole**2).mean()), rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("model", "focal_px", "tried"),
+    [("fisheye", 230.0, ("brown5", "fisheye")), ("brown4", 450.0, MODELS)],
+)
+def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
+    true, board, Ts = bench(model, focal_px, 14)
+    c = calibrate_boards(board, board_pairs(true, board.body.points, Ts, sigma=0.05), SIZES, models=tried, folds=3)
+    assert c.rig.left.model == c.rig.right.model == model
+    assert set(c.models) == set(tried)
+    assert c.heldout == c.models[model]
+    error = rig_error(c.rig, true)
+    assert (np.abs(error) < 4.5 * np.sqrt(np.diag(c.rig.cov))).all()
+
+
+def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
+    true, board, Ts = bench()
+    clean = board_pairs(true, board.body.points, Ts)
+    dirty = list(clean)
+    for n, corner in ((2, 7), (5, 20), (11, 50)):
+        uv = np.array(clean[n].right.uv)
+        uv[corner] += (9.0, -6.0)
+        dirty[n] = replace(clean[n], right=detections(clean[n].right.ids, uv))
+    rng = np.random.default_rng(1)
+    dirty[8] = replace(clean[8], left=detections(clean[8].left.ids, rng.permutation(clean[8].left.uv)))
+    without = [pair for n, pair in enumerate(clean) if n != 8]
+    c, best = (calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=4) for pairs in (dirty, without))
+    assert [r.pair for r in c.rejected] == ["p08"]
+    assert "wrong corners" in c.rejected[0].reason
+    assert [note.split(":")[0] for note in c.notes] == ["p02", "p05", "p11"]
+    assert all("1 of 108 corners dropped" in note for note in c.notes)
+    # The pairs' places in the folds shift by one, so held-out figures differ a little whatever is done.
+    assert c.heldout.epipolar_rms_px == pytest.approx(best.heldout.epipolar_rms_px, rel=0.03)
+    assert c.heldout.rigid_rms_m == pytest.approx(best.heldout.rigid_rms_m, rel=0.03)
+    assert c.rig.left.intrinsics == pytest.approx(best.rig.left.intrinsics, abs=0.1)
+
+
+def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
+    true, board, Ts = bench(spec="chessboard:9x7:25mm")
+    assert board.flips, "a board of odd counts can be read from both ends"
+    clean = board_pairs(true, board.body.points, Ts)
+    dirty = [
+        replace(pair, right=renamed(pair.right, board.flips[0])) if n in (3, 9) else pair
+        for n, pair in enumerate(clean)
+    ]
+    c, best = (calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=3) for pairs in (dirty, clean))
+    assert [note.split(":")[0] for note in c.notes] == ["p03", "p09"]
+    assert all("mended" in note for note in c.notes)
+    assert not c.rejected
+    # The same observations: the two differ by where the iterations stop.
+    sigma = np.sqrt(np.diag(best.rig.cov))
+    assert (np.abs(rig_error(c.rig, best.rig)) < 0.01 * sigma).all()
+
+
+def test_pairs_without_a_board_are_rejected_with_their_reason():
+    true, board, Ts = bench()
+    pairs = board_pairs(true, board.body.points, Ts)
+    pairs[1] = replace(pairs[1], left=Detections.none("too dark"))
+    few = detections(np.arange(5), pairs[4].right.uv[:5])
+    pairs[4] = replace(pairs[4], right=few)
+    c = calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=3)
+    assert {r.pair: r.reason for r in c.rejected} == {
+        "p01": "left: too dark",
+        "p04": "5 points seen by both cameras, 6 are needed",
+    }
+    assert c.pairs_found == len(pairs)
+    assert len(c.pairs) == len(pairs) - 2
+
+
+def test_too_few_pairs_say_how_many_are_needed_and_why_there_are_not():
+    true, board, Ts = bench()
+    pairs = board_pairs(true, board.body.points, Ts[: LEAST_PAIRS - 1])
+    pairs += [Pair("dark", Detections.none("too dark"), Detections.none("too dark"))]
+    with pytest.raises(CalibrationError, match="2 of 3 pairs are usable, at least 3 are needed.*dark: left: too dark"):
+        calibrate_boards(board, pairs, SIZES)
+
+
+def test_corners_in_random_places_are_no_calibration():
+    _, board, Ts = bench()
+    rng = np.random.default_rng(0)
+    ids = np.arange(54)
+    pairs = [Pair(f"p{n}", *(detections(ids, rng.uniform(0, 360, (54, 2))) for _ in "lr")) for n in range(len(Ts) // 2)]
+    with pytest.raises(CalibrationError):
+        calibrate_boards(board, pairs, SIZES, models=("brown4",))
