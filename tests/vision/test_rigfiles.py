@@ -2,6 +2,7 @@
 
 import builtins
 import errno
+import io
 import itertools
 import json
 import os
@@ -123,39 +124,19 @@ def test_an_export_that_cannot_be_written_leaves_nothing(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-class LateFullDisk:
-    """A file whose disk turns out to be full only when the buffer is written out."""
-
-    def __init__(self, file):
-        self.file = file
-
-    def write(self, text):
-        pass
-
-    def flush(self):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        self.file.close()
-        if exc[0] is None:
-            self.flush()
-
-
 @pytest.mark.parametrize("full", [0, 1])
 def test_a_full_disk_replaces_neither_file_of_a_pair(tmp_path, monkeypatch, full):
     targets = paths(tmp_path, "ros")
     export_rig(ordinary_rig("brown5"), "ros", targets)
     before = [path.read_bytes() for path in targets]
-    real, count = os.fdopen, itertools.count()
+    real, count = io.FileIO.write, itertools.count()
 
-    def fdopen(*args, **kwargs):
-        file = real(*args, **kwargs)
-        return LateFullDisk(file) if next(count) == full else file
+    def write(file, data):
+        if next(count) == full:  # the disk turns out to be full only when the buffer is written out
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+        return real(file, data)
 
-    monkeypatch.setattr("armsight.files.os.fdopen", fdopen)
+    monkeypatch.setattr("armsight.files._Named.write", write)
     with pytest.raises(InputError, match=rf"{targets[full].name}: cannot be written: No space left"):
         export_rig(ordinary_rig("brown5", seed=9), "ros", targets)
     assert [path.read_bytes() for path in targets] == before
