@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.geometry.pose import transform
-from armsight.geometry.rigid import fit_rigid
+from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.vision.bundle import Model, Observations, State, predict
 from armsight.vision.pnp import consensus_poses
 from armsight.vision.posefit import PoseFit, Sightings, fit_pose
@@ -33,6 +33,12 @@ _AGREEING = 0.5
 #: tried too, mirror solutions among them.
 _SAFE_POINTS = 8
 _COLLINEAR = 1e-3
+#: A robust fit whose median squared distance is this many times the expected one may be in a wrong minimum: then rigid
+#: fits of so many triples are judged, and the best few tried.
+_SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
+#: Residuals beyond chance and beyond this share of the body's apparent size are of something else than the body: a square
+#: of a wrong size, wrong names. A bent or badly printed body is a few hundredths off.
+_ALIKE = 0.2
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
@@ -47,23 +53,23 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
 
     Returns:
         The pose of the body in the left camera's frame, or why there is none: fewer than three points, points on one
-        line, or no pose that most detections agree with.
+        line, no pose that most detections agree with, or detections that do not look like the body.
     """
     reason = _unlocatable(body, points)
     if reason is not None:
         return Missed(reason)
     sightings = Sightings.of(points.seen, rig.sigma_px)
-    best: PoseFit | None = None
-    for start in _starts(rig, body, points):
-        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, start, robust=True)
-        if fit is not None and (best is None or fit.cost < best.cost):
-            best = fit
+    best = _best(rig, body, sightings, _starts(rig, body, points))
+    if best is None or np.median(best.distance2) > _SUSPECT * _MEDIAN:
+        others = _best(rig, body, sightings, _agreed_starts(body, points))
+        best = min((fit for fit in (best, others) if fit is not None), key=lambda fit: fit.cost, default=None)
     if best is None:
         return Missed("no pose of the body fits the detections")
     good, fit = _without_outliers(rig, body, best, sightings)
     if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    return _estimate(rig, body, points, fit, sightings, good)
+    reason = _unbelievable(body, points, fit, sightings.select(good))
+    return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
 
 
 def _unlocatable(body: Body, points: Points) -> str | None:
@@ -71,11 +77,29 @@ def _unlocatable(body: Body, points: Points) -> str | None:
     if len(points.ids) < 3:
         lost = f"; dropped: {_listed(points.dropped)}" if points.dropped else ""
         return f"{len(points.ids)} matched points, 3 are needed{lost}"
-    chosen = body.points[points.ids]
-    spread = np.linalg.svd(chosen - chosen.mean(axis=0), compute_uv=False)
-    if spread[1] < _COLLINEAR * spread[0]:
-        return "the matched points lie on one line"
-    return None
+    return "the matched points lie on one line" if _on_one_line(body.points[points.ids]) else None
+
+
+def _on_one_line(points: Array) -> bool:
+    """Whether points (N, 3), N >= 3, lie on one line, which can turn about itself unseen."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= _COLLINEAR * spread[0])
+
+
+def _unbelievable(body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
+    """Say why a fit is no measurement of the body, or None."""
+    if _on_one_line(body.points[np.unique(used.point)]):
+        return "the points that agree with one pose of the body lie on one line"
+    sides = [used.uv[used.camera == c] for c in (0, 1)]
+    size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
+    off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
+    if fit.cost <= _misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
+        return None
+    scale = fit_scale(body.points[points.ids], points.p_left)
+    return (
+        f"the detections are not those of the body: {off:.1f} px off at an apparent size of {size:.0f} px, and "
+        f"{scale:.2f} times as far apart as its points"
+    )
 
 
 def _listed(dropped: tuple[Dropped, ...]) -> str:
@@ -95,6 +119,29 @@ def _starts(rig: StereoRig, body: Body, points: Points) -> list[Array]:
             found = consensus_poses(body.points, camera, seen.ids[rows], seen.uv[rows, side])
             starts += [to_left @ candidate.T_camera_body for candidate in found]
     return starts
+
+
+def _agreed_starts(body: Body, points: Points) -> list[Array]:
+    """Return the rigid fits of three points, of a seeded choice of triples, that half of the points agree with best.
+
+    One point that is far off pulls the fit of all away from the minimum, but no fit of three others.
+    """
+    p_body = body.points[points.ids]
+    sigma = np.sqrt(np.trace(points.cov, axis1=1, axis2=2))
+    rng = np.random.default_rng(0)
+    fits = []
+    for _ in range(_TRIPLES):
+        rows = rng.choice(len(p_body), 3, replace=False)
+        T = fit_rigid(p_body[rows], points.p_left[rows])
+        gap = np.linalg.norm(points.p_left - transform(T, p_body), axis=1)
+        fits.append((float(np.median(gap / sigma)), T))
+    return [T for _, T in sorted(fits, key=lambda fit: fit[0])[:_TRIED]]
+
+
+def _best(rig: StereoRig, body: Body, sightings: Sightings, starts: list[Array]) -> PoseFit | None:
+    """Minimise robustly from every start and return the lowest; None where no start leads anywhere."""
+    fits = [fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, start, robust=True) for start in starts]
+    return min((fit for fit in fits if fit is not None), key=lambda fit: fit.cost, default=None)
 
 
 def _without_outliers(
