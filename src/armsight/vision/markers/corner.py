@@ -32,6 +32,8 @@ from armsight.vision.markers.normal import edge_noise, invert
 WINDOW_SHARE, WINDOW_MAX_PX = 0.42, 12.0
 #: Where squares carry a print, this much more room is left beside it, px, for its blur.
 ARM_GAP_PX = 1.5
+#: The blur a fit starts with.
+START_BLUR_PX = 1.0
 #: A fit with many more pixels than this is first made with about so many.
 PIXELS_FIRST = 100
 #: A start further off than this leaves the window off centre; it is drawn again about the corner.
@@ -129,7 +131,7 @@ def _place(
     n = _gather(image, start, square, arm, px)
     if n < 3 * PARAMETERS:
         return -_BORDER
-    first_guess(n, px, start, square, min(max(0.2 * _reach(square), 0.7), 1.5), q)
+    first_guess(n, px, start, square, START_BLUR_PX, q)
     step = n // PIXELS_FIRST
     if step > 1:  # a share of the pixels finds the corner faster, and all of them place it
         few = np.empty((3, (n + step - 1) // step))

@@ -11,7 +11,7 @@ from armsight.vision.markers.normal import edge_noise, factor, invert, normal_eq
 
 FIELD = 12  # coefficients of the quadratic field over the marker
 PARAMETERS = FIELD + 6  # ..., squared blur, b, c, a, k (2)
-_STEPS, _STOP, _STALL, _LAMBDA = 40, 0.01, 0.05, 1e-2  # as in corner.py
+_STEPS, _STOP, _STALL, _LAMBDA = 40, 0.05, 0.05, 1e-2  # as in corner.py
 _BLUR2_MIN = 0.03  # px^2, as in corner.py
 
 
