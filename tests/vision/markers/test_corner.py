@@ -12,8 +12,9 @@ from asserts import assert_jacobian
 NEIGHBOURS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
-def scene(rng, pitch_px, tilt, blur_px, samples=16):
+def scene(rng, pitch_px, tilt, blur_px):
     """Return a painted corner of a random view, its place and the sides of its square."""
+    samples = 16 if pitch_px < 28 else 10
     size = int(3.2 * pitch_px) | 1
     centre = size // 2 + rng.uniform(-0.5, 0.5, 2)
     H = view(pitch_px, tilt, *rng.uniform(0.0, 2 * np.pi, 2), centre, distance=40.0)
