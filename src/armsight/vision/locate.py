@@ -181,11 +181,11 @@ def _estimate(
     state = State(rig.cameras, rig.T_left_right, T[None], np.zeros(0))
     rows = Observations(np.zeros(len(used.point), np.int64), used.camera, used.point, used.uv, used.cov_uv, 1)
     _, J_rig, J_pose = predict(Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False), state, rows)
+    W = np.linalg.inv(np.linalg.cholesky(used.cov_uv))
+    A, B = (W @ J_pose).reshape(-1, 6), (W @ J_rig).reshape(-1, rig.parameter_count)
     noise = np.linalg.inv(fit.information).astype(np.float64)
-    weighted = np.linalg.inv(used.cov_uv) @ J_pose
-    gain = noise @ np.tensordot(weighted, J_rig, axes=((0, 1), (0, 1)))
-    freedom = 2 * len(used.point) - 6
-    misfit = fit.cost / freedom if fit.cost > _misfit_limit(freedom) else 1.0
+    gain = noise @ (A.T @ B)
+    misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
     distance = _distances(rig, body, T, sightings)[0]
     dropped = tuple(
         Dropped(
@@ -209,6 +209,24 @@ def _estimate(
         points,
         points.dropped + dropped,
     )
+
+
+def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
+    """Tell how many times the variance of a fit's residuals exceeds what pixel noise and calibration explain.
+
+    Args:
+        residuals: (M,) whitened residuals of a fit of six parameters.
+        by_rig: (M, P) what the rig's parameters do to them.
+        cov_rig: (P, P) covariance of the rig's parameters.
+
+    Returns:
+        The ratio, 1 where chance explains it: residuals weighted by the inverse of I + by_rig cov_rig by_rig^T (by
+        Woodbury's identity), per degree of freedom.
+    """
+    freedom, v = len(residuals) - 6, by_rig.T @ residuals
+    explained = v @ np.linalg.solve(np.eye(len(cov_rig)) + cov_rig @ (by_rig.T @ by_rig), cov_rig @ v)
+    chi_square = float(residuals @ residuals - explained)
+    return chi_square / freedom if chi_square > _misfit_limit(freedom) else 1.0
 
 
 @lru_cache(maxsize=256)
