@@ -1,42 +1,14 @@
 """A rendered recording with truth, made and calibrated once for all tests of the command line."""
 
-import json
-import sys
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from armsight.app.cli.main import main
 from armsight.sim.bench import demo_recording
 from armsight.sim.recording import Truth
-
-
-@dataclass(frozen=True)
-class Said:
-    """What one run of the command line printed, and how it ended."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def lines(self):
-        """The JSON objects on stdout, one a line; NaN and infinity are no JSON."""
-        return [json.loads(line, parse_constant=_refused) for line in self.out.splitlines()]
-
-
-def _refused(text):
-    raise AssertionError(f"{text} is not JSON")
-
-
-def run(*arguments):
-    """Run ``armsight`` with arguments in this process and return its exit code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["armsight", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-    return end.value.code
+from cli_runs import Said, run
 
 
 @pytest.fixture
@@ -88,3 +60,20 @@ def bench(tmp_path_factory):
     here = Bench(folder, of_board, of_arm)
     assert run("calibrate", *here.board, "--model", "brown5", "--folds", 4, "-o", here.rig) == 0
     return here
+
+
+@pytest.fixture
+def full_disk(tmp_path):
+    """A file system of one page, full."""
+    place = tmp_path / "tiny"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
+    try:
+        (place / "ballast").write_bytes(bytes(4096))
+        yield place
+    finally:
+        subprocess.run(["umount", place], check=True)

@@ -9,23 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_views import rig_error
 
 from armsight.vision.rig import StereoRig
+from board_views import rig_error
+from cli_runs import refused
 
 QUICK = ("--model", "brown5", "--folds", "3", "--flat-board")
-
-
-def refused(said, *words):
-    """Hold a run to the manners of a mistake: code 2, one line on stderr that has the words, nothing on stdout."""
-    assert said.code == 2, said
-    lines = said.err.splitlines()
-    assert len(lines) == 1, said.err
-    assert lines[0].startswith("armsight: error: ")
-    assert "Traceback" not in said.err
-    assert said.out == ""
-    for word in words:
-        assert str(word) in said.err, said.err
 
 
 @pytest.fixture
@@ -273,23 +262,6 @@ def test_an_interrupt_leaves_nothing(bench, tmp_path, module, name, wait):
     assert printed == ""
     assert out.read_text() == "what stood there"
     assert os.listdir(tmp_path) == ["rig.json"]
-
-
-@pytest.fixture
-def full_disk(tmp_path):
-    """A file system of one page, full."""
-    place = tmp_path / "tiny"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    try:
-        (place / "ballast").write_bytes(bytes(4096))
-        yield place
-    finally:
-        subprocess.run(["umount", place], check=True)
 
 
 def test_a_full_disk(few, armsight, full_disk):

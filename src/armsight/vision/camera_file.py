@@ -35,6 +35,8 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
         document = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, thousands of brackets
+        raise InputError(f"{path}: not a file of cameras: {error}") from None
     if not isinstance(document, dict) or not all(isinstance(document.get(side), dict) for side in SIDES):
         raise InputError(f'{path}: expected an object with "left" and "right", each with "K" and "distortion"')
     left, right = (_camera(path, document, side) for side in SIDES)

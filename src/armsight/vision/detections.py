@@ -54,7 +54,10 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
         InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
             all; the message names file and line.
     """
-    rows = list(csv.reader(io.StringIO(read_text(path))))
+    try:
+        rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a table of detections: {error}") from None
     if not rows:
         raise InputError(f"{path}: empty; expected a header {','.join(COLUMNS)}")
     header = [name.strip() for name in rows[0]]

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_views import SIZES, bench, board_pairs, detections, rig_error
 from scipy.stats import chi2
 
 from armsight.data import Detections
@@ -11,6 +10,7 @@ from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.vision.calibrate.boards import LEAST_PAIRS, MODELS, Pair, calibrate_boards
 from armsight.vision.match import renamed
+from board_views import SIZES, bench, board_pairs, detections, rig_error
 
 
 @pytest.mark.parametrize("flat", [True, False], ids=["drawing", "estimated board"])
@@ -137,7 +137,7 @@ def test_too_few_pairs_say_how_many_are_needed_and_why_there_are_not():
     true, board, Ts = bench()
     pairs = board_pairs(true, board.body.points, Ts[: LEAST_PAIRS - 1])
     pairs += [Pair("dark", Detections.none("too dark"), Detections.none("too dark"))]
-    with pytest.raises(CalibrationError, match="2 of 3 pairs are usable, at least 3 are needed.*dark: left: too dark"):
+    with pytest.raises(CalibrationError, match=r"2 of 3 pairs are usable, at least 3 are needed.*dark: left: too dark"):
         calibrate_boards(board, pairs, SIZES)
 
 

@@ -101,7 +101,7 @@ def calibrate_bodies(
 
 
 def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> Array:
-    """Return the relative pose under which most detections belong to bodies."""
+    """Return the relative pose under which most detections belong to bodies that both cameras see."""
     both = [j for j, (left, right) in enumerate(found) if left and right]
     both = sorted(both, key=lambda j: -sum(len(side[0].rows) for side in found[j]))[:_START_SHOTS]
     depths = [c.T_camera_body[2, 3] for j in both for side in found[j] for c in side]
@@ -111,8 +111,10 @@ def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenSh
     best, most = None, -1
     for T in relative_poses(views[0], views[1], float(np.median(depths))):
         T = _refined(points, cameras, T, [shots[j] for j in both], [found[j] for j in both])
+        # A body that one camera alone sees says nothing of the other: any relative pose explains it.
         explained = sum(
-            sum(int(seen.seen.sum()) for _, seen in instances(points, cameras, T, shots[j], found[j])) for j in both
+            sum(int(seen.seen.sum(axis=0).min()) for _, seen in instances(points, cameras, T, shots[j], found[j]))
+            for j in both
         )
         if explained > most:
             best, most = T, explained

@@ -1,0 +1,337 @@
+import csv
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from armsight.app.poses import CSV_COLUMNS
+from armsight.geometry.pose import inverse, log_se3, pose, transform
+from armsight.vision.markers.bodies import save_body_csv
+from armsight.vision.markers.targets import open_body
+from armsight.vision.rig import StereoRig
+from cli_runs import refused
+
+KEYS = {
+    "shot", "status", "reason", "t_s", "position_m", "quaternion_wxyz", "roll_pitch_yaw_deg", "covariance",
+    "residual_rms_m", "reprojection_rms_px", "points_m",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def measured(bench, tmp_path_factory):
+    """The arm's recording measured once, as a program reads it: JSON lines and the CSV."""
+    out = tmp_path_factory.mktemp("measured") / "poses.csv"
+    script = "from armsight.app.cli.main import main; main()"
+    arguments = ["measure", bench.rig, "--target", bench.plate, "--source", bench.folder / "arm", "--json", "-o", out]
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+    def refuse(text):
+        raise AssertionError(f"{text} is not JSON")
+
+    records = [json.loads(line, parse_constant=refuse) for line in done.stdout.splitlines()]
+    with open(out, newline="", encoding="utf-8") as file:
+        return records, list(csv.DictReader(file)), done.stderr
+
+
+def tangents(bench, records):
+    """Errors (N, 6) and covariances (N, 6, 6) in the body's axes."""
+    errors, covs = [], []
+    for record, true in zip(records, bench.of_arm.Ts_left_body, strict=True):
+        w, x, y, z = record["quaternion_wxyz"]
+        T = pose(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(record["position_m"]))
+        errors.append(log_se3(inverse(T) @ true))
+        covs.append(record["covariance_body"])
+    return np.array(errors), np.array(covs)
+
+
+def test_every_shot_is_measured_within_its_uncertainty(bench, measured):
+    records, _, complained = measured
+    assert [r["shot"] for r in records] == list(bench.of_arm.shots)
+    assert {r["status"] for r in records} == {"ok"}
+    assert "measured 16 of 16 shots" in complained
+    errors, covs = tangents(bench, records)
+    sigma = np.sqrt(np.einsum("nii->ni", covs))
+    assert (np.abs(errors) < 4 * sigma).all(), np.abs(errors / sigma).max(axis=0)
+    nees = np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, covs, strict=True)])
+    # The calibration's share is common to all shots, so they are fewer than 16 independent draws: the band is that of
+    # one shot in a thousand below and above for four.
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], 6 * 4) / 4
+    assert low < nees.mean() < high, nees
+
+
+def test_a_record_has_what_was_promised(bench, measured):
+    body = open_body(str(bench.plate))
+    for record in measured[0]:
+        assert set(record) >= KEYS
+        assert record["reason"] is None
+        assert np.shape(record["covariance"]) == np.shape(record["covariance_body"]) == (6, 6)
+        assert np.linalg.norm(record["quaternion_wxyz"]) == pytest.approx(1, abs=1e-12)
+        assert set(record["points_m"]) <= set(body.point_names)
+        assert len(record["points_m"]) + len(record["dropped"]) >= 3
+        w, x, y, z = record["quaternion_wxyz"]
+        roll, pitch, yaw = record["roll_pitch_yaw_deg"]
+        R = Rotation.from_quat([x, y, z, w]).as_matrix()
+        turned = Rotation.from_euler("ZYX", [roll, pitch, yaw], degrees=True).as_matrix()
+        assert pytest.approx(turned, abs=1e-12) == R
+
+
+def test_the_covariance_is_that_of_the_body_turned_into_the_left_cameras_axes(measured):
+    for record in measured[0]:
+        w, x, y, z = record["quaternion_wxyz"]
+        turn = block_diag(*[Rotation.from_quat([x, y, z, w]).as_matrix()] * 2)
+        body, left = np.array(record["covariance_body"]), np.array(record["covariance"])
+        assert left == pytest.approx(turn @ body @ turn.T, abs=1e-12 * np.trace(body))
+        assert (np.linalg.eigvalsh(left) > 0).all()
+
+
+def test_the_csv_says_the_same(measured):
+    records, rows, _ = measured
+    assert tuple(rows[0]) == CSV_COLUMNS
+    for record, row in zip(records, rows, strict=True):
+        assert (row["shot"], row["status"], row["reason"]) == (record["shot"], "ok", "")
+        said = [record["t_s"], *record["position_m"], *record["quaternion_wxyz"], *record["roll_pitch_yaw_deg"]]
+        names = ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "roll_deg", "pitch_deg", "yaw_deg"]
+        assert [float(row[name]) for name in names] == said
+        cov = np.array(record["covariance"])
+        for i in range(6):
+            for j in range(i, 6):
+                assert float(row[f"cov_{i}{j}"]) == cov[i, j]
+        sigmas = [float(row[f"sigma_{a}"]) for a in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")]
+        assert sigmas == pytest.approx(np.sqrt(np.diag(cov)), rel=1e-15)
+        assert float(row["residual_rms_m"]) == record["residual_rms_m"]
+        assert float(row["reprojection_rms_px"]) == record["reprojection_rms_px"]
+        assert int(row["points"]) == len(record["points_m"])
+
+
+@pytest.fixture
+def arm(bench, tmp_path):
+    """A folder of its own with three shots of the arm, to be spoilt."""
+    folder = tmp_path / "arm"
+    folder.mkdir()
+    for n in (0, 5, 10):
+        for side in ("left", "right"):
+            shutil.copy(bench.folder / "arm" / f"{side}{n:03d}.png", folder)
+    return folder
+
+
+@pytest.fixture
+def start(bench):
+    """How every measurement of the arm begins."""
+    return "measure", bench.rig, "--target", bench.plate
+
+
+def images(folder):
+    return "--left", folder / "left*.png", "--right", folder / "right*.png"
+
+
+def test_people_read_millimetres_and_a_sigma(start, arm, armsight):
+    said = armsight(*start, *images(arm))
+    assert said.code == 0, said.err
+    assert [line.split(":")[0] for line in said.out.splitlines()] == ["left000", "left005", "left010"]
+    assert all("±" in line and " mm, " in line and " deg ± " in line for line in said.out.splitlines())
+    assert said.err.startswith("measured 3 of 3 shots")
+
+
+def test_a_board_is_a_target(bench, armsight):
+    said = armsight("measure", bench.rig, "--target", "chessboard:9x6:25mm", *bench.images("board"), "--json")
+    assert said.code == 0, said.err
+    for record, true in zip(said.lines, bench.of_board.Ts_left_body, strict=True):
+        gap = np.array(record["position_m"]) - true[:3, 3]
+        assert gap @ np.linalg.solve(np.array(record["covariance"])[:3, :3], gap) < chi2.ppf(1 - 1e-5, 3)
+
+
+# Bad input, one by one.
+
+
+@pytest.mark.parametrize("what", ["missing", "truncated", "garbage", "another size"])
+def test_a_shot_that_cannot_be_read_is_missed_and_the_rest_measured(start, arm, armsight, tmp_path, what):
+    path = arm / "right005.png"
+    if what == "missing":
+        path.unlink()
+        path.mkdir()  # the name is there, a file is not: a glob of files does not see it
+        refused(armsight(*start, *images(arm)), "do not pair up")
+        return
+    if what == "another size":
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
+    else:
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2] if what == "truncated" else b"garbage")
+    said = armsight(*start, *images(arm), "--json", "-o", tmp_path / "poses.csv")
+    assert said.code == 0, said.err
+    records = said.lines
+    assert [r["status"] for r in records] == ["ok", "missed", "ok"]
+    assert set(records[1]) == {"shot", "t_s", "status", "reason"}
+    assert ("320x180" if what == "another size" else "right005.png") in records[1]["reason"]
+    assert "1 missed" in said.err
+    with open(tmp_path / "poses.csv", newline="", encoding="utf-8") as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["ok", "missed", "ok"]
+
+
+def test_nothing_in_view_is_an_error_after_its_lines(start, bench, armsight):
+    said = armsight(*start, *bench.images("board"))
+    assert said.code == 2
+    assert len(said.out.splitlines()) == 12
+    assert all(": missed: " in line for line in said.out.splitlines())
+    assert len(said.err.splitlines()) == 1
+    assert "none of 12 shots could be measured" in said.err
+
+
+def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
+    said = armsight(*start, "--left", arm / "right*.png", "--right", arm / "left*.png", "--json")
+    assert said.code == 2
+    assert all("left and right are exchanged" in record["reason"] for record in said.lines)
+    assert "left and right are exchanged" in said.err
+
+
+def test_a_rig_of_another_image_size(start, arm, armsight):
+    for path in arm.glob("*.png"):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
+    refused(armsight(*start, *images(arm)), "320x180", "640x360", "rig.json")
+
+
+def test_an_empty_glob(start, tmp_path, armsight):
+    refused(armsight(*start, *images(tmp_path)), "left*.png", "no such file")
+
+
+def test_a_missing_source(start, tmp_path, armsight):
+    refused(armsight(*start, "--source", tmp_path / "nowhere"), "nowhere")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--left", "a*.png"),
+        ("--left", "a", "--right", "b", "--source", "c"),
+        ("--source", "c", "--detections", "d.csv"),
+        ("--right", "b", "--detections", "d.csv"),
+    ],
+)
+def test_shots_given_no_way_or_two(start, armsight, options):
+    refused(armsight(*start, *options), "give the shots one way")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "not JSON"),
+        ("{", "not JSON"),
+        ("[1, 2]", "not a rig file"),
+        ('{"format": "other"}', "not a rig file"),
+        ('{"format": "armsight-rig", "version": 1}', "has no 'left'"),
+        (b"\xff\xfe\x00", "not a text file"),
+    ],
+)
+def test_a_damaged_rig(bench, arm, tmp_path, armsight, text, words):
+    path = tmp_path / "rig.json"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, words)
+
+
+def test_half_a_rig_and_a_newer_one_and_one_with_nan(bench, arm, tmp_path, armsight):
+    path, text = tmp_path / "rig.json", bench.rig.read_text()
+    path.write_text(text[: len(text) // 2])
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "not JSON")
+    document = json.loads(text)
+    path.write_text(json.dumps({**document, "version": 99}))
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "version 99", "update armsight")
+    path.write_text(json.dumps({**document, "sigma_px": math.nan}))
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path)
+    path.unlink()
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "no such file")
+
+
+@pytest.mark.parametrize("target", ["", "plate", "nowhere.toml", "nowhere.csv", "chessboard:9x6", "tag:1:2"])
+def test_a_target_that_is_none(bench, arm, armsight, target):
+    refused(armsight("measure", bench.rig, "--target", target, *images(arm)))
+
+
+def test_a_csv_body_cannot_be_found_in_images(bench, arm, tmp_path, armsight):
+    save_body_csv(open_body(str(bench.plate)), tmp_path / "plate.csv")
+    refused(armsight("measure", bench.rig, "--target", tmp_path / "plate.csv", *images(arm)), "--detections")
+
+
+def test_no_folder_for_the_result(start, arm, tmp_path, armsight):
+    out = tmp_path / "nowhere" / "poses.csv"
+    refused(armsight(*start, *images(arm), "-o", out), out, "there is no folder")
+
+
+def test_a_full_disk(start, arm, armsight, full_disk):
+    out = full_disk / "poses.csv"
+    said = armsight(*start, *images(arm), "-o", out)
+    assert said.code == 2
+    assert len(said.out.splitlines()) == 3, "what was measured was printed before"
+    assert said.err.splitlines() == [f"armsight: error: {out}: cannot be written: No space left on device"]
+    assert os.listdir(full_disk) == ["ballast"]
+
+
+# Detections instead of images.
+
+
+@pytest.fixture
+def seen(bench, tmp_path):
+    """The plate's corners as a CSV body and their true pixels in two shots; shot 9 has only two."""
+    body = open_body(str(bench.plate))
+    save_body_csv(body, tmp_path / "plate.csv")
+    rig, lines = StereoRig.load(bench.rig), ["shot,camera,marker,u_px,v_px"]
+    for shot, names in (("3", 16), ("7", 16), ("9", 2)):
+        T = bench.of_arm.Ts_left_body[int(shot)]
+        p = body.points[:names] @ T[:3, :3].T + T[:3, 3]
+        T_right_left = inverse(rig.T_left_right)
+        for side, camera, q in (("left", rig.left, p), ("right", rig.right, transform(T_right_left, p))):
+            for name, (u, v) in zip(body.point_names, camera.project(q), strict=False):
+                lines.append(f"{shot},{side},{name},{u:.6f},{v:.6f}")
+    (tmp_path / "d.csv").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def by_detections(bench, folder):
+    return "measure", bench.rig, "--target", folder / "plate.csv", "--detections", folder / "d.csv"
+
+
+def test_detections_are_measured_and_too_few_points_missed(bench, seen, armsight):
+    said = armsight(*by_detections(bench, seen), "--json")
+    assert said.code == 0, said.err
+    assert [(r["shot"], r["status"]) for r in said.lines] == [("3", "ok"), ("7", "ok"), ("9", "missed")]
+    assert "2" in said.lines[2]["reason"]
+    for record in said.lines[:2]:
+        # Pixels are written to a millionth: 1e-6 px is below a nanometre here, three decimals of room.
+        assert record["position_m"] == pytest.approx(bench.of_arm.Ts_left_body[int(record["shot"])][:3, 3], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("d.csv", "3,left,T0.0,", "3,left,T0.0,nan,1\n3,left,T0.0,", "line 2: u_px is nan"),
+        ("d.csv", "u_px", "u", "no column u_px"),
+        ("d.csv", "3,left,T0.0", "3,middle,T0.0", "line 2: camera 'middle'"),
+        ("d.csv", "3,left,T0.0", "3,left,T9.9", "line 2: unknown marker 'T9.9'"),
+        ("plate.csv", "T0.0,", "T0.0,nan,0,0\nT8,", "line 2"),
+        ("plate.csv", "T0.0,-", "T0.0,about ", "line 2"),
+        ("plate.csv", "T0.1,", "T0.0,", "line 3"),
+        ("plate.csv", "x_m", "left_m", "line 1"),
+    ],
+)
+def test_a_wrong_line_in_a_table(bench, seen, armsight, file, old, new, words):
+    text = (seen / file).read_text()
+    assert old in text
+    (seen / file).write_text(text.replace(old, new, 1))
+    said = armsight(*by_detections(bench, seen), "-o", seen / "poses.csv")
+    refused(said, seen / file, words)
+    assert not (seen / "poses.csv").exists()
+
+
+@pytest.mark.parametrize("text", ["", "shot,camera,marker,u_px,v_px\n"])
+def test_empty_tables(bench, seen, armsight, text):
+    (seen / "d.csv").write_text(text)
+    refused(armsight(*by_detections(bench, seen)), seen / "d.csv")
