@@ -1,0 +1,137 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from armsight.data import Detections, Missed, PoseEstimate, Shot
+from armsight.geometry.pose import inverse, log_se3
+from armsight.vision.detections import SeenShot
+from armsight.vision.match import renamed
+from armsight.vision.measure import measure, measure_detections, measure_seen, size_problem
+from board_views import SIZE, bench, board_pairs, detections
+
+SIGMA = 0.1
+
+
+class Told:
+    """A target that says it detects what the test tells it to."""
+
+    def __init__(self, body, left, right, flips=()):
+        self.body, self.flips, self._rest = body, flips, [left, right]
+
+    def detect(self, image):
+        return self._rest.pop(0)
+
+
+def known(spec="chessboard:9x6:25mm"):
+    """A true rig that knows the detector's noise, the board, one pose and what is seen of it."""
+    rig, board, Ts = bench(spec=spec)
+    rig = replace(rig, sigma_px=SIGMA)
+    (pair,) = board_pairs(rig, board.body.points, Ts[:1], sigma=SIGMA)
+    return rig, board, Ts[0], pair
+
+
+def grey_shot(width=SIZE[0]):
+    return Shot("s", *(np.zeros((SIZE[1], width), np.uint8) for _ in "lr"))
+
+
+def test_the_pose_is_found_within_its_covariance():
+    rig, board, _, _ = known()
+    _, _, Ts = bench()
+    nees = []
+    for n, pair in enumerate(board_pairs(rig, board.body.points, Ts, sigma=SIGMA, seed=1)):
+        estimate = measure(rig, Told(board.body, pair.left, pair.right), grey_shot())
+        assert isinstance(estimate, PoseEstimate)
+        e = log_se3(inverse(estimate.T_left_body) @ Ts[n])
+        nees.append(e @ np.linalg.solve(estimate.cov, e))
+    assert max(nees) < chi2.ppf(1 - 1e-4 / len(nees), 6)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 6 * len(nees)) / len(nees)
+    assert low < np.mean(nees) < high
+
+
+def test_a_shot_without_images_is_missed_with_its_reason():
+    rig, board, _, pair = known()
+    target = Told(board.body, pair.left, pair.right)
+    assert measure(rig, target, Shot("s", None, None, problem="unplugged")).reason == "unplugged"
+    assert measure(rig, target, Shot("s", None, None)).reason == "no image"
+    wrong = measure(rig, target, grey_shot(width=320))
+    assert "the left image is 320x360" in wrong.reason
+    assert size_problem(SIZE, np.zeros((360, 640, 3)), "left") is None
+
+
+def test_what_was_not_detected_is_named_by_side():
+    rig, board, _, pair = known()
+    nothing = Detections.none("no board")
+    assert measure(rig, Told(board.body, nothing, pair.right), grey_shot()).reason == "left: no board"
+    assert measure(rig, Told(board.body, nothing, nothing), grey_shot()).reason == "left: no board; right: no board"
+
+
+def test_exchanged_cameras_are_told():
+    rig, board, _, pair = known()
+    swapped = measure_detections(rig, board.body, pair.right, pair.left)
+    assert isinstance(swapped, Missed)
+    assert swapped.reason.startswith("left and right are exchanged")
+
+
+def test_detections_of_nothing_are_not_called_exchanged():
+    rig, board, _, pair = known()
+    rng = np.random.default_rng(3)
+    left, right = (detections(pair.left.ids, rng.uniform(0, 360, pair.left.uv.shape)) for _ in "lr")
+    result = measure_detections(rig, board.body, left, right)
+    assert isinstance(result, Missed)
+    assert "exchanged" not in result.reason
+
+
+def test_a_symmetric_board_read_from_the_other_end_is_measured_all_the_same():
+    rig, board, T, pair = known("chessboard:9x7:25mm")
+    straight = measure_detections(rig, board.body, pair.left, pair.right, flips=board.flips)
+    turned = measure_detections(rig, board.body, pair.left, renamed(pair.right, board.flips[0]), flips=board.flips)
+    assert turned.T_left_body == pytest.approx(straight.T_left_body, abs=1e-12)
+    assert np.linalg.norm(turned.T_left_body[:3, 3] - T[:3, 3]) < 5 * np.sqrt(np.trace(turned.cov[:3, :3]))
+
+
+def test_one_wrong_point_is_dropped_by_name_and_changes_little():
+    rig, board, _, pair = known()
+    uv = np.array(pair.right.uv)
+    uv[20] += (25.0, 0.3)  # along the epipolar line, where the gate is blind
+    uv[31] += (0.0, 25.0)  # across it
+    best = measure_detections(rig, board.body, pair.left, pair.right)
+    spoilt = measure_detections(rig, board.body, pair.left, detections(pair.right.ids, uv))
+    assert {d.point for d in spoilt.dropped} == {board.body.point_names[i] for i in (20, 31)}
+    gap = log_se3(inverse(best.T_left_body) @ spoilt.T_left_body)
+    # Without 2 of 54 points the estimate moves by about sqrt(2 / 52) of its own sigma; three times that.
+    assert gap @ np.linalg.solve(best.cov, gap) < 9 * 6 * 2 / 52
+
+
+def test_fewer_than_three_points_are_a_miss():
+    rig, board, _, pair = known()
+    two = [detections(d.ids[:2], d.uv[:2]) for d in (pair.left, pair.right)]
+    assert isinstance(measure_detections(rig, board.body, *two), Missed)
+    apart = measure_detections(
+        rig,
+        board.body,
+        detections(pair.left.ids[:2], pair.left.uv[:2]),
+        detections(pair.right.ids[5:], pair.right.uv[5:]),
+    )
+    assert isinstance(apart, Missed)
+    assert apart.reason
+
+
+def test_detections_of_a_file_are_measured_as_those_of_images():
+    rig, board, _, pair = known()
+    order = np.random.default_rng(0).permutation(54)
+    shot = SeenShot("1", (pair.left.ids[order], pair.right.ids), (pair.left.uv[order], pair.right.uv))
+    from_file, from_images = (
+        measure_seen(rig, board.body, shot),
+        measure_detections(rig, board.body, pair.left, pair.right),
+    )
+    assert from_file.T_left_body == pytest.approx(from_images.T_left_body, abs=1e-12)
+
+
+def test_markers_that_stand_twice_and_agree_with_nothing_are_a_miss():
+    rig, board, _, _ = known()
+    rng = np.random.default_rng(2)
+    ids = np.array([7, 7, 40, 40])
+    shot = SeenShot("1", (ids, ids), tuple(rng.uniform(0, 360, (4, 2)) for _ in "lr"))
+    assert "stand twice" in measure_seen(rig, board.body, shot).reason
