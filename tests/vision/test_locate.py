@@ -1,0 +1,281 @@
+"""Locating: scipy on OpenCV's projection is the oracle of the pose, Monte Carlo of its covariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from armsight.data import Correspondences, Missed
+from armsight.geometry.pose import exp_se3, log_se3, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.camera import Camera
+from armsight.vision.locate import locate
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+from asserts import numeric_jacobian
+from strategies import CAMERAS, ordinary_rig
+from views import board, body_of, both_pixels, seen, somewhere
+
+SIGMA_PX = 0.2
+CLOUD = np.random.default_rng(3).uniform(-0.05, 0.05, (12, 3))
+#: What a calibration from a dozen pairs leaves open: half a pixel of focal length and centre, a tenth of a milliradian.
+LENS = (0.5, 0.5, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4)
+CALIBRATION = np.array([*LENS, *LENS, *(3 * [1e-4]), *(3 * [1e-4])])
+
+
+def rig_of(model="brown4", *, known=True):
+    """A rig with a noise of SIGMA_PX, its calibration known exactly or with a dense covariance."""
+    base = ordinary_rig(model)
+    if known:
+        return replace(base, cov=np.zeros_like(base.cov), sigma_px=SIGMA_PX)
+    n = base.parameter_count
+    mix = np.linalg.qr(np.random.default_rng(0).normal(size=(n, n)))[0] * np.linspace(0.3, 1.5, n)
+    root = CALIBRATION[:, None] * mix
+    return replace(base, cov=root @ root.T, sigma_px=SIGMA_PX)
+
+
+def located(rig, points, shot):
+    """Locate without the gate: every detection reaches the fit."""
+    body = body_of(points)
+    return locate(rig, body, triangulate(rig, body, shot))
+
+
+def error(estimate, T):
+    """Tangent (6,) from the estimate to the truth."""
+    return log_se3(np.linalg.inv(estimate.T_left_body) @ T)
+
+
+def nees(estimate, T):
+    """Normalised squared error, six degrees of freedom."""
+    xi = error(estimate, T)
+    return xi @ np.linalg.solve(estimate.cov, xi)
+
+
+#: One in a hundred million by chance: beyond it a pose is in a wrong minimum, or its covariance is wrong.
+WRONG = chi2.ppf(1 - 1e-8, 6)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("points", [CLOUD, CLOUD[:4], CLOUD[:3], board(4, 3)], ids=["cloud", "four", "three", "board"])
+def test_without_noise_it_is_the_truth(model, points):
+    rig, rng = rig_of(model), np.random.default_rng(0)
+    for _ in range(5):
+        T = somewhere(rng)
+        found = located(rig, points, seen(rig, points, T))
+        assert np.abs(error(found, T)).max() < 1e-9
+        assert found.residual_rms_m < 1e-9
+        assert found.reprojection_rms_px < 1e-6
+        assert found.misfit == 1
+        assert found.dropped == ()
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_it_is_the_minimum_and_the_covariance_of_a_slow_solver(model):
+    rig, rng, points = rig_of(model, known=True), np.random.default_rng(1), CLOUD[:6]
+    root = 0.3 * (np.eye(2) + 0.5 * rng.normal(size=(6, 2, 2, 2)))
+    cov_uv = root @ root.transpose(0, 1, 3, 2)
+    T = somewhere(rng)
+    shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng, hidden=[(1, 0), (4, 1)])
+    shot = replace(shot, cov_uv=cov_uv)
+    found = located(rig, points, shot)
+    W = np.linalg.inv(np.linalg.cholesky(cov_uv + SIGMA_PX**2 * np.eye(2)))
+
+    def whitened(x):
+        r = shot.uv - both_pixels(rig, transform(found.T_left_body @ exp_se3(x), points))
+        return (W @ r[..., None])[shot.seen].ravel()
+
+    sigma = np.sqrt(np.diag(found.cov_noise))
+    slow = least_squares(whitened, np.zeros(6), x_scale=sigma, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert (np.abs(slow.x) < 1e-3 * sigma).all()
+    J = numeric_jacobian(whitened, np.zeros(6), 1e-4)
+    np.testing.assert_allclose(
+        found.cov_noise / np.outer(sigma, sigma), np.linalg.inv(J.T @ J) / np.outer(sigma, sigma), atol=1e-6
+    )
+    np.testing.assert_array_equal(found.cov, found.cov_noise)
+    r = (shot.uv - both_pixels(rig, transform(found.T_left_body, points)))[shot.seen]
+    assert found.reprojection_rms_px == pytest.approx(np.sqrt((r**2).sum(axis=1).mean()), rel=1e-6)
+    gap = found.points.p_left - transform(found.T_left_body, points[[0, 2, 3, 5]])
+    assert found.residual_rms_m == pytest.approx(np.sqrt((gap**2).sum(axis=1).mean()), rel=1e-9)
+
+
+def draws(points, n, seed, share):
+    """Measure shots that rigs drawn from the covariance see with noise, with the one rig we believe in."""
+    believed, rng = rig_of(known=False), np.random.default_rng(seed)
+    believed = replace(believed, cov=share**2 * believed.cov)
+    root = np.linalg.cholesky(believed.cov)
+    for _ in range(n):
+        true = believed.perturbed(root @ rng.normal(size=len(root)))
+        T = somewhere(rng, tilt=(0.4, 0.4, 1.0))
+        yield located(believed, points, seen(true, points, T, sigma=SIGMA_PX, rng=rng)), T
+
+
+def assert_covers(values):
+    """Hold normalised squared errors to be a chi-square of six degrees: mean and the 95% ellipsoid."""
+    n = len(values)
+    # The mean's 95% band; a chi-square of six degrees has variance twelve.
+    assert abs(np.mean(values) - 6) < 1.96 * np.sqrt(12 / n)
+    inside = np.mean(values < chi2.ppf(0.95, 6))
+    assert abs(inside - 0.95) < max(0.02, 3 * np.sqrt(0.95 * 0.05 / n))
+
+
+def test_the_covariance_covers_noise_and_calibration():
+    values, alone = [], []
+    for found, T in draws(CLOUD[:8], 2000, seed=1, share=0.3):
+        values.append(nees(found, T))
+        alone.append(nees(replace(found, cov=found.cov_noise), T))
+    assert_covers(np.array(values))
+    # Both shares count here: either alone would be far off.
+    assert np.mean(alone) > 10
+
+
+@pytest.mark.parametrize(
+    ("points", "n"), [(CLOUD[:3], 200), (CLOUD[:4], 100), (board(4, 3), 300)], ids=["3", "4", "board"]
+)
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_the_covariance_covers_for_other_bodies(points, n, share):
+    if share == 0.0:
+        rig, rng = rig_of(), np.random.default_rng(2)
+        Ts = [somewhere(rng) for _ in range(n)]
+        shots = [(located(rig, points, seen(rig, points, T, sigma=SIGMA_PX, rng=rng)), T) for T in Ts]
+    else:
+        shots = list(draws(points, n, 3, share))
+    assert_covers(np.array([nees(found, T) for found, T in shots]))
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("direction", [0.0, 0.8, 1.6])
+def test_one_gross_error_is_dropped_by_name_and_moves_nothing(camera, direction):
+    rig, points, rng = rig_of(), CLOUD[:8], np.random.default_rng(4)
+    for k in range(8):
+        T = somewhere(rng)
+        shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng)
+        uv = shot.uv.copy()
+        uv[k, camera] += 30 * np.array([np.cos(direction), np.sin(direction)])
+        found = located(rig, points, replace(shot, uv=uv))
+        assert [d.point for d in found.dropped] == [f"P{k}"]
+        assert found.dropped[0].reason.endswith(f"px off the body in the {('left', 'right')[camera]} image")
+        assert 25 < float(found.dropped[0].reason.split()[0]) < 35
+        assert k not in found.points.ids
+        uv[k, camera] = np.nan
+        without = located(rig, points, replace(shot, uv=uv))
+        assert (np.abs(error(found, without.T_left_body)) < 1e-3 * np.sqrt(np.diag(without.cov))).all()
+        np.testing.assert_allclose(found.cov, without.cov, rtol=1e-3, atol=1e-3 * np.abs(without.cov).max())
+
+
+@pytest.mark.parametrize("count", [4, 8, 12])
+@pytest.mark.parametrize("off", [100.0, 200.0, 350.0])
+def test_no_error_along_the_epipolar_line_leads_to_a_wrong_minimum(count, off):
+    """The gate lets such a point pass; its depth is metres off and pulls the rigid fit that is the start."""
+    rig, points, rng = rig_of(), CLOUD[:count], np.random.default_rng(5)
+    for _ in range(60):
+        T = somewhere(rng, tilt=(0.4, 0.4, 1.0))
+        shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng)
+        uv, k = shot.uv.copy(), rng.integers(count)
+        uv[k, rng.integers(2), 0] += rng.choice([-1, 1]) * off
+        found = located(rig, points, replace(shot, uv=uv))
+        assert nees(found, T) < WRONG
+        assert {d.point for d in found.dropped} == {f"P{k}"}
+
+
+def small_body_rig():
+    """Two cameras of 8000 px focal length, 0.35 m apart, that look at one place 1.7 m away; 0.5 px of noise."""
+    camera = Camera((2000, 1500), "none", np.array([8000.0, 8000.0, 999.5, 749.5]), np.zeros(0))
+    half = np.arcsin(0.175 / 1.7)
+    T = pose(exp_so3(np.array([0.0, -2 * half, 0.0])), 0.35 * np.array([np.cos(half), 0.0, np.sin(half)]))
+    return StereoRig(camera, camera, T, np.zeros((14, 14)), 0.5)
+
+
+SMALL = {
+    "triangle": (np.array([[0.0, 0, 0], [0.06, 0, 0], [0, 0.05, 0]]), 300),
+    "flat square": (board(2, 2, 0.042), 100),
+    "tetrahedron": (np.array([[0.0, 0, 0], [0.06, 0, 0], [0, 0.06, 0], [0, 0, 0.04]]), 100),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_small_bodies_far_away_are_not_mirrored(name):
+    rig, rng = small_body_rig(), np.random.default_rng(6)
+    points, n = SMALL[name]
+    points, wrong = points - points.mean(axis=0), 0
+    for _ in range(n):
+        T = pose(exp_so3(rng.normal(size=3) * [0.5, 0.5, 2.0]), np.array([0, 0, 1.7]) + rng.uniform(-0.05, 0.05, 3))
+        found = located(rig, points, seen(rig, points, T, sigma=0.5, rng=rng))
+        wrong += isinstance(found, Missed) or nees(found, T) > WRONG
+    assert wrong <= 0.01 * n
+
+
+def test_points_of_one_camera_improve_the_pose():
+    rig, rng = rig_of(), np.random.default_rng(7)
+    points, both = np.concatenate([0.5 * CLOUD[:8], 1.5 * CLOUD[8:]]), 8
+    errors, claims = {True: [], False: []}, {True: [], False: []}
+    for _ in range(100):
+        T = somewhere(rng)
+        shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng, hidden=[(i, i % 2) for i in range(both, 12)])
+        less = Correspondences(*(a[:both] for a in (shot.ids, shot.uv, shot.cov_uv)))
+        for more, given in ((True, shot), (False, less)):
+            found = located(rig, points, given)
+            assert len(found.points.ids) == both
+            errors[more].append(error(found, T))
+            claims[more].append(np.diag(found.cov))
+    rms = {more: np.sqrt(np.mean(np.square(e), axis=0)) for more, e in errors.items()}
+    sigma = {more: np.sqrt(np.mean(c, axis=0)) for more, c in claims.items()}
+    assert (sigma[True] < 0.95 * sigma[False]).all()
+    assert (rms[True] < 0.95 * rms[False]).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_points_are_missed(count):
+    rig, T = rig_of(), somewhere(np.random.default_rng(8))
+    found = located(rig, CLOUD, seen(rig, CLOUD, T, hidden=[(i, 1) for i in range(count, 12)]))
+    assert found == Missed(f"{count} matched points, 3 are needed")
+
+
+def test_a_miss_says_what_was_dropped():
+    rig, T = rig_of(), somewhere(np.random.default_rng(8))
+    shot = seen(rig, CLOUD[:3], T)
+    uv = shot.uv.copy()
+    uv[1, 1, 0] += 500.0  # its rays part
+    found = located(rig, CLOUD[:3], replace(shot, uv=uv))
+    assert found.reason.startswith("2 matched points, 3 are needed; dropped: P1 (its rays do not meet")
+
+
+LINE = np.outer(np.linspace(-0.05, 0.05, 5), [1.0, 0.5, 0.2])
+
+
+def test_points_on_one_line_are_missed():
+    rig, rng = rig_of(), np.random.default_rng(9)
+    for points in (LINE, LINE[:3], LINE + 1e-5 * rng.normal(size=(5, 3)), np.zeros((4, 3))):
+        found = located(rig, points, seen(rig, points, somewhere(rng), sigma=SIGMA_PX, rng=rng))
+        assert found == Missed("the matched points lie on one line")
+
+
+def test_points_left_on_one_line_by_an_outlier_are_missed():
+    rig, rng = rig_of(), np.random.default_rng(10)
+    points = np.concatenate([LINE, [[0.0, 0.06, 0.0]]])
+    for _ in range(20):
+        shot = seen(rig, points, somewhere(rng, tilt=(0.2, 0.2, 0.2)), sigma=SIGMA_PX, rng=rng)
+        uv = shot.uv.copy()
+        uv[5, :, 1] += 250.0  # off in both images, and farther from the line than any turn about it leads
+        found = located(rig, points, replace(shot, uv=uv))
+        assert found == Missed("the points that agree with one pose of the body lie on one line")
+
+
+def test_what_is_not_the_body_is_missed_and_a_bad_print_is_told():
+    rig, rng, points = rig_of(), np.random.default_rng(11), board(6, 4)
+    for _ in range(10):
+        T = somewhere(rng)
+        shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng)
+        mixed = located(rig, points[rng.permutation(24)], shot)
+        assert isinstance(mixed, Missed)
+        assert "the detections are not those of the body" in mixed.reason
+        doubled = located(rig, 2 * points, shot)
+        assert isinstance(doubled, Missed)
+        assert "0.50 times as far apart as its points" in doubled.reason
+        stretched = located(rig, 1.01 * points, shot)
+        # A hundredth of an apparent size of about 60 px is three times the noise, and the covariance says so.
+        assert stretched.misfit > 1.5
+        sharp = located(replace(rig, sigma_px=stretched.misfit * SIGMA_PX), 1.01 * points, shot)
+        assert sharp.misfit == 1
+        np.testing.assert_allclose(stretched.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())
