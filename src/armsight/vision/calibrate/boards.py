@@ -103,7 +103,15 @@ def calibrate_boards(
     rejected += screened.rejected
     _enough(len(screened.kept), len(pairs), rejected)
     names = tuple(usable[j].name for j in screened.kept)
-    search = _Search(model, screened.observations, screened.solution.state, min(folds, len(names)), sizes, progress)
+    search = _Search(
+        model,
+        screened.observations,
+        screened.unscreened,
+        screened.solution.state,
+        min(folds, len(names)),
+        sizes,
+        progress,
+    )
     trial, tried = search.best(models)
     rig = _calibrated(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
@@ -214,6 +222,7 @@ class _Search(Record):
 
     model: Model
     observations: Observations
+    unscreened: Observations
     state: State
     folds: int
     sizes: tuple[tuple[int, int], tuple[int, int]]
@@ -239,7 +248,7 @@ class _Search(Record):
         try:
             model, solution = self._adjusted(self._converted(distortion))
             errors = cross_validate(
-                lambda rows: self._fold(model, solution, rows), model.points, self.observations, self.folds
+                lambda rows: self._fold(model, solution, rows), model.points, self.unscreened, self.folds
             )
         except (CalibrationError, np.linalg.LinAlgError):
             return None

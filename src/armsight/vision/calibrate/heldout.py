@@ -22,6 +22,8 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
 _LEAST_SIGMA_PX = 1e-6
+#: A point this many times as far from the rigid fit as the usual one is a blunder, which measuring drops by name.
+BLUNDER_RATIO = 10.0
 
 
 def correspondences(observations: Observations, shot: int) -> Correspondences:
@@ -65,8 +67,10 @@ def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspo
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
     cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
     p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
-    good = np.isfinite(p).all(axis=1)
-    if good.sum() < 3:
+    good = np.flatnonzero(np.isfinite(p).all(axis=1))
+    if len(good) >= 3:
+        good = good[_without_blunders(estimated[seen.ids[good]], p[good])]
+    if len(good) < 3:
         return None
     board, found = drawing[seen.ids[good]], estimated[seen.ids[good]]
     p, cov_p, by_rig = p[good], cov_p[good], by_rig[good]
@@ -77,9 +81,22 @@ def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspo
         float(np.sqrt((epipolar**2).mean())),
         float(np.sqrt((gap**2).sum(axis=1).mean())),
         fit_scale(board, p),
-        float(good.sum()),
+        float(len(good)),
         _normalised(transform(fit_rigid(found, p), found), p, cov_p, by_rig, rig.cov),
     )
+
+
+def _without_blunders(body: Array, p: Array) -> NDArray[np.bool_]:
+    """(N,) which points a measurement would keep: all but those far off what most agree on."""
+    good = np.ones(len(p), bool)
+    for _ in range(3):
+        T = fit_rigid(body[good], p[good])
+        gap = np.linalg.norm(p - transform(T, body), axis=1)
+        now = gap <= BLUNDER_RATIO * np.median(gap)
+        if now.sum() < 3 or (now == good).all():
+            break
+        good = now
+    return good
 
 
 def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> float:
@@ -106,7 +123,7 @@ def cross_validate(
     Args:
         fit: rows of the shots to use -> the rig they give and the body as they show it (M, 3), m.
         drawing: (M, 3) points of the perfect body, m.
-        observations: all detections.
+        observations: all detections, bad ones included: a measurement meets them too.
         folds: number of folds, at most the number of shots.
 
     Returns:

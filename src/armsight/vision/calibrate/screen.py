@@ -36,6 +36,7 @@ class Screened(Record):
 
     Attributes:
         observations: the good detections, shots renumbered.
+        unscreened: all detections of the same pairs: what a measurement would have to cope with.
         kept: (S,) rows of the pairs that are left.
         solution: the robust adjustment of what is left.
         rejected: pairs thrown out, and why.
@@ -43,6 +44,7 @@ class Screened(Record):
     """
 
     observations: Observations
+    unscreened: Observations
     kept: NDArray[np.int64]
     solution: Solution
     rejected: tuple[Rejected, ...]
@@ -115,7 +117,8 @@ def screen(model: Model, start: State, observations: Observations, names: tuple[
         mine = observations.shot == j
         if lost := int((mine & ~good).sum()):
             notes.append(f"{names[j]}: {lost} of {mine.sum()} corners dropped as gross errors")
-    return Screened(final, kept, minimise(model, state, final, sigma), tuple(rejected), tuple(notes))
+    unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
+    return Screened(final, unscreened, kept, minimise(model, state, final, sigma), tuple(rejected), tuple(notes))
 
 
 def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArray[np.int64]) -> Observations:
