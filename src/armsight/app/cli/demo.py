@@ -54,7 +54,8 @@ def _tell(s: dict[str, Any], out: Path) -> None:
         table.add_row(name, *values)
     console.print(table)
     console.print(
-        f"{100 * s['inside_95_share']:.0f}% of the true poses lie in their predicted 95% ellipsoid; held-out calibration: "
+        f"the truth lies in the predicted 95% ellipsoid in {100 * s['inside_95_share']:.0f}% of the shots (one calibration "
+        f"serves all, so they err together); held-out calibration: "
         f"epipolar {s['heldout_epipolar_rms_px']:.3f} px, board {1e3 * s['heldout_rigid_rms_m']:.4f} mm; baseline off by "
         f"{1e3 * s['baseline_error_m']:+.4f} mm, focal length by {s['focal_error_px']:+.3f} px"
     )
