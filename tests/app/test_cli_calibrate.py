@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from armsight.app.cli import calibrate as command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import refused
@@ -77,13 +78,17 @@ def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
     assert said.err == ""
 
 
-def test_a_report_is_written(few, armsight, tmp_path):
+def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monkeypatch):
+    written = []  # its pages have their own tests
+    monkeypatch.setattr(command, "write_report", lambda calibration, folder: written.append((calibration, folder)))
     said = armsight(
         "calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--report", tmp_path / "r", "--json"
     )
     assert said.code == 0, said.err
     assert Path(said.lines[0]["report"]) == tmp_path / "r" / "index.html"
-    assert "<html" in (tmp_path / "r" / "index.html").read_text()
+    ((calibration, folder),) = written
+    assert folder == tmp_path / "r"
+    assert len(calibration.pairs) == 5
 
 
 # Bad input, one by one.

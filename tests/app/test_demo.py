@@ -12,10 +12,10 @@ from armsight.vision.rig import StereoRig
 
 @pytest.fixture
 def small(monkeypatch):
-    """Make the demo's recording small: ten pairs of the board and eight shots."""
+    """Make the demo's recording small: eight pairs of the board and six shots."""
 
     def recording(folder, *, seed=0):
-        return demo_recording(folder, seed=seed, image_size_px=(640, 360), boards=10, shots=8, rate_hz=3.0)
+        return demo_recording(folder, seed=seed, image_size_px=(640, 360), boards=8, shots=6, rate_hz=2.0)
 
     monkeypatch.setattr(demo, "demo_recording", recording)
 
@@ -25,7 +25,7 @@ def test_the_demo_does_the_main_job_and_tells_the_error(small, armsight, tmp_pat
     said = armsight("demo", "-o", tmp_path / "demo", "--json")
     assert said.code == 0, said.err
     (s,) = said.lines
-    assert s["measured"] == s["shots"] == 8
+    assert s["measured"] == s["shots"] == 6
     # Each squared error in sigmas is chi-square of three degrees of freedom, the calibration's share common to all.
     for kind in ("position", "orientation"):
         unit = "m" if kind == "position" else "rad"
@@ -38,7 +38,7 @@ def test_the_demo_does_the_main_job_and_tells_the_error(small, armsight, tmp_pat
     assert s["focal_error_px"] == pytest.approx(rig.left.intrinsics[0] - true.left.intrinsics[0], abs=1e-12)
     for name in ("demo.png", "pose.png", "poses.csv", "plate.toml", "arm/shots.csv"):
         assert (tmp_path / "demo" / name).stat().st_size > 0
-    assert len((tmp_path / "demo" / "poses.csv").read_text().splitlines()) == 9
+    assert len((tmp_path / "demo" / "poses.csv").read_text().splitlines()) == 7
     # What it wrote is a recording: the commands a user would type next run on it.
     again = armsight(
         "measure", tmp_path / "demo" / "rig.json", "--target", tmp_path / "demo" / "plate.toml", "--source",

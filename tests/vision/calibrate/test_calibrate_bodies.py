@@ -93,7 +93,7 @@ def test_a_refined_body_is_nearer_the_truth():
     true = true_rig()
     drawn, made = ball()
     shots, _ = recording(true, made, 30)
-    plain, refined = (calibrate_bodies(drawn, shots, known(true), refine_body=r, folds=3) for r in (False, True))
+    plain, refined = (calibrate_bodies(drawn, shots, known(true), refine_body=r, folds=2) for r in (False, True))
     assert off(refined.body.points, made) < 0.4 * off(drawn.points, made)
     error, cov = log_se3(inverse(refined.rig.T_left_right) @ true.T_left_right), refined.rig.cov[-6:, -6:]
     assert (np.abs(error) < 4 * np.sqrt(np.diag(cov))).all()
@@ -109,7 +109,7 @@ def test_a_body_as_drawn_is_left_as_drawn():
     true = true_rig()
     drawn, _ = ball()
     shots, _ = recording(true, drawn.points, 30)
-    c = calibrate_bodies(drawn, shots, known(true), refine_body=True, folds=3)
+    c = calibrate_bodies(drawn, shots, known(true), refine_body=True, folds=2)
     # A point is seen in some 15 shots by each camera: 0.3 px * 1.8 m / 8000 px / sqrt(30) is 0.012 mm an axis.
     assert c.deviation_m < 2e-5
 
