@@ -2,19 +2,26 @@
 
     camera --Shot--> markers --Detections--> match --Correspondences--> triangulate --Points--> locate --PoseEstimate
 
-``measure`` runs the line for one shot; the stages are plain functions of frozen records in :mod:`armsight.data`.
+``measure`` runs the line for one shot; the stages are plain functions of frozen records in :mod:`armsight.data`. Names are
+imported when they are first used, so that the command line starts at once.
 """
 
-from armsight.data import Body, Missed, PoseEstimate, Shot
-from armsight.errors import ArmsightError
-from armsight.vision.calibrate.boards import Pair, calibrate_boards
-from armsight.vision.calibrate.bodies import calibrate_bodies
-from armsight.vision.camera import Camera
-from armsight.vision.markers.board import open_board
-from armsight.vision.markers.targets import open_body, open_target
-from armsight.vision.measure import measure
-from armsight.vision.rig import StereoRig
-from armsight.vision.sources import open_source
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from armsight.data import Body, Missed, PoseEstimate, Shot
+    from armsight.errors import ArmsightError
+    from armsight.vision.calibrate.boards import Pair, calibrate_boards
+    from armsight.vision.calibrate.bodies import calibrate_bodies
+    from armsight.vision.camera import Camera
+    from armsight.vision.markers.board import open_board
+    from armsight.vision.markers.targets import open_body, open_target
+    from armsight.vision.measure import measure
+    from armsight.vision.rig import StereoRig
+    from armsight.vision.sources import open_source
 
 __all__ = [
     "ArmsightError",
@@ -33,3 +40,23 @@ __all__ = [
     "open_source",
     "open_target",
 ]
+
+_HOME = {
+    **dict.fromkeys(("Body", "Missed", "PoseEstimate", "Shot"), "armsight.data"),
+    "ArmsightError": "armsight.errors",
+    **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
+    "calibrate_bodies": "armsight.vision.calibrate.bodies",
+    "Camera": "armsight.vision.camera",
+    "open_board": "armsight.vision.markers.board",
+    **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
+    "measure": "armsight.vision.measure",
+    "StereoRig": "armsight.vision.rig",
+    "open_source": "armsight.vision.sources",
+}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type
+    """Import a public name on its first use (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
+    return getattr(importlib.import_module(_HOME[name]), name)

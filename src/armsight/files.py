@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 import os
 import secrets
@@ -30,6 +31,18 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: not a text file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_table(path: str | Path) -> list[list[str]]:
+    """Read a CSV file into rows of cells; a byte-order mark before the first is left out.
+
+    Raises:
+        InputError: missing, unreadable, not text or not a table.
+    """
+    try:
+        return list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a table: {error}") from None
 
 
 class _Named(io.FileIO):

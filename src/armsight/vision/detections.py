@@ -9,8 +9,6 @@ image where two bodies of the same kind are in view. Any other columns are ignor
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +16,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Body, Ids, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_table
 
 COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
 #: How many lines with the same mistake are named before the rest is counted.
@@ -54,10 +52,7 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
         InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
             all; the message names file and line.
     """
-    try:
-        rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
-    except csv.Error as error:
-        raise InputError(f"{path}: not a table of detections: {error}") from None
+    rows = read_table(path)
     if not rows:
         raise InputError(f"{path}: empty; expected a header {','.join(COLUMNS)}")
     header = [name.strip() for name in rows[0]]

@@ -93,13 +93,14 @@ def test_a_refined_body_is_nearer_the_truth():
     true = true_rig()
     drawn, made = ball()
     shots, _ = recording(true, made, 30)
-    plain, refined = (calibrate_bodies(drawn, shots, known(true), refine_body=r, folds=2) for r in (False, True))
+    plain, refined = (calibrate_bodies(drawn, shots, known(true), refine_body=r) for r in (False, True))
     assert off(refined.body.points, made) < 0.4 * off(drawn.points, made)
     error, cov = log_se3(inverse(refined.rig.T_left_right) @ true.T_left_right), refined.rig.cov[-6:, -6:]
     assert (np.abs(error) < 4 * np.sqrt(np.diag(cov))).all()
     # The drawing's errors look like noise until the body may differ from it.
     assert plain.rig.sigma_px > 1.3 * SIGMA_PX
-    assert refined.rig.sigma_px == pytest.approx(SIGMA_PX, rel=0.13)
+    # Scaled by the held-out residuals, in which the body as four fifths of the shots show it errs too: never below.
+    assert 0.87 * SIGMA_PX < refined.rig.sigma_px < 1.2 * SIGMA_PX
     assert refined.reprojection_rms_px < plain.reprojection_rms_px
     assert refined.deviation_m == pytest.approx(off(drawn.points, made), rel=0.2)
     assert refined.body.point_names == drawn.point_names

@@ -21,7 +21,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise
-from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, summary
+from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary
 from armsight.vision.calibrate.result import Calibration, HeldOut, PairErrors, Rejected
 from armsight.vision.calibrate.screen import LEAST_CORNERS, mend_flips, noise_px, screen
 from armsight.vision.calibrate.start import start_board
@@ -113,7 +113,7 @@ def calibrate_boards(
         progress,
     )
     trial, tried = search.best(models)
-    rig = _calibrated(rig_of(trial.solution), trial.heldout)
+    rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
     found = trial.model.body(state.shape)
     found = transform(fit_rigid(found, points), found)
@@ -198,12 +198,6 @@ def _shaped(points: Array) -> Model:
     """The board as it may have been printed."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     return Model(points, smooth(points, BOARD_DEGREE), BOARD_SIGMA_SHARE * diagonal, True)
-
-
-def _calibrated(rig: StereoRig, heldout: HeldOut) -> StereoRig:
-    """Scale the rig's uncertainty by what the held-out pairs show: residuals that are not white make it larger."""
-    factor = heldout.normalised_rms
-    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * factor)
 
 
 @dataclass(frozen=True, eq=False)

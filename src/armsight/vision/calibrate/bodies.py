@@ -20,10 +20,11 @@ from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise
-from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, summary
+from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary
 from armsight.vision.calibrate.result import Calibration, Rejected
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.start import relative_poses
+from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.pnp import Candidate
@@ -230,9 +231,9 @@ def _result(
     heldout = summary(errors, folds)
     found = model.body(solution.state.shape)
     found = transform(fit_rigid(found, body.points), found)
-    rig = rig_of(solution)
+    rig = scaled(rig_of(solution), heldout)
     notes = (f"body held to its drawing within {tolerance_m * 1e3:g} mm per point, judged on held-out shots",)
-    return Calibration(
+    calibration = Calibration(
         rig,
         replace(body, points=found),
         float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean())),
@@ -248,3 +249,4 @@ def _result(
         notes,
         (),
     )
+    return replace(calibration, weaknesses=weaknesses(calibration))

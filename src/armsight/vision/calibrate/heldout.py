@@ -6,12 +6,14 @@ K folds of pairs; each fold is measured with a rig fitted on the others, by the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from armsight.data import Array, Correspondences
+from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
@@ -165,15 +167,26 @@ def residual_epipolar_rms(rig: StereoRig, observations: Observations) -> float:
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def rig_of(solution: Solution, provenance: dict[str, object] | None = None) -> StereoRig:
-    """Return the rig of an adjusted state: its covariance is that of cameras and relative pose, the shape averaged over."""
-    cameras = solution.state.cameras
-    count = sum(camera.parameters.size for camera in cameras) + 6
-    return StereoRig(
-        cameras[0],
-        cameras[1],
-        solution.state.T_left_right,
-        solution.cov_shared[:count, :count],
-        solution.sigma_px,
-        provenance or {},
-    )
+def rig_of(solution: Solution) -> StereoRig:
+    """Return the rig of an adjusted state: its covariance is that of cameras and relative pose, the shape averaged over.
+
+    Raises:
+        CalibrationError: the detections leave one of the rig's parameters undetermined.
+    """
+    left, right = solution.state.cameras
+    count = left.parameters.size + right.parameters.size + 6
+    cov = solution.cov_shared[:count, :count]
+    rig = StereoRig(left, right, solution.state.T_left_right, np.zeros((count, count)), solution.sigma_px)
+    bad = ~(np.diag(cov) >= 0)
+    if bad.any():
+        name = rig.parameter_names[int(np.argmax(bad))]
+        raise CalibrationError(
+            f"the detections do not determine {name}: take more pairs, the board or body tilted and at other distances"
+        )
+    return replace(rig, cov=(cov + cov.T) / 2)
+
+
+def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
+    """Scale a rig's uncertainty by what the held-out pairs show: residuals that are not white make it larger."""
+    factor = heldout.normalised_rms
+    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * factor)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import numpy as np
 
 from armsight.data import Body
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_table, write_text
 
 #: Headers that are taken; all lengths are metres. The first is the one written.
 HEADERS = (
@@ -34,7 +32,7 @@ def load_body_csv(path: str | Path) -> Body:
         InputError: missing, malformed, not numbers, a name twice, fewer than three points, or a size that says the
             unit is wrong; the message names the file and the line.
     """
-    rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
+    rows = read_table(path)
     if not rows or tuple(cell.strip().lower() for cell in rows[0]) not in HEADERS:
         given = ",".join(rows[0]) if rows else "an empty file"
         raise InputError(f"{path}: line 1: expected the header {','.join(HEADERS[0])} (metres), got {given!r}")
