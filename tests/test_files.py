@@ -13,7 +13,7 @@ import pytest
 
 from armsight import files
 from armsight.errors import InputError
-from armsight.files import read_text, replacing, write_text
+from armsight.files import check_writable, read_table, read_text, replacing, write_text
 
 SMALL, LARGE = "new\n", "new\n" * 100_000  # within one buffer, and many of them
 
@@ -142,6 +142,8 @@ def test_a_missing_folder_is_told(tmp_path, where):
         write_text(tmp_path / where, SMALL)
     folder = (tmp_path / where).parent
     assert str(caught.value) == f"{tmp_path / where}: cannot be written: there is no folder {folder}; make it first"
+    with pytest.raises(InputError, match="there is no folder"):
+        check_writable(tmp_path / where)
     assert os.listdir(tmp_path) == ["text"]
 
 
@@ -150,9 +152,26 @@ def test_a_folder_or_a_device_is_no_file(tmp_path):
     for name, kind in (("", "folder"), ("pipe", "device")):
         with pytest.raises(InputError, match=f"cannot be written: it is a {kind}; give the name of a file"):
             write_text(tmp_path / name, SMALL)
+        with pytest.raises(InputError, match=f"cannot be written: it is a {kind}; give the name of a file"):
+            check_writable(tmp_path / name)
     with pytest.raises(InputError, match="it is a device"):
         write_text("/dev/null", SMALL)
     assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
+    check_writable(tmp_path / "file")
+    assert os.listdir(tmp_path) == []
+    monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # root may write anywhere
+    with pytest.raises(InputError, match=f"file: cannot be written: no permission to write in {tmp_path}"):
+        check_writable(tmp_path / "file")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_refuses_is_told(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match="file: cannot be written: Permission denied"):
+        write_text(tmp_path / "file", SMALL)
 
 
 def test_a_name_that_is_too_long_is_told(tmp_path):
@@ -171,6 +190,15 @@ def test_reading_tells_what_is_wrong(tmp_path, content, said):
         path.write_bytes(content)
     with pytest.raises(InputError, match=f"file: {said}"):
         read_text(path)
+
+
+def test_tables_are_read_as_cells(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text('\ufeffname,x\n"a, b",1\n\n"two\nlines",2\n', encoding="utf-8")
+    assert read_table(path) == [["name", "x"], ["a, b", "1"], [], ["two\nlines", "2"]]
+    path.write_text("x" * 200_000)
+    with pytest.raises(InputError, match=r"table\.csv: not a table: field larger than field limit"):
+        read_table(path)
 
 
 def test_an_interrupt_anywhere_leaves_the_old_file_or_the_new_one(tmp_path):

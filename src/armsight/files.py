@@ -73,6 +73,17 @@ class _Named(io.FileIO):
             super().close()
 
 
+def _target(path: str | Path) -> Path:
+    """Return the file that ``path`` is, or links to, or is to be; refuse what cannot be one."""
+    target = Path(os.path.realpath(path))
+    if not os.path.isdir(target.parent):
+        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}; make it first")
+    if os.path.exists(target) and not os.path.isfile(target):
+        kind = "a folder" if os.path.isdir(target) else "a device"
+        raise InputError(f"{path}: cannot be written: it is {kind}; give the name of a file")
+    return target
+
+
 @contextlib.contextmanager
 def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a file for writing that takes the place of ``path`` only when the block ends well.
@@ -87,12 +98,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         InputError: the folder is missing or not writable, ``path`` is no ordinary file, or the disk is full; what stood
             at ``path`` stays.
     """
-    target = Path(os.path.realpath(path))
-    if not os.path.isdir(target.parent):
-        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}; make it first")
-    if os.path.exists(target) and not os.path.isfile(target):
-        kind = "a folder" if os.path.isdir(target) else "a device"
-        raise InputError(f"{path}: cannot be written: it is {kind}; give the name of a file")
+    target = _target(path)
     # The name is chosen first: whatever happens from here on, there is only one file to take away.
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     raw: _Named | None = None
@@ -127,12 +133,8 @@ def check_writable(path: str | Path) -> None:
     """Find out before long work whether a file can be written at ``path``.
 
     Raises:
-        InputError: its folder is missing, or is not writable, or ``path`` is a folder.
+        InputError: its folder is missing or not writable, or ``path`` is no ordinary file.
     """
-    target = Path(path)
-    if target.is_dir():
-        raise InputError(f"{path}: is a folder, expected the name of a file to write")
-    if not target.parent.is_dir():
-        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
-    if not os.access(target.parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written: no permission to write in {target.parent}")
+    folder = _target(path).parent
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path}: cannot be written: no permission to write in {folder}")
