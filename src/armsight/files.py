@@ -7,7 +7,7 @@ import csv
 import io
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -129,12 +129,19 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
-def check_writable(path: str | Path) -> None:
+def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] = ()) -> None:
     """Find out before long work whether a file can be written at ``path``.
 
+    Args:
+        path: the file to be.
+        apart_from: files that must not be written over: what is read, and what else is written.
+
     Raises:
-        InputError: its folder is missing or not writable, or ``path`` is no ordinary file.
+        InputError: its folder is missing or not writable, ``path`` is no ordinary file, or one of ``apart_from``.
     """
+    for other in apart_from:
+        if other is not None and os.path.realpath(other) == os.path.realpath(path):
+            raise InputError(f"{path}: is given twice, or is read as well as written; give the result another name")
     folder = _target(path).parent
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: cannot be written: no permission to write in {folder}")

@@ -39,6 +39,8 @@ _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
 #: Residuals beyond chance and beyond this share of the body's apparent size are of something else than the body: a square
 #: of a wrong size, wrong names. A bent or badly printed body is a few hundredths off.
 _ALIKE = 0.2
+#: A body whose points are this much too far apart or too close together, and by so many standard deviations, is another.
+_SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
@@ -67,8 +69,9 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
         return Missed("no pose of the body fits the detections")
     good, fit = _without_outliers(rig, body, best, sightings)
     if fit is None:
-        return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    reason = _unbelievable(body, points, fit, sightings.select(good))
+        size = _wrong_size(rig, body, points)
+        return Missed(size or f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
+    reason = _unbelievable(rig, body, points, fit, sightings.select(good))
     return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
 
 
@@ -86,8 +89,32 @@ def _on_one_line(points: Array) -> bool:
     return bool(spread[1] <= _COLLINEAR * spread[0])
 
 
-def _unbelievable(body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
+def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
+    """Say that the points are closer together or further apart than the body's, beyond what the rig can be wrong, or None.
+
+    The scale is that of a similarity fit; its sigma holds pixel noise and the rig's calibration.
+    """
+    p_body = body.points[points.ids] - body.points[points.ids].mean(axis=0)
+    p = p_body @ fit_rigid(body.points[points.ids], points.p_left)[:3, :3].T
+    spread = float((p**2).sum())
+    by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
+    variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
+    scale = fit_scale(body.points[points.ids], points.p_left)
+    if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * np.sqrt(variance)):
+        return None
+    return (
+        f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
+        "square, a tag, the body file's unit), and is it the target the rig sees?"
+    )
+
+
+def _unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
     """Say why a fit is no measurement of the body, or None."""
+    kept = np.isin(points.ids, used.point)
+    if kept.sum() >= 3 and not _on_one_line(body.points[points.ids[kept]]):
+        arrays = (points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept])
+        if (size_problem := _wrong_size(rig, body, Points(*arrays, points.seen))) is not None:
+            return size_problem
     if _on_one_line(body.points[np.unique(used.point)]):
         return "the points that agree with one pose of the body lie on one line"
     sides = [used.uv[used.camera == c] for c in (0, 1)]

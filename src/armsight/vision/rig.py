@@ -64,6 +64,8 @@ class StereoRig(Record):
             raise InputError(f"the last row of T_left_right must be 0 0 0 1, got {_row(self.T_left_right[3])}")
         checked(self.cov, (self.parameter_count, self.parameter_count), "rig covariance")
         _check_covariance(self.cov, self.parameter_names)
+        if not np.linalg.norm(self.T_left_right[:3, 3]) > 0:
+            raise InputError("T_left_right has no translation: two cameras in one place measure no distance")
         if not 0 <= self.sigma_px < np.inf:
             raise InputError(f"sigma_px must be a finite number not below zero, got {self.sigma_px}")
 

@@ -81,8 +81,9 @@ def command(
         raise InputError("give --left, --right and --board, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a board in images is estimated by itself")
-    for path in (out, *([refine_body] if refine_body else [])):
-        check_writable(path)
+    check_writable(out, apart_from=(refine_body, *points))
+    if refine_body is not None:
+        check_writable(refine_body, apart_from=points)
     if report is not None:
         report_folder(report)
     started = time.perf_counter()

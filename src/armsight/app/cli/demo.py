@@ -15,6 +15,7 @@ from armsight.app.cli.progress import steps
 from armsight.app.demo import run_demo
 from armsight.app.demo_figure import write_figure
 from armsight.app.report import write_report
+from armsight.app.report_draw import require_matplotlib
 
 
 @click.command("demo")
@@ -28,6 +29,7 @@ def command(out: Path, seed: int, as_json: bool) -> None:
 
     Needs no hardware. DIR receives the recording, the rig, the poses, a report and figures.
     """
+    require_matplotlib()
     started = time.perf_counter()
     with steps() as progress:
         result = run_demo(out, seed=seed, progress=progress)

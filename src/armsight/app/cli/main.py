@@ -56,13 +56,18 @@ def main() -> None:
     """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 interrupted."""
     try:
         code = group.main(standalone_mode=False)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         sys.exit(code if isinstance(code, int) else 0)
     except click.exceptions.Abort:
         click.echo("armsight: interrupted", err=True)
         sys.exit(130)
     except click.ClickException as error:
         error.show()
+        if "extra argument" in error.format_message():
+            click.echo(
+                "A glob must be quoted: --left 'DIR/left*.png', or the shell puts every file name there.", err=True
+            )
         sys.exit(2)
     except ArmsightError as error:
         click.echo(f"armsight: error: {error}", err=True)
@@ -71,5 +76,14 @@ def main() -> None:
         click.echo("armsight: interrupted", err=True)
         sys.exit(130)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence_stdout()
         sys.exit(0)
+    except OSError as error:  # every file and device names itself in an ArmsightError: what is left is the output
+        _silence_stdout()
+        click.echo(f"armsight: error: the output cannot be written: {error.strerror}", err=True)
+        sys.exit(2)
+
+
+def _silence_stdout() -> None:
+    """Let what is still buffered go nowhere, so that the interpreter does not stumble over it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

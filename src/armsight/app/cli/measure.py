@@ -58,7 +58,7 @@ def command(
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
     stereo = StereoRig.load(rig)
     if out is not None:
-        check_writable(out)
+        check_writable(out, apart_from=(rig, target, detections))
     records: list[dict[str, Any]] = []
     started = time.perf_counter()
     results: Iterator[Result]
@@ -120,6 +120,7 @@ def _line(record: dict[str, Any]) -> str:
     )
     turned = np.degrees(np.linalg.norm(sigma[3:]))
     note = f", {len(record['dropped'])} points dropped" if record["dropped"] else ""
+    note += f", misfit {record['misfit']:.1f}" if record["misfit"] > 1 else ""
     singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""
     return f"{record['shot']}: {position} mm, {angles} deg ± {turned:.3f}{singular}, {len(record['points_m'])} points{note}"
 
@@ -136,4 +137,6 @@ def _close(records: list[dict[str, Any]], seconds: float, out: Path | None) -> N
         )
     summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
     summary += f", {len(missed)} missed (their lines say why)" if missed else ""
+    if odd := sum(r["misfit"] > 1 for r in good):
+        summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma holds it)"
     click.echo(summary + (f"; written to {out}" if out is not None else ""), err=True)

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +24,7 @@ from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise
 from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary
 from armsight.vision.calibrate.result import Calibration, HeldOut, PairErrors, Rejected
-from armsight.vision.calibrate.screen import LEAST_CORNERS, mend_flips, noise_px, screen
+from armsight.vision.calibrate.screen import LEAST_CORNERS, Screened, mend_flips, noise_px, screen
 from armsight.vision.calibrate.start import start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
@@ -98,21 +99,19 @@ def calibrate_boards(
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
     progress("looking for gross errors")
     model = _drawn(points) if flat else _shaped(points)
-    start = replace(first.state, shape=np.zeros(len(model.modes)))
-    screened = screen(model, start, observations, tuple(pair.name for pair in usable))
+    judge = _Judge(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
+    screened, trial, tried = judge.chosen(first.state, models)
+    lens = trial.solution.state.cameras[0].model
+    if lens != first.state.cameras[0].model and (screened.rejected or screened.notes):
+        # What was thrown out under a simple lens may fit the one that was chosen.
+        progress(f"looking for gross errors again, under {lens}")
+        with contextlib.suppress(CalibrationError):
+            again, trial_again, _ = judge.chosen(start_board(points, sizes, observations, lens).state, (lens,))
+            if len(again.observations.shot) > len(screened.observations.shot):
+                screened, trial = again, trial_again
+                tried = {**tried, lens: trial.heldout}
     rejected += screened.rejected
-    _enough(len(screened.kept), len(pairs), rejected)
     names = tuple(usable[j].name for j in screened.kept)
-    search = _Search(
-        model,
-        screened.observations,
-        screened.unscreened,
-        screened.solution.state,
-        min(folds, len(names)),
-        sizes,
-        progress,
-    )
-    trial, tried = search.best(models)
     rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
     found = trial.model.body(state.shape)
@@ -198,6 +197,35 @@ def _shaped(points: Array) -> Model:
     """The board as it may have been printed."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     return Model(points, smooth(points, BOARD_DEGREE), BOARD_SIGMA_SHARE * diagonal, True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge(Record):
+    """Screening and the choice of the model, from a start."""
+
+    model: Model
+    observations: Observations
+    names: tuple[str, ...]
+    sizes: tuple[tuple[int, int], tuple[int, int]]
+    folds: int
+    given: int
+    progress: Progress
+
+    def chosen(self, start: State, models: tuple[str, ...]) -> tuple[Screened, _Trial, dict[str, HeldOut]]:
+        """Throw out gross errors, then return the best model's trial and the held-out errors of all."""
+        start = replace(start, shape=np.zeros(len(self.model.modes)))
+        screened = screen(self.model, start, self.observations, self.names)
+        _enough(len(screened.kept), self.given, list(screened.rejected))
+        search = _Search(
+            self.model,
+            screened.observations,
+            screened.unscreened,
+            screened.solution.state,
+            min(self.folds, len(screened.kept)),
+            self.sizes,
+            self.progress,
+        )
+        return screened, *search.best(models)
 
 
 @dataclass(frozen=True, eq=False)

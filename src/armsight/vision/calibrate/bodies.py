@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences, Ids
+from armsight.data import Array, Body, Correspondences
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
@@ -31,11 +31,11 @@ from armsight.vision.pnp import Candidate
 from armsight.vision.rig import StereoRig
 from armsight.vision.shape import every_point
 
-#: Tolerances of the body's points that are tried, m, per shape mode; the first is the drawing as it is.
-TOLERANCES_M = (0.0, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
+#: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the drawing as it is.
+TOLERANCES_M = (0.0, 1e-4, 2e-4, 4e-4, 1e-3, 2e-3)
 #: A looser body must lower the held-out error by this share.
 WORTH = 0.005
-_START_TOLERANCE_M = 1e-4
+_START_TOLERANCE_M = 4e-4
 LEAST_SHOTS = 5
 FOLDS = 5
 _START_SIGMA_PX = 2.0
@@ -98,7 +98,11 @@ def calibrate_bodies(
         if score < trials[chosen][2] * (1 - WORTH):
             chosen = tolerance
     model, solution, _ = trials[chosen]
-    return _result(body, model, solution, observations, names, len(shots), rejected, min(folds, len(seen)), chosen)
+    notes: tuple[str, ...] = ()
+    if refine_body:
+        held = f"with a prior sigma of {chosen * 1e3:g} mm per coordinate" if chosen else "exactly"
+        notes = (f"the body is held to its drawing {held}, as left-out shots judge",)
+    return _result(body, model, solution, observations, names, len(shots), rejected, min(folds, len(seen)), notes)
 
 
 def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> Array:
@@ -149,11 +153,6 @@ def _refined(
         return T_left_right
 
 
-def _chosen(arrays: tuple[Array, Array], rows: tuple[Ids, Ids]) -> tuple[Array, Array]:
-    """Pick rows of each camera's array."""
-    return arrays[0][rows[0]], arrays[1][rows[1]]
-
-
 def _assigned(
     points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: Sequence[SeenShot], found: list[Found]
 ) -> tuple[list[str], list[Correspondences], list[Array], list[Rejected]]:
@@ -174,8 +173,11 @@ def _assigned(
 
 def _model(points: Array, tolerance_m: float) -> Model:
     """The body as drawn, or free within a tolerance."""
-    modes = every_point(points) if tolerance_m > 0 else np.zeros((0, len(points), 3))
-    return Model(points, modes, tolerance_m or 1.0, False)
+    if tolerance_m == 0:
+        return Model(points, np.zeros((0, len(points), 3)), 1.0, False)
+    # A mode moves the points by one RMS: K modes of sigma s together give each coordinate a sigma of s sqrt(K / 3).
+    modes = every_point(points)
+    return Model(points, modes, tolerance_m / np.sqrt(len(modes) / 3), False)
 
 
 def _adjusted(model: Model, state: State, observations: Observations) -> Solution:
@@ -218,7 +220,7 @@ def _result(
     given: int,
     rejected: list[Rejected],
     folds: int,
-    tolerance_m: float,
+    notes: tuple[str, ...],
 ) -> Calibration:
     """Cross-validate the choice and put everything together."""
 
@@ -232,7 +234,6 @@ def _result(
     found = model.body(solution.state.shape)
     found = transform(fit_rigid(found, body.points), found)
     rig = scaled(rig_of(solution), heldout)
-    notes = (f"body held to its drawing within {tolerance_m * 1e3:g} mm per point, judged on held-out shots",)
     calibration = Calibration(
         rig,
         replace(body, points=found),

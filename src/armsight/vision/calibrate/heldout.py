@@ -146,6 +146,8 @@ _FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised")
 
 def summary(errors: PairErrors, folds: int) -> HeldOut:
     """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs."""
+    if not len(errors.pair):
+        raise CalibrationError("no left-out shot has three points seen by both cameras, so the rig cannot be judged")
     w = errors.weight / errors.weight.sum()
     rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}
     return HeldOut(
@@ -187,6 +189,14 @@ def rig_of(solution: Solution) -> StereoRig:
 
 
 def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
-    """Scale a rig's uncertainty by what the held-out pairs show: residuals that are not white make it larger."""
+    """Scale a rig's uncertainty by what the held-out pairs show.
+
+    Up where residuals are not white, down where both cameras err alike and their points agree the better for it.
+
+    Raises:
+        CalibrationError: the held-out residuals say nothing.
+    """
     factor = heldout.normalised_rms
+    if not (np.isfinite(factor) and factor > 0):
+        raise CalibrationError("the left-out shots do not tell how noisy the detections are: take more pairs")
     return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * factor)

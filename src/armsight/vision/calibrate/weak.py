@@ -22,7 +22,9 @@ def weaknesses(calibration: Calibration) -> tuple[str, ...]:
     Returns:
         One sentence per weakness: what it is and what to do; empty where nothing stands out.
     """
-    checks = (_pairs, _tilts, _coverage, _focus, _synchrony, _sides, _focal, _scale)
+    checks = [_pairs, _focus, _synchrony, _sides]
+    if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
+        checks += [_tilts, _coverage, _focal, _scale]
     return tuple(message for check in checks if (message := check(calibration)) is not None)
 
 
@@ -89,7 +91,7 @@ def _focus(calibration: Calibration) -> str | None:
 
 
 def _synchrony(calibration: Calibration) -> str | None:
-    """Pairs whose epipolar error stands out, although each image fits the board by itself."""
+    """Pairs whose epipolar error stands out."""
     errors = calibration.errors
     usual = float(np.median(errors.epipolar_px))
     late = [calibration.pairs[int(j)] for j, e in zip(errors.pair, errors.epipolar_px, strict=True) if e > 2.5 * usual]
@@ -129,7 +131,8 @@ def _scale(calibration: Calibration) -> str | None:
     error = calibration.heldout.scale_error
     if abs(error) > max(0.005, _SCALE_SIGMAS * spread):
         return (
-            f"held-out boards come out {100 * error:+.2f}% too {'large' if error > 0 else 'small'}: the cameras do not fit "
-            "the board's proportions; is the square size right, and the board flat?"
+            f"held-out boards come out {100 * error:+.2f}% too {'large' if error > 0 else 'small'}: lens and board do "
+            "not fit each other; is the board flat, and as wide as drawn? (a wrong square size does not show here: it "
+            "makes baseline and board wrong alike, so measure a square)"
         )
     return None

@@ -55,8 +55,8 @@ class Fields:
             given = f"the unit {match[2]!r}" if match[2] else "no unit"
             raise self.error(f"has {given} in {text!r}: a length needs one of {', '.join(_UNITS_M)}")
         length = float(match[1]) * _UNITS_M[match[2]]
-        if not 1e-5 <= length <= 100.0:
-            raise self.error(f"has the length {text}, which is not between 0.01 mm and 100 m")
+        if not 1e-5 <= length <= 2.0:
+            raise self.error(f"has the length {text}, which is not between 0.01 mm and 2 m")
         return length
 
     def ratio(self, index: int) -> float:

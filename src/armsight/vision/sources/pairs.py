@@ -87,6 +87,8 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
     left, right = (sorted(files, key=natural_key) for files in (lefts, rights))
     for files, said in ((left, said_left), (right, said_right)):
         if not files:
+            if os.path.isdir(os.path.expanduser(said)):
+                raise InputError(f"{said}: is a folder; give its images as a quoted glob such as '{said}/left*.png'")
             raise InputError(f"{said}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
     both = {file.resolve() for file in left} & {file.resolve() for file in right}
     if both:
