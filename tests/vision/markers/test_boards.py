@@ -9,6 +9,11 @@ import pytest
 from supersampled import board, expose, paint, picture, project, view
 
 from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.render import render
+from armsight.sim.scene import Placed, chessboard
+from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, open_board
 
@@ -258,3 +263,14 @@ def test_a_malformed_spec_says_what_is_wrong_and_what_is_right(spec, words):
 @pytest.mark.parametrize(("text", "metres"), [("25mm", 0.025), ("2.5cm", 0.025), ("0.025m", 0.025), ("1in", 0.0254)])
 def test_lengths_take_their_units(text, metres):
     assert open_board(f"chessboard:9x6:{text}").square_m == pytest.approx(metres, rel=1e-12)
+
+
+@pytest.mark.parametrize("said", ["8x6", "9x5", "7x5"])
+def test_a_board_said_too_small_is_refused(said):
+    T = pose(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([-0.1, -0.06, 0.45]))
+    camera = Camera((640, 480), "none", np.array([560.0, 560.0, 319.5, 239.5]), np.zeros(0))
+    image = render(camera, [Placed((chessboard(9, 6, 0.025),), T)], rng=np.random.default_rng(0))
+    assert open_board("chessboard:9x6:25mm").detect(image).problem is None
+    problem = open_board(f"chessboard:{said}:25mm").detect(image).problem
+    assert problem is not None
+    assert "goes on beyond" in problem or "found" in problem

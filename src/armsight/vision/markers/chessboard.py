@@ -27,6 +27,8 @@ SEARCH_SIDE_PX = 1600
 IMAGE_SIDE_MIN_PX = 32
 #: Fewer corners than this share of the board are not taken for the board.
 KEPT_SHARE = 0.5
+#: A board is larger than it was said to be if this share of a further row is made of corners too.
+MORE_SHARE = 0.7
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, is not of a
 #: clean corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
 MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
@@ -79,6 +81,11 @@ class Chessboard(Record):
         kept = fits.kept & ~misfits(fits) & self._colours_agree(fits)
         if kept.sum() < max(4, KEPT_SHARE * kept.size):
             return Detections.none(_why_not(fits, int(kept.sum())))
+        if goes_on(image, fits, kept, self._parity, (self.rows, self.columns)):
+            return Detections.none(
+                f"the chessboard goes on beyond {self.columns}x{self.rows} inner corners: count those where two dark "
+                "squares touch, columns x rows"
+            )
         order = self._canonical_order(fits)
         kept = kept[order]
         return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
@@ -152,6 +159,32 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
         fits = refine_corners(image, uv.reshape(-1, 2), squares, None if first else bows, arm=arm, rough=first)
         uv = np.where(fits.kept[:, None], fits.uv, rough.reshape(-1, 2)).reshape(rough.shape)
     return fits
+
+
+def goes_on(
+    image: NDArray[np.uint8], fits: CornerFits, kept: NDArray[np.bool_], parity: Array, shape: tuple[int, int]
+) -> bool:
+    """Tell whether another row or column of corners stands where a board should end: it is larger than it was said to be.
+
+    Args:
+        image: (H, W) grey image.
+        fits: of the board's corners, row by row.
+        kept: (M,) which of them are good.
+        parity: (M,) +1 and -1 by turns, as the colours go.
+        shape: (rows, columns).
+    """
+    uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
+    squares = local_squares(uv)[0]
+    sign = np.sign(np.nansum(np.where(kept, fits.contrast * parity, 0.0))) * parity.reshape(shape)
+    for turned in range(4):
+        grid, sides, colour = (np.rot90(array, turned) for array in (uv, squares, sign))
+        beyond = 2 * grid[0] - grid[1]
+        known = np.isfinite(beyond).all(axis=1)
+        more = refine_corners(image, beyond[known], np.ascontiguousarray(sides[0][known]), rough=True)
+        alike = more.kept & (np.sign(more.contrast) == -colour[0][known])
+        if known.sum() >= 3 and alike.sum() >= MORE_SHARE * known.sum():
+            return True
+    return False
 
 
 def misfits(fits: CornerFits) -> NDArray[np.bool_]:
