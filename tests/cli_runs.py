@@ -1,6 +1,7 @@
 """Runs of the command line in this process, and the manners a mistake must have."""
 
 import json
+import signal
 import sys
 from dataclasses import dataclass
 
@@ -46,3 +47,8 @@ def refused(said, *words):
     assert said.out == ""
     for word in words:
         assert str(word) in said.err, said.err
+
+
+def listening():
+    """Run in a child before it starts: hear an interrupt even where the tests themselves run with it ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -13,7 +13,7 @@ import pytest
 from armsight.app.cli import calibrate as command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
-from cli_runs import refused
+from cli_runs import listening, refused
 
 QUICK = ("--model", "brown5", "--folds", "3", "--flat-board")
 
@@ -257,7 +257,7 @@ def test_an_interrupt_leaves_nothing(bench, tmp_path, module, name, wait):
     script = INTERRUPTED.format(module=module, name=name, wait=wait)
     process = subprocess.Popen(
         [sys.executable, "-c", script, "calibrate", *bench.board, *QUICK, "-o", out],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listening,
     )  # fmt: skip
     assert process.stdout.readline() == "there\n"
     process.send_signal(signal.SIGINT)

@@ -20,6 +20,7 @@ from armsight.app.recording import record
 from armsight.data import Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import FolderSource, open_source
+from cli_runs import listening
 
 rng = np.random.default_rng(20240611)
 
@@ -285,7 +286,12 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     folder = tmp_path / "a"
     command = [sys.executable, "-c", "from armsight.app.cli.main import main; main()", "record", f"video:{video}"]
     process = subprocess.Popen(
-        [*command, "-o", folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+        [*command, "-o", folder],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ,
+        preexec_fn=listening,
     )
     while process.poll() is None and not Path(folder, "right000004.png").exists():
         time.sleep(0.01)

@@ -69,8 +69,7 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
         return Missed("no pose of the body fits the detections")
     good, fit = _without_outliers(rig, body, best, sightings)
     if fit is None:
-        size = _wrong_size(rig, body, points)
-        return Missed(size or f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
+        return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
     reason = _unbelievable(rig, body, points, fit, sightings.select(good))
     return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
 
@@ -110,18 +109,17 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
 
 def _unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
     """Say why a fit is no measurement of the body, or None."""
-    kept = np.isin(points.ids, used.point)
-    if kept.sum() >= 3 and not _on_one_line(body.points[points.ids[kept]]):
-        arrays = (points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept])
-        if (size_problem := _wrong_size(rig, body, Points(*arrays, points.seen))) is not None:
-            return size_problem
     if _on_one_line(body.points[np.unique(used.point)]):
         return "the points that agree with one pose of the body lie on one line"
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
     off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
     if fit.cost <= _misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
-        return None
+        both = np.bincount(used.point, minlength=len(body.points))[points.ids] == 2
+        if both.sum() < 3 or _on_one_line(body.points[points.ids[both]]):
+            return None
+        arrays = (points.ids[both], points.p_left[both], points.cov[both], points.calibration[both])
+        return _wrong_size(rig, body, Points(*arrays, points.seen))
     scale = fit_scale(body.points[points.ids], points.p_left)
     return (
         f"the detections are not those of the body: {off:.1f} px off at an apparent size of {size:.0f} px, and "
