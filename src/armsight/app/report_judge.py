@@ -167,14 +167,21 @@ def advice(calibration: Calibration) -> tuple[str, ...]:
     )
 
 
+def _baseline_share(calibration: Calibration) -> float:
+    """Return one standard deviation of the baseline as a share of it."""
+    rig = calibration.rig
+    along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
+    return float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along)) / rig.baseline_m
+
+
 def verdict(calibration: Calibration) -> tuple[Grade, str, str]:
     """Return the grade of a calibration, its headline, and what that means for the one who made it."""
     h = calibration.heldout
     grades = {row.grade for row in judged(calibration)}
     expect = (
         f"On pairs it was not fitted on, measured points lie {1e3 * h.rigid_rms_m:.2g} mm (RMS) off their true shape, at "
-        f"a distance of about {1e3 * distance_m(calibration):.0f} mm, and lengths are right to "
-        f"{100 * abs(h.scale_error):.2g}%."
+        f"a distance of about {1e3 * distance_m(calibration):.0f} mm, and lengths, compared with the "
+        f"{target(calibration)}'s, are right to {100 * max(abs(h.scale_error), _baseline_share(calibration)):.2g}%."
     )
     if "poor" in grades:
         return "poor", "Do not rely on this calibration yet.", f"{expect} Do what is said below and calibrate again."

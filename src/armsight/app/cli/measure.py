@@ -59,6 +59,8 @@ def command(
     stereo = StereoRig.load(rig)
     if out is not None:
         check_writable(out, apart_from=(rig, target, detections))
+    if not stereo.cov.any():
+        click.echo(f"note: {rig} does not say how well it is known: every ± is the pixel noise's share alone", err=True)
     records: list[dict[str, Any]] = []
     started = time.perf_counter()
     results: Iterator[Result]

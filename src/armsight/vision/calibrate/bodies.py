@@ -93,10 +93,9 @@ def calibrate_bodies(
         solution = _adjusted(model, start, observations)
         score = _heldout_cost(model, solution, observations, min(folds, len(seen)))
         trials[tolerance] = (model, solution, score)
-    chosen = 0.0
-    for tolerance, (_, _, score) in trials.items():
-        if score < trials[chosen][2] * (1 - WORTH):
-            chosen = tolerance
+    chosen = min(trials, key=lambda tolerance: trials[tolerance][2])
+    if trials[chosen][2] > trials[0.0][2] * (1 - WORTH):
+        chosen = 0.0
     model, solution, _ = trials[chosen]
     notes: tuple[str, ...] = ()
     if refine_body:
