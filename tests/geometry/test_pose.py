@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 from hypothesis import given
 
-from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, transform
+from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, pose, transform
 from armsight.geometry.rotation import exp_so3, skew
 from asserts import assert_jacobian, assert_rotation
 from strategies import poses, rotation_vectors, vectors
@@ -47,17 +47,6 @@ def test_poses_form_a_group(A, B, C):
 @given(poses(), poses(), vectors(-2, 2))
 def test_inner_letters_cancel(T_a_b, T_b_c, p_c):
     np.testing.assert_allclose(transform(T_a_b @ T_b_c, p_c), transform(T_a_b, transform(T_b_c, p_c)), atol=8 * TIGHT)
-
-
-@given(poses(), vectors(-2, 2), rotation_vectors())
-def test_adjoint_law(T, rho, phi):
-    xi = np.concatenate([rho, phi])
-    np.testing.assert_allclose(T @ exp_se3(xi), exp_se3(adjoint(T) @ xi) @ T, atol=1e-12)
-
-
-@given(poses(), poses())
-def test_adjoint_of_a_product(A, B):
-    np.testing.assert_allclose(adjoint(A @ B), adjoint(A) @ adjoint(B), atol=1e-13)
 
 
 @given(poses(), vectors(-2, 2))

@@ -60,15 +60,6 @@ def log_se3(T: Array) -> Array:
     return np.concatenate([rho, phi], axis=-1)
 
 
-def adjoint(T: Array) -> Array:
-    """Return the (6, 6) Ad with ``T @ exp_se3(xi) == exp_se3(Ad @ xi) @ T``."""
-    R, t = T[:3, :3], T[:3, 3]
-    Ad = np.zeros((6, 6))
-    Ad[:3, :3] = Ad[3:, 3:] = R
-    Ad[:3, 3:] = skew(t) @ R
-    return Ad
-
-
 def mean_pose(Ts: Array) -> Array:
     """Return the mean (4, 4) of transforms (N, 4, 4): mean translation, chordal mean rotation."""
     U, _, Vt = np.linalg.svd(Ts[:, :3, :3].sum(axis=0))

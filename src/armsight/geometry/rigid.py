@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.errors import InputError
-from armsight.geometry.pose import pose, transform
+from armsight.geometry.pose import pose
 from armsight.geometry.rotation import Array
 
 
@@ -34,11 +34,6 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     U, _, Vt = np.linalg.svd((w[:, None] * (p_a - mean_a)).T @ (p_b - mean_b))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
     return pose(R, mean_a - R @ mean_b)
-
-
-def rigid_residuals(p_b: Array, p_a: Array) -> Array:
-    """Return (N, 3) what is left of ``p_a`` after the best rigid motion of ``p_b``, in a's axes."""
-    return np.asarray(p_a - transform(fit_rigid(p_b, p_a), p_b))
 
 
 def fit_scale(p_b: Array, p_a: Array) -> float:

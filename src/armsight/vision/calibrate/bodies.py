@@ -20,7 +20,7 @@ from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise
-from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary
+from armsight.vision.calibrate.heldout import cross_validate, folds_of, residual_epipolar_rms, rig_of, scaled, summary
 from armsight.vision.calibrate.result import Calibration, Rejected
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.start import relative_poses
@@ -196,8 +196,7 @@ def _heldout_cost(model: Model, full: Solution, observations: Observations, fold
     """Mean squared pixel distance, px^2, of left-out shots from the body and rig that the others give."""
     total, count = 0.0, 0
     everyone = np.arange(observations.shot_count)
-    for k in range(folds):
-        held = everyone[everyone % folds == k]
+    for held in folds_of(observations.shot_count, folds):
         rest = np.setdiff1d(everyone, held)
         state = replace(full.state, Ts_left_body=full.state.Ts_left_body[rest])
         fitted = minimise(model, state, observations.shots(rest), full.sigma_px).state
