@@ -96,6 +96,44 @@ class Detections(Record):
 
 
 @dataclass(frozen=True)
+class Rejected:
+    """A place in an image that looked like a marker and is none, and why.
+
+    Attributes:
+        uv: (column, row), raw pixels.
+        reason: why.
+    """
+
+    uv: tuple[float, float]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Discs(Record):
+    """The discs that one camera saw; which of a body's discs each one is, a single image does not say.
+
+    Attributes:
+        uv: (N, 2) centres of their image ellipses, raw pixels.
+        cov_uv: (N, 2, 2) covariance of the centres from the image's own noise, px^2.
+        shape: (N, 3) S11, S12, S22 of each ellipse, px^2: its rim is uv + x with x^T S^-1 x = 1.
+        bright: (N,) whether a disc is brighter than its surround.
+        rejected: what was looked at and is no disc.
+    """
+
+    uv: Array
+    cov_uv: Array
+    shape: Array
+    bright: NDArray[np.bool_]
+    rejected: tuple[Rejected, ...] = ()
+
+    @property
+    def radius_px(self) -> Array:
+        """(N,) the longer half axis of each ellipse, px: a disc's radius over its distance, however it is turned."""
+        mean, half = (self.shape[:, 0] + self.shape[:, 2]) / 2, (self.shape[:, 0] - self.shape[:, 2]) / 2
+        return np.asarray(np.sqrt(mean + np.hypot(half, self.shape[:, 1])))
+
+
+@dataclass(frozen=True)
 class Dropped:
     """A point that was seen and not used, and why."""
 
