@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Discs, Record
+from armsight.vision.markers.body_check import check_discs
 from armsight.vision.markers.body_file import Marker
 
 
@@ -49,6 +50,7 @@ class DiscTarget(Record):
             bright.append(kind)
             normal = marker.normal()
             normals.append(np.full(3, np.nan) if normal is None else normal)
+        check_discs(markers, radii)
         body = Body(name, tuple(m.name for m in markers), np.array([m.position for m in markers]))
         return DiscTarget(body, np.array(radii), np.array(bright), np.array(normals))
 

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.board_marker import BoardTarget
 from armsight.vision.markers.bodies import load_body_csv
+from armsight.vision.markers.body_check import check_points
 from armsight.vision.markers.body_file import Marker, read_body_file
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
@@ -21,6 +23,7 @@ from armsight.vision.markers.tag import TagTarget
 #: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name.
 MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
     "tag": TagTarget.from_markers,
+    "board": BoardTarget.from_markers,
 }
 
 
@@ -68,7 +71,9 @@ def load_body_toml(path: str | Path) -> Target:
     parts = tuple(
         make(name, chosen) for kind, make in MARKERS.items() if (chosen := [m for m in markers if m.kind == kind])
     )
-    return parts[0] if len(parts) == 1 else Composite(name, parts)
+    target = parts[0] if len(parts) == 1 else Composite(name, parts)
+    check_points(path, target.body)
+    return target
 
 
 def open_target(spec: str) -> Target:

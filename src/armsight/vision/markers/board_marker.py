@@ -1,0 +1,107 @@
+"""Boards as markers of a body: ``board = { spec = "chessboard:9x6:25mm" }``.
+
+The marker's frame is the board's own: its points lie in z = 0, the first at the origin. They are named after the marker
+and their name on the board: ``B.0``, ``B.1``, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Body, Detections, Record
+from armsight.geometry.pose import transform
+from armsight.vision.markers.board import Board, open_board
+from armsight.vision.markers.body_file import Marker
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBoard(Record):
+    """One board on a body.
+
+    Attributes:
+        name: what its points are named after.
+        board: the board.
+        T_body_board: (4, 4) its pose on the body, m.
+    """
+
+    name: str
+    board: Board
+    T_body_board: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BoardTarget(Record):
+    """A body found by its boards.
+
+    Attributes:
+        name: what the body is called.
+        boards: its boards.
+    """
+
+    name: str
+    boards: tuple[PlacedBoard, ...]
+
+    @staticmethod
+    def from_markers(name: str, markers: Sequence[Marker]) -> BoardTarget:
+        """Build the target from a body file's markers of kind ``board``.
+
+        Raises:
+            InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is turned, or two
+                boards of one body that may be taken for one another.
+        """
+        boards: list[PlacedBoard] = []
+        for marker in markers:
+            marker.check_keys("board", required=("spec",))
+            board = open_board(marker.converted("spec", _checked))
+            if board.flips:
+                raise marker.error(
+                    f"{board.body.name} looks the same when it is turned, so its corners cannot be named on a body: take "
+                    "a chessboard whose columns + rows is odd, such as 9x6, a charuco board or an aprilgrid"
+                )
+            for other in boards:
+                if _alike(board, other.board):
+                    raise marker.error(
+                        f"{board.body.name} may be taken for {other.name!r}, {other.board.body.name}: boards of one body "
+                        "need to be of different kinds, or charuco boards of different families"
+                    )
+            boards.append(PlacedBoard(marker.name, board, marker.pose()))
+        return BoardTarget(name, tuple(boards))
+
+    @cached_property
+    def body(self) -> Body:
+        """The points of all boards, board by board."""
+        names = tuple(f"{placed.name}.{name}" for placed in self.boards for name in placed.board.body.point_names)
+        points = [transform(placed.T_body_board, placed.board.body.points) for placed in self.boards]
+        return Body(self.name, names, np.concatenate(points))
+
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the boards in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
+        first, found, problems = 0, [], []
+        for placed in self.boards:
+            seen = placed.board.detect(image)
+            if seen.problem is None:
+                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv))
+            else:
+                problems.append(f"{placed.name}: {seen.problem}")
+            first += len(placed.board.body.point_names)
+        if not found:
+            return Detections.none("; ".join(problems))
+        ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
+        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
+
+
+def _checked(spec: str) -> str:
+    """Return a spec that names a board."""
+    open_board(spec)
+    return spec
+
+
+def _alike(one: Board, other: Board) -> bool:
+    """Whether the finder of one board may find the other: two of a kind, unless their markers are of two families."""
+    families = getattr(one, "family", None), getattr(other, "family", None)
+    return type(one) is type(other) and families[0] == families[1]
