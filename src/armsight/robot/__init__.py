@@ -1,0 +1,1 @@
+"""Pose <-> joints: arms from their tables. Never imports vision."""
