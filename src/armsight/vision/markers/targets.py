@@ -17,14 +17,20 @@ from armsight.vision.markers.board_marker import BoardTarget
 from armsight.vision.markers.bodies import load_body_csv
 from armsight.vision.markers.body_check import check_points
 from armsight.vision.markers.body_file import Marker, read_body_file
+from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
 
-#: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name.
+#: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name. Discs carry
+#: no code, so one image does not name them: they are a kind of their own, :data:`DISC`.
 MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
     "tag": TagTarget.from_markers,
     "board": BoardTarget.from_markers,
 }
+
+
+#: The kind of a plain disc in a body file.
+DISC = "disc"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,20 +39,23 @@ class Composite(Record):
 
     Attributes:
         name: what the body is called.
-        parts: one target for each kind of marker, all in the body's frame.
+        parts: one target for each kind of coded marker, all in the body's frame.
+        discs: its plain discs, whose points come last; None where it has none.
     """
 
     name: str
     parts: tuple[Target, ...]
+    discs: DiscTarget | None = None
 
     @cached_property
     def body(self) -> Body:
-        """All parts' points."""
-        names = tuple(name for part in self.parts for name in part.body.point_names)
-        return Body(self.name, names, np.concatenate([part.body.points for part in self.parts]))
+        """All parts' points, then the discs' centres."""
+        bodies = [part.body for part in (*self.parts, *([] if self.discs is None else [self.discs]))]
+        names = tuple(name for body in bodies for name in body.point_names)
+        return Body(self.name, names, np.concatenate([body.points for body in bodies]))
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
-        """Find every part in one grey image."""
+        """Find every coded part in one grey image; discs are named by both cameras together."""
         first, found, problems = 0, [], []
         for part in self.parts:
             seen = part.detect(image)
@@ -56,7 +65,9 @@ class Composite(Record):
                 problems.append(seen.problem)
             first += len(part.body.point_names)
         if not found:
-            return Detections.none("; ".join(problems))
+            return Detections.none(
+                "; ".join(problems) or "plain discs carry no names: one image cannot tell them apart"
+            )
         ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
         return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
 
@@ -67,11 +78,11 @@ def load_body_toml(path: str | Path) -> Target:
     Raises:
         InputError: missing, malformed, or an unknown kind of marker; the message names file and entry.
     """
-    name, markers = read_body_file(path, MARKERS)
-    parts = tuple(
-        make(name, chosen) for kind, make in MARKERS.items() if (chosen := [m for m in markers if m.kind == kind])
-    )
-    target = parts[0] if len(parts) == 1 else Composite(name, parts)
+    name, markers = read_body_file(path, (*MARKERS, DISC))
+    of_kind = {kind: [m for m in markers if m.kind == kind] for kind in (*MARKERS, DISC)}
+    parts = tuple(make(name, of_kind[kind]) for kind, make in MARKERS.items() if of_kind[kind])
+    discs = DiscTarget.from_markers(name, of_kind[DISC]) if of_kind[DISC] else None
+    target = parts[0] if len(parts) == 1 and discs is None else Composite(name, parts, discs)
     check_points(path, target.body)
     return target
 
