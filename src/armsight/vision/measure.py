@@ -14,7 +14,9 @@ from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
 from armsight.vision.image import grey
 from armsight.vision.locate import locate
+from armsight.vision.locate_discs import locate_composite
 from armsight.vision.markers.marker import Target
+from armsight.vision.markers.targets import Composite
 from armsight.vision.match import gate, join, match
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
@@ -40,11 +42,15 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
     for side, camera, image in zip(SIDES, rig.cameras, images, strict=True):
         if (problem := size_problem(camera.image_size_px, image, side)) is not None:
             return Missed(problem)
-    found = tuple(target.detect(grey(image)) for image in images)
+    left, right = (grey(image) for image in images)
+    found, flips = (target.detect(left), target.detect(right)), getattr(target, "flips", ())
+    if isinstance(target, Composite) and target.discs is not None:
+        discs = target.discs.find(left), target.discs.find(right)
+        return locate_composite(rig, target.body, target.discs, found, discs, flips=flips)
     problems = [f"{side}: {d.problem}" for side, d in zip(SIDES, found, strict=True) if d.problem is not None]
     if problems:
         return Missed("; ".join(problems))
-    return measure_detections(rig, target.body, found[0], found[1], flips=getattr(target, "flips", ()))
+    return measure_detections(rig, target.body, *found, flips=flips)
 
 
 def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:

@@ -50,7 +50,7 @@ class Composite(Record):
     @cached_property
     def body(self) -> Body:
         """All parts' points, then the discs' centres."""
-        bodies = [part.body for part in (*self.parts, *([] if self.discs is None else [self.discs]))]
+        bodies = [part.body for part in self.parts] + ([] if self.discs is None else [self.discs.body])
         names = tuple(name for body in bodies for name in body.point_names)
         return Body(self.name, names, np.concatenate([body.points for body in bodies]))
 

@@ -1,0 +1,189 @@
+"""How likely it is that given discs are those of a body at one pose, rather than discs of something else.
+
+The score is the logarithm of the Bayes factor of the two explanations: the body at some pose, of which nothing is known
+beforehand, against discs of the same size and brightness strewn as densely as the image has them (Bar-Shalom and Li,
+"Multitarget-Multisensor Tracking", 1995, 6: association likelihoods). Pose and calibration are integrated out in Laplace's
+approximation. It weighs in one number how well the discs fit, how many there are, how sharply they could have contradicted,
+and how easily clutter would do the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from armsight.data import Array, Correspondences, Discs, Ids, Record
+from armsight.geometry.pose import exp_se3
+from armsight.vision.assign_discs import correspondences, detection_cov, settle
+from armsight.vision.expected import Expected, expect, visible
+from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.pairing import DEPTHS_M, SIZE_TOLERANCE, fits, rig_root, size_sigma
+from armsight.vision.rig import StereoRig
+
+#: A disc in view is found with this probability.
+FOUND = 0.9
+#: One standard deviation of an ellipse's size about the disc's, as a share, beside its noise.
+SIZE_SHARE = SIZE_TOLERANCE / 3
+#: A disc turned further away than this cosine is not found, and its back is not seen.
+LEAST_FACING = 0.09
+#: Discs that fit worse than this quantile of chi-square are not those of the body.
+FIT_QUANTILE = 1.0 - 1e-5
+_STEPS, _DONE = 12, 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis(Record):
+    """A naming of detections and the pose that follows.
+
+    Attributes:
+        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
+        T_left_body: (4, 4) the pose.
+        cov: (6, 6) covariance of its tangent, noise and calibration.
+        seen: ellipse centres by rows of the target's body.
+        score: logarithm of the Bayes factor against clutter.
+    """
+
+    rows: Ids
+    T_left_body: Array
+    cov: Array
+    seen: Correspondences
+    score: float
+
+    def contradicts(self, other: Hypothesis) -> bool:
+        """Whether one disc is two detections, or one detection two discs."""
+        for side in (0, 1):
+            mine, theirs = self.rows[:, side], other.rows[:, side]
+            both = (mine >= 0) & (theirs >= 0)
+            if (mine[both] != theirs[both]).any():
+                return True
+            ids = {row: m for m, row in enumerate(mine) if row >= 0}
+            if any(ids.get(row, m) != m for m, row in enumerate(theirs) if row >= 0):
+                return True
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit(Record):
+    """A least-squares pose: with its covariance, chi-square, and log-determinant of the residuals' covariance."""
+
+    T_left_body: Array
+    cov: Array
+    chi2: float
+    log_det: float
+
+
+def hypothesis(
+    rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], T_left_body: Array, rows: Ids
+) -> Hypothesis | str:
+    """Grow a few named detections into a hypothesis over all discs.
+
+    Args:
+        rig: the calibrated pair.
+        target: the discs.
+        discs: what both cameras saw.
+        T_left_body: (4, 4) about the pose.
+        rows: (M, 2) detections of three discs or more, -1 elsewhere.
+
+    Returns:
+        The hypothesis, or why it is none.
+    """
+    fit = _fit(rig, target, discs, T_left_body, rows)
+    if fit is None:
+        return "no pose fits"
+    found = settle(rig, target, fit.T_left_body, fit.cov, discs, rows)
+    fit = _fit(rig, target, discs, found.T_left_body, found.rows)
+    if fit is None:
+        return "no pose fits"
+    used = int((found.rows >= 0).sum())
+    if fit.chi2 > chi2.ppf(FIT_QUANTILE, 2 * used - 6):
+        return "the discs do not fit the body"
+    expected = expect(rig, target, fit.T_left_body)
+    turned = 3.0 * np.sqrt(np.linalg.eigvalsh(fit.cov[3:, 3:])[-1])
+    if (expected.facing[found.rows >= 0] + turned < LEAST_FACING).any():
+        return "its discs would be seen from behind"
+    size = _size_chi2(target, expected, discs, found.rows)
+    if size is None:
+        return "the discs do not look as large as the body's would"
+    score = _score(rig, target, discs, expected, found.rows, fit) - size / 2
+    return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(found, discs), score)
+
+
+def _fit(rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], T: Array, rows: Ids) -> _Fit | None:
+    """Fit a pose to named ellipse centres; the rig's errors weigh as noise that all detections share."""
+    m, side = np.nonzero(rows >= 0)
+    uv = np.array([discs[s].uv[rows[i, s]] for i, s in zip(m, side, strict=True)])
+    root = rig_root(rig)
+    for _ in range(_STEPS):
+        expected = expect(rig, target, T)
+        gap = (uv - expected.uv[m, side]).ravel()
+        if not np.isfinite(gap).all():
+            return None
+        blocks = [
+            detection_cov(rig, target, expected, discs[s], i, s, rows[i, s : s + 1])[0]
+            for i, s in zip(m.tolist(), side.tolist(), strict=True)
+        ]
+        by_rig = expected.J_rig[m, side].reshape(len(gap), -1) @ root
+        S, J = block_diag(*blocks) + by_rig @ by_rig.T, expected.J[m, side].reshape(-1, 6)
+        W = np.linalg.inv(S)
+        information = J.T @ W @ J
+        if not np.linalg.cond(information) < 1e15:
+            return None
+        cov = np.asarray(np.linalg.inv(information), np.float64)
+        step = cov @ (J.T @ W @ gap)
+        left = float(step @ information @ step)
+        if left < _DONE:
+            return _Fit(T, cov, float(gap @ W @ gap) - left, float(np.linalg.slogdet(S)[1]))
+        T = T @ exp_se3(step)
+    return None
+
+
+def _size_chi2(target: DiscTarget, expected: Expected, discs: tuple[Discs, Discs], rows: Ids) -> float | None:
+    """Return the chi-square of the ellipses' sizes, or None where one does not fit at all."""
+    total = 0.0
+    for side, seen in enumerate(discs):
+        m = np.flatnonzero(rows[:, side] >= 0)
+        chosen, long = rows[m, side], expected.radius_px[m, side]
+        radius, sigma = seen.radius_px[chosen], size_sigma(seen)[chosen]
+        if not fits(radius, sigma, long, long).all():
+            return None
+        total += float(((radius - long) ** 2 / ((SIZE_SHARE * long) ** 2 + sigma**2)).sum())
+    return total
+
+
+def _score(
+    rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], expected: Expected, rows: Ids, fit: _Fit
+) -> float:
+    """Return the logarithm of the Bayes factor of the centres; see the module."""
+    named = rows >= 0
+    evidence = -fit.chi2 / 2 - fit.log_det / 2 - named.sum() * np.log(2 * np.pi)
+    # The prior: any direction, anywhere in view, and no distance likelier than another on a logarithmic scale.
+    camera, z = rig.left, max(float(fit.T_left_body[2, 3]), DEPTHS_M[0])
+    width, height = camera.image_size_px
+    area = z**2 * width * height / (camera.intrinsics[0] * camera.intrinsics[1])
+    prior = -np.log(8 * np.pi**2 * area * z * np.log(DEPTHS_M[1] / DEPTHS_M[0]))
+    pose = 3 * np.log(2 * np.pi) + np.linalg.slogdet(fit.cov)[1] / 2 + prior
+    lost = int((visible(rig, expected) & ~named).sum())
+    clutter = sum(
+        float(np.log(_density(rig, target, expected, discs[side], rows[:, side], int(m), int(side))))
+        for m, side in np.argwhere(named)
+    )
+    return float(evidence + pose + named.sum() * np.log(FOUND) + lost * np.log(1 - FOUND) - clutter)
+
+
+def _density(
+    rig: StereoRig, target: DiscTarget, expected: Expected, discs: Discs, mine: Ids, m: int, side: int
+) -> float:
+    """Return how many discs that may be disc m a square pixel has: in the image, or others about the body if denser."""
+    long = expected.radius_px[m, side]
+    alike = (discs.bright == target.bright[m]) & fits(discs.radius_px, size_sigma(discs), long, long)
+    other = np.array(alike)
+    other[mine[mine >= 0]] = False
+    uv = expected.uv[np.isfinite(expected.uv[:, side, 0]), side]
+    middle = uv.mean(axis=0)
+    reach = np.linalg.norm(uv - middle, axis=1).max() + 2 * long
+    about = int((other & (np.linalg.norm(discs.uv - middle, axis=1) <= reach)).sum())
+    width, height = rig.cameras[side].image_size_px
+    return max(int(alike.sum()) / (width * height), about / float(np.pi * reach**2))
