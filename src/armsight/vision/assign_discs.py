@@ -1,4 +1,4 @@
-"""Which detection is which disc where the pose is about known: gates, each choice made only where there is one.
+"""Which detection is which disc where the pose is about known: gates, and a choice only where there is one.
 
 A disc's two detections are judged together: what is not known of the pose moves both images of a disc as one, so the
 epipolar distance and the disparity count by themselves. What is settled narrows the pose, and with it the other gates.
@@ -6,7 +6,6 @@ epipolar distance and the disparity count by themselves. What is settled narrows
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,17 +15,17 @@ from scipy.stats import chi2
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
 from armsight.geometry.pose import exp_se3
+from armsight.vision.disc_view import DiscView
 from armsight.vision.expected import Expected, expect, visible
 from armsight.vision.markers.disc import DiscTarget
-from armsight.vision.pairing import UNMODELLED_SHARE, fits, noise, size_sigma
 from armsight.vision.rig import StereoRig
 
 #: A detection beyond this quantile of the chi-square distribution of its distance is of something else.
 GATE_QUANTILE = 1.0 - 1e-5
+_GATE_ONE, _GATE_BOTH = (float(chi2.ppf(GATE_QUANTILE, n)) for n in (2, 4))
 _NONE = np.zeros(0, np.int64)
 #: Rows of the left and of the right camera's discs that may be one disc of the body.
 Claim = tuple[Ids, Ids]
-_GATE = {n: float(chi2.ppf(GATE_QUANTILE, n)) for n in (2, 4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +35,11 @@ class Assigned(Record):
     Attributes:
         rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
         T_left_body: (4, 4) the pose, improved by what was settled.
-        cov: (6, 6) covariance of its tangent.
         dropped: discs for which detections compete.
     """
 
     rows: Ids
     T_left_body: Array
-    cov: Array
     dropped: tuple[Dropped, ...]
 
 
@@ -63,8 +60,9 @@ def assign(
         Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed where
         nothing is left.
     """
-    found = settle(rig, target, T_left_body, cov, (left, right), np.full((len(target.radii_m), 2), -1))
-    seen = correspondences(found, (left, right))
+    view = DiscView.of(rig, target, left, right)
+    found = settle(view, T_left_body, cov, np.full((len(target.radii_m), 2), -1))
+    seen = correspondences(view, found)
     if len(seen.ids):
         return seen
     if found.dropped:
@@ -72,88 +70,66 @@ def assign(
     return Missed(f"no disc is where {target.body.name} should show one")
 
 
-def correspondences(found: Assigned, discs: Sequence[Discs]) -> Correspondences:
+def correspondences(view: DiscView, found: Assigned) -> Correspondences:
     """Return what was named as correspondences of ellipse centres."""
     ids = np.flatnonzero((found.rows >= 0).any(axis=1))
     uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
-    for side, seen in enumerate(discs):
+    for side, seen in enumerate(view.discs):
         rows = found.rows[ids, side]
         there = rows >= 0
         uv[there, side], cov[there, side] = seen.uv[rows[there]], seen.cov_uv[rows[there]]
     return Correspondences(ids, uv, cov, found.dropped)
 
 
-def detection_cov(
-    rig: StereoRig, target: DiscTarget, expected: Expected, discs: Discs, m: int, side: int, rows: Ids
-) -> Array:
-    """Return (N, 2, 2) covariance of detections ``rows`` as disc m: noise, and what the body's making leaves open, px^2."""
-    size = np.ptp(target.body.points, axis=0).max()
-    made = UNMODELLED_SHARE * size * expected.radius_px[m, side] / target.radii_m[m]
-    return np.asarray(noise(rig, discs.cov_uv[rows]) + made**2 * np.eye(2) + expected.cov_bias[m, side])
-
-
-def settle(
-    rig: StereoRig, target: DiscTarget, T_left_body: Array, cov: Array, discs: tuple[Discs, Discs], rows: Ids
-) -> Assigned:
+def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
     """Name detections by a pose, the clear ones first.
 
     Args:
-        rig: the calibrated pair.
-        target: the discs.
+        view: what both cameras saw.
         T_left_body: (4, 4) about where the body is.
         cov: (6, 6) covariance of its tangent.
-        discs: what both cameras saw.
         rows: (M, 2) what is settled already and is part of the pose; -1 elsewhere.
     """
-    T, rows, ends = T_left_body, rows.copy(), tuple(seen.radius_px for seen in discs)
+    T, rows = T_left_body, rows.copy()
     while True:
-        expected = expect(rig, target, T)
-        see = visible(rig, expected)
-        free = [np.isin(np.arange(len(seen.uv)), rows[:, side], invert=True) for side, seen in enumerate(discs)]
+        expected = expect(view.rig, view.target, T)
+        see = visible(view.rig, expected)
+        free = [np.isin(np.arange(len(seen.uv)), rows[:, s], invert=True) for s, seen in enumerate(view.discs)]
         claims: dict[int, Claim] = {}
-        for m in np.flatnonzero((rows < 0).all(axis=1) & see.any(axis=1)):
-            near = tuple(
-                _near(rig, target, expected, cov, discs[s], ends[s], int(m), s, free[s]) if see[m, s] else _NONE
-                for s in (0, 1)
-            )
-            if len(near[0]) or len(near[1]):
-                claims[int(m)] = _together(rig, target, expected, cov, discs, int(m), (near[0], near[1]))
+        for m in np.flatnonzero((rows < 0).all(axis=1) & see.any(axis=1)).tolist():
+            left, right = (_near(view, expected, cov, m, s, free[s]) if see[m, s] else _NONE for s in (0, 1))
+            if len(left) or len(right):
+                claims[m] = _together(view, expected, cov, m, (left, right))
         clear = _clear(claims)
         if not len(clear):
             break
         rows[clear[:, 0]] = clear[:, 1:]
-        T, cov = _improved(rig, target, expected, T, cov, discs, clear)
-    names = target.body.point_names
-    return Assigned(rows, T, cov, tuple(Dropped(names[m], _competing(claim)) for m, claim in claims.items()))
+        T, cov = _improved(view, expected, T, cov, clear)
+    names = view.target.body.point_names
+    return Assigned(rows, T, tuple(Dropped(names[m], _competing(claim)) for m, claim in claims.items()))
 
 
-def _near(
-    rig: StereoRig, target: DiscTarget, expected: Expected, cov: Array, discs: Discs, radius: Array, m: int, side: int,
-    free: NDArray[np.bool_],
-) -> Ids:  # fmt: skip
+def _near(view: DiscView, expected: Expected, cov: Array, m: int, side: int, free: NDArray[np.bool_]) -> Ids:
     """Return the free detections of one camera that may be disc m."""
-    long = expected.radius_px[m, side]
-    rows = np.flatnonzero(free & (discs.bright == target.bright[m]) & fits(radius, size_sigma(discs), long, long))
-    gap = discs.uv[rows] - expected.uv[m, side]
+    rows = np.flatnonzero(free & view.alike(m, side, float(expected.radius_px[m, side])))
+    gap = view.discs[side].uv[rows] - expected.uv[m, side]
     J = expected.J[m, side]
-    S = J @ cov @ J.T + detection_cov(rig, target, expected, discs, m, side, rows)
+    S = J @ cov @ J.T + view.covariances(expected, np.full(len(rows), m), side, rows)
     far = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap)
-    return np.asarray(rows[far <= _GATE[2]])
+    return np.asarray(rows[far <= _GATE_ONE])
 
 
-def _together(
-    rig: StereoRig, target: DiscTarget, expected: Expected, cov: Array, discs: Sequence[Discs], m: int, near: Claim
-) -> Claim:
+def _together(view: DiscView, expected: Expected, cov: Array, m: int, near: Claim) -> Claim:
     """Return what is left of a disc's detections where those of both cameras must agree; all of one camera's."""
     if not len(near[0]) or not len(near[1]):
         return near
     a, b = (grid.ravel() for grid in np.meshgrid(*near, indexing="ij"))
     J = expected.J[m].reshape(4, 6)
     S = np.tile(J @ cov @ J.T, (len(a), 1, 1))
-    S[:, :2, :2] += detection_cov(rig, target, expected, discs[0], m, 0, a)
-    S[:, 2:, 2:] += detection_cov(rig, target, expected, discs[1], m, 1, b)
-    gap = np.concatenate([discs[0].uv[a] - expected.uv[m, 0], discs[1].uv[b] - expected.uv[m, 1]], axis=1)
-    good = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap) <= _GATE[4]
+    S[:, :2, :2] += view.covariances(expected, np.full(len(a), m), 0, a)
+    S[:, 2:, 2:] += view.covariances(expected, np.full(len(b), m), 1, b)
+    gap = np.concatenate([view.discs[0].uv[a] - expected.uv[m, 0], view.discs[1].uv[b] - expected.uv[m, 1]], axis=1)
+    good = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap) <= _GATE_BOTH
     return np.unique(a[good]), np.unique(b[good])
 
 
@@ -168,17 +144,14 @@ def _clear(claims: dict[int, Claim]) -> Ids:
     return np.array(clear, np.int64).reshape(-1, 3)
 
 
-def _improved(
-    rig: StereoRig, target: DiscTarget, expected: Expected, T: Array, cov: Array, discs: Sequence[Discs], clear: Ids
-) -> tuple[Array, Array]:
+def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, clear: Ids) -> tuple[Array, Array]:
     """Return the pose and its covariance with discs (K, 3) more, by a Kalman update."""
     J, gap, noises = [], [], []
-    for m, *pair in clear:
-        for side, row in enumerate(pair):
-            if row >= 0:
-                J.append(expected.J[m, side])
-                gap.append(discs[side].uv[row] - expected.uv[m, side])
-                noises.append(detection_cov(rig, target, expected, discs[side], m, side, np.array([row]))[0])
+    for side in (0, 1):
+        m, rows = clear[clear[:, 1 + side] >= 0][:, [0, 1 + side]].T
+        J.append(expected.J[m, side].reshape(-1, 6))
+        gap.append((view.discs[side].uv[rows] - expected.uv[m, side]).ravel())
+        noises += list(view.covariances(expected, m, side, rows))
     by_pose = np.concatenate(J)
     S = by_pose @ cov @ by_pose.T + block_diag(*noises)
     gain = np.linalg.solve(S, by_pose @ cov).T

@@ -31,6 +31,7 @@ class Expected(Record):
     Attributes:
         uv: (M, 2, 2) disc, camera: centres of the ellipses, raw px.
         bias: (M, 2, 2) centres of the ellipses less images of the centres, px.
+        shape: (M, 2, 3) S11, S12, S22 of the ellipses, px^2; as if turned to the camera where the normal is not known.
         radius_px: (M, 2) longer half axes of the ellipses, px.
         facing: (M, 2) cosine between a disc's normal and its direction to the camera; NaN where the body does not say.
         J: (M, 2, 2, 6) derivative of ``uv`` by the tangent of the pose.
@@ -41,6 +42,7 @@ class Expected(Record):
 
     uv: Array
     bias: Array
+    shape: Array
     radius_px: Array
     facing: Array
     J: Array
@@ -76,7 +78,7 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
     points, normals = target.body.points, bias_normals(target)
     known = np.isfinite(normals[:, 0])
     T_right_left, count = inverse(rig.T_left_right), len(points)
-    uv, bias, radius = np.empty((count, 2, 2)), np.empty((count, 2, 2)), np.empty((count, 2))
+    uv, bias, shape = np.empty((count, 2, 2)), np.empty((count, 2, 2)), np.empty((count, 2, 3))
     facing, J, J_bias = np.empty((count, 2)), np.empty((count, 2, 2, 6)), np.empty((count, 2, 2, 6))
     J_rig, cov = np.zeros((count, 2, 2, rig.parameter_count)), np.zeros((count, 2, 2, 2))
     first = 0
@@ -87,9 +89,7 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
         n = np.where(known[:, None], normals, 0.0) @ R.T
         n[~known] = p[~known] / np.linalg.norm(p[~known], axis=1, keepdims=True)
         centre, J_p, J_camera = camera.project_jacobians(p)
-        uv[:, side], shape, J_P, J_n = project_discs(camera, p, n, target.radii_m)
-        mean, half = (shape[:, 0] + shape[:, 2]) / 2, (shape[:, 0] - shape[:, 2]) / 2
-        radius[:, side] = np.sqrt(mean + np.hypot(half, shape[:, 1]))
+        uv[:, side], shape[:, side], J_P, J_n = project_discs(camera, p, n, target.radii_m)
         uv[~known, side] = centre[~known]
         J_P[~known], J_n[~known] = J_p[~known], 0.0
         by_place = np.concatenate([np.broadcast_to(R, (count, 3, 3)), -R @ skew(points)], axis=2)
@@ -103,7 +103,9 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
         first += J_camera.shape[2]
         if side == 1:
             J_rig[:, side, :, first:] = np.concatenate([-J_p, J_p @ skew(p)], axis=2)
-    return Expected(uv, bias, radius, facing, J, J_bias, J_rig, cov)
+    mean, half = (shape[..., 0] + shape[..., 2]) / 2, (shape[..., 0] - shape[..., 2]) / 2
+    radius = np.sqrt(mean + np.hypot(half, shape[..., 1]))
+    return Expected(uv, bias, shape, radius, facing, J, J_bias, J_rig, cov)
 
 
 def centred(

@@ -10,18 +10,17 @@ and how easily clutter would do the same.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from armsight.data import Array, Correspondences, Discs, Ids, Record
+from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.pose import exp_se3
-from armsight.vision.assign_discs import correspondences, detection_cov, settle
+from armsight.vision.assign_discs import correspondences, settle
+from armsight.vision.disc_view import SIZE_SIGMAS, SIZE_TOLERANCE, DiscView
 from armsight.vision.expected import Expected, expect, visible
-from armsight.vision.markers.disc import DiscTarget
-from armsight.vision.pairing import DEPTHS_M, SIZE_TOLERANCE, fits, rig_root, size_sigma
-from armsight.vision.rig import StereoRig
+from armsight.vision.pairing import DEPTHS_M
 
 #: A disc in view is found with this probability.
 FOUND = 0.9
@@ -64,6 +63,10 @@ class Hypothesis(Record):
                 return True
         return False
 
+    def shares_with(self, other: Hypothesis) -> bool:
+        """Whether one detection is used by both."""
+        return any(bool(np.isin(self.rows[self.rows[:, s] >= 0, s], other.rows[:, s]).any()) for s in (0, 1))
+
 
 @dataclass(frozen=True, eq=False)
 class _Fit(Record):
@@ -75,59 +78,60 @@ class _Fit(Record):
     log_det: float
 
 
-def hypothesis(
-    rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], T_left_body: Array, rows: Ids
-) -> Hypothesis | str:
+def hypothesis(view: DiscView, T_left_body: Array, rows: Ids) -> Hypothesis | str:
     """Grow a few named detections into a hypothesis over all discs.
 
     Args:
-        rig: the calibrated pair.
-        target: the discs.
-        discs: what both cameras saw.
+        view: what both cameras saw.
         T_left_body: (4, 4) about the pose.
         rows: (M, 2) detections of three discs or more, -1 elsewhere.
 
     Returns:
         The hypothesis, or why it is none.
     """
-    fit = _fit(rig, target, discs, T_left_body, rows)
+    fit = _fit(view, T_left_body, rows)
     if fit is None:
         return "no pose fits"
-    found = settle(rig, target, fit.T_left_body, fit.cov, discs, rows)
-    fit = _fit(rig, target, discs, found.T_left_body, found.rows)
-    if fit is None:
-        return "no pose fits"
-    used = int((found.rows >= 0).sum())
-    if fit.chi2 > chi2.ppf(FIT_QUANTILE, 2 * used - 6):
+    found = settle(view, fit.T_left_body, fit.cov, rows)
+    if (found.rows != rows).any():
+        fit = _fit(view, found.T_left_body, found.rows)
+        if fit is None:
+            return "no pose fits"
+    if fit.chi2 > _limit(2 * int((found.rows >= 0).sum()) - 6):
         return "the discs do not fit the body"
-    expected = expect(rig, target, fit.T_left_body)
+    expected = expect(view.rig, view.target, fit.T_left_body)
     turned = 3.0 * np.sqrt(np.linalg.eigvalsh(fit.cov[3:, 3:])[-1])
     if (expected.facing[found.rows >= 0] + turned < LEAST_FACING).any():
         return "its discs would be seen from behind"
-    size = _size_chi2(target, expected, discs, found.rows)
-    if size is None:
-        return "the discs do not look as large as the body's would"
-    score = _score(rig, target, discs, expected, found.rows, fit) - size / 2
-    return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(found, discs), score)
+    sizes = _size_chi2(view, expected, found.rows)
+    if sizes is None:
+        return "the discs do not look as the body's would"
+    score = _score(view, expected, found.rows, fit) - sizes / 2
+    return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(view, found), score)
 
 
-def _fit(rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], T: Array, rows: Ids) -> _Fit | None:
+@lru_cache(maxsize=256)
+def _limit(freedom: int) -> float:
+    """Chi-square beyond which a fit is none."""
+    return float(chi2.ppf(FIT_QUANTILE, freedom))
+
+
+def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
     """Fit a pose to named ellipse centres; the rig's errors weigh as noise that all detections share."""
-    m, side = np.nonzero(rows >= 0)
-    uv = np.array([discs[s].uv[rows[i, s]] for i, s in zip(m, side, strict=True)])
-    root = rig_root(rig)
+    side, m = np.nonzero(rows.T >= 0)
+    uv = np.concatenate([view.discs[s].uv[rows[m[side == s], s]] for s in (0, 1)])
     for _ in range(_STEPS):
-        expected = expect(rig, target, T)
+        expected = expect(view.rig, view.target, T)
         gap = (uv - expected.uv[m, side]).ravel()
         if not np.isfinite(gap).all():
             return None
-        blocks = [
-            detection_cov(rig, target, expected, discs[s], i, s, rows[i, s : s + 1])[0]
-            for i, s in zip(m.tolist(), side.tolist(), strict=True)
-        ]
-        by_rig = expected.J_rig[m, side].reshape(len(gap), -1) @ root
-        S, J = block_diag(*blocks) + by_rig @ by_rig.T, expected.J[m, side].reshape(-1, 6)
-        W = np.linalg.inv(S)
+        by_rig = expected.J_rig[m, side].reshape(len(gap), -1) @ view.rig_root
+        S = by_rig @ by_rig.T
+        for s in (0, 1):
+            here = np.flatnonzero(side == s)
+            at = 2 * here[:, None] + [0, 1]
+            S[at[:, :, None], at[:, None, :]] += view.covariances(expected, m[here], s, rows[m[here], s])
+        J, W = expected.J[m, side].reshape(-1, 6), np.linalg.inv(S)
         information = J.T @ W @ J
         if not np.linalg.cond(information) < 1e15:
             return None
@@ -140,50 +144,43 @@ def _fit(rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], T: Arra
     return None
 
 
-def _size_chi2(target: DiscTarget, expected: Expected, discs: tuple[Discs, Discs], rows: Ids) -> float | None:
+def _size_chi2(view: DiscView, expected: Expected, rows: Ids) -> float | None:
     """Return the chi-square of the ellipses' sizes, or None where one does not fit at all."""
     total = 0.0
-    for side, seen in enumerate(discs):
-        m = np.flatnonzero(rows[:, side] >= 0)
-        chosen, long = rows[m, side], expected.radius_px[m, side]
-        radius, sigma = seen.radius_px[chosen], size_sigma(seen)[chosen]
-        if not fits(radius, sigma, long, long).all():
+    for m, side in np.argwhere(rows >= 0).tolist():
+        row, long = rows[m, side], float(expected.radius_px[m, side])
+        if not view.congruent(expected, m, side)[row]:
             return None
-        total += float(((radius - long) ** 2 / ((SIZE_SHARE * long) ** 2 + sigma**2)).sum())
+        sigma2 = (SIZE_SHARE * long) ** 2 + float(view.slack_px[side][row] / SIZE_SIGMAS) ** 2
+        total += (float(view.radius_px[side][row]) - long) ** 2 / sigma2
     return total
 
 
-def _score(
-    rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], expected: Expected, rows: Ids, fit: _Fit
-) -> float:
+def _score(view: DiscView, expected: Expected, rows: Ids, fit: _Fit) -> float:
     """Return the logarithm of the Bayes factor of the centres; see the module."""
     named = rows >= 0
-    evidence = -fit.chi2 / 2 - fit.log_det / 2 - named.sum() * np.log(2 * np.pi)
+    count = int(named.sum())
+    evidence = -fit.chi2 / 2 - fit.log_det / 2 - count * np.log(2 * np.pi)
     # The prior: any direction, anywhere in view, and no distance likelier than another on a logarithmic scale.
-    camera, z = rig.left, max(float(fit.T_left_body[2, 3]), DEPTHS_M[0])
+    camera, z = view.rig.left, max(float(fit.T_left_body[2, 3]), DEPTHS_M[0])
     width, height = camera.image_size_px
-    area = z**2 * width * height / (camera.intrinsics[0] * camera.intrinsics[1])
+    area = z**2 * width * height / float(camera.intrinsics[0] * camera.intrinsics[1])
     prior = -np.log(8 * np.pi**2 * area * z * np.log(DEPTHS_M[1] / DEPTHS_M[0]))
     pose = 3 * np.log(2 * np.pi) + np.linalg.slogdet(fit.cov)[1] / 2 + prior
-    lost = int((visible(rig, expected) & ~named).sum())
-    clutter = sum(
-        float(np.log(_density(rig, target, expected, discs[side], rows[:, side], int(m), int(side))))
-        for m, side in np.argwhere(named)
-    )
-    return float(evidence + pose + named.sum() * np.log(FOUND) + lost * np.log(1 - FOUND) - clutter)
+    lost = int((visible(view.rig, expected) & ~named).sum())
+    clutter = sum(np.log(_density(view, expected, rows[:, side], m, side)) for m, side in np.argwhere(named).tolist())
+    return float(evidence + pose + count * np.log(FOUND) + lost * np.log(1 - FOUND) - clutter)
 
 
-def _density(
-    rig: StereoRig, target: DiscTarget, expected: Expected, discs: Discs, mine: Ids, m: int, side: int
-) -> float:
+def _density(view: DiscView, expected: Expected, mine: Ids, m: int, side: int) -> float:
     """Return how many discs that may be disc m a square pixel has: in the image, or others about the body if denser."""
-    long = expected.radius_px[m, side]
-    alike = (discs.bright == target.bright[m]) & fits(discs.radius_px, size_sigma(discs), long, long)
+    long = float(expected.radius_px[m, side])
+    alike = view.congruent(expected, m, side)
     other = np.array(alike)
     other[mine[mine >= 0]] = False
     uv = expected.uv[np.isfinite(expected.uv[:, side, 0]), side]
     middle = uv.mean(axis=0)
-    reach = np.linalg.norm(uv - middle, axis=1).max() + 2 * long
-    about = int((other & (np.linalg.norm(discs.uv - middle, axis=1) <= reach)).sum())
-    width, height = rig.cameras[side].image_size_px
-    return max(int(alike.sum()) / (width * height), about / float(np.pi * reach**2))
+    reach = float(np.linalg.norm(uv - middle, axis=1).max()) + 2 * long
+    about = int((other & (np.linalg.norm(view.discs[side].uv - middle, axis=1) <= reach)).sum())
+    width, height = view.rig.cameras[side].image_size_px
+    return max(int(alike.sum()) / (width * height), about / (np.pi * reach**2))

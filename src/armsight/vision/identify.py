@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations
+from math import comb
 
 import numpy as np
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
 from armsight.vision.assign_discs import assign
+from armsight.vision.disc_view import DiscView
 from armsight.vision.expected import centred
 from armsight.vision.hypothesis import Hypothesis, hypothesis
 from armsight.vision.markers.disc import DiscTarget
@@ -29,7 +31,7 @@ __all__ = ["Identified", "assign", "centred", "identify"]
 #: A naming is given only where it is so many times likelier than all others together, and than clutter.
 ERROR_ODDS = 1e6
 #: More ways than these to lay the body on the discs are not weighed.
-MOST_HYPOTHESES = 200
+MOST_HYPOTHESES = 64
 #: A triple whose discs a rough rigid fit turns away by more than this (cosine) is not looked at more closely.
 _ROUGHLY_AWAY = -0.3
 
@@ -72,36 +74,38 @@ def identify(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> I
     discs = (left, right)
     if min(len(seen.uv) for seen in discs) < 3:
         return Missed(_too_few(target, discs))
-    pairs = pair(rig, target, left, right)
+    view = DiscView.of(rig, target, left, right)
+    pairs = pair(view)
     if pairs is None:
         return Missed(f"{_counts(discs)} make more than {MOST_PAIRS} pairs: too many to tell which are of {body.name}")
-    found = triples(target, pairs)
+    found = triples(view, pairs)
     if found is None:
         return Missed(f"ambiguous: {_counts(discs)} fit {body.name} in too many ways to look at")
-    weighed = _weighed(rig, target, discs, pairs, found)
-    return weighed if isinstance(weighed, Missed) else _decided(target, discs, weighed)
+    weighed = _weighed(view, pairs, found)
+    return weighed if isinstance(weighed, Missed) else _decided(view, weighed)
 
 
-def _weighed(
-    rig: StereoRig, target: DiscTarget, discs: tuple[Discs, Discs], pairs: Pairs, found: Triples
-) -> list[Hypothesis] | Missed:
+def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] | Missed:
     """Grow every triple into a hypothesis, those that another has grown into already left out."""
+    target, discs, count = view.target, view.discs, len(view.target.radii_m)
     reasons: Counter[str] = Counter()
     grown: list[Hypothesis] = []
     both = np.stack([pairs.left, pairs.right], axis=1)
+    possible = np.flatnonzero(_turned_to(view, found))
+    many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} in more than {MOST_HYPOTHESES} places or turns")
+    if len(possible) > MOST_HYPOTHESES * comb(count, 3):  # each body has so many triples, and no more
+        return many
     tried = 0
-    for n in np.flatnonzero(_turned_to(rig, target, found)):
+    for n in possible:
         ids, detections = found.ids[n], both[found.rows[n]]
         if any((h.rows[ids] == detections).all() for h in grown):
             continue
         if tried == MOST_HYPOTHESES:
-            return Missed(
-                f"ambiguous: {_counts(discs)} show {target.body.name} in more than {MOST_HYPOTHESES} places or turns"
-            )
+            return many
         tried += 1
-        rows = np.full((len(target.radii_m), 2), -1)
+        rows = np.full((count, 2), -1)
         rows[ids] = detections
-        result = hypothesis(rig, target, discs, found.Ts_left_body[n], rows)
+        result = hypothesis(view, found.Ts_left_body[n], rows)
         if isinstance(result, str):
             reasons[result] += 1
         elif not any((h.rows == result.rows).all() for h in grown):
@@ -116,33 +120,34 @@ def _weighed(
     return Missed(f"{what}, but no three have its distances; {_too_few(target, discs)}")
 
 
-def _turned_to(rig: StereoRig, target: DiscTarget, found: Triples) -> Array:
+def _turned_to(view: DiscView, found: Triples) -> Array:
     """(T,) whether no disc of a triple is turned well away from a camera."""
-    points, normals = target.body.points[found.ids], target.normals[found.ids]
+    points, normals = view.target.body.points[found.ids], view.target.normals[found.ids]
     R, t = found.Ts_left_body[:, :3, :3], found.Ts_left_body[:, :3, 3]
     p, n = np.einsum("tij,tmj->tmi", R, points) + t[:, None], np.einsum("tij,tmj->tmi", R, normals)
     good = np.ones(len(p), bool)
-    for eye in (np.zeros(3), rig.T_left_right[:3, 3]):
+    for eye in (np.zeros(3), view.rig.T_left_right[:3, 3]):
         ray = p - eye
         good &= ~(np.einsum("tmi,tmi->tm", ray, n) / np.linalg.norm(ray, axis=2) > -_ROUGHLY_AWAY).any(axis=1)
     return good
 
 
-def _decided(target: DiscTarget, discs: tuple[Discs, Discs], weighed: list[Hypothesis]) -> Identified | Missed:
-    """Take the best hypothesis where nothing else comes near it."""
+def _decided(view: DiscView, weighed: list[Hypothesis]) -> Identified | Missed:
+    """Take the best hypothesis where nothing else comes near it, and no second body of the kind is there."""
     best = max(weighed, key=lambda h: h.score)
     others = [h for h in weighed if best.contradicts(h)]
     scores = [0.0, *(h.score for h in others)]
     odds = best.score - float(np.logaddexp.reduce(scores))
-    if odds >= np.log(ERROR_ODDS):
-        return Identified(best.T_left_body, best.cov, best.seen, best.rows, odds)
     rival = max(others, key=lambda h: h.score, default=None)
+    twin = any(h.score >= np.log(ERROR_ODDS) and not best.shares_with(h) for h in others)
+    if odds >= np.log(ERROR_ODDS) and not twin:
+        return Identified(best.T_left_body, best.cov, best.seen, best.rows, odds)
     if rival is None or rival.score < 0:
         return Missed(
-            f"ambiguous: {int((best.rows >= 0).all(axis=1).sum())} discs fit {target.body.name}, but so many others are in "
-            f"view that it may be chance; {_counts(discs)}"
+            f"ambiguous: {int((best.rows >= 0).all(axis=1).sum())} discs fit {view.target.body.name}, but with so many in "
+            f"view it may be chance; {_counts(view.discs)}"
         )
-    return Missed(_ambiguous(target, best, rival))
+    return Missed(_ambiguous(view.target, best, rival))
 
 
 def _ambiguous(target: DiscTarget, best: Hypothesis, rival: Hypothesis) -> str:

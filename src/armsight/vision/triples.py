@@ -7,6 +7,7 @@ gives a pose by a rigid fit.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armsight.data import Array, Ids, Record
-from armsight.vision.markers.disc import DiscTarget
-from armsight.vision.pairing import UNMODELLED_SHARE, Pairs
+from armsight.vision.disc_view import DiscView
+from armsight.vision.pairing import Pairs
 
 #: Distances that differ by more standard deviations than this are different.
 DISTANCE_SIGMAS = 4.5
@@ -23,11 +24,12 @@ DISTANCE_SIGMAS = 4.5
 SLIM = 0.05
 #: More edges, corners or triangles than these are not looked at.
 MOST_EDGES, MOST_CORNERS, MOST_TRIPLES = 500_000, 2_000_000, 20_000
+_NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Triples(Record):
-    """Triples of pairs that may be three discs of the body, likeliest first.
+    """Triples of pairs that may be three discs of the body, those of the largest bodies first, then those that fit best.
 
     Attributes:
         ids: (T, 3) rows of the body's discs.
@@ -40,9 +42,10 @@ class Triples(Record):
     Ts_left_body: Array
 
 
-def triples(target: DiscTarget, pairs: Pairs) -> Triples | None:
+def triples(view: DiscView, pairs: Pairs) -> Triples | None:
     """Find every triple of pairs with the body's distances; None where there are too many."""
-    edges = _edges(target, pairs)
+    target = view.target
+    edges = _edges(view, pairs)
     if edges is None:
         return None
     nodes, first, second, chi2 = edges
@@ -54,15 +57,18 @@ def triples(target: DiscTarget, pairs: Pairs) -> Triples | None:
     good = spread(target.body.points[ids])
     ids, rows, cost = ids[good], rows[good], chi2[e[good]].sum(axis=1)
     Ts = _rigid(target.body.points[ids], pairs.p_left[rows])
-    order = np.argsort(cost, kind="stable")
+    shared = np.bincount(
+        np.stack([a, b, c]).ravel(), minlength=len(nodes)
+    )  # of a body's discs, each is in many triples
+    support = np.min([shared[a], shared[b], shared[c]], axis=0)[good]
+    order = np.lexsort([cost, -support])
     return Triples(ids[order], rows[order], Ts[order]) if len(order) <= MOST_TRIPLES else None
 
 
-def _edges(target: DiscTarget, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
+def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     """Return nodes (V, 2) of pair and disc, the first and second node (E,) of every edge, and its chi-square (E,)."""
-    points = target.body.points
+    points, slack = view.target.body.points, view.unmade_m
     sides = np.linalg.norm(points[:, None] - points[None], axis=2)
-    slack = UNMODELLED_SHARE * sides.max()
     pair, disc = np.nonzero(pairs.fits)
     node = np.full(pairs.fits.shape, -1)
     node[pair, disc] = np.arange(len(pair))
@@ -83,14 +89,20 @@ def _edges(target: DiscTarget, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | No
     along /= np.maximum(distance, 1e-12)[:, None]
     by_rig = np.einsum("ni,nir->nr", along, pairs.by_rig[i] - pairs.by_rig[j])
     variance = np.einsum("ni,nij,nj->n", along, pairs.cov[i] + pairs.cov[j], along) + (by_rig**2).sum(axis=1) + slack**2
-    first, second, chi2 = [], [], []
-    for a, b in np.argwhere(~np.eye(len(points), dtype=bool)):
-        off = (distance - sides[a, b]) ** 2 / variance
-        rows = np.flatnonzero((off <= DISTANCE_SIGMAS**2) & pairs.fits[i, a] & pairs.fits[j, b])
-        u, v = node[i[rows], a], node[j[rows], b]
-        first.append(np.minimum(u, v))
-        second.append(np.maximum(u, v))
-        chi2.append(off[rows])
+    order = np.argsort(distance)
+    i, j, distance, variance = i[order], j[order], distance[order], variance[order]
+    widest = DISTANCE_SIGMAS * np.sqrt(variance.max(initial=0.0))
+    first, second, chi2 = [_NONE], [_NONE], [np.zeros(0)]
+    for a, b in itertools.combinations(range(len(points)), 2):
+        low, high = np.searchsorted(distance, [sides[a, b] - widest, sides[a, b] + widest])
+        off = (distance[low:high] - sides[a, b]) ** 2 / variance[low:high]
+        close = low + np.flatnonzero(off <= DISTANCE_SIGMAS**2)
+        for u, v in ((i[close], j[close]), (j[close], i[close])):
+            fit = pairs.fits[u, a] & pairs.fits[v, b]
+            ends = node[u[fit], a], node[v[fit], b]
+            first.append(np.minimum(*ends))
+            second.append(np.maximum(*ends))
+            chi2.append(off[close[fit] - low])
         if sum(map(len, first)) > MOST_EDGES:
             return None
     return nodes, np.concatenate(first), np.concatenate(second), np.concatenate(chi2)
