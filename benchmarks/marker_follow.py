@@ -1,0 +1,159 @@
+"""Figure 5: following the plate along a path with occlusions, and the one place that knows how armsight follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from armsight import measure
+from armsight.data import Missed, PoseEstimate, Shot
+from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.rig import StereoRig
+from disc_images import exposed
+from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, parallel_rig, views
+from marker_report import Report, disc_target, lacking
+
+RATE_HZ, SPEED, NOISE = 60.0, 0.5, 2.0
+Follow = Callable[[np.ndarray, np.ndarray], PoseEstimate | Missed]
+#: A pose is wrong where its squared distance from truth in sigmas is beyond chance, or it is turned by so much.
+WRONG_QUANTILE, WRONG_RAD = 1 - 1e-7, np.radians(5.0)
+
+
+def follower(rig: StereoRig, target: DiscTarget) -> Follow:
+    """Return what measures pair after pair, 1/60 s apart: following where armsight can, else searching every shot."""
+    if lacking("follow") is not None:
+        return lambda left, right: measure(rig, target, Shot("", left, right))
+    from armsight.vision.follow import Follower
+
+    following, count = Follower(rig, target), [0]
+
+    def follow(left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
+        count[0] += 1
+        return following.measure(Shot(str(count[0]), left, right, count[0] / RATE_HZ))
+
+    return follow
+
+
+@dataclass
+class Moment:
+    """One shot of a path.
+
+    Attributes:
+        T: truth.
+        images: both.
+        whole: whether every disc shows whole in both images.
+        hidden: how many of the discs' images are covered, in part or whole.
+    """
+
+    T: np.ndarray
+    images: tuple[np.ndarray, np.ndarray]
+    whole: bool
+    hidden: int
+
+
+def path(shots: int) -> list[np.ndarray]:
+    """Return poses along a closed way at constant speed, turning as it goes."""
+    t = np.linspace(0, 2 * np.pi, 4000)
+    way = np.stack([0.11 + 0.2 * np.sin(t), 0.1 * np.sin(2 * t), 0.85 + 0.15 * np.cos(t)], axis=1)
+    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))]
+    out = []
+    for k in range(shots):
+        s = np.interp((k * SPEED / RATE_HZ) % length[-1], length, t)
+        p = np.stack([np.interp(s, t, way[:, i]) for i in range(3)])
+        R = exp_so3(np.array([0.35 * np.sin(s), 0.4 * np.cos(2 * s), 0.0])) @ exp_so3(
+            np.array([0.0, 0.0, 0.6 * np.sin(s)])
+        )
+        out.append(pose(R, p))
+    return out
+
+
+def occlusions(shots: int, rng: np.random.Generator) -> np.ndarray:
+    """Return (shots, 2, 4) how far each disc in each image, and the whole plate (last), is covered: 0 to 1."""
+    out = np.zeros((shots, 2, 4))
+    k = 12
+    while k < shots:
+        length = int(rng.integers(1, 12))
+        side, what = int(rng.integers(0, 2)), int(rng.integers(0, 4))
+        share = 1.0 if rng.random() < 0.6 else rng.uniform(0.2, 0.9)
+        out[k : k + length, side if rng.random() < 0.5 else slice(None), what] = 1.0 if what == 3 else share
+        k += length + int(rng.integers(3, 25)) - (2 if rng.random() < 0.2 else 0)
+    return out
+
+
+def moments(rig: StereoRig, target: DiscTarget, shots: int, rng: np.random.Generator):
+    """Yield the shots of the path; something of the background's level comes in from a random side."""
+    covered = occlusions(shots, rng)
+    for k, T in enumerate(path(shots)):
+        assert in_view(rig, target, T)
+        images = []
+        for side, (camera, at) in enumerate(zip(rig.cameras, views(rig, T), strict=True)):
+            light = light_of(camera, target, at)
+            uv, shape = ellipses(camera, target, at)
+            turn = rng.uniform(0, 2 * np.pi)
+            across, down = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+            for disc, share in enumerate(covered[k, side]):
+                if share == 0:
+                    continue
+                middle = uv[disc] if disc < 3 else uv.mean(axis=0)
+                size = 1.8 * np.sqrt(shape.max()) if disc < 3 else np.abs(uv - middle).max() + 4 * np.sqrt(shape.max())
+                # A square that stands over the disc, moved off so that it covers about its share.
+                place = middle + (2 * (1 - share) * size if disc < 3 else 0.0) * across
+                corners = np.array([across + down, down - across, -across - down, across - down]) * size + place
+                cover_up(light, corners, BLUR)
+            images.append(exposed(light, NOISE, 0.0, rng))
+        hidden = int((covered[k, :, :3] > 0).sum()) if not covered[k, :, 3].any() else 6
+        yield Moment(T, (images[0], images[1]), hidden == 0, hidden)
+
+
+def figure(seed: int, report: Report, shots: int = 900) -> None:
+    missing = lacking("find", "identify")
+    if missing is not None:
+        report.say(f"  {missing}")
+        return
+    without = lacking("follow")
+    if without is not None:
+        report.say(f"  {without}: every shot is searched anew")
+    rng, rig, target = np.random.default_rng(seed), parallel_rig(LENS, 3.0), disc_target()
+    follow = follower(rig, target)
+    limit = chi2.ppf(WRONG_QUANTILE, 6)
+    # Shots since the whole plate shows, whether the last one gave no pose, and how many whole shots each regain took.
+    run, lost, regained = 0, False, []
+    wrong = losses = measured_in_part = in_part = missed_whole = 0
+    nees, reasons = [], set()
+    for moment in moments(rig, target, shots, rng):
+        result = follow(*moment.images)
+        run = run + 1 if moment.whole else 0
+        in_part += not moment.whole
+        if isinstance(result, Missed):
+            losses, missed_whole = losses + (not lost), missed_whole + moment.whole
+            lost = True
+            reasons.add(result.reason)
+            continue
+        if lost and run:
+            regained.append(run)
+        lost = False
+        measured_in_part += not moment.whole
+        xi = log_se3(inverse(result.T_left_body) @ moment.T)
+        nees.append(xi @ np.linalg.solve(result.cov, xi))
+        wrong += nees[-1] > limit or np.linalg.norm(xi[3:]) > WRONG_RAD
+    if lost and run:
+        regained.append(run + 1)
+    report.say(
+        f"  {shots} shots, {SPEED} m/s at {RATE_HZ:g} Hz: {shots - in_part} with the whole plate in both images, "
+        f"{missed_whole} of them missed; of {in_part} with something covered {measured_in_part} measured; {losses} losses"
+    )
+    report.figure("wrong poses", wrong, "0", form="d", good=wrong == 0)
+    if regained:
+        most = max(regained)
+        report.figure(
+            "shots to regain once the whole plate shows again, at most", most, "<= 2", form="d", good=most <= 2
+        )
+    if nees:
+        report.figure("mean NEES (6 is honest)", np.mean(nees), form=".2f")
+    if reasons:
+        report.say(f"  reasons of misses: {'; '.join(sorted(reasons)[:5])}")

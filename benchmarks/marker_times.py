@@ -1,0 +1,145 @@
+"""Figure 2: reading an image, searching it, fitting a disc, following, a pair to a pose. Medians over cold frames, us."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from armsight.data import Missed
+from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.vision.rig import StereoRig
+from disc_images import disc_picture
+from marker_follow import follower
+from marker_plate import LENS, parallel_rig, poses, project, shot, views
+from marker_report import Report, disc_target, lacking, last_level_cache_bytes, read_us, ring, timed
+
+#: Discs on the images between which the time of one more disc is told.
+COUNTS = (0, 4, 16, 48, 96)
+HALF = 20  # of a window about a predicted disc, px
+
+
+def whole_image(seed: int, report: Report) -> None:
+    """Read, search, fit: the time of the search is what an image without discs takes, a disc's what one more adds."""
+    rng = np.random.default_rng(seed)
+    images = {
+        n: [
+            disc_picture(
+                rng, count=n, radius=(5.0, 15.0), contrast=(80.0, 160.0), blur=0.8, noise=2.0, bright=True
+            ).image
+            for _ in range(12)
+        ]
+        for n in COUNTS
+    }
+    read = read_us(ring(images[4]))
+    report.figure("reading an HD image once, cold", read, form=".1f", unit="us")
+    missing = lacking("find")
+    if missing is not None:
+        report.say(f"  search and fit: {missing}")
+        return
+    target = disc_target()
+    medians = []
+    for n in COUNTS:
+        times, results = timed(target.find, ring(images[n]), 200)
+        found = np.mean([len(result.uv) for result in results])
+        medians.append(np.median(times))
+        report.say(
+            f"  {f'find, {n} discs ({found:.1f} found)':62s} {medians[-1]:.1f} us, fastest tenth "
+            f"{np.quantile(times, 0.1):.1f}"
+        )
+    slope, start = np.polyfit(COUNTS, medians, 1)
+    read = min(read, read_us(ring(images[4])))
+    report.figure(
+        "the search of an image without discs, over reading it",
+        medians[0] / read,
+        "<= 2.0",
+        form=".2f",
+        good=medians[0] <= 2 * read,
+    )
+    report.figure(
+        "the search as the line over disc counts has it", start / read, "<= 2.0", form=".2f", good=start <= 2 * read
+    )
+    report.figure("one disc more", slope, "<= 15", form=".1f", unit="us", good=slope <= 15)
+
+
+def kabsch(p_b: np.ndarray, p_a: np.ndarray) -> np.ndarray:
+    """Return T_a_b of matched points (N, 3)."""
+    mean_b, mean_a = p_b.mean(axis=0), p_a.mean(axis=0)
+    U, _, Vt = np.linalg.svd((p_a - mean_a).T @ (p_b - mean_b))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return pose(R, mean_a - R @ mean_b)
+
+
+class LibraryRoute:
+    """What one would write with OpenCV: a threshold and moments in each window, undistort, triangulate, Kabsch."""
+
+    def __init__(self, rig: StereoRig, points: np.ndarray) -> None:
+        self.points = points
+        self.K = [camera.matrix for camera in rig.cameras]
+        self.d = [camera.distortion for camera in rig.cameras]
+        self.P = [np.eye(4)[:3], inverse(rig.T_left_right)[:3]]
+
+    def centres(self, image: np.ndarray, about: np.ndarray) -> np.ndarray:
+        out = np.empty((len(about), 1, 2))
+        for i, (u, v) in enumerate(about):
+            part = image[v - HALF : v + HALF + 1, u - HALF : u + HALF + 1]
+            m = cv2.moments(cv2.threshold(part, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[1], True)
+            out[i, 0] = u - HALF + m["m10"] / m["m00"], v - HALF + m["m01"] / m["m00"]
+        return out
+
+    def __call__(self, case: tuple) -> np.ndarray:
+        images, about = case
+        xy = [cv2.undistortPoints(self.centres(images[i], about[i]), self.K[i], self.d[i])[:, 0].T for i in (0, 1)]
+        p = cv2.triangulatePoints(*self.P, *xy)
+        return kabsch(self.points, (p[:3] / p[3]).T)
+
+
+def accuracy(xi: np.ndarray) -> str:
+    """Say the RMS of pose errors (N, 6)."""
+    position, turn = (np.sqrt((part**2).sum(axis=1).mean()) for part in (xi[:, :3], xi[:, 3:]))
+    return f"{1e3 * position:.3f} mm, {np.degrees(turn):.3f} deg RMS"
+
+
+def pairs(seed: int, report: Report, count: int = 24) -> None:
+    """Following four discs, and a pair of images to a pose with covariance."""
+    rng = np.random.default_rng(seed)
+    rig, target = parallel_rig(LENS, 3.0), disc_target(count=4)
+    Ts = poses(rig, target, count, rng, (0.6, 0.9), 25.0)
+    images = [shot(rig, target, T, 2.0, rng) for T in Ts]
+    about = []
+    for T in Ts:
+        p = [target.body.points @ at[:3, :3].T + at[:3, 3] for at in views(rig, T)]
+        about.append([np.round(project(camera, q)).astype(int) for camera, q in zip(rig.cameras, p, strict=True)])
+    repeat = max(2, -(-5 * last_level_cache_bytes() // (4 * images[0][0].nbytes * count)))
+    copies = [tuple(image.copy() for image in pair) for _ in range(repeat) for pair in images]
+    route = LibraryRoute(rig, target.body.points)
+    cases = [(pair, about[i % count]) for i, pair in enumerate(copies)]
+    times, results = timed(route, cases, 300)
+    xi = np.array([log_se3(inverse(T_hat) @ Ts[i % count]) for i, T_hat in enumerate(results)])
+    library = float(np.median(times))
+    report.figure("library route, windows known, pair to pose", library, form=".0f", unit="us")
+    report.say(f"  {'its error':62s} {accuracy(xi)}")
+    missing = lacking("find", "identify", "follow")
+    if missing is not None:
+        report.say(f"  following: {missing}")
+        return
+    times, xi, lost = [], [], 0
+    for k, T in enumerate(Ts):
+        # The same still scene again and again: the first shots find it, the rest follow. Cold copies of the images.
+        follow, still = follower(rig, target), copies[k::count]
+        for pair in still * 2:
+            follow(*pair)
+        own, results = timed(lambda pair, follow=follow: follow(*pair), still, 10)
+        times.append(own)
+        lost += sum(isinstance(result, Missed) for result in results)
+        xi += [log_se3(inverse(r.T_left_body) @ T) for r in results if not isinstance(r, Missed)]
+    ours = float(np.median(np.concatenate(times)))
+    report.figure(
+        "following four discs, pair to pose with covariance", ours, "<= 200", form=".0f", unit="us", good=ours <= 200
+    )
+    report.figure("the same over the library route", ours / library, form=".2f")
+    report.say(f"  {'its error':62s} {accuracy(np.array(xi).reshape(-1, 6))}; {lost} lost")
+
+
+def figure(seed: int, report: Report) -> None:
+    whole_image(seed, report)
+    pairs(seed, report)

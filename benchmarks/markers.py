@@ -1,0 +1,81 @@
+"""Disc markers against the bound, the clock and other finders, on images with truth, in one run and one thread.
+
+    python benchmarks/markers.py                   all figures, a fresh seed (printed) and then the fixed one
+    python benchmarks/markers.py 1 3               only these
+    python benchmarks/markers.py --fixed-only      the fixed seed only
+    python benchmarks/markers.py --seed 7          this seed only
+    python benchmarks/markers.py --json found.json figures as JSON, too
+
+Figures: 1 centres against the Cramer-Rao bound, textures and clutter, 2 times, 3 other finders, 4 the pose of the
+three-disc plate, 5 following a path with occlusions, 6 perspective bias. pyapriltags is compared with where it is installed
+(``pip install armsight[bench]``).
+"""
+
+from __future__ import annotations
+
+import os
+
+for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[name] = "1"  # before numpy and numba are imported
+
+import argparse  # noqa: E402
+import json  # noqa: E402
+import secrets  # noqa: E402
+import time  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+
+import disc_images  # noqa: E402
+import marker_accuracy  # noqa: E402
+import marker_follow  # noqa: E402
+import marker_peers  # noqa: E402
+import marker_pose  # noqa: E402
+import marker_times  # noqa: E402
+from marker_report import Report  # noqa: E402
+
+FIXED_SEED = 3
+FIGURES = {
+    "1": ("Centres against the Cramer-Rao bound", marker_accuracy.figure),
+    "2": ("Times, HD, one thread, cold frames", marker_times.figure),
+    "3": ("Other finders on the same images", marker_peers.figure),
+    "4": ("Pose of the three-disc plate", marker_pose.figure),
+    "5": ("Following 0.5 m/s at 60 Hz with random occlusions", marker_follow.figure),
+    "6": ("Perspective bias", marker_pose.perspective),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"of {' '.join(FIGURES)}; all by default")
+    parser.add_argument("--fixed-only", action="store_true", help="only the fixed seed")
+    parser.add_argument("--seed", type=int, help="only this seed")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    wanted = parser.parse_args()
+    for name in wanted.figures:
+        if name not in FIGURES:
+            parser.error(f"no figure {name!r}; there are {' '.join(FIGURES)}")
+    cv2.setNumThreads(1)
+    report = Report()
+    report.say(f"OpenCV {cv2.__version__}, numpy {np.__version__}; load of the machine before {os.getloadavg()[0]:.2f}")
+    shift, difference = disc_images.check(2)
+    report.say(f"Test images against 64 x 64 samples a pixel: {shift:.1e} px, {difference:.1e} of the contrast")
+    fresh = secrets.randbelow(10**6)
+    seeds = [wanted.seed] if wanted.seed is not None else [FIXED_SEED] if wanted.fixed_only else [fresh, FIXED_SEED]
+    runs = {}
+    for seed in seeds:
+        report.say(f"\nSeed {seed}{' (the fixed one)' if seed == FIXED_SEED else ''}")
+        report.found = runs[str(seed)] = {}
+        for name in wanted.figures or FIGURES:
+            title, figure = FIGURES[name]
+            report.say(f"\n{name}. {title}")
+            start = time.perf_counter()
+            figure(seed, report)
+            report.say(f"  ({time.perf_counter() - start:.0f} s)")
+    if wanted.json is not None:
+        wanted.json.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
