@@ -1,0 +1,35 @@
+"""Motions: joint angles over time, known and checked against every limit before the first step (trajectory.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from armsight.robot.trajectories.circle import arc, circle
+from armsight.robot.trajectories.line import line
+from armsight.robot.trajectories.point_to_point import point_to_point
+from armsight.robot.trajectories.resolved_rate import resolved_rate
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory
+from armsight.robot.trajectories.waypoints import waypoints
+
+__all__ = [
+    "TRAJECTORIES",
+    "Joints",
+    "MotionRefused",
+    "Trajectory",
+    "arc",
+    "circle",
+    "line",
+    "point_to_point",
+    "resolved_rate",
+    "waypoints",
+]
+
+#: Every way to make a trajectory; each takes the arm and the joint angles to start from, and then what it needs.
+TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {
+    "arc": arc,
+    "circle": circle,
+    "line": line,
+    "point_to_point": point_to_point,
+    "resolved_rate": resolved_rate,
+    "waypoints": waypoints,
+}

@@ -1,0 +1,194 @@
+"""Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz.
+
+The share of the way moves under limits of its own speed, acceleration and jerk. They are scaled as time is (1/k, 1/k^2,
+1/k^3) until the fastest joint, by speed, acceleration or jerk, is just at its limit; from rest that is exact, because the
+whole motion then is the same one, k times slower.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
+from armsight.robot.trajectories.path import Path
+from armsight.robot.trajectories.profile import Profile, plan_profile
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, sample
+from armsight.robot.trajectories.walk import Obstacle, Walk, columns, derivatives, solve, walk
+
+if TYPE_CHECKING:
+    from armsight.robot.arm import Arm
+
+#: Rounds of scaling; from rest the second is exact up to where the samples fall.
+ROUNDS = 12
+#: How near to its limit the fastest joint is brought, and how far from the path a start's speeds may point.
+CLOSE, ALONG = 1e-3, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PathMotion:
+    """A path of the tool over time.
+
+    Attributes:
+        arm: the arm that travels it.
+        path: the path.
+        law: share of the way over time.
+        guide: the joints along the path, by which the right solution is told.
+    """
+
+    arm: Arm
+    path: Path
+    law: Profile
+    guide: Walk
+
+    @property
+    def duration_s(self) -> float:
+        """How long the motion takes, s."""
+        return self.law.duration_s
+
+    def at(self, t_s: float) -> Joints:
+        """Return the joints (6,) ``t_s`` seconds after the start."""
+        return Joints(*(part[0] for part in self.sample(np.array([t_s]))))
+
+    def sample(self, t_s: Array) -> Joints:
+        """Return the joints (N, 6) at times (N,), s."""
+        share, speed, acceleration = (part[:, :1] for part in sample(self.law, t_s))
+        places = self.path.at(share[:, 0])
+        nears = self.guide.near(share[:, 0])
+        q = np.array([self._joints(T, near) for T, near in zip(places.T_base_tool, nears, strict=True)])
+        q1, q2 = derivatives(self.arm, q, places)
+        return Joints(q, q1 * speed, q1 * acceleration + q2 * speed**2)
+
+    def _joints(self, T_base_tool: Array, q_near: Array) -> Array:
+        """Return the joint angles (6,) of a pose on the path."""
+        q = solve(self.arm, T_base_tool, q_near)
+        if isinstance(q, str):
+            raise InputError(f"a pose on the path has no joint angles: {q}")
+        return q
+
+
+def follow(
+    arm: Arm,
+    path: Path,
+    q_start: ArrayLike,
+    *,
+    qd_start: ArrayLike | None = None,
+    qdd_start: ArrayLike | None = None,
+    duration_s: float | None = None,
+) -> PathMotion:
+    """Plan to travel a path of the tool, in the configuration of the start.
+
+    Args:
+        arm: the arm.
+        path: the path; its start is where ``q_start`` puts the tool.
+        q_start: (6,) angles to start from, rad.
+        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
+        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
+
+    Raises:
+        MotionRefused: the path leaves the reach or the joint limits, or meets a singularity.
+        InputError: bad numbers, a start that does not move along the path, or a duration that cannot be met.
+    """
+    check_duration(duration_s)
+    start = start_state(arm, q_start, qd_start, qdd_start)
+    guide, obstacle = walk(arm, path, start.q)
+    if obstacle is not None and obstacle.share == 0:
+        raise _refused(path, obstacle, 0.0)
+    share = _share_state(start, guide, arm)
+    if obstacle is not None:
+        law, _ = _fit(arm, Walk(*(part[: obstacle.clear] for part in guide)), share, None)
+        slower = 1.0 if duration_s is None else duration_s / law.duration_s
+        raise _refused(path, obstacle, slower * law.first_time_s(0, obstacle.share))
+    law, k = _fit(arm, guide, share, duration_s)
+    for _ in range(ROUNDS):
+        motion = PathMotion(arm, path, law, guide)
+        t_s = check_times(law.duration_s)
+        joints = motion.sample(t_s)
+        _check_whole(arm, path, motion, t_s, joints)
+        most = worst(arm, t_s, joints)
+        if most.ratio <= 1 + ROUNDING:
+            return motion
+        if duration_s is not None or start.qd.any():
+            at_s = float(t_s[most.row])
+            raise _refused(path, Obstacle(float(law.at(at_s).q[0]), most.what), at_s)
+        k *= most.stretch * (1 + CLOSE / 10)
+        law = _law(guide, arm, share, k, None)
+    raise InputError("the motion could not be brought within the arm's limits of speed, acceleration and jerk")
+
+
+def _refused(path: Path, obstacle: Obstacle, t_s: float) -> MotionRefused:
+    """Return the refusal of a motion at an obstacle."""
+    p_base = path.at(np.array([obstacle.share])).T_base_tool[0, :3, 3]
+    return MotionRefused(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
+
+
+def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
+    """Return the start as share, its speed and its acceleration (1,)."""
+    along, bend = guide.q1[0], guide.q2[0]
+    speed = float(along @ start.qd / (along @ along))
+    acceleration = float(along @ (start.qdd - bend * speed**2) / (along @ along))
+    for name, value, wanted, limit in (
+        ("qd_start", start.qd, along * speed, arm.qd_max),
+        ("qdd_start", start.qdd, along * acceleration + bend * speed**2, arm.qdd_max),
+    ):
+        if (np.abs(value - wanted) > ALONG * limit).any():
+            raise InputError(f"{name} does not carry the tool along the path: give speeds that do, or start from rest")
+    if speed < 0:
+        raise InputError("qd_start carries the tool backwards on the path")
+    return Joints(np.zeros(1), np.array([speed]), np.array([acceleration]))
+
+
+def _law(guide: Walk, arm: Arm, start: Joints, k: float, duration_s: float | None) -> Profile:
+    """Return the share over time under the limits of the joints along the way, scaled ``k`` times slower."""
+    one, two = np.abs(guide.q1), np.abs(guide.q2)
+    with np.errstate(divide="ignore"):
+        speed = min(float((arm.qd_max / one).min()), float(np.sqrt(arm.qdd_max / two).min()))
+        acceleration, jerk = float((arm.qdd_max / one).min()), float((arm.qddd_max / one).min())
+    limits = (np.array([speed / k]), np.array([acceleration / k**2]), np.array([jerk / k**3]))
+    law = plan_profile(start, np.ones(1), *limits, duration_s)
+    low, high = law.extrema(0)
+    if low < -ROUNDING or high > 1 + ROUNDING:
+        raise InputError("from this moving start the tool cannot stop at the end of the path within the arm's limits")
+    return law
+
+
+def _fit(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> tuple[Profile, float]:
+    """Return the share over time that just keeps the limits by the walk's derivatives, and its scale."""
+    k = 1.0
+    law = _law(guide, arm, start, k, None)
+    for _ in range(ROUNDS):
+        t_s = check_times(law.duration_s)
+        share, speed, acceleration = (part[:, :1] for part in sample(law, t_s))
+        q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
+        stretch = worst(arm, t_s, Joints(q1, q1 * speed, q1 * acceleration + q2 * speed**2)).stretch
+        if 1 - CLOSE <= stretch <= 1:
+            break
+        k *= stretch / (1 - CLOSE / 2)
+        law = _law(guide, arm, start, k, None)
+    if duration_s is None:
+        return law, k
+    if duration_s < law.duration_s:
+        raise InputError(
+            f"duration_s is {duration_s:.6g}; within the arm's limits this motion takes {law.duration_s:.6g} s"
+        )
+    k *= duration_s / law.duration_s
+    return _law(guide, arm, start, k, duration_s), k
+
+
+def _check_whole(arm: Arm, path: Path, motion: PathMotion, t_s: Array, joints: Joints) -> None:
+    """Refuse a motion whose joints leave their limits or jump from one configuration to another."""
+    steps = np.diff(t_s)[:, None]
+    moved = np.diff(joints.q, axis=0) - steps * (joints.qd[1:] + joints.qd[:-1]) / 2
+    jumps = np.append((np.abs(moved) > steps**2 * arm.qdd_max + ROUNDING).any(axis=1), False)
+    reasons = [outside(arm, row) for row in joints.q]
+    row = next((i for i, reason in enumerate(reasons) if reason is not None or jumps[i]), None)
+    if row is not None:
+        reason = reasons[row] or "the arm would have to change its configuration"
+        share = float(motion.law.at(float(t_s[row])).q[0])
+        raise _refused(path, Obstacle(share, reason), float(t_s[row]))

@@ -1,0 +1,131 @@
+"""An arm's limits: which start states may be moved on from, and whether a motion keeps within them at 1 kHz."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times, sample
+
+if TYPE_CHECKING:
+    from armsight.robot.arm import Arm
+
+#: Relative excess of a limit that is rounding and no motion.
+ROUNDING = 1e-9
+
+
+class Worst(NamedTuple):
+    """Where a motion comes nearest to a limit, or passes it furthest.
+
+    Attributes:
+        ratio: the value over its limit; at most 1 within it.
+        stretch: how many times longer the motion would have to take to be at that limit.
+        what: the limited quantity in words, with its values.
+        row: which of the samples.
+    """
+
+    ratio: float
+    stretch: float
+    what: str
+    row: int
+
+
+def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | None) -> Joints:
+    """Return a start state that has been found within the arm's limits; at rest where no speeds are given.
+
+    Raises:
+        InputError: wrong shapes, NaN, or outside the limits, or bound to leave them whatever is done.
+    """
+    zero = np.zeros(6)
+    start = Joints(
+        inside(arm, q, "q_start"),
+        zero if qd is None else checked(qd, (6,), "qd_start"),
+        zero if qdd is None else checked(qdd, (6,), "qdd_start"),
+    )
+    # The speed still gains this while the acceleration is taken back at full jerk.
+    gain = np.where(start.qdd == 0, 0.0, start.qdd * np.abs(start.qdd) / (2 * arm.qddd_max))
+    for name, value, limit, unit in (
+        ("qdd_start", start.qdd, arm.qdd_max, "deg/s^2"),
+        ("qd_start", start.qd, arm.qd_max, "deg/s"),
+        ("qd_start with what qdd_start adds to it", start.qd + gain, arm.qd_max, "deg/s"),
+    ):
+        over = np.abs(value) > limit * (1 + ROUNDING)
+        if over.any():
+            i = int(np.argmax(over))
+            raise InputError(
+                f"{name}: joint {i + 1} has {np.degrees(value[i]):.3f} {unit}, its limit is {np.degrees(limit[i]):.3f}"
+            )
+    return start
+
+
+def inside(arm: Arm, q: ArrayLike, name: str) -> Array:
+    """Return joint angles (6,), rad, that have been found within the arm's limits.
+
+    Raises:
+        InputError: wrong shape, NaN or outside.
+    """
+    angles = checked(q, (6,), name)
+    arm.forward(angles)  # refuses degrees with a hint
+    if (reason := outside(arm, angles)) is not None:
+        raise InputError(f"{name}: {reason}")
+    return angles
+
+
+def outside(arm: Arm, q: Array) -> str | None:
+    """Return which joint (6,) is beyond its limits, in words; None where none is."""
+    over = np.maximum(arm.q_min - q, q - arm.q_max)
+    i = int(np.argmax(over))
+    if over[i] <= ROUNDING:
+        return None
+    low, high = np.degrees(arm.q_min[i]), np.degrees(arm.q_max[i])
+    return f"joint {i + 1} at {np.degrees(q[i]):.3f} deg is outside its limits {low:.3f} to {high:.3f} deg"
+
+
+def worst(arm: Arm, t_s: Array, joints: Joints) -> Worst:
+    """Return where samples (N, 6) at times (N,) come nearest to a limit of speed, acceleration or jerk."""
+    steps = np.diff(t_s)
+    full = steps > 0.5 * np.median(steps) if len(steps) else np.zeros(0, bool)  # the last one may be a sliver
+    jerk = np.zeros_like(joints.qdd)
+    jerk[:-1][full] = np.diff(joints.qdd, axis=0)[full] / steps[full, None]
+    found = []
+    for name, order, unit, value, limit in (
+        ("speed", 1, "deg/s", joints.qd, arm.qd_max),
+        ("acceleration", 2, "deg/s^2", joints.qdd, arm.qdd_max),
+        ("jerk", 3, "deg/s^3", jerk, arm.qddd_max),
+    ):
+        ratios = np.abs(value) / limit
+        row, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        had, most = np.degrees(abs(value[row, i])), np.degrees(limit[i])
+        what = f"joint {i + 1} would need a {name} of {had:.4g} {unit}, its limit is {most:.4g}"
+        ratio = float(ratios[row, i])
+        found.append(Worst(ratio, ratio ** (1 / order), what, int(row)))
+    return max(found, key=lambda w: w.stretch)
+
+
+def check_limits(arm: Arm, trajectory: Trajectory) -> None:
+    """Hold a motion in joints against every limit of the arm at 1 kHz.
+
+    Raises:
+        MotionRefused: at the first instant outside the joint limits, or where another limit is passed furthest.
+    """
+    t_s = check_times(trajectory.duration_s)
+    joints = sample(trajectory, t_s)
+    over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
+    if over.any():
+        row = int(np.argmax(over))
+        reason = outside(arm, joints.q[row])
+        raise _refused(arm, str(reason), t_s, joints.q, row)
+    most = worst(arm, t_s, joints)
+    if most.ratio > 1 + ROUNDING:
+        raise _refused(arm, most.what, t_s, joints.q, most.row)
+
+
+def _refused(arm: Arm, reason: str, t_s: Array, q: Array, row: int) -> MotionRefused:
+    """Return the refusal of a motion in joints at one of its samples."""
+    share = float(t_s[row] / t_s[-1]) if t_s[-1] > 0 else 0.0
+    return MotionRefused(reason, share=share, t_s=float(t_s[row]), p_base=arm.forward(q[row])[:3, 3])

@@ -1,0 +1,80 @@
+"""A straight line of the tool in space, its orientation turning evenly about one axis (slerp)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.rotation import exp_so3
+from armsight.robot.trajectories.cartesian import PathMotion, follow
+from armsight.robot.trajectories.path import Places, checked_pose, way
+
+if TYPE_CHECKING:
+    from armsight.robot.arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class LinePath(Record):
+    """A straight line with an even turn.
+
+    Attributes:
+        T_base_start: (4, 4) where it starts.
+        step: (3,) how far it goes, m, base axes.
+        turn: (3,) how far it turns, rad, axes of the tool.
+    """
+
+    T_base_start: Array
+    step: Array
+    turn: Array
+
+    @staticmethod
+    def between(T_base_start: Array, T_base_goal: Array) -> LinePath:
+        """Return the line from one pose (4, 4) to another.
+
+        Raises:
+            InputError: they are the same.
+        """
+        step, turn, length = way(T_base_start, T_base_goal)
+        if length == 0:
+            raise InputError("T_base_goal is where the tool already is: there is nothing to travel")
+        return LinePath(T_base_start, step, turn)
+
+    def at(self, share: Array) -> Places:
+        """Return the path at shares (N,)."""
+        T = np.tile(self.T_base_start, (len(share), 1, 1))
+        T[:, :3, 3] += share[:, None] * self.step
+        T[:, :3, :3] = self.T_base_start[:3, :3] @ exp_so3(share[:, None] * self.turn)
+        twist = np.tile(np.concatenate([self.step, self.T_base_start[:3, :3] @ self.turn]), (len(share), 1))
+        return Places(T, twist, np.zeros_like(twist))
+
+
+def line(
+    arm: Arm,
+    q_start: ArrayLike,
+    T_base_goal: ArrayLike,
+    *,
+    qd_start: ArrayLike | None = None,
+    qdd_start: ArrayLike | None = None,
+    duration_s: float | None = None,
+) -> PathMotion:
+    """Plan a straight line of the tool from where it is.
+
+    Args:
+        arm: the arm.
+        q_start: (6,) angles to start from, rad; their configuration is kept.
+        T_base_goal: (4, 4) pose of the tool to end at.
+        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the line. None for rest.
+        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
+
+    Raises:
+        MotionRefused: the line leaves the reach or the joint limits, or meets a singularity.
+        InputError: bad numbers, nothing to travel, or a duration that cannot be met.
+    """
+    path = LinePath.between(arm.forward(q_start), checked_pose(T_base_goal, "T_base_goal"))
+    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)

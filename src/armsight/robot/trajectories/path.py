@@ -1,0 +1,70 @@
+"""Paths of the tool in space: where it is and how it turns as the share of the way goes from 0 to 1, without time.
+
+Every path here is twice continuously differentiable, so that a jerk-limited share of the way gives joint accelerations
+without steps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.geometry.rotation import log_so3
+
+#: A turn of one radian counts as this length, m, where a way is measured that turns as well as travels: about what a
+#: tool's tip sweeps.
+TURN_M = 0.25
+#: How far from orthonormal a pose handed in may be.
+POSE_TOLERANCE = 1e-6
+
+
+class Places(NamedTuple):
+    """A path at N shares of its way.
+
+    Attributes:
+        T_base_tool: (N, 4, 4) poses of the tool.
+        twist: (N, 6) their derivative by the share: [position m; rotation rad], base axes.
+        bend: (N, 6) the derivative of the twist by the share.
+    """
+
+    T_base_tool: Array
+    twist: Array
+    bend: Array
+
+
+class Path(Protocol):
+    """A way of the tool, from share 0 to share 1."""
+
+    def at(self, share: Array) -> Places:
+        """Return the path at shares (N,)."""
+
+
+def checked_pose(T: object, name: str) -> Array:
+    """Return a pose (4, 4) that has been found to be one.
+
+    Raises:
+        InputError: wrong shape, NaN, or no rotation in it.
+    """
+    pose = checked(T, (4, 4), name)  # type: ignore[arg-type]
+    R = pose[:3, :3]
+    if (
+        np.abs(R @ R.T - np.eye(3)).max() > POSE_TOLERANCE
+        or np.linalg.det(R) < 0
+        or np.abs(pose[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE
+    ):
+        raise InputError(f"{name} is no pose: its 3x3 must be a rotation, its last row 0 0 0 1")
+    return pose
+
+
+def way(T_a: Array, T_b: Array) -> tuple[Array, Array, float]:
+    """Return what lies between two poses: (3,) m in base axes, (3,) rad in the tool's, and the length of both, m.
+
+    The turn is the shorter one; of two half turns either.
+    """
+    step = T_b[:3, 3] - T_a[:3, 3]
+    turn = log_so3(np.ascontiguousarray(T_a[:3, :3].T @ T_b[:3, :3]))
+    return step, turn, float(max(np.linalg.norm(step), TURN_M * np.linalg.norm(turn)))

@@ -1,0 +1,219 @@
+"""Resolved-rate tracking: the tool's wanted velocity turned into joint speeds through the Jacobian, step by step.
+
+qd = J# (V_ref + K e), e being how far the tool is behind its reference (Whitney, "Resolved motion rate control of
+manipulators and human prostheses", 1969), the chapter's trajectory tracking. J# is the inverse, damped where the smallest
+singular value is small (Nakamura and Hanafusa, 1986; here with a damping that sets in smoothly): the tool then leaves the
+path a little instead of the joints turning without bound, so this tracker passes singularities at which exact motions are
+refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
+from armsight.robot.trajectories.path import Path, Places
+from armsight.robot.trajectories.profile import Profile, plan_profile
+from armsight.robot.trajectories.trajectory import (
+    CHECK_RATE_HZ,
+    Joints,
+    MotionRefused,
+    check_duration,
+    check_times,
+    clamped,
+    sample,
+)
+
+if TYPE_CHECKING:
+    from armsight.robot.arm import Arm
+
+#: How fast the tool returns to its reference, 1/s: what is left of an error falls to a third in 1/GAIN.
+GAIN = 30.0
+#: Damping sets in below this singular value (linear rows over the arm's size) and reaches its square's share of DAMPING.
+SOFT, DAMPING = 0.04, 0.03
+#: After the reference stands, the tool settles until the joints are slower than this share of their limits, or this long.
+SETTLED, SETTLE_S = 1e-4, 2.0
+#: Rounds of slowing down until the limits hold.
+ROUNDS = 12
+#: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
+SHAPE = (1.6, 8.0, 80.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedMotion:
+    """The joints as the tracker moved them, between its steps as a cubic spline.
+
+    Attributes:
+        duration_s: how long the motion takes, the settling at its end included, s.
+        deviation_m: the furthest the tool is from its reference at any step, m.
+        deviation_rad: the furthest it is turned from it, rad.
+        least_singular: the smallest singular value met; damping sets in below :data:`SOFT`.
+        least_singular_t_s: when, s.
+        spline: the joints over time.
+    """
+
+    duration_s: float
+    deviation_m: float
+    deviation_rad: float
+    least_singular: float
+    least_singular_t_s: float
+    spline: CubicSpline
+
+    def at(self, t_s: float) -> Joints:
+        """Return the joints (6,) ``t_s`` seconds after the start."""
+        t_s = clamped(t_s, self.duration_s)
+        return Joints(*(np.asarray(self.spline(t_s, order)) for order in range(3)))
+
+
+class _Run(NamedTuple):
+    """One run of the tracker at N instants: times, joints, distance m and rad from the reference, singular value."""
+
+    t_s: Array
+    q: Array
+    off_m: Array
+    off_rad: Array
+    least: Array
+
+
+def resolved_rate(
+    arm: Arm, q_start: ArrayLike, path: Path, *, duration_s: float | None = None, tolerance_m: float = 1e-3
+) -> TrackedMotion:
+    """Track a path of the tool from rest through the Jacobian, past singularities too.
+
+    Args:
+        arm: the arm.
+        q_start: (6,) angles to start from, rad; they put the tool at the path's start.
+        path: the path: a LinePath, an ArcPath, a BlendedPath, or anything with their ``at``.
+        duration_s: how long the reference is to take, s; None for about as short as the limits allow.
+        tolerance_m: how far the tool may leave the path where damping sets in, m.
+
+    Raises:
+        MotionRefused: a joint limit is passed, or the tool leaves the path further than allowed.
+        InputError: bad numbers, or a duration within which the limits cannot be kept.
+    """
+    check_duration(duration_s)
+    if not tolerance_m > 0:
+        raise InputError(f"tolerance_m is {tolerance_m}; it must be a positive length in m")
+    start = start_state(arm, q_start, None, None)
+    gap = np.linalg.norm(path.at(np.zeros(1)).T_base_tool[0] - arm.forward(start.q))
+    if gap > tolerance_m:
+        raise InputError(f"q_start does not put the tool at the start of the path: it is {1e3 * gap:.3f} mm away")
+    wanted_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
+    for _ in range(ROUNDS):
+        law = _law(wanted_s)
+        run = _track(arm, start.q, path, law)
+        motion = _motion(run)
+        t_s = check_times(motion.duration_s)
+        joints = sample(motion, t_s)
+        most = worst(arm, t_s, joints)
+        if most.ratio <= 1 + ROUNDING or run.off_m[-1] > tolerance_m:  # no slower motion mends a goal that is missed
+            _check(arm, path, law, run, tolerance_m)
+            return motion
+        if duration_s is not None:
+            raise _refused(path, law, most.what, float(t_s[most.row]))
+        wanted_s *= min(most.stretch, 4.0) * 1.01
+    raise InputError(
+        "the tracked motion could not be brought within the arm's limits; start further from the singularity"
+    )
+
+
+def _law(duration_s: float) -> Profile:
+    """Return the share of the way over time."""
+    speed, acceleration, jerk = (np.array([limit / duration_s**order]) for order, limit in enumerate(SHAPE, start=1))
+    rest = Joints(np.zeros(1), np.zeros(1), np.zeros(1))
+    return plan_profile(rest, np.ones(1), speed, acceleration, jerk, duration_s)
+
+
+def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
+    """Return a duration that the speeds and accelerations of the joints at the start would allow."""
+    twist = path.at(np.zeros(1)).twist[0]
+    q1 = np.abs(_speeds(arm, arm.jacobian(q), twist)[0])
+    slowest = max(float((SHAPE[0] * q1 / arm.qd_max).max()), float(np.sqrt((SHAPE[1] * q1 / arm.qdd_max).max())))
+    return max(slowest, 1e-2)
+
+
+def _speeds(arm: Arm, J: Array, V: Array) -> tuple[Array, float]:
+    """Return joint speeds (6,) for a tool velocity (6,), damped, and the smallest singular value."""
+    size_m = float(np.hypot(arm.a, arm.d).sum())
+    scale = np.array([size_m, size_m, size_m, 1, 1, 1])
+    U, s, Vt = np.linalg.svd(J / scale[:, None])
+    soft = max(0.0, 1 - (s[-1] / SOFT) ** 2)
+    return Vt.T @ (s / (s**2 + (DAMPING * soft) ** 2) * (U.T @ (V / scale))), float(s[-1])
+
+
+def _off(T_ref: Array, T: Array) -> Array:
+    """Return how far a pose (4, 4) is behind another: [m; rad], base axes, for small turns."""
+    turn = np.cross(T[:3, :3], T_ref[:3, :3], axis=0).sum(axis=1) / 2
+    return np.concatenate([T_ref[:3, 3] - T[:3, 3], turn])
+
+
+def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
+    """Run the tracker in steps of 1 ms, by the midpoint rule."""
+    steps = int(np.ceil(law.duration_s * CHECK_RATE_HZ))
+    most = steps + int(SETTLE_S * CHECK_RATE_HZ)
+    dt = law.duration_s / steps
+    moved = sample(law, np.arange(2 * most + 1) * dt / 2)
+    places = path.at(moved.q[:, 0])
+    V_ref = places.twist * moved.qd
+    rows: list[tuple[Array, Array, float]] = []
+    q = q_start
+    for k in range(most):
+        qd, off, least = _step(arm, q, places, V_ref, 2 * k)
+        rows.append((q, off, least))
+        if k >= steps and (np.abs(qd) < SETTLED * arm.qd_max).all():
+            break
+        q = q + dt * _step(arm, q + dt / 2 * qd, places, V_ref, 2 * k + 1)[0]
+    qs, offs, leasts = (np.array(part) for part in zip(*rows, strict=True))
+    off_m, off_rad = (np.asarray(np.linalg.norm(part, axis=1)) for part in (offs[:, :3], offs[:, 3:]))
+    return _Run(np.arange(len(qs)) * dt, qs, off_m, off_rad, leasts)
+
+
+def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int) -> tuple[Array, Array, float]:
+    """Return the joint speeds (6,) wanted now, how far the tool is behind (6,), and the smallest singular value."""
+    off = _off(places.T_base_tool[row], arm.forward(q))
+    qd, least = _speeds(arm, arm.jacobian(q), V_ref[row] + GAIN * off)
+    return qd, off, least
+
+
+def _motion(run: _Run) -> TrackedMotion:
+    """Return a run as a trajectory."""
+    row = int(np.argmin(run.least))
+    still = np.zeros(run.q.shape[1])
+    spline = CubicSpline(run.t_s, run.q, bc_type=((1, still), (1, still)))
+    return TrackedMotion(
+        float(run.t_s[-1]),
+        float(run.off_m.max()),
+        float(run.off_rad.max()),
+        float(run.least[row]),
+        float(run.t_s[row]),
+        spline,
+    )
+
+
+def _check(arm: Arm, path: Path, law: Profile, run: _Run, tolerance_m: float) -> None:
+    """Refuse a run that leaves the joint limits or the path."""
+    beyond = np.maximum(arm.q_min - run.q, run.q - arm.q_max).max(axis=1) > ROUNDING
+    if beyond.any():
+        row = int(np.argmax(beyond))
+        raise _refused(path, law, str(outside(arm, run.q[row])), float(run.t_s[row]))
+    off = run.off_m > tolerance_m
+    if off.any():
+        reason = (
+            f"near a singularity the tool would leave the path, by {1e3 * run.off_m.max():.3f} mm in the end where "
+            f"{1e3 * tolerance_m:.3f} mm are allowed"
+        )
+        raise _refused(path, law, reason, float(run.t_s[int(np.argmax(off))]))
+
+
+def _refused(path: Path, law: Profile, reason: str, t_s: float) -> MotionRefused:
+    """Return the refusal of a tracked motion at a time."""
+    share = float(law.at(t_s).q[0])
+    p_base = path.at(np.array([share])).T_base_tool[0, :3, 3]
+    return MotionRefused(reason, share=share, t_s=t_s, p_base=p_base)

@@ -1,0 +1,98 @@
+"""The contract of a trajectory: joint angles over time, known and checked before the first step is taken.
+
+A member of this family is a function ``(arm, q_start, ...) -> Trajectory``. It looks at the whole motion first, at 1 kHz,
+and raises :class:`MotionRefused` with the place and the time where an arm's limit would be passed, so that what it returns
+can be run as it is. To write a new one: return a frozen object with ``duration_s`` and ``at``, hand it to
+:func:`armsight.robot.trajectories.limits.check_limits`, and add it to the registry in ``__init__``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+
+#: Every trajectory is checked at this rate when it is made, Hz.
+CHECK_RATE_HZ = 1000.0
+
+
+class Joints(NamedTuple):
+    """The joints at an instant, or at N of them with a leading axis.
+
+    Attributes:
+        q: (6,) or (N, 6) angles, rad.
+        qd: the same of the speeds, rad/s.
+        qdd: the same of the accelerations, rad/s^2.
+    """
+
+    q: Array
+    qd: Array
+    qdd: Array
+
+
+class Trajectory(Protocol):
+    """Joint angles over time; ends at rest."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the motion takes, s."""
+
+    def at(self, t_s: float) -> Joints:
+        """Return the joints ``t_s`` seconds after the start; before it the first state stands, after the end the last."""
+
+
+class MotionRefused(InputError):
+    """A motion that cannot be made, found before it starts.
+
+    Attributes:
+        reason: what is in the way.
+        share: how much of the way lies before it, 0 to 1: of the path in space, of the time for motions in joints.
+        t_s: when the motion would be there, s.
+        p_base: (3,) where the tool would be, m, base frame.
+    """
+
+    def __init__(self, reason: str, *, share: float, t_s: float, p_base: Array) -> None:
+        self.reason, self.share, self.t_s, self.p_base = reason, share, t_s, p_base
+        x, y, z = 1e3 * p_base
+        super().__init__(
+            f"the motion cannot be made: {reason}; {100 * share:.1f} % of the way, {t_s:.3f} s after the start, "
+            f"tool at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+        )
+
+
+def clamped(t_s: float, duration_s: float) -> float:
+    """Return a time within the motion.
+
+    Raises:
+        InputError: not a number.
+    """
+    if not np.isfinite(t_s):
+        raise InputError(f"t_s is {t_s}; it must be a finite number of seconds")
+    return min(max(float(t_s), 0.0), duration_s)
+
+
+def check_duration(duration_s: float | None) -> float | None:
+    """Return a duration that was asked for; None stands for none.
+
+    Raises:
+        InputError: no positive number.
+    """
+    if duration_s is not None and not (np.isfinite(duration_s) and duration_s > 0):
+        raise InputError(
+            f"duration_s is {duration_s}; it must be a positive number of seconds, or None for the shortest"
+        )
+    return duration_s
+
+
+def check_times(duration_s: float) -> Array:
+    """Return (N,) the times at which a motion is checked, s: 1 kHz, its first and its last instant."""
+    return np.append(np.arange(0.0, duration_s, 1 / CHECK_RATE_HZ), duration_s)
+
+
+def sample(trajectory: Trajectory, t_s: Array) -> Joints:
+    """Return the joints at times (N,), s."""
+    states = [trajectory.at(float(t)) for t in t_s]
+    return Joints(*(np.array(part) for part in zip(*states, strict=True)))

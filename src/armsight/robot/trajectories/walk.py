@@ -1,0 +1,171 @@
+"""Walk along a path of the tool before it is travelled: the joints all along it, and the first thing in the way.
+
+The joints follow by inverse kinematics in the configuration of the start. Their derivatives by the share of the way are
+exact: with the tool's twist c and its derivative b, q' = J^-1 c and q'' = J^-1 (b - J'(q, q') q').
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.robot.trajectories.limits import outside
+from armsight.robot.trajectories.path import TURN_M, Path, Places
+
+if TYPE_CHECKING:
+    from armsight.robot.arm import Arm
+
+#: The smallest singular value of the Jacobian, its linear rows divided by the arm's size, below which a pose counts as
+#: singular: joints would turn 200 times as fast as the tool. A wrist is there within about 0.4 degrees.
+SINGULAR = 5e-3
+#: The same where a motion begins to be slow because of it.
+SLOW = 10 * SINGULAR
+#: The walk's steps, m, with turns counted as in :data:`TURN_M`, and the bounds of how many there are.
+STEP_M, STEPS = 1e-3, (100, 5000)
+#: Halvings of a step that find where a reason begins: to 1e-12 of the way.
+HALVINGS = 30
+
+
+class Walk(NamedTuple):
+    """The joints along a path, as far as it can be travelled.
+
+    Attributes:
+        share: (K,) shares of the way, rising from 0.
+        q: (K, 6) joint angles, rad.
+        q1: (K, 6) their derivative by the share, and ``q2`` the second.
+        q2: see ``q1``.
+    """
+
+    share: Array
+    q: Array
+    q1: Array
+    q2: Array
+
+    def near(self, share: Array) -> Array:
+        """Return joint angles (N, 6) near shares (N,), to choose the right solution by."""
+        return columns(share, self.share, self.q)
+
+
+class Obstacle(NamedTuple):
+    """The first thing in the way.
+
+    Attributes:
+        share: where on the way.
+        reason: what it is.
+        clear: how many places of the walk are not yet slowed down by a singularity before it, at least 1.
+    """
+
+    share: float
+    reason: str
+    clear: int = 1
+
+
+def columns(x: Array, at: Array, values: Array) -> Array:
+    """Interpolate each column of ``values`` (K, 6) linearly from ``at`` (K,) to ``x`` (N,)."""
+    return np.stack([np.interp(x, at, column) for column in values.T], axis=1)
+
+
+def solve(arm: Arm, T_base_tool: Array, q_near: Array) -> Array | str:
+    """Return the joint angles (6,) of a pose that are nearest to others, inside the limits or not; or why not."""
+    found = arm.inverse(T_base_tool, near=q_near)
+    if not found.solutions:
+        return str(found.reason)
+    q = np.array([solution.q for solution in found.solutions])
+    q += 2 * np.pi * np.round((q_near - q) / (2 * np.pi))
+    return np.asarray(q[np.argmin(np.abs(q - q_near).max(axis=1))])
+
+
+def derivatives(arm: Arm, q: Array, places: Places) -> tuple[Array, Array]:
+    """Return q', q'' (N, 6) by the share of the way at joint angles (N, 6)."""
+    J = arm.jacobian(q)
+    q1 = np.linalg.solve(J, places.twist[..., None])[..., 0]
+    turning = np.array([arm.jacobian_rate(a, b) @ b for a, b in zip(q, q1, strict=True)])
+    return q1, np.linalg.solve(J, (places.bend - turning)[..., None])[..., 0]
+
+
+def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
+    """Return the smallest singular value (N,) and the sign of the determinant (N,) at joint angles (N, 6)."""
+    # What the tool's point and its turning have in common: the arm's size.
+    size_m = float(np.hypot(arm.a, arm.d).sum())
+    J: Array = arm.jacobian(q) / np.array([size_m, size_m, size_m, 1, 1, 1])[:, None]
+    return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), np.asarray(np.sign(np.linalg.det(J)))
+
+
+def walk(arm: Arm, path: Path, q_start: Array) -> tuple[Walk, Obstacle | None]:
+    """Walk along a path as far as it can be travelled.
+
+    Args:
+        arm: the arm.
+        path: the path.
+        q_start: (6,) joint angles at its start, rad.
+
+    Returns:
+        The walk up to the first obstacle, and that; None where there is none.
+    """
+    share = _steps(path)
+    places = path.at(share)
+    q, reason = _chain(arm, places, q_start)
+    smallest, sign = singular_values(arm, q)
+    bad = (smallest < SINGULAR) | (sign != sign[0]) | np.array([outside(arm, row) is not None for row in q])
+    good = int(np.argmax(bad)) if bad.any() else len(q)
+    obstacle = None
+    if good < len(share):
+        # An arm that stretches out becomes singular just before it cannot reach: then the reach is what is in the way.
+        stretched = reason is not None and bool((smallest[good:] < 4 * SINGULAR).all())
+        last = max((len(q) if stretched else good) - 1, 0)
+        obstacle = _obstacle(arm, path, (share[last], share[min(last + 1, len(share) - 1)]), q[last], sign[0])
+        if good == 0:
+            obstacle = Obstacle(0.0, _problem(arm, q[0], sign[0]) or obstacle.reason)
+        slow = smallest[:good] < SLOW
+        obstacle = obstacle._replace(clear=max(1, int(np.argmax(slow)) if slow.any() else good))
+    kept = Places(*(part[:good] for part in places))
+    q1, q2 = derivatives(arm, q[:good], kept)
+    return Walk(share[:good], q[:good], q1, q2), obstacle
+
+
+def _steps(path: Path) -> Array:
+    """Return (K,) shares in steps of about :data:`STEP_M`."""
+    coarse = path.at(np.linspace(0, 1, 65)).twist
+    length = np.maximum(np.linalg.norm(coarse[:, :3], axis=1), TURN_M * np.linalg.norm(coarse[:, 3:], axis=1)).mean()
+    return np.linspace(0, 1, int(np.clip(length / STEP_M, *STEPS)) + 1)
+
+
+def _chain(arm: Arm, places: Places, q_start: Array) -> tuple[Array, str | None]:
+    """Return joint angles (K, 6) from place to place, and why they end before the path does."""
+    chain = [q_start]
+    for T in places.T_base_tool[1:]:
+        q = solve(arm, T, chain[-1])
+        if isinstance(q, str):
+            return np.array(chain), q
+        chain.append(q)
+    return np.array(chain), None
+
+
+def _problem(arm: Arm, q: Array, sign: float) -> str | None:
+    """Return what is wrong with joint angles (6,), in words; None where nothing is."""
+    if (reason := outside(arm, q)) is not None:
+        return reason
+    smallest, now = singular_values(arm, q[None])
+    if smallest[0] >= SINGULAR and now[0] == sign:
+        return None
+    idle = np.abs(np.linalg.svd(arm.jacobian(q))[2][-1])
+    joints = [str(i + 1) for i in np.nonzero(idle > 0.1 * idle.max())[0]]
+    named = " and ".join([", ".join(joints[:-1]), joints[-1]] if len(joints) > 1 else joints)
+    return f"a singularity: joints {named} can turn with hardly any motion of the tool"
+
+
+def _obstacle(arm: Arm, path: Path, between: tuple[float, float], q_good: Array, sign: float) -> Obstacle:
+    """Find where between two shares, of which the first is good, a reason begins."""
+    low, high = between
+    reason = "the configuration cannot be kept"
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        q = solve(arm, path.at(np.array([middle])).T_base_tool[0], q_good)
+        problem = q if isinstance(q, str) else _problem(arm, q, sign)
+        if problem is None:
+            low, q_good = middle, np.asarray(q)
+        else:
+            high, reason = middle, problem
+    return Obstacle(high, reason)

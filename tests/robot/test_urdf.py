@@ -1,0 +1,281 @@
+"""URDF: what is written comes back to the last digit; what no table holds, and what is malformed, is refused by name."""
+
+import itertools
+import tempfile
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import strategies as ours
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.robot.arm import Arm
+from armsight.robot.models import MODELS
+from armsight.robot.urdf import read_urdf
+from armsight.robot.urdf_table import decompose
+from armsight.robot.urdf_write import urdf_text, write_urdf
+
+SIX_R = MODELS["six_r"]
+TABLE = ("a", "d", "alpha", "offset", "direction", "T_base_0", "T_flange_tool")
+LIMITS = ("q_min", "q_max", "qd_max", "qdd_max", "qddd_max", "home")
+
+
+def probes(n=50, seed=0):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, 6))
+
+
+def returned(arm, tmp_path):
+    path = tmp_path / "arm.urdf"
+    write_urdf(arm, path)
+    return read_urdf(path)
+
+
+def chain_pose(path, q):
+    """The tool by the URDF's own words: every joint's origin, then its turn, up to the last link (slow and obvious)."""
+    T, angles = np.eye(4), iter(q)
+    joints = {joint.find("parent").get("link"): joint for joint in ET.parse(path).getroot().findall("joint")}
+    link = (set(joints) - {joint.find("child").get("link") for joint in joints.values()}).pop()
+    while link in joints:
+        joint = joints[link]
+        origin = joint.find("origin")
+        xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
+        T = T @ pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+        if joint.get("type") == "revolute":
+            axis = np.array(joint.find("axis").get("xyz").split(), float)
+            T = T @ pose(Rotation.from_rotvec(axis / np.linalg.norm(axis) * next(angles)).as_matrix(), np.zeros(3))
+        link = joint.find("child").get("link")
+    return T
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_comes_back_with_the_same_table(name, tmp_path):
+    arm = MODELS[name]
+    back = returned(arm, tmp_path)
+    for field in (*TABLE, *LIMITS):
+        np.testing.assert_allclose(getattr(back, field), getattr(arm, field), atol=2e-16, err_msg=field)
+    assert (back.name, back.joint_names, back.source) == (arm.name, arm.joint_names, arm.source)
+    np.testing.assert_allclose(back.forward(probes()), arm.forward(probes()), atol=1e-12)
+    for q in probes(5):
+        np.testing.assert_allclose(chain_pose(tmp_path / "arm.urdf", q), arm.forward(q), atol=1e-12)
+
+
+RIGHT = st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
+LENGTHS = st.one_of(st.just(0.0), ours.finite(-1, 1).filter(lambda x: abs(x) > 1e-3))
+
+
+@st.composite
+def arms(draw):
+    """Arms of any table: right angles and others, no lengths and others, either direction, either convention."""
+    alpha = [draw(st.one_of(RIGHT, ours.finite(0.05, 3.0))) for _ in range(6)]
+    return replace(
+        SIX_R,
+        a=np.array([draw(LENGTHS) for _ in range(6)]),
+        d=np.array([draw(LENGTHS) for _ in range(6)]),
+        alpha=np.array(alpha),
+        offset=np.array([draw(st.one_of(RIGHT, ours.finite(-3, 3))) for _ in range(6)]),
+        direction=np.array([draw(st.sampled_from([1.0, -1.0])) for _ in range(6)]),
+        convention=draw(st.sampled_from(["standard", "modified"])),
+        T_base_0=draw(st.one_of(st.just(np.eye(4)), ours.poses(0.5))),
+        T_flange_tool=draw(st.one_of(st.just(np.eye(4)), ours.poses(0.5))),
+    )
+
+
+@given(arms())
+def test_any_arm_comes_back_with_the_same_forward_kinematics(arm):
+    with tempfile.TemporaryDirectory() as folder:
+        back = returned(arm, Path(folder))
+    np.testing.assert_allclose(back.forward(probes(20)), arm.forward(probes(20)), atol=1e-12)
+
+
+@given(arms())
+def test_a_standard_table_comes_back_where_it_is_unique(arm):
+    arm = replace(arm, convention="standard")
+    with tempfile.TemporaryDirectory() as folder:
+        back = returned(arm, Path(folder))
+    for field in ("a", "d"):
+        np.testing.assert_allclose(getattr(back, field), getattr(arm, field), atol=1e-12, err_msg=field)
+    for field in ("alpha", "offset"):
+        apart = np.remainder(getattr(back, field) - getattr(arm, field) + 1.0, 2 * np.pi) - 1.0
+        np.testing.assert_allclose(apart, 0, atol=1e-12, err_msg=field)
+    assert (back.direction == arm.direction).all()
+
+
+def moved(text, rng):
+    """The same arm with its frames put anywhere: links turned and shifted, axes no longer along z."""
+    robot = ET.fromstring(text)
+    frames = {"base": np.eye(4), "tool": np.eye(4)}
+    for joint in robot.findall("joint"):
+        parent, child = (joint.find(tag).get("link") for tag in ("parent", "child"))
+        origin = joint.find("origin")
+        xyz, rpy = (np.array(origin.get(key).split(), float) for key in ("xyz", "rpy"))
+        T = pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+        # A child's new frame must stay on its joint's axis: turn it anyhow, shift it along the axis.
+        R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+        F = frames.setdefault(child, pose(R, np.array([0, 0, rng.normal() * 0.1])))
+        T = np.linalg.inv(frames[parent]) @ T @ F
+        origin.set("xyz", " ".join(map(repr, map(float, T[:3, 3]))))
+        origin.set("rpy", " ".join(map(repr, map(float, Rotation.from_matrix(T[:3, :3]).as_euler("xyz")))))
+        axis = joint.find("axis")
+        if axis is not None:
+            turned = F[:3, :3].T @ np.array(axis.get("xyz").split(), float)
+            axis.set("xyz", " ".join(map(repr, map(float, 2.5 * turned))))
+    return ET.tostring(robot, encoding="unicode")
+
+
+@pytest.mark.parametrize(("name", "seed"), list(itertools.product(MODELS, range(3))))
+def test_the_table_is_found_whatever_frames_the_file_uses(name, seed, tmp_path):
+    arm = MODELS[name]
+    path = tmp_path / "arm.urdf"
+    path.write_text(moved(urdf_text(arm), np.random.default_rng(seed)))
+    back = read_urdf(path)
+    np.testing.assert_allclose(back.forward(probes()), arm.forward(probes()), atol=1e-9)
+
+
+@given(ours.poses(1.0))
+def test_a_step_between_axes_is_split_exactly(C):
+    step = decompose(C)
+    sine = np.hypot(C[0, 2], C[1, 2])
+    if 0 < sine < 1e-3:  # the common normal of nearly parallel axes is far away
+        return
+
+    def turn(axis, angle):
+        return pose(Rotation.from_euler(axis, angle).as_matrix(), np.zeros(3))
+
+    def shift(x, z):
+        return pose(np.eye(3), np.array([x, 0, z]))
+
+    made = (
+        turn("z", step.beta) @ shift(step.a, step.d) @ turn("x", step.alpha) @ shift(0, step.e) @ turn("z", step.gamma)
+    )
+    np.testing.assert_allclose(made, C, atol=1e-14 / max(sine, 1e-3) ** 2)
+
+
+def changed(old, new, count=1):
+    text = urdf_text(SIX_R)
+    assert old in text
+    return text.replace(old, new, count)
+
+
+RPY = 'rpy="-1.5707963267948966 0.0 0.0"'
+PRISMATIC = (
+    '<link name="finger"/><joint name="grip" type="{}"><parent link="tool"/><child link="finger"/>'
+    '<limit lower="0" upper="1" velocity="1"/></joint></robot>'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "not XML: no element found"),
+        ("<robot", "not XML"),
+        ("<arm/>", "outermost element is <arm>, must be <robot>"),
+        ("<robot name='x'/>", "0 revolute joints"),
+        (changed("<link", '<xacro:x xmlns:xacro="http://www.ros.org/wiki/xacro"/><link'), "expand them first"),
+        (changed('name="joint2"', ""), "a <joint> has no name"),
+        (changed('type="revolute"', 'type="rotary"'), "joint 'joint1': type 'rotary' is unknown"),
+        (changed('type="revolute"', 'type="prismatic"'), "'joint1' is prismatic"),
+        (changed('type="revolute"', 'type="continuous"'), "'joint1' is continuous"),
+        (changed('type="revolute"', 'type="fixed"'), r"5 revolute joints \(joint2, joint3"),
+        (changed("</robot>", PRISMATIC.format("prismatic")), "'grip' is prismatic"),
+        (changed("</robot>", PRISMATIC.format("revolute")), "7 revolute joints"),
+        (changed('<axis xyz="0 0 1" />', '<axis xyz="0 0 1"/><mimic joint="joint2"/>'), "'joint1' is a mimic"),
+        (changed('<parent link="link1" />', ""), "joint 'joint2': no <parent link=\"...\">"),
+        (changed('<parent link="link1" />', '<parent link="elbow" />'), "joint 'joint2': there is no link 'elbow'"),
+        (
+            changed('<child link="link2" />', '<child link="link3" />'),
+            "link 'link3' hangs on two joints, 'joint2' and 'joint3'",
+        ),
+        (changed('<parent link="base" />', '<parent link="tool" />'), "hangs on itself|do not follow"),
+        (changed('<parent link="link3" />', '<parent link="link1" />'), "do not follow one another"),
+        (changed(RPY, 'rpy="-1.57 0"'), "joint 'joint2': <origin rpy=\"-1.57 0\"> must be three numbers"),
+        (changed(RPY, 'rpy="a b c"'), "must be three numbers"),
+        (changed(RPY, 'rpy="0 0 nan"'), "must be three numbers"),
+        (changed('xyz="0 0 1"', 'xyz="0 0 0"'), "joint 'joint1': <axis> is zero"),
+        (changed("<limit", "<boundary"), "not XML|no <limit>"),
+        (
+            changed('lower="-2.9670597283903604"', 'lower="9"'),
+            r"joint 'joint1': <limit> goes from lower=9 to upper=2.96",
+        ),
+        (changed('lower="-2.9670597283903604"', 'lower="x"'), "joint 'joint1': <limit lower=\"x\"> must be a number"),
+        (changed('velocity="1.5707963267948966"', ""), "joint 'joint1': <limit> has no velocity"),
+        (
+            changed('velocity="1.5707963267948966"', 'velocity="0"'),
+            "joint 'joint1': <limit> velocity=0 must be more than 0",
+        ),
+        (changed("home_rad", "home_deg"), '<armsight>: home_rad="" must be six numbers'),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line_that_names_the_element(text, said, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError, match=said) as found:
+        read_urdf(path)
+    assert str(found.value).startswith(str(path))
+    assert "\n" not in str(found.value)
+
+
+def test_files_that_are_none_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_urdf(tmp_path / "none.urdf")
+    (tmp_path / "b.urdf").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not a text file"):
+        read_urdf(tmp_path / "b.urdf")
+
+
+def test_a_rounded_right_angle_is_refused_and_ten_digits_are_not(tmp_path):
+    path = tmp_path / "arm.urdf"
+    # Axes 2 and 3 are meant to be parallel; with an angle of 1e-5 between them their common normal is kilometres away.
+    path.write_text(changed('xyz="0.2515 0.0 0.0" rpy="0.0 0.0 0.0"', 'xyz="0.2515 0.1 0.0" rpy="0.00001 0.0 0.0"'))
+    with pytest.raises(
+        InputError, match=r"joints 'joint2' and 'joint3' are 0.00057 deg from parallel.*were angles rounded"
+    ):
+        read_urdf(path)
+    path.write_text(changed(RPY, 'rpy="-1.5707963268 0.0 0.0"'))
+    np.testing.assert_allclose(read_urdf(path).forward(probes()), SIX_R.forward(probes()), atol=1e-9)
+
+
+def test_the_tool_must_be_named_where_several_links_end_the_chain(tmp_path):
+    path = tmp_path / "arm.urdf"
+    camera = (
+        '<link name="eye"/><joint name="mount" type="fixed"><parent link="flange"/><child link="eye"/>'
+        '<origin xyz="0 0.05 0.1" rpy="0 0 0"/></joint></robot>'
+    )
+    path.write_text(changed("</robot>", camera))
+    with pytest.raises(InputError, match=r"several links end the chain \(tool, eye\)"):
+        read_urdf(path)
+    with pytest.raises(InputError, match=r"link 'hand' is not behind all six joints; these are: tool, eye"):
+        read_urdf(path, tool_link="hand")
+    T = pose(np.eye(3), np.array([0, 0.05, 0.1]))
+    seen = read_urdf(path, tool_link="eye").forward(probes())
+    np.testing.assert_allclose(seen, SIX_R.forward(probes()) @ T, atol=1e-12)
+    np.testing.assert_allclose(read_urdf(path, tool_link="tool").forward(probes()), SIX_R.forward(probes()), atol=1e-12)
+    flange = read_urdf(path, tool_link="flange").forward(probes())
+    np.testing.assert_allclose(flange, SIX_R.forward(probes()), atol=1e-12)
+
+
+def test_what_plain_urdf_leaves_out_is_filled_in(tmp_path):
+    path = tmp_path / "arm.urdf"
+    robot = ET.fromstring(urdf_text(SIX_R))
+    robot.remove(robot.find("armsight"))
+    for limit in robot.iter("limit"):
+        for key in ("acceleration", "deceleration", "jerk"):
+            del limit.attrib[key]
+    path.write_text(ET.tostring(robot, encoding="unicode"))
+    arm = read_urdf(path)
+    assert isinstance(arm, Arm)
+    np.testing.assert_allclose(arm.qdd_max, arm.qd_max / 0.25)
+    np.testing.assert_allclose(arm.qddd_max, arm.qdd_max / 0.1)
+    assert (arm.home == 0).all()
+    assert arm.source == "URDF arm.urdf"
+
+
+def test_nothing_half_written_is_left(tmp_path):
+    with pytest.raises(InputError, match="there is no folder"):
+        write_urdf(SIX_R, tmp_path / "none" / "arm.urdf")
+    assert list(tmp_path.iterdir()) == []
