@@ -102,8 +102,9 @@ def ours_of(pairs: list[Pair]) -> dict[str, Correspondences]:
     return {name: c for name, c in joined.items() if c.paired.sum() >= 6}
 
 
-def errors_on(rig, points, shots: list[Correspondences], estimated=None):
-    return summary(pair_errors(rig, points, Observations.from_shots(shots), estimated=estimated), 1)
+def errors_on(rig, points, shots: list[Correspondences], estimated=None, motion=None):
+    observations = Observations.from_shots(shots)
+    return summary(pair_errors(rig, points, observations, estimated=estimated, motion=motion), 1)
 
 
 def line(who: str, n: int, h) -> str:
@@ -172,7 +173,16 @@ def normalised_residuals() -> None:
         ours = calibrate_boards(s.board, [p for p in s.pairs if parity(p.name) == 0], (s.size, s.size))
         shots = ours_of([p for p in s.pairs if parity(p.name)])
         points = s.board.body.points
-        everything = errors_on(ours.rig, points, list(shots.values()), ours.body.points).normalised_rms
+        everything = errors_on(ours.rig, points, list(shots.values()), ours.body.points, ours.motion).normalised_rms
         good = [c for k, c in shots.items() if k not in s.bad]
-        chosen = errors_on(ours.rig, points, good, ours.body.points).normalised_rms
-        print(f"  {name}: {everything:.3f} on all odd pairs, {chosen:.3f} without those a person would throw out")
+        chosen = errors_on(ours.rig, points, good, ours.body.points, ours.motion).normalised_rms
+        print(
+            f"  {name}: {everything:.3f} on all odd pairs, {chosen:.3f} without those a person would throw out{said(ours)}"
+        )
+
+
+def said(ours) -> str:
+    if ours.motion is None:
+        return "; boards found to stand still between the exposures"
+    way, turn = 1e3 * ours.motion.rms_m, 1e3 * ours.motion.rms_rad
+    return f"; boards found to move by {way:.3f} mm and {turn:.2f} mrad RMS an axis between the exposures"

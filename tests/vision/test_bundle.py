@@ -3,6 +3,7 @@
 import functools
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -107,6 +108,44 @@ def test_jacobian_by_the_poses(name):
     )
 
 
+def moving(model, truth, seed=3, sigma=(2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02)):
+    """Let the body move between the exposures of every shot, far enough to tell a derivative from its linear part."""
+    motions = np.random.default_rng(seed).normal(size=(len(truth.Ts_left_body), 6)) * sigma
+    return replace(model, motion_sigmas=np.tile(sigma, (len(motions), 1))), replace(truth, motions=motions)
+
+
+def test_a_motion_is_a_turn_about_the_bodys_middle_and_a_way_in_the_right_image_alone():
+    model, truth, observations = problem("brown4", degree=2, shots=3)
+    model, moved_on = moving(model, truth)
+    uv, there = (predict(model, state, observations)[0] for state in (truth, moved_on))
+    left = observations.camera == 0
+    np.testing.assert_array_equal(uv[left], there[left])
+    body, middle = model.body(truth.shape), model.points.mean(axis=0)
+    for j, motion in enumerate(moved_on.motions):
+        R = cv2.Rodrigues(np.array(motion[3:]))[0]
+        body_then = (body - middle) @ R.T + middle + motion[:3]
+        rows = ~left & (observations.shot == j)
+        one = replace(model, points=body_then - np.tensordot(truth.shape, model.modes, axes=1))
+        np.testing.assert_allclose(there[rows], predict(one, truth, observations)[0][rows], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["brown4", "fisheye"])
+def test_jacobians_where_the_body_moves_between_the_exposures(name):
+    model, truth, observations = problem(name, degree=2, shots=2)
+    model, truth = moving(model, truth)
+    _, J_shared, J_shot = predict(model, truth, observations)
+    q = J_shared.shape[2]
+    by_all = np.zeros((len(J_shot), 2, 2, 12))
+    by_all[np.arange(len(J_shot)), :, observations.shot] = J_shot
+    scale = np.concatenate([0.1 * scales(model, truth), np.full(24, 1e-4)])
+    assert_jacobian(
+        np.concatenate([J_shared, by_all.reshape(len(J_shot), 2, 24)], axis=2),
+        lambda x: predict(model, moved(truth, x[:q], x[q:].reshape(2, 12)), observations)[0],
+        np.zeros(q + 24),
+        scale,
+    )
+
+
 def test_whiteners_are_roots_of_the_inverse_covariance():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(5, 2, 2))
@@ -207,6 +246,52 @@ def test_gross_errors_move_a_robust_fit_by_less_than_its_sigma():
     plain = minimise(model, truth, replace(observations, uv=uv), SIGMA_PX, robust=False)
     assert (np.abs(apart(clean, robust.state)) < sigma).all()
     assert np.abs(apart(clean, plain.state) / sigma).max() > 10
+
+
+def test_minimum_and_covariance_with_motions_are_those_of_the_dense_problem():
+    model, truth, _ = problem("brown4", shots=5)
+    model, truth = moving(model, truth, sigma=(5e-4, 5e-4, 5e-4, 3e-3, 3e-3, 3e-3))
+    _, _, observations = problem("brown4", shots=5)
+    rng = np.random.default_rng(7)
+    uv = predict(model, truth, observations)[0]
+    observations = replace(observations, uv=uv + SIGMA_PX * rng.normal(size=uv.shape))
+    start = replace(truth, motions=np.zeros((0, 6)))
+    solution = minimise(model, start, observations, SIGMA_PX, robust=False)
+    assert solution.converged
+    state, q = solution.state, size(model, truth)
+    W = whiteners(observations, SIGMA_PX)
+    _, J_shared, J_shot = predict(model, state, observations)
+    by_shot = np.zeros((*J_shot.shape[:2], 5, 12))
+    by_shot[np.arange(len(J_shot)), :, observations.shot] = W @ J_shot
+    n = 2 * len(J_shot)
+    J = np.concatenate([(W @ J_shared).reshape(n, -1), by_shot.reshape(n, -1)], axis=1)
+    own = q + (12 * np.arange(5)[:, None] + np.arange(6, 12)).ravel()
+    prior = np.zeros((30, J.shape[1]))
+    prior[np.arange(30), own] = 1 / model.motion_sigmas.ravel()
+    J = np.concatenate([J, prior])
+    r = (W @ (observations.uv - predict(model, state, observations)[0])[..., None]).ravel()
+    r = np.concatenate([r, -(state.motions / model.motion_sigmas).ravel()])
+    assert solution.cost == pytest.approx(r @ r, rel=1e-12)
+    scale = np.linalg.norm(J, axis=0)
+    C = np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
+    sigma = np.sqrt(np.diag(C))
+    # At a minimum one more Gauss-Newton step gains no more than the last one did: 1e-7 of the cost.
+    assert (np.abs(C @ J.T @ r) <= np.sqrt(1e-7 * solution.cost) * sigma).all()
+    np.testing.assert_allclose(
+        solution.cov_shared / np.outer(sigma[:q], sigma[:q]), C[:q, :q] / np.outer(sigma[:q], sigma[:q]), atol=1e-6
+    )
+    for j in range(5):
+        rows = own[6 * j : 6 * j + 6]
+        s = np.outer(sigma[rows], sigma[rows])
+        np.testing.assert_allclose(solution.cov_motions[j] / s, C[np.ix_(rows, rows)] / s, atol=1e-6)
+    off = (state.motions - truth.motions) / np.sqrt(np.diagonal(solution.cov_motions, axis1=1, axis2=2))
+    assert np.abs(off).max() < 4
+
+
+def test_an_adjustment_that_runs_out_of_steps_says_so():
+    model, truth, observations = problem("brown4")
+    assert not minimise(model, started(model, truth), observations, SIGMA_PX, max_steps=2).converged
+    assert minimise(model, started(model, truth), observations, SIGMA_PX).converged
 
 
 def test_covariance_is_that_of_the_dense_jacobian():

@@ -141,7 +141,7 @@ def test_every_shot_is_held_out_once_and_never_fitted_then():
 
     def fit(rows):
         asked.append(rows.tolist())
-        return true, board.body.points
+        return true, board.body.points, None
 
     errors = cross_validate(fit, board.body.points, observations, 3)
     assert errors.pair.tolist() == list(range(7))

@@ -20,7 +20,15 @@ from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.bundle import Model, Observations, Solution, State, minimise
-from armsight.vision.calibrate.heldout import cross_validate, folds_of, residual_epipolar_rms, rig_of, scaled, summary
+from armsight.vision.calibrate.heldout import (
+    cross_validate,
+    folds_of,
+    residual_epipolar_rms,
+    rig_of,
+    scaled,
+    summary,
+    unfinished,
+)
 from armsight.vision.calibrate.result import Calibration, Rejected
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.start import relative_poses
@@ -222,10 +230,10 @@ def _result(
 ) -> Calibration:
     """Cross-validate the choice and put everything together."""
 
-    def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array]:
+    def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array, None]:
         state = replace(solution.state, Ts_left_body=solution.state.Ts_left_body[rows])
         part = minimise(model, state, observations.shots(rows), solution.sigma_px)
-        return rig_of(part), model.body(part.state.shape)
+        return rig_of(part), model.body(part.state.shape), None
 
     errors = cross_validate(fit, body.points, observations, folds)
     heldout = summary(errors, folds)
@@ -245,7 +253,7 @@ def _result(
         errors,
         {rig.left.model: heldout},
         tuple(rejected),
-        notes,
+        notes + unfinished(solution),
         (),
     )
     return replace(calibration, weaknesses=weaknesses(calibration))

@@ -14,10 +14,11 @@ from scipy.linalg import block_diag
 
 from armsight.data import Array, Correspondences
 from armsight.errors import CalibrationError
-from armsight.geometry.pose import transform
+from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.bundle import Observations, Solution
+from armsight.vision.calibrate.motion import Motion
 from armsight.vision.calibrate.result import HeldOut, PairErrors
 from armsight.vision.match import epipolar_distances
 from armsight.vision.rig import StereoRig
@@ -40,7 +41,12 @@ def correspondences(observations: Observations, shot: int) -> Correspondences:
 
 
 def pair_errors(
-    rig: StereoRig, drawing: Array, observations: Observations, *, estimated: Array | None = None
+    rig: StereoRig,
+    drawing: Array,
+    observations: Observations,
+    *,
+    estimated: Array | None = None,
+    motion: Motion | None = None,
 ) -> PairErrors:
     """Measure every pair of ``observations`` with a rig and compare with the perfect body.
 
@@ -50,21 +56,23 @@ def pair_errors(
         observations: detections of S shots.
         estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is judged: how
             a print differs from its drawing is no error of the cameras; the drawing by default.
+        motion: how far the body is expected to move between the two exposures; it stands still by default.
 
     Returns:
         One row for each shot that has three or more matched points.
     """
     rows = []
+    found = drawing if estimated is None else estimated
     for shot in range(observations.shot_count):
-        row = _pair_error(
-            rig, drawing, drawing if estimated is None else estimated, correspondences(observations, shot)
-        )
+        row = _pair_error(rig, drawing, found, correspondences(observations, shot), motion)
         if row is not None:
             rows.append((float(shot), *row))
     return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
 
 
-def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences) -> tuple[float, ...] | None:
+def _pair_error(
+    rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences, motion: Motion | None
+) -> tuple[float, ...] | None:
     """Return epipolar px, rigid m, scale, weight, normalised of one shot; None where it has too little."""
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
     cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
@@ -79,12 +87,16 @@ def _pair_error(rig: StereoRig, drawing: Array, estimated: Array, seen: Correspo
     T = fit_rigid(board, p)
     gap = p - transform(T, board)
     epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
+    T_found, cov_rig = fit_rigid(found, p), np.array(rig.cov)
+    if motion is not None:
+        # What moved between the exposures looks as if the right camera stood elsewhere for this one pair.
+        cov_rig[-6:, -6:] += motion.seen_from(inverse(rig.T_left_right) @ T_found, estimated.mean(axis=0))
     return (
         float(np.sqrt((epipolar**2).mean())),
         float(np.sqrt((gap**2).sum(axis=1).mean())),
         fit_scale(board, p),
         float(len(good)),
-        _normalised(transform(fit_rigid(found, p), found), p, cov_p, by_rig, rig.cov),
+        _normalised(transform(T_found, found), p, cov_p, by_rig, cov_rig),
     )
 
 
@@ -102,7 +114,7 @@ def _without_blunders(body: Array, p: Array) -> NDArray[np.bool_]:
 
 
 def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> float:
-    """RMS of a rigid fit's residuals (N, 3) over their predicted sigma: pixel noise and calibration, less the fit."""
+    """RMS of a rigid fit's residuals (N, 3) over their predicted sigma: pixel noise, calibration, motion, less the fit."""
     n, gap = len(p), p - fitted
     G = by_rig.reshape(3 * n, -1)
     full = block_diag(*cov) + G @ cov_rig @ G.T
@@ -118,12 +130,16 @@ def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:
 
 
 def cross_validate(
-    fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array]], drawing: Array, observations: Observations, folds: int
+    fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array, Motion | None]],
+    drawing: Array,
+    observations: Observations,
+    folds: int,
 ) -> PairErrors:
     """Fit on all folds but one and measure that one, for every fold.
 
     Args:
-        fit: rows of the shots to use -> the rig they give and the body as they show it (M, 3), m.
+        fit: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
+            between the exposures.
         drawing: (M, 3) points of the perfect body, m.
         observations: all detections, bad ones included: a measurement meets them too.
         folds: number of folds, at most the number of shots.
@@ -133,8 +149,8 @@ def cross_validate(
     """
     parts = []
     for held in folds_of(observations.shot_count, folds):
-        rig, estimated = fit(np.setdiff1d(np.arange(observations.shot_count), held))
-        errors = pair_errors(rig, drawing, observations.shots(held), estimated=estimated)
+        rig, estimated, motion = fit(np.setdiff1d(np.arange(observations.shot_count), held))
+        errors = pair_errors(rig, drawing, observations.shots(held), estimated=estimated, motion=motion)
         fields = [getattr(errors, name) for name in _FIELDS]
         parts.append(np.stack([held[errors.pair.astype(int)].astype(float), *fields]))
     merged = np.concatenate(parts, axis=1)
@@ -144,8 +160,14 @@ def cross_validate(
 _FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised")
 
 
-def summary(errors: PairErrors, folds: int) -> HeldOut:
-    """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs."""
+def summary(errors: PairErrors, folds: int, motion: Motion | None = None) -> HeldOut:
+    """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs.
+
+    Args:
+        errors: of pairs that were left out.
+        folds: into how many parts the pairs were split.
+        motion: how far the board was expected to move between the exposures.
+    """
     if not len(errors.pair):
         raise CalibrationError("no left-out shot has three points seen by both cameras, so the rig cannot be judged")
     w = errors.weight / errors.weight.sum()
@@ -156,6 +178,8 @@ def summary(errors: PairErrors, folds: int) -> HeldOut:
         rms["rigid_m"],
         float(errors.scale.mean() - 1),
         rms["normalised"],
+        0.0 if motion is None else motion.rms_m,
+        0.0 if motion is None else motion.rms_rad,
     )
 
 
@@ -167,6 +191,16 @@ def residual_epipolar_rms(rig: StereoRig, observations: Observations) -> float:
         uv = seen.uv[seen.paired]
         squares.append(epipolar_distances(rig, uv[:, 0], uv[:, 1]).ravel() ** 2)
     return float(np.sqrt(np.concatenate(squares).mean()))
+
+
+def unfinished(solution: Solution) -> tuple[str, ...]:
+    """Note that an adjustment ran out of steps, if it did."""
+    if solution.converged:
+        return ()
+    return (
+        f"the adjustment stopped at its last step, {solution.steps}, while still getting better: the detections hardly "
+        "determine some parameter; take more pairs, or fix --model",
+    )
 
 
 def rig_of(solution: Solution) -> StereoRig:

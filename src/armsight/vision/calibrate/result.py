@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from armsight.data import Array, Body, Record
 from armsight.vision.bundle import Observations, Solution
+from armsight.vision.calibrate.motion import Motion
 from armsight.vision.rig import StereoRig
 
 
@@ -48,6 +49,9 @@ class HeldOut:
         rigid_rms_m: triangulated board against the perfect one, after a rigid fit, m.
         scale_error: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%.
         normalised_rms: rigid residual over its predicted sigma; 1 where the uncertainty is honest.
+        motion_rms_m: how far the board is expected to move along an axis between the exposures of a left-out pair, m; 0
+            where boards stand still.
+        motion_rms_rad: by how much it is expected to turn about an axis, rad.
     """
 
     folds: int
@@ -55,6 +59,8 @@ class HeldOut:
     rigid_rms_m: float
     scale_error: float
     normalised_rms: float
+    motion_rms_m: float = 0.0
+    motion_rms_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +82,7 @@ class Calibration(Record):
         rejected: pairs thrown away, and why.
         notes: what was mended or partly dropped, and why.
         weaknesses: what is weak, and what to do about it.
+        motion: how far the board moved between the two exposures of a pair; None where it stood still.
     """
 
     rig: StereoRig
@@ -92,6 +99,7 @@ class Calibration(Record):
     rejected: tuple[Rejected, ...]
     notes: tuple[str, ...]
     weaknesses: tuple[str, ...]
+    motion: Motion | None = None
 
     @property
     def reprojection_rms_px(self) -> float:

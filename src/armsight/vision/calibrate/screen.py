@@ -6,7 +6,7 @@ away is named with its reason.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from armsight.vision.pnp import body_poses
 CORNER_SIGMAS = 6.0
 #: A pair whose typical corner is this many times the usual error is bad as a whole.
 PAIR_RATIO = 3.0
+#: While errors are looked for, a board may move between the exposures this many times as far as is usual at no great cost;
+#: twice as far again, RMS over the six freedoms, and it is no board in a hand.
+MOTION_EASE, _FAR = 5.0, 2.0
 #: A pair that loses more than this share of its corners is not trusted for the rest.
 LOST_SHARE = 0.25
 #: Fewest corners, seen by both cameras, that make a pair useful.
@@ -74,7 +77,9 @@ def robust_sigma(solution: Solution) -> float:
     return float(np.sqrt(np.median((solution.residuals_px**2).sum(axis=1)) / _MEDIAN_CHI2_2))
 
 
-def screen(model: Model, start: State, observations: Observations, names: tuple[str, ...]) -> Screened:
+def screen(
+    model: Model, start: State, observations: Observations, names: tuple[str, ...], *, sigma_px: float = 1.0
+) -> Screened:
     """Adjust robustly and throw out gross corners and bad pairs until nothing more stands out.
 
     Args:
@@ -82,6 +87,7 @@ def screen(model: Model, start: State, observations: Observations, names: tuple[
         start: a start for all pairs.
         observations: all detections.
         names: (S,) names of the pairs.
+        sigma_px: standard deviation of a detection to begin with, px.
 
     Returns:
         What is left.
@@ -89,23 +95,23 @@ def screen(model: Model, start: State, observations: Observations, names: tuple[
     rejected: list[Rejected] = []
     kept = np.arange(observations.shot_count)
     good = np.ones(len(observations.shot), bool)
-    state, sigma = start, 1.0
+    state, sigma = start, sigma_px
     for _ in range(_ROUNDS):
         rows = good & np.isin(observations.shot, kept)
         now = _renumbered(observations, rows, kept)
-        solution = minimise(model, state, now, sigma)
+        solution = minimise(_of_shots(model, kept), state, now, sigma)
         new_sigma = robust_sigma(solution)
         distance = np.full(len(good), np.nan)
         distance[rows] = _whitened(solution, now)
         good &= ~(distance > CORNER_SIGMAS)
-        bad = _bad_pairs(observations, kept, distance, good)
+        bad = _bad_pairs(observations, kept, distance, good) | _far_moved(model, kept, solution)
         rejected += [Rejected(names[j], reason) for j, reason in bad.items()]
         left = np.array([j for j in kept if j not in bad], dtype=np.int64)
-        state = State(
-            solution.state.cameras,
-            solution.state.T_left_right,
-            solution.state.Ts_left_body[np.isin(kept, left)],
-            solution.state.shape,
+        still = np.isin(kept, left)
+        state = replace(
+            solution.state,
+            Ts_left_body=solution.state.Ts_left_body[still],
+            motions=solution.state.motions[still] if len(solution.state.motions) else solution.state.motions,
         )
         done = not bad and abs(new_sigma - sigma) < 0.02 * sigma and (good[rows]).all()
         kept, sigma = left, new_sigma
@@ -118,7 +124,27 @@ def screen(model: Model, start: State, observations: Observations, names: tuple[
         if lost := int((mine & ~good).sum()):
             notes.append(f"{names[j]}: {lost} of {mine.sum()} corners dropped as gross errors")
     unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
-    return Screened(final, unscreened, kept, minimise(model, state, final, sigma), tuple(rejected), tuple(notes))
+    solution = minimise(_of_shots(model, kept), state, final, sigma)
+    return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))
+
+
+def _of_shots(model: Model, kept: NDArray[np.int64]) -> Model:
+    """Return the model of some of the shots."""
+    return replace(model, motion_sigmas=model.motion_sigmas[kept]) if len(model.motion_sigmas) else model
+
+
+def _far_moved(model: Model, kept: NDArray[np.int64], solution: Solution) -> dict[int, str]:
+    """Return the pairs whose board is at another place in each image, further than a hand moves it, with the reason."""
+    bad: dict[int, str] = {}
+    for j, motion in zip(kept, solution.state.motions, strict=False):
+        ratio = float(np.sqrt(np.mean((motion / model.motion_sigmas[j]) ** 2)))
+        if ratio > _FAR:
+            bad[int(j)] = (
+                f"the images show the board {1e3 * np.linalg.norm(motion[:3]):.1f} mm and "
+                f"{np.degrees(np.linalg.norm(motion[3:])):.1f} degrees apart, {MOTION_EASE * ratio:.0f} times as far as "
+                "usual: wrong corners, or a board that moved between the two images"
+            )
+    return bad
 
 
 def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArray[np.int64]) -> Observations:

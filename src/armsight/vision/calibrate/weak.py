@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import Array
+from armsight.vision.calibrate.motion import Motion
 from armsight.vision.calibrate.result import Calibration
 
 _LEAST_TILT_DEG = 15.0
@@ -14,6 +15,7 @@ _LEAST_COVERED = 0.6
 _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
+_FAR_MOTION = 2.0
 
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
@@ -91,7 +93,9 @@ def _focus(calibration: Calibration) -> str | None:
 
 
 def _synchrony(calibration: Calibration) -> str | None:
-    """Pairs whose epipolar error stands out."""
+    """Boards that moved between the exposures of a pair, or pairs whose epipolar error stands out."""
+    if calibration.motion is not None:
+        return _moved(calibration, calibration.motion)
     errors = calibration.errors
     usual = float(np.median(errors.epipolar_px))
     late = [calibration.pairs[int(j)] for j, e in zip(errors.pair, errors.epipolar_px, strict=True) if e > 2.5 * usual]
@@ -101,6 +105,21 @@ def _synchrony(calibration: Calibration) -> str | None:
             "unsynchronised cameras see a moving board at two places; hold it still, or trigger both cameras together"
         )
     return None
+
+
+def _moved(calibration: Calibration, motion: Motion) -> str:
+    state = calibration.solution.state
+    distance = float(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1).mean())
+    way_px = calibration.rig.right.intrinsics[0] * motion.rms_m / distance
+    ways = np.linalg.norm(state.motions[:, :3], axis=1)
+    far = [j for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m]
+    most = f"; furthest: {', '.join(calibration.pairs[int(j)] for j in far[:4])}" if far else ""
+    return (
+        f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2f} mm and "
+        f"{1e3 * motion.rms_rad:.1f} mrad RMS along and about each axis ({way_px:.2f} px{most}): the cameras are not "
+        "synchronised. The rig's sigma allows for it, but what moves like that while it is measured is off by as much: "
+        "hold it still, or trigger both cameras together"
+    )
 
 
 def _sides(calibration: Calibration) -> str | None:

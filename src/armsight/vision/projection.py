@@ -1,0 +1,188 @@
+"""What bundle adjustment is about: detections, where everything is, what is believed beforehand, and what would be seen.
+
+Observations and states go in, projections with their analytic derivatives come out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Correspondences, Ids, Record
+from armsight.geometry.pose import exp_se3, inverse, transform
+from armsight.geometry.rotation import exp_so3, skew
+from armsight.vision.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Observations(Record):
+    """Detections of one body over many shots, one row each, sorted by shot.
+
+    Attributes:
+        shot: (N,) row of the shot.
+        camera: (N,) 0 left, 1 right.
+        point: (N,) row of the body's points.
+        uv: (N, 2) raw pixels.
+        cov_uv: (N, 2, 2) covariance the image supports, px^2.
+        shot_count: how many shots there are.
+    """
+
+    shot: Ids
+    camera: Ids
+    point: Ids
+    uv: Array
+    cov_uv: Array
+    shot_count: int
+
+    @staticmethod
+    def from_shots(shots: list[Correspondences]) -> Observations:
+        """Flatten one record of correspondences per shot."""
+        rows = [np.argwhere(c.seen) for c in shots]
+        return Observations(
+            np.concatenate([np.full(len(r), j) for j, r in enumerate(rows)]),
+            np.concatenate([r[:, 1] for r in rows]),
+            np.concatenate([c.ids[r[:, 0]] for c, r in zip(shots, rows, strict=True)]),
+            np.concatenate([c.uv[r[:, 0], r[:, 1]] for c, r in zip(shots, rows, strict=True)]),
+            np.concatenate([c.cov_uv[r[:, 0], r[:, 1]] for c, r in zip(shots, rows, strict=True)]),
+            len(shots),
+        )
+
+    def select(self, keep: NDArray[np.bool_]) -> Observations:
+        """Return the rows where ``keep`` (N,) is true; shots keep their numbers."""
+        shot, camera, point = self.shot[keep], self.camera[keep], self.point[keep]
+        return Observations(shot, camera, point, self.uv[keep], self.cov_uv[keep], self.shot_count)
+
+    def shots(self, rows: NDArray[np.intp] | list[int]) -> Observations:
+        """Return only the shots in ``rows``, renumbered in ascending order."""
+        order = np.unique(rows)
+        keep = np.isin(self.shot, order)
+        chosen = self.select(keep)
+        return replace(chosen, shot=np.searchsorted(order, chosen.shot), shot_count=len(order))
+
+
+def _still() -> Array:
+    """(0, 6): no motion between the exposures is modelled."""
+    return np.zeros((0, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class State(Record):
+    """What bundle adjustment estimates.
+
+    Attributes:
+        cameras: left and right.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame.
+        Ts_left_body: (S, 4, 4) pose of the body in every shot.
+        shape: (K,) coordinates of the body's shape along its modes, m.
+        motions: (S, 6) how the body moved from the left exposure to the right one, in its own frame: the way of its
+            middle, m, and the rotation vector about it, rad; (0, 6) where it stood still.
+    """
+
+    cameras: tuple[Camera, Camera]
+    T_left_right: Array
+    Ts_left_body: Array
+    shape: Array
+    motions: Array = field(default_factory=_still)
+
+
+@dataclass(frozen=True, eq=False)
+class Model(Record):
+    """What bundle adjustment holds fixed, and what it believes beforehand.
+
+    The shared parameters are: left intrinsics and distortion, right intrinsics and distortion, the tangent of
+    T_left_right, and the shape.
+
+    Attributes:
+        points: (M, 3) nominal points of the body, m.
+        modes: (K, M, 3) shape modes: the body is ``points + shape @ modes``.
+        shape_sigma_m: standard deviation of every shape coordinate before any image, m.
+        free_cameras: whether intrinsics and distortion are estimated.
+        motion_sigmas: (S, 6) standard deviation of every shot's motion between the exposures before any image, m and
+            rad, as in :class:`State`; (0, 6) where the body stands still.
+    """
+
+    points: Array
+    modes: Array
+    shape_sigma_m: float
+    free_cameras: bool
+    motion_sigmas: Array = field(default_factory=_still)
+
+    def body(self, shape: Array) -> Array:
+        """(M, 3) points of the body of a given shape, m."""
+        return np.asarray(self.points + np.tensordot(shape, self.modes, axes=1))
+
+
+def predict(model: Model, state: State, observations: Observations) -> tuple[Array, Array, Array]:
+    """Project every observation and differentiate.
+
+    Args:
+        model: the body and its modes.
+        state: where everything is.
+        observations: N rows.
+
+    Returns:
+        (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
+        pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
+    """
+    sizes = [camera.parameters.size for camera in state.cameras]
+    n_cameras = sum(sizes)
+    count = n_cameras + 6 + len(model.modes)
+    uv = np.empty((len(observations.shot), 2))
+    J_shared, J_shot = np.zeros((len(uv), 2, count)), np.zeros((len(uv), 2, 12 if len(state.motions) else 6))
+    body, middle = model.body(state.shape), model.points.mean(axis=0)
+    T_right_left = inverse(state.T_left_right)
+    for side, camera in enumerate(state.cameras):
+        rows = observations.camera == side
+        points, shots = observations.point[rows], observations.shot[rows]
+        T = state.Ts_left_body[shots]
+        T = T if side == 0 else T_right_left @ T
+        p_body, by_body = body[points], T[:, :3, :3]
+        turned = by_body
+        if side == 1 and len(state.motions):
+            arm = p_body - middle
+            R = exp_so3(np.array(state.motions[:, 3:]))[shots]
+            p_body = (R @ arm[..., None])[..., 0] + middle + state.motions[shots, :3]
+            turned = by_body @ R
+        p = transform(T, p_body)
+        uv[rows], J_p, J_k = camera.project_jacobians(p)
+        by_body, turned = J_p @ by_body, J_p @ turned
+        J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
+        if side == 1 and len(state.motions):
+            by_turn = -turned @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
+            J_shot[rows, :, 6:] = np.concatenate([by_body, by_turn], axis=2)
+        start = 0 if side == 0 else sizes[0]
+        block = np.zeros((len(points), 2, count))
+        block[:, :, start : start + sizes[side]] = J_k
+        if side == 1:
+            block[:, :, n_cameras : n_cameras + 6] = np.concatenate([-J_p, J_p @ skew(p)], axis=2)
+        if len(model.modes):
+            block[:, :, n_cameras + 6 :] = turned @ model.modes[:, points].transpose(1, 2, 0)
+        J_shared[rows] = block
+    return uv, J_shared, J_shot
+
+
+def _right_jacobians(turns: Array) -> Array:
+    """(S, 3, 3) how the rotations of vectors (S, 3) turn, on the right, as the vectors change.
+
+    It is the transpose of the matrix by which exp_se3 takes its translation.
+    """
+    tangents = np.concatenate([np.tile(np.eye(3), (len(turns), 1, 1)), np.repeat(turns[:, None], 3, axis=1)], axis=2)
+    return np.asarray(exp_se3(tangents)[..., :3, 3])
+
+
+def moved(state: State, shared: Array, shots: Array) -> State:
+    """Return the state moved by ``shared`` (Q,) and ``shots``: tangents (S, 6) of the poses, or (S, 12) with motions."""
+    left, right = state.cameras
+    n_left, n = left.parameters.size, left.parameters.size + right.parameters.size
+    return State(
+        (
+            left.with_parameters(left.parameters + shared[:n_left]),
+            right.with_parameters(right.parameters + shared[n_left:n]),
+        ),
+        state.T_left_right @ exp_se3(shared[n : n + 6]),
+        state.Ts_left_body @ exp_se3(shots[:, :6]),
+        state.shape + shared[n + 6 :],
+        state.motions + shots[:, 6:] if len(state.motions) else state.motions,
+    )
