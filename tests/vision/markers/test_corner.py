@@ -7,6 +7,7 @@ from supersampled import checks, expose, paint, project, view
 
 from armsight.vision.markers import crossing
 from armsight.vision.markers.corner import MOVED_MAX_PX, VERDICTS, refine_corners
+from armsight.vision.markers.edge import edge, edge_single
 from asserts import assert_jacobian
 
 NEIGHBOURS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -96,23 +97,55 @@ def test_known_bow_is_taken_out():
     assert np.abs(known).max() < 0.006  # grey levels are rounded here, and the edges run along the pixels
 
 
+def crossing_work(px):
+    """Return a work space with the pixels px (3, n): x, y, grey."""
+    work = np.zeros(crossing.WORK, np.float32)
+    for row, values in zip((0, crossing.Y, crossing.GREY), px, strict=True):
+        work[row : row + len(values)] = values
+    return work
+
+
+Q = np.array([0.3, -0.2, 1.8, 0.1, 0.5, 0.9, 120.0, 55.0, 0.003, -0.002])
+SIDES, BOW = np.array([[0.96, 0.28], [-0.1, 0.99]]), np.array([[0.0005, -0.001], [0.001, 0.0004]])
+
+
 def test_derivatives_hold_against_finite_differences():
     rng = np.random.default_rng(4)
     n = 200
     px = np.vstack([rng.uniform(-8, 8, (2, n)), rng.uniform(0, 255, n)])
-    sides, bow = np.array([[0.96, 0.28], [-0.1, 0.99]]), np.array([[0.0005, -0.001], [0.001, 0.0004]])
-    q = np.array([0.3, -0.2, 1.8, 0.1, 0.5, 0.9, 120.0, 55.0, 0.003, -0.002])
 
-    def residuals(q):
-        J, r = np.empty((crossing.PARAMETERS, n)), np.empty(n)
-        crossing._evaluate(n, px, q, sides, bow, J, r)
-        return r
+    def evaluated(q):
+        work = crossing_work(px)
+        crossing.evaluate(n, work, 0.0, 0.0, q, SIDES, BOW)
+        rows = work[crossing.JACOBIAN :].reshape(-1, crossing.ROOM)[: crossing.PARAMETERS + 1, :n]
+        return rows.astype(np.float64)
 
-    J, r = np.empty((crossing.PARAMETERS, n)), np.empty(n)
-    crossing._evaluate(n, px, q, sides, bow, J, r)
-    # Profiles come from tables, and are cut off at four sigma with 6e-5 of the contrast left: over a step of 0.02 this
-    # is 0.003 of a derivative.
-    assert_jacobian(-J.T, residuals, q, np.array([0.02, 0.02, 0.01, 0.01, 0.02, 0.02, 1, 1, 0.01, 0.01]), rtol=4e-3)
+    # Single precision: residuals of up to 200 are good to 2e-5, differences of two over a step of 0.02 to 1e-3, where a
+    # derivative is up to 50. The model's own C has 6e-5 of the contrast left.
+    steps = np.array([0.02, 0.02, 0.01, 0.01, 0.02, 0.02, 1, 1, 0.01, 0.01])
+    assert_jacobian(-evaluated(Q)[:-1].T, lambda q: evaluated(q)[-1], Q, steps, rtol=4e-3)
+
+
+def test_pixels_of_plain_squares_count_by_their_moments_as_one_by_one():
+    rng = np.random.default_rng(8)
+    x, y = (array.ravel() for array in np.mgrid[-11:12, -11:12].astype(np.float64))
+    u = np.stack([np.cos(Q[2]) * x + np.sin(Q[2]) * y, np.cos(Q[3]) * x + np.sin(Q[3]) * y])
+    far = np.abs(u).min(axis=0) > 7.0  # beyond any blur: both ways of counting see M = 1 or -1
+    px = np.stack([x, y, rng.uniform(60, 180, len(x))])
+    moments = np.zeros((2, crossing.MOMENTS))
+    for row, side in enumerate((u[0] * u[1] > 0, u[0] * u[1] < 0)):
+        x_, y_, grey = px[:, far & side]
+        moments[row] = [
+            np.sum(v) for v in (x_ * 0 + 1, x_, y_, x_**2, x_ * y_, y_**2, grey, grey * x_, grey * y_, grey**2)
+        ]
+    found = []
+    for pixels, flat in ((px, np.zeros_like(moments)), (px[:, ~far], moments)):
+        H = np.zeros((crossing.PARAMETERS + 1, crossing.PARAMETERS + 2))
+        work, n = crossing_work(pixels), pixels.shape[1]
+        cost = crossing._assemble(n, work, flat, 0.0, 0.0, Q, SIDES, BOW, H)
+        found.append(np.append(H[np.tril_indices(crossing.PARAMETERS)], [*H[crossing.PARAMETERS, :10], cost]))
+    scale = np.abs(found[0]) + 1e-3 * np.abs(found[0]).max()
+    assert (np.abs(found[1] - found[0]) / scale).max() < 1e-4  # single precision on one side only
 
 
 def test_a_start_far_off_is_refused():
@@ -149,3 +182,15 @@ def test_contrast_tells_the_colours_and_does_not_depend_on_which_way_the_sides_p
     assert fit.contrast[0] < -50  # checks are dark between the first and the second side
     np.testing.assert_allclose(fit.contrast[1], fit.contrast[0], rtol=1e-3)
     np.testing.assert_allclose(fit.contrast[2], -fit.contrast[0], rtol=1e-3)
+
+
+def test_edges_in_single_precision_are_those_from_tables():
+    u = np.linspace(-15.0, 15.0, 3001)
+    for s, w in ((0.17, 1.0), (0.5, 0.8), (1.3, 0.71)):
+        # Tables end at four sigma, where 6e-5 is left and a density of 1.3e-4.
+        exact = np.array([edge(x, s, w) for x in u])
+        arguments = (1.0 / s, 2.0 * s, 0.5 * w, 1.0 / w)
+        single = np.array([edge_single(np.float32(x), *map(np.float32, arguments)) for x in u])
+        np.testing.assert_allclose(single, exact, atol=5e-4)
+        inside = np.abs(u) < 4.0 * s - 0.5 * w  # both ends of the box are within the tables
+        np.testing.assert_allclose(single[inside], exact[inside], atol=1e-5)

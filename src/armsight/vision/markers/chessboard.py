@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
-from armsight.vision.markers.corner import VERDICTS, CornerFits, refine_corners
+from armsight.vision.markers.corner import VERDICTS, CornerFits, crossed, refine_corners
 from armsight.vision.markers.grid import grid_points, local_squares, rotations
 from armsight.vision.markers.spec import Fields
 
@@ -64,9 +64,14 @@ class Chessboard(Record):
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     @cached_property
+    def _turns(self) -> tuple[tuple[int, Ids], ...]:
+        """The quarter turns that lay the board on itself, colours aside."""
+        return rotations(self.body.points)
+
+    @cached_property
     def flips(self) -> tuple[Ids, ...]:
         """Permutations (M,) under which the board looks the same, without identity: corner i may as well be perm[i]."""
-        return tuple(perm for turns, perm in rotations(self.body.points) if not self._colours_tell(turns))
+        return tuple(perm for turns, perm in self._turns if not self._colours_tell(turns))
 
     def _colours_tell(self, turns: int) -> bool:
         """Whether a rotation by so many quarter turns exchanges dark and bright."""
@@ -90,7 +95,7 @@ class Chessboard(Record):
         kept = kept[order]
         return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
 
-    @property
+    @cached_property
     def _parity(self) -> Array:
         """(M,) +1 where the square right and below of a corner has the colour of the first square, else -1."""
         y, x = np.mgrid[: self.rows, : self.columns]
@@ -105,9 +110,8 @@ class Chessboard(Record):
         """Return (M,) the permutation that brings fits into the board's order."""
         here = np.arange(self.columns * self.rows)
         first_is_dark = float(np.sum((np.sign(fits.contrast) * self._parity)[fits.kept])) < 0
-        turns = rotations(self.body.points)
-        orders = [here, *(perm for _, perm in turns)]
-        dark = [first_is_dark, *(first_is_dark != self._colours_tell(n) for n, _ in turns)]
+        orders = [here, *(perm for _, perm in self._turns)]
+        dark = [first_is_dark, *(first_is_dark != self._colours_tell(n) for n, _ in self._turns)]
         if any(dark):
             orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
         uv = np.where(fits.kept[:, None], fits.uv, np.nan).reshape(self.rows, self.columns, 2)
@@ -153,12 +157,11 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
     Returns:
         The fits row by row; one without a rough place is not kept.
     """
-    uv = rough
-    for first in (True, False):
-        squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv))
-        fits = refine_corners(image, uv.reshape(-1, 2), squares, None if first else bows, arm=arm, rough=first)
-        uv = np.where(fits.kept[:, None], fits.uv, rough.reshape(-1, 2)).reshape(rough.shape)
-    return fits
+    places = rough.reshape(-1, 2)
+    first = refine_corners(image, places, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
+    uv = np.where(first.kept[:, None], first.uv, places)
+    squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv.reshape(rough.shape)))
+    return refine_corners(image, uv, squares, bows, arm=arm, like=first)
 
 
 def goes_on(
@@ -175,14 +178,17 @@ def goes_on(
     """
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
     squares = local_squares(uv)[0]
-    sign = np.sign(np.nansum(np.where(kept, fits.contrast * parity, 0.0))) * parity.reshape(shape)
+    sign = np.sign((fits.contrast * parity)[kept].sum()) * parity.reshape(shape)
     for turned in range(4):
         grid, sides, colour = (np.rot90(array, turned) for array in (uv, squares, sign))
         beyond = 2 * grid[0] - grid[1]
-        known = np.isfinite(beyond).all(axis=1)
-        more = refine_corners(image, beyond[known], np.ascontiguousarray(sides[0][known]), rough=True)
-        alike = more.kept & (np.sign(more.contrast) == -colour[0][known])
-        if known.sum() >= 3 and alike.sum() >= MORE_SHARE * known.sum():
+        known = np.isfinite(beyond[:, 0])
+        least = max(3.0, MORE_SHARE * np.count_nonzero(known))
+        beyond, sides, colour = beyond[known], np.ascontiguousarray(sides[0][known]), -colour[0][known]
+        if np.count_nonzero(crossed(image, beyond, sides) == colour) < least:
+            continue
+        more = refine_corners(image, beyond, sides, rough=True)
+        if np.count_nonzero(more.kept & (np.sign(more.contrast) == colour)) >= least:
             return True
     return False
 

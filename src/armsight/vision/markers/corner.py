@@ -24,18 +24,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.vision.markers.crossing import PARAMETERS, first_guess, fit_crossing
-from armsight.vision.markers.normal import edge_noise, invert
+from armsight.vision.markers.crossing import (
+    LANES,
+    MOMENTS,
+    PARAMETERS,
+    WORK,
+    Work,
+    edge_noise,
+    first_guess,
+    fit_crossing,
+)
+from armsight.vision.markers.window import WINDOW_MAX_PX, WINDOW_SHARE, fill_up, gather, reach_px, thin
 
-#: How far the window reaches along each square's side, as a share of the side, and at most in px. The next corners
-#: stay out of it with their blur.
-WINDOW_SHARE, WINDOW_MAX_PX = 0.42, 12.0
-#: Where squares carry a print, this much more room is left beside it, px, for its blur.
-ARM_GAP_PX = 1.5
+#: How far the window of a first fit reaches at most, px.
+WINDOW_ROUGH_PX = 8.0
 #: The blur a fit starts with.
 START_BLUR_PX = 1.0
-#: A fit with many more pixels than this is first made with about so many.
-PIXELS_FIRST = 100
+#: Pixels further from an edge than so many sigmas of its blur, and these px, are of plain squares. The error left is
+#: 5e-4 of the contrast at the most; a rough place asks for more room.
+NEAR_SIGMAS, NEAR_PX, NEAR_ROUGH_PX = 3.5, 0.25, 0.75
+#: A fit ends with the step that lowers the sum of squares by less than this share of one pixel's noise, a first one by
+#: less than this.
+STOP, STOP_ROUGH = 0.05, 20.0
+#: A window whose opposite quadrants differ by less, grey levels, shows nothing.
+PLAIN = 1.0
 #: A start further off than this leaves the window off centre; it is drawn again about the corner.
 RECENTRE_PX = 0.5
 #: A fit that ends further from its start has found something else: share of the shorter side, and px.
@@ -63,49 +75,34 @@ class CornerFits(Record):
     """What became of each corner.
 
     Attributes:
-        uv: (N, 2) refined places, raw pixels; meaningless where the verdict is not 0.
+        models: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k (2).
         cov_uv: (N, 2, 2) covariance from each fit's own residuals, px^2.
-        contrast: (N,) signed half step between the squares, grey levels; the sign tells the colours: positive where the
-            square between the first and the second side is bright.
         residual: (N,) standard deviation of the residuals at the edges, grey levels.
-        blur_px: (N, 2) standard deviation of the blur across each of the two edges, the pixel's width aside.
         verdict: (N,) index into VERDICTS; 0 is kept.
     """
 
-    uv: Array
+    models: Array
     cov_uv: Array
-    contrast: Array
     residual: Array
-    blur_px: Array
     verdict: Ids
+
+    @property
+    def uv(self) -> Array:
+        """(N, 2) refined places, raw pixels; meaningless where the verdict is not 0."""
+        return self.models[:, :2]
+
+    @property
+    def contrast(self) -> Array:
+        """(N,) signed half step between the squares, grey levels.
+
+        The sign tells the colours: positive where the square between the first and the second side is bright.
+        """
+        return self.models[:, 7]
 
     @property
     def kept(self) -> NDArray[np.bool_]:
         """(N,) whether a corner's fit is good."""
         return np.asarray(self.verdict == _KEPT)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _gather(image: NDArray[np.uint8], c: Array, square: Array, arm: float, px: Array) -> int:
-    """Collect the pixels of the window about c into px (3, n): x, y, grey; return how many."""
-    height, width = image.shape
-    s1, s2 = np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1])
-    m1, m2 = min(WINDOW_SHARE, WINDOW_MAX_PX / s1), min(WINDOW_SHARE, WINDOW_MAX_PX / s2)
-    arm1, arm2 = max(0.5 * arm, arm - ARM_GAP_PX / s1), max(0.5 * arm, arm - ARM_GAP_PX / s2)
-    det = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
-    rx = m1 * abs(square[0, 0]) + m2 * abs(square[1, 0])
-    ry = m1 * abs(square[0, 1]) + m2 * abs(square[1, 1])
-    n = 0
-    for y in range(max(0, int(np.ceil(c[1] - ry))), min(height - 1, int(c[1] + ry)) + 1):
-        for x in range(max(0, int(np.ceil(c[0] - rx))), min(width - 1, int(c[0] + rx)) + 1):
-            dx, dy = x - c[0], y - c[1]
-            u = (dx * square[1, 1] - dy * square[1, 0]) / det
-            v = (dy * square[0, 0] - dx * square[0, 1]) / det
-            clean = abs(u) <= arm1 or abs(v) <= arm2
-            if clean and abs(u) <= m1 and abs(v) <= m2 and n < px.shape[1]:
-                px[0, n], px[1, n], px[2, n] = x, y, image[y, x]
-                n += 1
-    return n
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -116,46 +113,50 @@ def _place(
     bow: Array,
     arm: float,
     rough: bool,
-    px: Array,
+    known: bool,
+    w: Work,
     q: Array,
-    J: Array,
-    r: Array,
     L: Array,
 ) -> int:
-    """Fit one corner; q, J, r and L are left at the solution. Return how many pixels were fitted, or minus a verdict."""
+    """Fit one corner, from q where that is known; q, w and L are left at the solution.
+
+    Return how many pixels near the edges were fitted, or minus a verdict.
+    """
     if not np.isfinite(start[0] + start[1] + square.sum()):
         return -_BORDER
-    sides, centre = np.empty((2, 2)), np.empty(2)
+    sides, centre, near, flat = np.empty((2, 2)), np.empty(2), np.empty(2), np.empty((2, MOMENTS))
     for j in range(2):
         sides[j] = square[j] / np.hypot(square[j, 0], square[j, 1])
-    n = _gather(image, start, square, arm, px)
-    if n < 3 * PARAMETERS:
-        return -_BORDER
-    first_guess(n, px, start, square, START_BLUR_PX, q)
-    step = n // PIXELS_FIRST
-    if step > 1:  # a share of the pixels finds the corner faster, and all of them place it
-        few = np.empty((3, (n + step - 1) // step))
-        few[:] = px[:, :n:step]
-        if not fit_crossing(few.shape[1], few, q, sides, bow, J, r, L):
+    if not known:  # a share of the pixels finds the corner faster, and all of them place it
+        near[:] = NEAR_SIGMAS * np.sqrt(START_BLUR_PX**2 + 1.0 / 12.0) + NEAR_ROUGH_PX
+        n = gather(image, start, square, bow, arm, WINDOW_ROUGH_PX, near, w, flat)
+        if n < LANES or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
+            return -_BORDER
+        n = thin(n, w, flat)
+        fill_up(n, w)
+        x0, y0 = np.rint(start[0]), np.rint(start[1])
+        first_guess(n, w, flat, x0, y0, start, square, START_BLUR_PX, q)
+        if abs(q[7]) < PLAIN:
+            return -_FAINT
+        if not fit_crossing(n, w, flat, x0, y0, q, sides, bow, L, STOP_ROUGH):
             return -_DIVERGED
         if rough:
-            return few.shape[1]
+            return n
     for _ in range(2):
         centre[:] = q[:2]
-        if np.hypot(centre[0] - start[0], centre[1] - start[1]) > RECENTRE_PX:
-            n = _gather(image, centre, square, arm, px)
-        if n < 3 * PARAMETERS or not fit_crossing(n, px, q, sides, bow, J, r, L):
+        if not (abs(centre[0] - start[0]) + abs(centre[1] - start[1]) < 2.0 * WINDOW_MAX_PX):
+            return -_DIVERGED
+        for j in range(2):
+            near[j] = NEAR_SIGMAS * np.sqrt(q[4 + j] + 1.0 / 12.0) + NEAR_PX
+        n = gather(image, centre, square, bow, arm, WINDOW_MAX_PX, near, w, flat)
+        if n < LANES or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
+            return -_DIVERGED
+        fill_up(n, w)
+        if not fit_crossing(n, w, flat, np.rint(centre[0]), np.rint(centre[1]), q, sides, bow, L, STOP):
             return -_DIVERGED
         if np.hypot(q[0] - centre[0], q[1] - centre[1]) < RECENTRE_PX:
             break
     return n
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _reach(square: Array) -> float:
-    """Return how far the window reaches along the shorter side of a square, px."""
-    shorter = min(np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1]))
-    return float(min(WINDOW_SHARE * shorter, WINDOW_MAX_PX))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -166,37 +167,62 @@ def _refine(
     bows: Array,
     arm: float,
     rough: bool,
-    uv: Array,
+    known: NDArray[np.bool_],
+    models: Array,
     cov: Array,
-    about: Array,
+    residual: Array,
     verdict: Ids,
 ) -> None:
-    """Fit every corner; about (N, 4) receives contrast, residual and the two blurs."""
-    size = int((2 * WINDOW_MAX_PX + 2) ** 2 * 2)
-    px, J, r = np.empty((3, size)), np.empty((PARAMETERS, size)), np.empty(size)
-    L, inverse, q = np.zeros((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    """Fit every corner; models (N, PARAMETERS) holds the starts of those that are known, and receives the solutions."""
+    w, L = np.zeros(WORK, np.float32), np.zeros((PARAMETERS, PARAMETERS))
     for i in range(uv0.shape[0]):
-        uv[i] = uv0[i]
-        n = _place(image, uv0[i], squares[i], bows[i], arm, rough, px, q, J, r, L)
+        q = models[i]
+        n = _place(image, uv0[i], squares[i], bows[i], arm, rough, known[i], w, q, L)
         if n < 0:
             verdict[i] = -n
             continue
-        uv[i] = q[:2]
-        invert(L, inverse)
-        variance = edge_noise(n, J, r, inverse, 0, 1)
-        cov[i] = variance * inverse[:2, :2]
-        about[i, 1] = np.sqrt(variance)
-        about[i, 0], about[i, 2], about[i, 3] = q[7], np.sqrt(q[4]), np.sqrt(q[5])
-        reach = _reach(squares[i])
+        residual[i] = np.sqrt(edge_noise(n, w, L, cov[i]))
+        reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
             verdict[i] = _MOVED
         elif not abs(q[7]) >= 0.5 * CONTRAST_MIN:
             verdict[i] = _FAINT
-        elif about[i, 1] > MISFIT_MAX * abs(q[7]) or max(about[i, 2], about[i, 3]) > reach:
+        elif residual[i] > MISFIT_MAX * abs(q[7]) or np.sqrt(max(q[4], q[5])) > reach:
             verdict[i] = _MISFIT
         else:
             verdict[i] = _KEPT
+
+
+@numba.njit(cache=True, error_model="numpy")
+def crossed(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
+    """Tell where squares of two colours may cross, at a glance.
+
+    Args:
+        image: (H, W) grey image.
+        uv: (N, 2) places, raw pixels, right to a quarter of a square.
+        squares: (N, 2, 2) the two sides of the square at each place, px.
+
+    Returns:
+        (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
+        both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
+    """
+    out, means = np.zeros(len(uv)), np.empty((2, 2))
+    for n in range(len(uv)):
+        inside = True
+        for i in range(2):
+            for j in range(2):
+                p = uv[n] + 0.25 * ((1 - 2 * i) * squares[n, 0] + (1 - 2 * j) * squares[n, 1])
+                x, y = int(np.rint(p[0])), int(np.rint(p[1]))
+                if not (1 <= x < image.shape[1] - 1 and 1 <= y < image.shape[0] - 1):
+                    inside = False
+                    continue
+                means[i, j] = image[y - 1 : y + 2, x - 1 : x + 2].sum()
+        if inside and min(means[0, 0], means[1, 1]) > max(means[0, 1], means[1, 0]):
+            out[n] = 1.0
+        elif inside and max(means[0, 0], means[1, 1]) < min(means[0, 1], means[1, 0]):
+            out[n] = -1.0
+    return out
 
 
 def refine_corners(
@@ -207,6 +233,7 @@ def refine_corners(
     *,
     arm: float = 1.0,
     rough: bool = False,
+    like: CornerFits | None = None,
 ) -> CornerFits:
     """Fit X corners.
 
@@ -218,14 +245,20 @@ def refine_corners(
             straight by default.
         arm: how far from the edges the squares are plain, as a share of a side; what lies further from both edges is
             not looked at. The squares of a charuco board are plain only along their sides.
-        rough: fit a share of the pixels only, in a third of the time; good to some hundredths of a pixel.
+        rough: fit a share of the pixels only, in half the time; good to some hundredths of a pixel.
+        like: earlier fits of the same corners at uv; those it kept are where the fits start, in half the time.
 
     Returns:
         The fits, in the order given.
     """
     n = len(uv)
-    out, cov, about, verdict = np.empty((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 4)), np.zeros(n, np.int64)
-    bows = np.zeros((n, 2, 2)) if bows is None else bows
-    uv, squares, bows = (np.ascontiguousarray(a, dtype=np.float64) for a in (uv, squares, bows))
-    _refine(np.ascontiguousarray(image), uv, squares, bows, arm, rough, out, cov, about, verdict)
-    return CornerFits(out, cov, about[:, 0], about[:, 1], about[:, 2:], verdict)
+    uv, squares = np.ascontiguousarray(uv, dtype=np.float64), np.ascontiguousarray(squares, dtype=np.float64)
+    bows = np.zeros((n, 2, 2)) if bows is None else np.ascontiguousarray(bows, dtype=np.float64)
+    if like is None:
+        known, models = np.zeros(n, np.bool_), np.zeros((n, PARAMETERS))
+        models[:, :2] = uv
+    else:
+        known, models = like.kept, np.array(like.models)
+    cov, residual, verdict = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
+    _refine(np.ascontiguousarray(image), uv, squares, bows, arm, rough, known, models, cov, residual, verdict)
+    return CornerFits(models, cov, residual, verdict)

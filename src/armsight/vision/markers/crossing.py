@@ -1,86 +1,182 @@
-"""The compiled image model of two crossing edges and its fit; what it means is told in ``corner.py``."""
+"""The compiled image model of two crossing edges and its fit; what it means is told in ``corner.py``.
+
+Pixels near an edge are evaluated one by one, in single precision and without branches so that they fill the processor's
+vectors: grey levels have eight bits, single precision has 24. Pixels further off lie on a plain square, M is 1 or -1
+there, and what they say about the light is in their moments: they cost nothing however many they are.
+"""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.edge import edge
-from armsight.vision.markers.normal import factor, normal_equations, solve
+from armsight.vision.markers.edge import decay_single, edge_single
+from armsight.vision.markers.normal import factor, solve
+
+Work = NDArray[np.float32]
 
 PARAMETERS = 10  # c (2), edge angles (2), squared blurs (2), a, b, k (2)
+#: Length of a row of the work space: the most pixels a window has near its edges, and some to fill the last vector.
+ROOM = 1424
+#: Rows of the work space: x, y, grey, the derivatives by the parameters, the residual, one to fill the last tile.
+Y, GREY, JACOBIAN, _R = ROOM, 2 * ROOM, 3 * ROOM, (3 + PARAMETERS) * ROOM
+WORK = (5 + PARAMETERS) * ROOM
+#: Pixels are worked on by so many at once; rows are filled up to a multiple of it.
+LANES = 16
+#: Moments of the pixels of plain squares of one colour: n, x, y, xx, xy, yy, I, Ix, Iy, II.
+MOMENTS = 10
 _STEPS = 25
-_STOP = 0.05  # a step is the last when it lowers the cost by less than this share of one pixel's noise
-_STALL = 0.05  # the same, for a step that the cost's small kinks keep from lowering it
-_LAMBDA = 1e-2
+_LAMBDA = 1e-3
 _BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
 #: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It decides
 #: only what the pixels leave open: the blur of an edge that falls between two pixels.
 _BLUR2_PRIOR = (0.25, 0.25)
 
+_f = np.float32
+_ZERO, _HALF, _ONE, _TWO = _f(0.0), _f(0.5), _f(1.0), _f(2.0)
+_TWO_OVER_PI, _THIRD = _f(2.0 / np.pi), _f(1.0 / 3.0)
+
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _evaluate(n: int, px: Array, q: Array, sides: Array, bow: Array, J: Array, r: Array) -> float:
-    """Fill residuals r (n,) and derivatives J (10, n) of the pixels px (3, n) at parameters q; return the cost."""
+def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow: Array) -> None:
+    """Fill residuals and derivatives of the n pixels in the work space w at parameters q.
+
+    The pixels' x and y are counted from x0, y0.
+    """
     # Everything constant is a local: what is read from an array in the loop is read again for every pixel.
-    cx, cy, _, _, _, _, middle, half, kx, ky = q
-    n1x, n1y, n2x, n2y = np.cos(q[2]), np.sin(q[2]), np.cos(q[3]), np.sin(q[3])
-    (s1x, s1y), (s2x, s2y) = sides
-    (b1x, b1y), (b2x, b2y) = bow
+    cx, cy, middle, half, kx, ky = _f(q[0] - x0), _f(q[1] - y0), _f(q[6]), _f(q[7]), _f(q[8]), _f(q[9])
+    n1x, n1y, n2x, n2y = _f(np.cos(q[2])), _f(np.sin(q[2])), _f(np.cos(q[3])), _f(np.sin(q[3]))
+    s1x, s1y, s2x, s2y = _f(sides[0, 0]), _f(sides[0, 1]), _f(sides[1, 0]), _f(sides[1, 1])
+    b1x, b1y, b2x, b2y = _f(bow[0, 0]), _f(bow[0, 1]), _f(bow[1, 0]), _f(bow[1, 1])
     # A pixel's shadows across each edge, from the edges' first directions: constants of the fit.
-    width1, width2 = np.abs(sides[0]).max(), np.abs(sides[1]).max()
-    blur1 = np.sqrt(q[4] + (1.0 - width1 * width1) / 12.0)
-    blur2 = np.sqrt(q[5] + (1.0 - width2 * width2) / 12.0)
-    rho, drho = np.cos(q[2] - q[3]), np.sin(q[3] - q[2])
-    rho2, rho3 = 0.5 * rho * rho, rho * rho * rho / 6.0
-    k1, k2 = 1.0 / np.sqrt(q[4] + 1.0 / 12.0), 1.0 / np.sqrt(q[5] + 1.0 / 12.0)
-    bow1 = 2.0 * (n1x * b1x + n1y * b1y)
-    bow2 = 2.0 * (n2x * b2x + n2y * b2y)
-    cost = ((q[4] - _BLUR2_PRIOR[0]) ** 2 + (q[5] - _BLUR2_PRIOR[0]) ** 2) / _BLUR2_PRIOR[1] ** 2
+    width1, width2 = max(abs(s1x), abs(s1y)), max(abs(s2x), abs(s2y))
+    blur1 = _f(np.sqrt(q[4] + (1.0 - width1 * width1) / 12.0))
+    blur2 = _f(np.sqrt(q[5] + (1.0 - width2 * width2) / 12.0))
+    per_s1, per_s2, two_s1, two_s2 = _ONE / blur1, _ONE / blur2, _TWO * blur1, _TWO * blur2
+    half_w1, half_w2, per_w1, per_w2 = _HALF * width1, _HALF * width2, _ONE / width1, _ONE / width2
+    half_per_s1, half_per_s2 = _HALF * per_s1, _HALF * per_s2
+    rho, drho = _f(np.cos(q[2] - q[3])), _f(np.sin(q[3] - q[2]))
+    rho2, rho3 = _HALF * rho * rho, rho * rho * rho * _HALF * _THIRD
+    k1, k2 = _f(1.0 / np.sqrt(q[4] + 1.0 / 12.0)), _f(1.0 / np.sqrt(q[5] + 1.0 / 12.0))
+    bow1 = _TWO * (n1x * b1x + n1y * b1y)
+    bow2 = _TWO * (n2x * b2x + n2y * b2y)
     for i in range(n):
-        dx, dy = px[0, i] - cx, px[1, i] - cy
+        dx, dy = w[i] - cx, w[Y + i] - cy
         t1 = dx * s1x + dy * s1y
         t2 = dx * s2x + dy * s2y
         x1, y1 = dx - b1x * t1 * t1, dy - b1y * t1 * t1
         x2, y2 = dx - b2x * t2 * t2, dy - b2y * t2 * t2
         u1, u2 = n1x * x1 + n1y * y1, n2x * x2 + n2y * y2
-        e1, d1, f1 = edge(u1, blur1, width1)
-        e2, d2, f2 = edge(u2, blur2, width2)
-        light = 1.0 + kx * dx + ky * dy
+        e1, d1, f1 = edge_single(u1, per_s1, two_s1, half_w1, per_w1)
+        e2, d2, f2 = edge_single(u2, per_s2, two_s2, half_w2, per_w2)
+        light = _ONE + kx * dx + ky * dy
         scale = half * light
-        M, g1, g2, h, c1, c2 = e1 * e2, d1 * e2, d2 * e1, 0.0, 0.0, 0.0
         z1, z2 = u1 * k1, u2 * k2
-        if z1 * z1 + z2 * z2 < 25.0:
-            w1, w2 = z1 * z1 - 1.0, z2 * z2 - 1.0
-            ff = (2.0 / np.pi) * np.exp(-0.5 * (z1 * z1 + z2 * z2))
-            series = rho + rho2 * z1 * z2 + rho3 * w1 * w2
-            M += ff * series
-            c1 = ff * k1 * (rho2 * z2 + 2.0 * rho3 * z1 * w2 - z1 * series)
-            c2 = ff * k2 * (rho2 * z1 + 2.0 * rho3 * z2 * w1 - z2 * series)
-            g1 += c1
-            g2 += c2
-            h = ff * (1.0 + rho * z1 * z2 + 0.5 * rho * rho * w1 * w2) * drho * scale
+        w1, w2 = z1 * z1 - _ONE, z2 * z2 - _ONE
+        ff = _TWO_OVER_PI * decay_single(_HALF * (z1 * z1 + z2 * z2))
+        series = rho + rho2 * z1 * z2 + rho3 * w1 * w2
+        M = e1 * e2 + ff * series
+        c1 = ff * k1 * (rho2 * z2 + _TWO * rho3 * z1 * w2 - z1 * series)
+        c2 = ff * k2 * (rho2 * z1 + _TWO * rho3 * z2 * w1 - z2 * series)
+        g1, g2 = scale * (d1 * e2 + c1), scale * (d2 * e1 + c2)
+        h = ff * (_ONE + rho * z1 * z2 + rho2 * w1 * w2) * drho * scale
         level = middle + half * M
-        g1 *= scale
-        g2 *= scale
-        J[0, i] = -g1 * (n1x - bow1 * t1 * s1x) - g2 * (n2x - bow2 * t2 * s2x) - kx * level
-        J[1, i] = -g1 * (n1y - bow1 * t1 * s1y) - g2 * (n2y - bow2 * t2 * s2y) - ky * level
-        J[2, i] = g1 * (n1x * y1 - n1y * x1) + h
-        J[3, i] = g2 * (n2x * y2 - n2y * x2) - h
-        J[4, i] = scale * 0.5 * (f1 * e2 / blur1 - c1 * u1 * k1 * k1)
-        J[5, i] = scale * 0.5 * (f2 * e1 / blur2 - c2 * u2 * k2 * k2)
-        J[6, i] = light
-        J[7, i] = light * M
-        J[8, i] = level * dx
-        J[9, i] = level * dy
-        r[i] = px[2, i] - light * level
-        cost += r[i] * r[i]
+        w[_R + i] = w[GREY + i] - light * level
+        w[JACOBIAN + i] = -g1 * (n1x - bow1 * t1 * s1x) - g2 * (n2x - bow2 * t2 * s2x) - kx * level
+        w[JACOBIAN + ROOM + i] = -g1 * (n1y - bow1 * t1 * s1y) - g2 * (n2y - bow2 * t2 * s2y) - ky * level
+        w[JACOBIAN + 2 * ROOM + i] = g1 * (n1x * y1 - n1y * x1) + h
+        w[JACOBIAN + 3 * ROOM + i] = g2 * (n2x * y2 - n2y * x2) - h
+        w[JACOBIAN + 4 * ROOM + i] = scale * (half_per_s1 * f1 * e2 - _HALF * c1 * z1 * k1)
+        w[JACOBIAN + 5 * ROOM + i] = scale * (half_per_s2 * f2 * e1 - _HALF * c2 * z2 * k2)
+        w[JACOBIAN + 6 * ROOM + i] = light
+        w[JACOBIAN + 7 * ROOM + i] = light * M
+        w[JACOBIAN + 8 * ROOM + i] = level * dx
+        w[JACOBIAN + 9 * ROOM + i] = level * dy
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _products(n: int, w: Work, H: Array) -> None:
+    """Fill the lower half of H (11, 12) with the products of derivatives and residuals, summed over n pixels."""
+    for i in range(PARAMETERS + 1):
+        o = JACOBIAN + i * ROOM
+        a = w[o : o + n]
+        for j in range(0, i + 1, 4):
+            o = JACOBIAN + j * ROOM
+            b0, b1 = w[o : o + n], w[o + ROOM : o + ROOM + n]
+            b2, b3 = w[o + 2 * ROOM : o + 2 * ROOM + n], w[o + 3 * ROOM : o + 3 * ROOM + n]
+            s0, s1, s2, s3 = _ZERO, _ZERO, _ZERO, _ZERO
+            for m in range(n):
+                s0 += a[m] * b0[m]
+                s1 += a[m] * b1[m]
+                s2 += a[m] * b2[m]
+                s3 += a[m] * b3[m]
+            H[i, j], H[i, j + 1], H[i, j + 2], H[i, j + 3] = s0, s1, s2, s3
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _add_plain(flat: Array, x0: float, y0: float, q: Array, H: Array) -> None:
+    """Add to H what the plain squares say: there the image is linear in x and y, and moments are all it takes."""
+    cx, cy, kx, ky = q[0] - x0, q[1] - y0, q[8], q[9]
+    B, S, p = np.zeros((PARAMETERS, 3)), np.empty((3, 3)), np.empty(3)
+    p[0], p[1], p[2] = 1.0 - kx * cx - ky * cy, kx, ky
+    for k in range(2):
+        m, sign = flat[k], 1.0 - 2.0 * k
+        level = q[6] + sign * q[7]
+        B[0, 0], B[1, 0] = -kx * level, -ky * level
+        B[8, 0], B[8, 1], B[9, 0], B[9, 2] = -cx * level, level, -cy * level, level
+        S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = m[0], m[1], m[2], m[3], m[4], m[5]
+        S[1, 0], S[2, 0], S[2, 1] = m[1], m[2], m[4]
+        gx, gy, gz = m[6], m[7], m[8]
+        cost = m[9]
+        for i in range(3):
+            B[6, i], B[7, i] = p[i], sign * p[i]
+            cost -= 2.0 * level * p[i] * m[6 + i]
+            for j in range(3):
+                cost += level * level * p[i] * S[i, j] * p[j]
+        gx -= level * (S[0, 0] * p[0] + S[0, 1] * p[1] + S[0, 2] * p[2])
+        gy -= level * (S[1, 0] * p[0] + S[1, 1] * p[1] + S[1, 2] * p[2])
+        gz -= level * (S[2, 0] * p[0] + S[2, 1] * p[1] + S[2, 2] * p[2])
+        for i in (0, 1, 6, 7, 8, 9):
+            v0 = B[i, 0] * S[0, 0] + B[i, 1] * S[1, 0] + B[i, 2] * S[2, 0]
+            v1 = B[i, 0] * S[0, 1] + B[i, 1] * S[1, 1] + B[i, 2] * S[2, 1]
+            v2 = B[i, 0] * S[0, 2] + B[i, 1] * S[1, 2] + B[i, 2] * S[2, 2]
+            H[PARAMETERS, i] += B[i, 0] * gx + B[i, 1] * gy + B[i, 2] * gz
+            for j in (0, 1, 6, 7, 8, 9):
+                if j <= i:
+                    H[i, j] += v0 * B[j, 0] + v1 * B[j, 1] + v2 * B[j, 2]
+        H[PARAMETERS, PARAMETERS] += cost
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _assemble(
+    n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, H: Array
+) -> float:
+    """Fill the normal equations at q: H (11, 12), lower half, its last row the gradient; return the cost."""
+    full = (n + LANES - 1) // LANES * LANES
+    evaluate(full, w, x0, y0, q, sides, bow)
+    for i in range(PARAMETERS + 1):
+        for m in range(JACOBIAN + i * ROOM + n, JACOBIAN + i * ROOM + full):
+            w[m] = _ZERO
+    _products(full, w, H)
+    _add_plain(flat, x0, y0, q, H)
+    mean, weight = _BLUR2_PRIOR[0], 1.0 / _BLUR2_PRIOR[1] ** 2
+    cost = H[PARAMETERS, PARAMETERS]
+    for i in (4, 5):
+        H[i, i] += weight
+        H[PARAMETERS, i] += weight * (mean - q[i])
+        cost += weight * (mean - q[i]) ** 2
+        if q[i] < 1.001 * _BLUR2_MIN and H[PARAMETERS, i] < 0.0:  # at its bound: held there for this step
+            H[i, i] *= 1e9
+            H[PARAMETERS, i] = 0.0
     return float(cost)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def first_guess(n: int, px: Array, c: Array, square: Array, blur: float, q: Array) -> None:
+def first_guess(
+    n: int, w: Work, flat: Array, x0: float, y0: float, c: Array, square: Array, blur: float, q: Array
+) -> None:
     """Set the parameters from the squares' shape and the mean grey of opposite quadrants."""
     q[:] = 0.0
     q[0], q[1], q[4], q[5] = c[0], c[1], blur * blur, blur * blur
@@ -88,52 +184,53 @@ def first_guess(n: int, px: Array, c: Array, square: Array, blur: float, q: Arra
     q[2] = np.arctan2(turn * square[0, 0], -turn * square[0, 1])  # the normal of side 0 points to side 1
     q[3] = np.arctan2(-turn * square[1, 0], turn * square[1, 1])  # and the other way round
     n1x, n1y, n2x, n2y = np.cos(q[2]), np.sin(q[2]), np.cos(q[3]), np.sin(q[3])
-    total, signed = 0.0, 0.0
+    cx, cy = c[0] - x0, c[1] - y0
+    count, total, signed = flat[0, 0] + flat[1, 0] + n, flat[0, 6] + flat[1, 6], flat[0, 6] - flat[1, 6]
     for i in range(n):
-        dx, dy = px[0, i] - c[0], px[1, i] - c[1]
-        u1, u2 = n1x * dx + n1y * dy, n2x * dx + n2y * dy
-        total += px[2, i]
-        signed += px[2, i] if u1 * u2 > 0 else -px[2, i]
-    q[6], q[7] = total / n, signed / n
+        dx, dy, grey = w[i] - cx, w[Y + i] - cy, w[GREY + i]
+        total += grey
+        signed += grey if (n1x * dx + n1y * dy) * (n2x * dx + n2y * dy) > 0 else -grey
+    q[6], q[7] = total / count, signed / count
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _prior(q: Array, A: Array, g: Array) -> None:
-    """Add the blurs' prior to the normal equations A, g, and hold a blur that is at its bound."""
-    mean, weight = _BLUR2_PRIOR[0], 1.0 / _BLUR2_PRIOR[1] ** 2
-    for i in (4, 5):
-        A[i, i] += weight
-        g[i] += weight * (mean - q[i])
-        if q[i] < 1.001 * _BLUR2_MIN and g[i] < 0.0:  # at its bound: held there for this step
-            A[i, i] *= 1e9
-            g[i] = 0.0
+def fit_crossing(
+    n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, L: Array, stop: float
+) -> bool:
+    """Minimise from q by Levenberg-Marquardt; the work space and L are left at the solution. False if it does not settle.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def fit_crossing(n: int, px: Array, q: Array, sides: Array, bow: Array, J: Array, r: Array, L: Array) -> bool:
-    """Minimise from q by Levenberg-Marquardt; J, r, L are left at the solution. False where it does not settle."""
-    A, g, x, trial = (
-        np.empty((PARAMETERS, PARAMETERS)),
-        np.empty(PARAMETERS),
-        np.empty(PARAMETERS),
-        np.empty(PARAMETERS),
-    )
-    cost = _evaluate(n, px, q, sides, bow, J, r)
-    damping = _LAMBDA
-    normal_equations(n, J, r, A, g)
-    _prior(q, A, g)
+    Args:
+        n: how many pixels there are near the edges.
+        w: (WORK,) work space; x, y from x0, y0 and grey of those pixels in its first rows.
+        flat: (2, MOMENTS) moments of the pixels of plain squares, those where M is 1 and where it is -1.
+        x0: where x is counted from, px.
+        y0: where y is counted from, px.
+        q: (PARAMETERS,) start, and solution.
+        sides: (2, 2) unit vectors along the edges.
+        bow: (2, 2) how each edge bows, 1/px.
+        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information.
+        stop: a step is the last when it lowers the cost by less than this share of one pixel's noise.
+    """
+    H, T = np.empty((PARAMETERS + 1, PARAMETERS + 2)), np.empty((PARAMETERS + 1, PARAMETERS + 2))
+    x, trial = np.empty(PARAMETERS), np.empty(PARAMETERS)
+    pixels = n + flat[0, 0] + flat[1, 0]
+    cost, damping, current = _assemble(n, w, flat, x0, y0, q, sides, bow, H), _LAMBDA, True
     for _ in range(_STEPS):
-        if not factor(A, damping, L):
+        if not factor(H, damping, L):
             return False
+        g = H[PARAMETERS, :PARAMETERS]
         solve(L, g, x)
         trial[:] = q + x
         trial[4], trial[5] = max(trial[4], _BLUR2_MIN), max(trial[5], _BLUR2_MIN)
         gain = np.dot(x, g)  # how much lower the cost should get, or a little more
-        done = damping <= 1.0 and gain < _STOP * cost / n
-        new = _evaluate(n, px, trial, sides, bow, J, r)
-        done |= max(gain, abs(new - cost)) < _STALL * cost / n
+        done = damping <= 1.0 and gain < stop * cost / pixels
+        if done and current:  # a step as small as this changes neither derivatives nor residuals
+            q[:] = trial
+            return factor(H, 0.0, L)
+        new = _assemble(n, w, flat, x0, y0, trial, sides, bow, T)
+        done |= max(gain, abs(new - cost)) < stop * cost / pixels
         if new > cost and not done:
-            damping = max(damping * 10.0, 1e-4)
+            damping, current = max(damping * 10.0, 1e-4), False
             if damping > 1e8:
                 return False
             continue
@@ -141,10 +238,48 @@ def fit_crossing(n: int, px: Array, q: Array, sides: Array, bow: Array, J: Array
             damping = max(damping * 0.1, 1e-9)
         elif cost - new < 0.2 * gain:  # the step went over a kink: sharp edges between two pixels have them
             damping = max(damping * 3.0, 1e-2)
-        q[:] = trial
-        cost = new
-        normal_equations(n, J, r, A, g)
-        _prior(q, A, g)
+        q[:], H[:], cost, current = trial, T, new, True
         if done:
-            return factor(A, 0.0, L)
+            return factor(H, 0.0, L)
     return False
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
+    """Return the variance of the noise and fill cov (2, 2), the covariance of the place.
+
+    The noise is that of the pixels that tell the place, as in ``normal.edge_noise``; here leverage is the squared length
+    of L^-1 times a pixel's derivatives.
+    """
+    inverse = np.zeros((PARAMETERS, PARAMETERS))
+    for j in range(PARAMETERS):
+        inverse[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, PARAMETERS):
+            s = 0.0
+            for m in range(j, i):
+                s -= L[i, m] * inverse[m, j]
+            inverse[i, j] = s / L[i, i]
+    jx, jy, r = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[_R : _R + n]
+    weight, power = _ZERO, _ZERO
+    for m in range(n):
+        v = jx[m] * jx[m] + jy[m] * jy[m]
+        weight += v
+        power += v * r[m] * r[m]
+    left = w[:n]  # the pixels have done their work
+    for i in range(PARAMETERS):
+        left[:] = _ZERO
+        for j in range(i + 1):
+            share, o = _f(inverse[i, j]), JACOBIAN + j * ROOM
+            row = w[o : o + n]
+            for m in range(n):
+                left[m] += share * row[m]
+        for m in range(n):
+            weight -= (jx[m] * jx[m] + jy[m] * jy[m]) * left[m] * left[m]
+    variance = max(float(power / weight), 1.0 / 12.0)
+    for i in range(2):
+        for j in range(2):
+            s = 0.0
+            for m in range(PARAMETERS):
+                s += inverse[m, i] * inverse[m, j]
+            cov[i, j] = variance * s
+    return float(variance)

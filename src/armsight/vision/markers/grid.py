@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 from armsight.data import Array, Ids
@@ -35,13 +35,6 @@ def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
     return tuple(found)
 
 
-def _neighbours(uv: Array, axis: int) -> tuple[Array, Array]:
-    """Return the steps from each point of uv (rows, columns, 2) to the next and from the previous one; NaN off the grid."""
-    gap = np.diff(uv, axis=axis)
-    none = np.full_like(np.take(uv, [0], axis=axis), np.nan)
-    return np.concatenate([gap, none], axis=axis), np.concatenate([none, gap], axis=axis)
-
-
 def local_squares(uv: Array) -> tuple[Array, Array]:
     """Read the shape of the squares around each point of a seen grid from its neighbours.
 
@@ -53,42 +46,66 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
         sides that meet, from a homography where neighbours are missing; (rows, columns, 2, 2) the bow of the grid's
         lines, 1/px: a point t px along a line lies ``t^2 * bow`` off its tangent; zero where it is not known.
     """
-    squares, bows = np.empty((*uv.shape, 2)).swapaxes(-1, -2), np.zeros((*uv.shape[:2], 2, 2))
-    for side, axis in enumerate((1, 0)):
-        after, before = _neighbours(uv, axis)
-        steps = np.stack([after, before])
-        known = np.isfinite(steps[..., 0])
-        length = np.where(known, np.linalg.norm(steps, axis=-1), np.inf).min(axis=0)
-        direction = np.where(known[..., None], steps, 0.0).sum(axis=0)
-        norm = np.linalg.norm(direction, axis=-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = direction / norm[..., None]
-            squares[..., side, :] = np.where(np.isfinite(length)[..., None], unit * length[..., None], np.nan)
-            bend = after - before
-            bend -= (bend * unit).sum(axis=-1, keepdims=True) * unit
-            bow = bend / (np.linalg.norm(steps, axis=-1) ** 2).sum(axis=0)[..., None]
-        bows[..., side, :] = _smoothed(_extended(bow, axis))
-    missing = ~np.isfinite(squares).all(axis=(-1, -2)) & np.isfinite(uv[..., 0])
+    squares, bows = np.empty((*uv.shape, 2)), np.empty((*uv.shape, 2))
+    _read_squares(np.ascontiguousarray(uv, dtype=np.float64), squares, bows)
+    missing = np.isnan(squares.sum(axis=(2, 3))) & np.isfinite(uv[..., 0])
     if missing.any():
         squares[missing] = _homography_squares(uv, missing)
     return squares, bows
 
 
-def _extended(bow: Array, axis: int) -> Array:
-    """Give the ends of each line the bow of the point beside them."""
-    bow = np.array(np.moveaxis(bow, axis, 0))
-    if len(bow) >= 3:
-        bow[0], bow[-1] = bow[1], bow[-2]
-    return np.moveaxis(bow, 0, axis)
+@numba.njit(cache=True, error_model="numpy")
+def _read_squares(uv: Array, squares: Array, bows: Array) -> None:
+    """Fill what :func:`local_squares` returns; squares without a neighbour are NaN."""
+    rows, columns = uv.shape[:2]
+    bow = np.empty((2, rows, columns, 2))
+    for y in range(rows):
+        for x in range(columns):
+            _read_side(uv, y, x, 0, 1, squares[y, x, 0], bow[0, y, x])
+            _read_side(uv, y, x, 1, 0, squares[y, x, 1], bow[1, y, x])
+    if columns >= 3:  # the ends of a line have the bow of the point beside them
+        bow[0, :, 0], bow[0, :, -1] = bow[0, :, 1], bow[0, :, -2]
+    if rows >= 3:
+        bow[1, 0], bow[1, -1] = bow[1, 1], bow[1, -2]
+    for y in range(rows):
+        for x in range(columns):
+            for side in range(2):
+                _mean_about(bow[side], y, x, bows[y, x, side])
 
 
-def _smoothed(bow: Array) -> Array:
-    """Average bow (rows, columns, 2) over each point and its known neighbours: lenses bow lines slowly over the image."""
-    known = np.isfinite(bow[..., :1]).astype(np.float64)
-    total, count = (
-        uniform_filter(array, size=(3, 3, 1), mode="constant") for array in (np.nan_to_num(bow, nan=0.0), known)
-    )
-    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 1e-9))
+@numba.njit(cache=True, error_model="numpy")
+def _read_side(uv: Array, y: int, x: int, down: int, right: int, side: Array, bow: Array) -> None:
+    """Fill the side (2,) of the square and the bow (2,) of the line at a point, along a row or a column; NaN if unknown."""
+    rows, columns = uv.shape[:2]
+    here, length, known = uv[y, x], np.inf, 0
+    sx, sy, bx, by, lengths2 = 0.0, 0.0, 0.0, 0.0, 0.0
+    for sign in (1, -1):
+        i, j = y + sign * down, x + sign * right
+        if 0 <= i < rows and 0 <= j < columns:
+            dx, dy = sign * (uv[i, j, 0] - here[0]), sign * (uv[i, j, 1] - here[1])
+            if np.isfinite(dx):
+                sx, sy, bx, by = sx + dx, sy + dy, bx + sign * dx, by + sign * dy
+                lengths2 += dx * dx + dy * dy
+                length, known = min(length, np.hypot(dx, dy)), known + 1
+    norm = np.hypot(sx, sy)
+    ux, uy = sx / norm, sy / norm
+    side[0], side[1] = (ux * length, uy * length) if known else (np.nan, np.nan)
+    along = bx * ux + by * uy
+    bow[0], bow[1] = ((bx - along * ux) / lengths2, (by - along * uy) / lengths2) if known == 2 else (np.nan, np.nan)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mean_about(bow: Array, y: int, x: int, mean: Array) -> None:
+    """Average bow (rows, columns, 2) over a point and its known neighbours: lenses bow lines slowly over the image."""
+    count = 0
+    mean[:] = 0.0
+    for i in range(max(y - 1, 0), min(y + 2, bow.shape[0])):
+        for j in range(max(x - 1, 0), min(x + 2, bow.shape[1])):
+            if np.isfinite(bow[i, j, 0]):
+                count += 1
+                mean += bow[i, j]
+    if count:
+        mean /= count
 
 
 def completed(uv: Array) -> Array:

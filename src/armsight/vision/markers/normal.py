@@ -26,8 +26,8 @@ def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def factor(A: Array, damping: float, L: Array) -> bool:
-    """Cholesky-factor A with its diagonal raised by ``damping``; False where it is not positive definite."""
-    for i in range(len(A)):
+    """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite."""
+    for i in range(len(L)):
         for j in range(i + 1):
             s = A[i, j]
             if i == j:
