@@ -1,7 +1,8 @@
 """Boards as markers of a body: ``board = { spec = "chessboard:9x6:25mm" }``.
 
-The marker's frame is the board's own: its points lie in z = 0, the first at the origin. They are named after the marker
-and their name on the board: ``B.0``, ``B.1``, ...
+A marker's place is the board's first point, and its frame is turned as every marker's: x along the columns, y down, z into
+the face. (Kalibr's boards have y up and z out of themselves: they are turned over.) Points are named after the marker and
+their name on the board: ``B.0``, ``B.1``, ...
 """
 
 from __future__ import annotations
@@ -15,23 +16,29 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
+from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.board import Board, open_board
 from armsight.vision.markers.body_file import Marker
+
+#: From a frame whose y runs up and whose z points out of the face to the marker's.
+_TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedBoard(Record):
-    """One board on a body.
+    """One board on a body, seen from its face.
 
     Attributes:
         name: what its points are named after.
         board: the board.
-        T_body_board: (4, 4) its pose on the body, m.
+        T_body_board: (4, 4) pose of the board's own frame on the body, m.
+        normal: (3,) out of its face, body frame.
     """
 
     name: str
     board: Board
     T_body_board: Array
+    normal: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +76,10 @@ class BoardTarget(Record):
                         f"{board.body.name} may be taken for {other.name!r}, {other.board.body.name}: boards of one body "
                         "need to be of different kinds, or charuco boards of different families"
                     )
-            boards.append(PlacedBoard(marker.name, board, marker.pose()))
+            T = marker.pose()
+            boards.append(
+                PlacedBoard(marker.name, board, T @ _TURNED_OVER if isinstance(board, AprilGrid) else T, -T[:3, 2])
+            )
         return BoardTarget(name, tuple(boards))
 
     @cached_property

@@ -1,0 +1,98 @@
+"""What a body file says about looks: discs, tags and boards, and which way each point's face looks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from armsight.data import Array, Body, Record
+from armsight.errors import InputError
+from armsight.vision.markers.aprilgrid import FAMILY, AprilGrid
+from armsight.vision.markers.board_marker import BoardTarget
+from armsight.vision.markers.body_check import check_points
+from armsight.vision.markers.body_file import Marker, read_body_file
+from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.tag import TagTarget
+
+KINDS = ("disc", "tag", "board")
+
+
+@dataclass(frozen=True, eq=False)
+class Layout(Record):
+    """The markers of a body by kind.
+
+    Attributes:
+        name: what the body is called.
+        discs: its discs, or None.
+        tags: its tags, or None.
+        boards: its boards, or None.
+    """
+
+    name: str
+    discs: DiscTarget | None
+    tags: TagTarget | None
+    boards: BoardTarget | None
+
+    @cached_property
+    def body(self) -> Body:
+        """All points: discs first, then the corners of tags and of boards."""
+        bodies = [part.body for part in (self.discs, self.tags, self.boards) if part is not None]
+        names = tuple(name for body in bodies for name in body.point_names)
+        return Body(self.name, names, np.concatenate([body.points for body in bodies]))
+
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit vectors out of the face of each point; NaN where the file does not say."""
+        rows = [] if self.discs is None else [self.discs.normals]
+        rows += [] if self.tags is None else [np.tile(-tag.T_body_tag[:3, 2], (4, 1)) for tag in self.tags.tags]
+        if self.boards is not None:
+            for placed in self.boards.boards:
+                rows.append(np.tile(placed.normal, (len(placed.board.body.points), 1)))
+        return np.concatenate(rows)
+
+    @property
+    def disc_count(self) -> int:
+        """How many discs there are; they are the first points."""
+        return 0 if self.discs is None else len(self.discs.radii_m)
+
+    @property
+    def coded(self) -> bool:
+        """Whether a tag or a board says which body this is, and how it is turned."""
+        return self.tags is not None or self.boards is not None
+
+
+def read_layout(path: str | Path) -> Layout:
+    """Read a body file.
+
+    Raises:
+        InputError: missing, malformed, no TOML body, or a body that is refused everywhere (``body_check``).
+    """
+    if Path(path).suffix.lower() != ".toml":
+        raise InputError(f"{path}: expected a TOML body file, which says how its markers look (docs/targets.md)")
+    name, markers = read_body_file(path, KINDS)
+    of = {kind: [marker for marker in markers if marker.kind == kind] for kind in KINDS}
+    layout = Layout(
+        name,
+        DiscTarget.from_markers(name, of["disc"]) if of["disc"] else None,
+        TagTarget.from_markers(name, of["tag"]) if of["tag"] else None,
+        BoardTarget.from_markers(name, of["board"]) if of["board"] else None,
+    )
+    check_points(path, layout.body)
+    _check_codes(layout, of["tag"])
+    return layout
+
+
+def _check_codes(layout: Layout, entries: list[Marker]) -> None:
+    """Raise InputError where a tag of the body is on one of its boards too."""
+    if layout.tags is None or layout.boards is None:
+        return
+    for entry, tag in zip(entries, layout.tags.tags, strict=True):
+        for placed in layout.boards.boards:
+            count = len(placed.board.body.points) // 4 if isinstance(placed.board, AprilGrid) else 0
+            if tag.family == FAMILY and tag.identity < count:
+                raise entry.error(
+                    f"{tag.family} id {tag.identity} is on the board {placed.name!r} too: give it another"
+                )
