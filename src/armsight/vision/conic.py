@@ -1,8 +1,8 @@
 """The image of a disc: an ellipse whose centre is not the image of the disc's centre.
 
 A disc of radius r around P (camera's frame) with unit normal n has the dual conic r^2 (I - n n^T) - P P^T (Hartley and
-Zisserman, "Multiple View Geometry", 2nd ed., 8.3: the dual of the image of a conic). Its last column is the pole of the line at
-infinity, so a pinhole shows the ellipse's centre where it shows the point
+Zisserman, "Multiple View Geometry", 2nd ed., 8.3: the dual of the image of a conic). Its last column is the pole of the
+line at infinity, so a pinhole shows the ellipse's centre where it shows the point
 
     Q = P + (r^2 / P_z) (n_z n - e_z)
 
@@ -26,7 +26,16 @@ _STEP = 1e-4  # for the Hessian of the distortion, focal lengths
 
 @numba.njit(cache=True, error_model="numpy")
 def disc_image(
-    fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: float, uv: Array, shape: Array, J_P: Array, J_n: Array
+    fisheye: bool,
+    k: Array,
+    d: Array,
+    P: Array,
+    n: Array,
+    radius: float,
+    uv: Array,
+    shape: Array,
+    J_P: Array,
+    J_n: Array,
 ) -> bool:
     """Project one disc; see :func:`project_discs`. Fills uv (2,), shape (3,), J_P (2, 3), J_n (2, 3).
 
@@ -102,7 +111,16 @@ def disc_image(
 
 @numba.njit(cache=True, error_model="numpy")
 def _each(
-    fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: Array, uv: Array, shape: Array, J_P: Array, J_n: Array
+    fisheye: bool,
+    k: Array,
+    d: Array,
+    P: Array,
+    n: Array,
+    radius: Array,
+    uv: Array,
+    shape: Array,
+    J_P: Array,
+    J_n: Array,
 ) -> None:
     """Project discs one after the other; NaN where one has no image."""
     for i in range(len(P)):

@@ -12,9 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Discs, Record
+from armsight.data import Array, Body, Discs, Record, Rejected
+from armsight.vision.markers import disc_fit, disc_model, disc_search
 from armsight.vision.markers.body_check import check_discs
 from armsight.vision.markers.body_file import Marker
+
+#: Most places looked at in an image, and most rejected ones that are told.
+_MOST_PLACES, _MOST_TOLD = 16384, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,5 +59,32 @@ class DiscTarget(Record):
         return DiscTarget(body, np.array(radii), np.array(bright), np.array(normals))
 
     def find(self, image: NDArray[np.uint8]) -> Discs:
-        """Find the discs of either kind that the body has in one grey image (H, W)."""
-        raise NotImplementedError
+        """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has."""
+        found = [_find(image, kind) for kind in np.unique(self.bright)]
+        if len(found) == 1:
+            return found[0]
+        uv, cov, shape, bright = (
+            np.concatenate([getattr(part, name) for part in found]) for name in ("uv", "cov_uv", "shape", "bright")
+        )
+        return Discs(uv, cov, shape, bright, found[0].rejected + found[1].rejected)
+
+
+def _find(image: NDArray[np.uint8], bright: np.bool_) -> Discs:
+    """Find the bright or the dark discs of an image."""
+    image = np.ascontiguousarray(image)
+    if image.shape[1] % 8:
+        image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
+    starts, codes = np.empty((_MOST_PLACES, disc_model.UNKNOWNS)), np.empty(_MOST_PLACES, np.int64)
+    noise = disc_search.noise_of(image)
+    sign = 1 if bright else -1
+    n = disc_search.search(image, image.view(np.uint64), noise, sign, starts, codes, disc_search.workspace())
+    theta, codes, cov = starts[:n], codes[:n], np.empty((n, 2, 2))
+    disc_fit.fit_all(image, noise, theta, cov, codes, disc_model.workspace())
+    good = codes == 0
+    shape = disc_fit.shapes_of(theta[good])
+    # Those that came furthest are told first: they look most like discs.
+    others = np.flatnonzero(~good)[np.argsort(~np.isin(codes[~good], disc_fit.LOOK_ALIKES), kind="stable")[:_MOST_TOLD]]
+    rejected = tuple(
+        Rejected((float(theta[i, 0]), float(theta[i, 1])), disc_fit.REASONS[int(codes[i])]) for i in others.tolist()
+    )
+    return Discs(theta[good, :2], cov[good], shape, np.full(int(good.sum()), bool(bright)), rejected)

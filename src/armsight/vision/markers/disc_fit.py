@@ -1,0 +1,314 @@
+"""The centre of one disc to the limit that the image's noise sets, and what is no disc.
+
+Gauss-Newton on :mod:`~armsight.vision.markers.disc_model`: a first step on a third of the rows, then on all until the
+centre rests. Where the surround is not plain its own variance lowers the weight of what shows it; where the disc has a
+gradient (a score test), the kind of gradient that fits best is taken. What is left tells discs from what looks like one.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.vision.markers.disc_model import (
+    LIGHT,
+    STRAY,
+    SURROUND,
+    UNKNOWNS,
+    F,
+    Work,
+    factor,
+    gather,
+    inside_products,
+    linearise,
+    normal_equations,
+    solve,
+)
+
+_STEPS = 8
+#: A step of the centre after which the next one does not count: the next is a tenth of it at the most, px; and in
+#: standard deviations of the centre.
+_SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
+_BLUR_LEAST_PX = 0.2
+#: A step of the centre after which the residuals away from the rim tell the surround's variance, px.
+_WEIGH_PX = 0.3
+#: A gradient of so many standard deviations is one.
+_GRADIENT_SIGMAS = 3.0
+
+#: Why a place is no disc: code -> words. 0 is a disc.
+REASONS = {
+    1: "cut by the image's border",
+    2: "no ellipse fits its rim",
+    3: "its rim is not sharp enough for its size",
+    4: "too narrow for a disc seen at less than 75 degrees",
+    5: "its rim is not that of an ellipse",
+    6: "too faint against the noise",
+    7: "smaller than 4 px across",
+    8: "its inside is not even",
+    9: "open on one side",
+}
+#: Reasons that only the fit gives: such a place has a closed rim.
+LOOK_ALIKES = (3, 4, 5, 6, 8)
+_MOST_BLUR = 0.8  # of the smaller half axis
+_LEAST_RATIO = 0.22
+#: How far a sixteenth of the rim may lie off the ellipse beyond what noise does: px, and share of the size.
+_RIM_PX, _RIM_SHARE, _RIM_SIGMAS = 0.15, 0.02, 4.5
+#: How uneven the inside may be beyond the image's noise, as a share of the contrast.
+_UNEVEN = 0.12
+_LEAST_SNR = 3.0
+_SECTORS = 16
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step(n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: Work) -> tuple[float, float]:
+    """Make one Gauss-Newton step on the first n pixels.
+
+    Returns:
+        How far the centre moved, px, -1 where no step is possible; the sum of the squared residuals after the step.
+    """
+    J, residual, H, g, L, scale, x, at = work.J, work.residual, work.H, work.g, work.L, work.scale, work.x, work.at
+    for a in range(UNKNOWNS):
+        at[a] = theta[a]
+    at[0], at[1] = theta[0] - x0, theta[1] - y0
+    square = linearise(n, slope, texture, work)
+    normal_equations(n, J, residual, H, g)
+    if not factor(H, L, scale):
+        return -1.0, square
+    solve(L, scale, g, x)
+    shift = np.sqrt(x[0] * x[0] + x[1] * x[1])
+    shrink = 1.0
+    for a in (2, 4, 5):  # a blur or a shape at most halves or doubles
+        if abs(x[a]) > 0.5 * theta[a]:
+            shrink = min(shrink, 0.5 * theta[a] / abs(x[a]))
+    if not shift * shift * (theta[2] + theta[4]) < 1.0:
+        return -1.0, square
+    for a in range(UNKNOWNS):
+        theta[a] += shrink * x[a]
+        square -= x[a] * g[a]
+    theta[5] = max(theta[5], _BLUR_LEAST_PX)
+    if not theta[2] * theta[4] - theta[3] * theta[3] > 0.0:
+        return -1.0, square
+    return (shift if shrink == 1.0 else max(shift, 1.0)), square
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _spread(n: int, work: Work, flat: Array) -> None:
+    """Fill the mean squares of the residuals inside and outside, away from the rim, and their counts (4,)."""
+    residual, inside = work.residual, work.inside
+    square_in, square_out, count_in, count_out = F(0.0), F(0.0), F(0.0), F(0.0)
+    for i in range(n):
+        square = residual[i] * residual[i]
+        disc = F(1.0) if inside[i] > F(0.995) else F(0.0)
+        surround = F(1.0) if inside[i] < F(0.005) else F(0.0)
+        square_in += disc * square
+        square_out += surround * square
+        count_in += disc
+        count_out += surround
+    flat[0], flat[1] = square_in / max(count_in, F(1.0)), square_out / max(count_out, F(1.0))
+    flat[2], flat[3] = count_in, count_out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) -> None:
+    """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
+    px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
+    sectors[:, :] = 0.0
+    cx, cy = F(theta[0] - x0), F(theta[1] - y0)
+    for i in range(n):
+        if F(0.01) < inside[i] < F(0.99):
+            square = J[0, i] * J[0, i] + J[1, i] * J[1, i]
+            u, v = px[i] - cx, py[i] - cy
+            a, b = abs(u), abs(v)
+            k = 8 * (u > F(0.0)) + 4 * (v > F(0.0)) + 2 * (a > b) + (min(a, b) > F(0.41421356) * max(a, b))
+            sectors[0, k] += np.sqrt(square) * residual[i]
+            sectors[1, k] += square
+    for k in range(_SECTORS):
+        sectors[0, k] /= max(sectors[1, k], 1e-12)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _minimise(
+    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: Work
+) -> tuple[float, float]:
+    """Step until the centre rests; return the sum of squared residuals, -1 where there is no minimum, and the texture.
+
+    ``weigh``: where the surround varies more than the disc, weigh it less.
+    """
+    flat, H = work.sectors[0], work.H
+    texture, weighed = 0.0, not weigh
+    for _ in range(_STEPS):
+        shift, square = _step(n, theta, x0, y0, slope, texture, work)
+        if shift < 0.0:
+            return -1.0, 0.0
+        if shift < _WEIGH_PX and not weighed:
+            weighed = True
+            _spread(n, work, flat)
+            v_in = flat[0] if flat[2] >= 30.0 else noise_sigma * noise_sigma
+            v_in = max(v_in, 0.05, 1e-4 * theta[6] * theta[6])
+            if flat[1] > (2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))) * v_in:
+                texture = flat[1] / v_in - 1.0
+                continue
+        if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
+            return square, texture
+    return -1.0, 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _texture_factor(n: int, blur: float, texture: float, work: Work) -> float:
+    """Return how many times larger the centre's variance is because neighbouring pixels of a texture are alike.
+
+    The correlation of neighbours, k, gives (1 + k) / (1 - k) pixels that vary as one along the rim, and at most the width
+    of the edge across it; it counts by the share that the texture has in what tells the centre.
+    """
+    px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
+    square, product = 0.0, 0.0
+    by_texture, by_all = 0.0, 1e-12
+    for i in range(n):
+        if inside[i] < F(0.005):
+            square += residual[i] * residual[i]
+            if i + 1 < n and py[i + 1] == py[i] and px[i + 1] == px[i] + F(1.0):
+                product += residual[i] * residual[i + 1]
+        tells = J[0, i] * J[0, i] + J[1, i] * J[1, i]
+        rest = 1.0 - inside[i]
+        by_texture += tells * texture * rest * rest / (1.0 + texture * rest * rest)
+        by_all += tells
+    k = min(max(product / max(square, 1e-12), 0.0), 0.95)
+    along = (1.0 + k) / (1.0 - k)
+    return 1.0 + (along * min(along, 1.0 + 2.0 * blur) - 1.0) * by_texture / by_all
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pair(first: int, work: Work, cov: Array) -> None:
+    """Fill the (2, 2) block of H^-1 of two neighbouring unknowns."""
+    g, L, scale, x = work.g, work.L, work.scale, work.x
+    for a in range(2):
+        g[:] = 0.0
+        g[first + a] = 1.0
+        solve(L, scale, g, x)
+        cov[a, 0], cov[a, 1] = x[first], x[first + 1]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> float:
+    """Return what chi-square would gain from a gradient of the disc's own, in units of the noise's variance."""
+    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
+    inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
+    s0, s1 = out[0, 10], out[1, 10]
+    k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
+    # The residual is the one before the last step x = H^-1 g; then the columns as far as J does not explain them.
+    for a in range(UNKNOWNS):
+        s0 -= out[0, a] * x[a]
+        s1 -= out[1, a] * x[a]
+    g[:] = out[0, :UNKNOWNS]
+    solve(L, scale, g, x)
+    for a in range(UNKNOWNS):
+        k00 -= out[0, a] * x[a]
+        k01 -= out[1, a] * x[a]
+    g[:] = out[1, :UNKNOWNS]
+    solve(L, scale, g, x)
+    for a in range(UNKNOWNS):
+        k11 -= out[1, a] * x[a]
+    det = k00 * k11 - k01 * k01
+    if not det > 0.0:
+        return 0.0
+    return float((k11 * s0 * s0 - 2 * k01 * s0 * s1 + k00 * s1 * s1) / det)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: Work) -> int:
+    """Fit one disc.
+
+    Args:
+        image: (H, W) grey.
+        noise_sigma: the image's noise as far as it is known beforehand, grey levels; judges what is no disc.
+        theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
+            result.
+        cov: (2, 2) covariance of the centre, px^2; filled.
+        work: what :func:`workspace` returns.
+
+    Returns:
+        0, or why it is no disc (REASONS).
+    """
+    sectors = work.sectors
+    n, sample = gather(image, theta, work)
+    if n < 0:
+        return 1
+    if n < 4 * UNKNOWNS:
+        return 7
+    x0, y0 = np.rint(theta[0]), np.rint(theta[1])
+    if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
+        return 2
+    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
+    if square < 0.0:
+        return 2
+    if _slope_inside(n, theta, x0, y0, work) > _GRADIENT_SIGMAS**2 * square / (n - UNKNOWNS):
+        trial, start, best, square = work.trial, work.start, SURROUND, np.inf
+        start[:] = theta
+        for slope in (SURROUND, LIGHT, STRAY):
+            trial[:] = start
+            other, _ = _minimise(n, trial, x0, y0, slope, noise_sigma, False, work)
+            if 0.0 <= other < square - (0.0 if slope == SURROUND else 9.0 * other / (n - UNKNOWNS)):
+                square, best = other, slope
+                theta[:] = trial
+        square, texture = _minimise(n, theta, x0, y0, best, noise_sigma, True, work)
+        if square < 0.0:
+            return 2
+    variance = square / (n - UNKNOWNS)
+    det = theta[2] * theta[4] - theta[3] * theta[3]
+    half = (theta[2] + theta[4]) / 2
+    root = np.sqrt(max(half * half - det, 0.0))
+    minor, major = 1.0 / np.sqrt(half + root), 1.0 / np.sqrt(max(half - root, 1e-12))
+    if theta[5] > _MOST_BLUR * minor:
+        return 3
+    if minor < _LEAST_RATIO * major:
+        return 4
+    if not abs(theta[6]) > _LEAST_SNR * np.sqrt(variance):
+        return 6
+    _rim(n, theta, x0, y0, work, sectors)
+    allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor)
+    for k in range(_SECTORS):
+        if sectors[1, k] > 0.0 and abs(sectors[0, k]) > allowed + _RIM_SIGMAS * np.sqrt(variance / sectors[1, k]):
+            return 5
+    _spread(n, work, sectors[0])
+    if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
+        return 8
+    _pair(0, work, cov)
+    if texture > 0.0:
+        variance *= _texture_factor(n, theta[5], texture, work)
+    for a in range(2):
+        for b in range(2):
+            cov[a, b] *= variance
+    return 0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fit_all(
+    image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, codes: NDArray[np.int64],
+    work: Work,
+) -> None:  # fmt: skip
+    """Fit the discs whose code is 0, one by one: theta (N, 10), cov (N, 2, 2), codes (N,) as :func:`fit` has them."""
+    for i in range(len(codes)):
+        if codes[i] == 0:
+            codes[i] = fit(image, noise_sigma, theta[i], cov[i], work)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def shape_of(theta: Array, shape: Array) -> None:
+    """Fill S11, S12, S22 of a fitted ellipse, px^2.
+
+    Blur moves the half-way level of a curved edge inwards by blur^2 / (2 radius); that is put right here.
+    """
+    det = theta[2] * theta[4] - theta[3] * theta[3]
+    wider = (1.0 + 0.5 * theta[5] * theta[5] * np.sqrt(det)) ** 2 / det
+    shape[0], shape[1], shape[2] = wider * theta[4], -wider * theta[3], wider * theta[2]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def shapes_of(theta: Array) -> Array:
+    """Return S11, S12, S22 (N, 3) of fitted ellipses, px^2, theta (N, 10)."""
+    shapes = np.empty((len(theta), 3))
+    for i in range(len(theta)):
+        shape_of(theta[i], shapes[i])
+    return shapes
