@@ -12,6 +12,8 @@ from armsight.vision.rig import StereoRig
 
 SIZE = (1280, 720)
 SIGMA = 0.03
+#: Relative noise of an ellipse's area.
+SHAPE_NOISE = 0.02
 
 
 def hd_rig(known=False):
@@ -92,6 +94,7 @@ def views(rig, target, Ts, rng=None, sigma=SIGMA, clutter=0, hidden=(), radii=(4
         uv, shape, bright, owner = (np.concatenate(x) for x in (uv, shape, bright, owner))
         order = rng.permutation(len(uv))
         uv = uv + sigma * rng.normal(size=uv.shape)
+        shape = shape * (1 + SHAPE_NOISE * rng.normal(size=(len(uv), 1)))
         found.append(
             (
                 Discs(

@@ -1,9 +1,9 @@
 """What both cameras should see of a body's discs where the body is at a given pose, and the bias of their centres.
 
 An ellipse's centre is not the image of its disc's centre (:mod:`~armsight.vision.conic`). The difference depends on how
-the disc is turned, so it is known once the pose is. Of a disc whose normal nobody gave it is known only how large it can
-be: its centre seems to move by -(r^2 / z) times the part of the optical axis that lies in the disc, which is a point of the
-sphere that has this axis, r^2 / z long, as its diameter.
+the disc is turned, so it is known once the pose is. Of a disc whose normal nobody gave only the size of it is known: the
+centre seems to move by -(r^2 / z) times the part of the optical axis e that lies in the disc, e - (n e) n, which over all
+directions n has the second moments 1/15 across e and 8/15 along it.
 """
 
 from __future__ import annotations
@@ -96,9 +96,9 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
         J[:, side] = J_P @ by_place
         J[:, side, :, 3:] -= J_n @ (R @ skew(np.where(known[:, None], normals, 0.0)))
         bias[:, side], J_bias[:, side] = uv[:, side] - centre, J[:, side] - J_p @ by_place
-        reach = target.radii_m**2 / (2 * p[:, 2])
-        ball = (reach**2)[:, None, None] * (np.eye(3) / 3 + np.diag([0.0, 0.0, 1.0]))
-        cov[~known, side] = (J_p @ ball @ np.swapaxes(J_p, 1, 2))[~known]
+        reach2 = (target.radii_m**2 / p[:, 2]) ** 2
+        moved = reach2[:, None, None] * np.diag([1.0, 1.0, 8.0]) / 15
+        cov[~known, side] = (J_p @ moved @ np.swapaxes(J_p, 1, 2))[~known]
         J_rig[:, side, :, first : first + J_camera.shape[2]] = J_camera
         first += J_camera.shape[2]
         if side == 1:
