@@ -15,8 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.robot.kinematics import chain
-from armsight.robot.kinematics.table import packed
+from armsight.geometry.rotation import log_so3
+from armsight.robot.checks import DEGREES, angle_refusal, angles_of, near_angles, pose_refusal, poses_of
+from armsight.robot.kinematics import chain, inverse, lanes
+from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
+from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised
+from armsight.robot.kinematics.table import KIND, packed
+from armsight.robot.solutions import ManySolutions, Nearest, Solutions
 
 Convention = Literal["standard", "modified"]
 Axes = Literal["base", "tool"]
@@ -72,6 +77,8 @@ class Arm(Record):
     joint_names: tuple[str, ...] = tuple(f"joint{i}" for i in range(1, 7))
     source: str = ""
     table: Array = field(init=False, repr=False)
+    _closed: Array = field(init=False, repr=False)
+    _limits: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the numbers and pack them for the kernels.
@@ -95,7 +102,11 @@ class Arm(Record):
             self.T_flange_tool,
             modified=self.convention == "modified",
         )
+        closed, exact = recognised(table)
+        table[KIND] = closed[KIND] if exact else NEITHER
         object.__setattr__(self, "table", table)
+        object.__setattr__(self, "_closed", closed)
+        object.__setattr__(self, "_limits", np.stack([self.q_min, self.q_max]))
         super().__post_init__()
 
     def _check(self) -> None:
@@ -107,9 +118,7 @@ class Arm(Record):
             raise InputError(f"{self.name}: direction is {self.direction.tolist()}; each must be 1 or -1")
         for name in ("alpha", "offset", "q_min", "q_max", "home"):
             if np.abs(getattr(self, name)).max() > chain.MOST_RADIANS:
-                raise InputError(
-                    f"{self.name}: {name} has an angle of more than {chain.MOST_RADIANS:g} rad; {_DEGREES}"
-                )
+                raise InputError(f"{self.name}: {name} has an angle of more than {chain.MOST_RADIANS:g} rad; {DEGREES}")
         for name in ("q_max - q_min", "qd_max", "qdd_max", "qddd_max"):
             value = self.q_max - self.q_min if " " in name else getattr(self, name)
             if not (value > 0).all():
@@ -133,15 +142,15 @@ class Arm(Record):
         Raises:
             InputError: wrong shape, NaN, or angles that are no radians.
         """
-        angles = _angles(q)
+        angles = angles_of(q)
         if angles.ndim == 1:
             T = np.empty((4, 4))
             if chain.forward(self.table, angles, T):
-                raise _refusal(angles)
+                raise angle_refusal(angles)
             return T
         Ts = np.empty((len(angles), 4, 4))
-        if chain.forward_batch(self.table, angles, Ts):
-            raise _refusal(angles)
+        if lanes.forward_batch(self.table, angles, Ts, np.empty(lanes.WORK), lanes.LANES):
+            raise angle_refusal(angles)
         return Ts
 
     def links(self, q: ArrayLike) -> Array:
@@ -153,10 +162,10 @@ class Arm(Record):
         Returns:
             (8, 4, 4) in the base, m: the table's frame 0, the frames of links 1 to 6 by the arm's own convention, the tool.
         """
-        angles = _angles(q, batch=False)
+        angles = angles_of(q, batch=False)
         Ts = np.empty((8, 4, 4))
         if chain.links(self.table, angles, Ts):
-            raise _refusal(angles)
+            raise angle_refusal(angles)
         return Ts
 
     def jacobian(self, q: ArrayLike, frame: Axes = "base") -> Array:
@@ -169,15 +178,15 @@ class Arm(Record):
         Returns:
             (6, 6) J_base or J_tool, or (N, 6, 6).
         """
-        angles, in_tool_axes = _angles(q), _in_tool_axes(frame)
+        angles, in_tool_axes = angles_of(q), _in_tool_axes(frame)
         if angles.ndim == 1:
             J = np.empty((6, 6))
             if chain.jacobian(self.table, angles, in_tool_axes, J):
-                raise _refusal(angles)
+                raise angle_refusal(angles)
             return J
         Js = np.empty((len(angles), 6, 6))
         if chain.jacobian_batch(self.table, angles, in_tool_axes, Js):
-            raise _refusal(angles)
+            raise angle_refusal(angles)
         return Js
 
     def jacobian_rate(self, q: ArrayLike, qd: ArrayLike, frame: Axes = "base") -> Array:
@@ -191,10 +200,10 @@ class Arm(Record):
         Returns:
             (6, 6) the derivative of each entry by time, 1/s.
         """
-        angles, speeds = _angles(q, batch=False), checked(qd, (6,), "qd").copy()
+        angles, speeds = angles_of(q, batch=False), checked(qd, (6,), "qd").copy()
         J = np.empty((6, 6))
         if chain.jacobian_rate(self.table, angles, speeds, _in_tool_axes(frame), J):
-            raise _refusal(angles)
+            raise angle_refusal(angles)
         return J
 
     def manipulability(self, q: ArrayLike) -> Array:
@@ -208,33 +217,116 @@ class Arm(Record):
         """
         return np.asarray(np.abs(np.linalg.det(self.jacobian(q))))
 
+    def inverse(self, T_base_tool: ArrayLike, near: ArrayLike | None = None) -> Solutions:
+        """Return all joint angles that bring the tool to a pose.
+
+        All of up to eight, exact to rounding, where the table has a closed form (docs/arm.md says which do); else those
+        that damped least squares finds from many starts. Nothing is raised for a pose out of reach or singular: the
+        answer says so.
+
+        Args:
+            T_base_tool: (4, 4) where the tool shall be, m. A rotation off by up to 1e-6 is put right.
+            near: (6,) joint angles, rad: solutions are ordered by their distance from these (the root of the sum of
+                squares), whole turns are taken towards them, and a joint that is not determined is given its value of
+                these. Without: the whole turn nearest 0, and 0.
+
+        Raises:
+            InputError: not a rigid motion, wrong shape, NaN, or ``near`` in what are no radians.
+        """
+        T = poses_of(T_base_tool, 2)
+        goal = _NO_ANGLES if near is None else near_angles(near)
+        rows, scratch = np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        count, missed, bits = inverse.inverse(
+            self.table, self._closed, self._limits, T, goal, near is not None, rows, scratch, lanes.LANES
+        )
+        if count < 0:
+            raise pose_refusal(T[None])
+        if count and not bits:
+            return Solutions(rows[:count])
+        lost = count == 0 or bits >= inverse.OUTSIDE
+        reason = self._reason(bits, near is not None) if count else _out_of_reach(missed)
+        return Solutions(rows[:count], reason, self._nearest(T, goal) if lost else None)
+
+    def inverse_batch(self, Ts_base_tool: ArrayLike, near: ArrayLike | None = None) -> ManySolutions:
+        """Return all joint angles for many poses, without reasons and nearest poses.
+
+        Args:
+            Ts_base_tool: (N, 4, 4) where the tool shall be, m.
+            near: (6,) joint angles, rad: what a joint that is not determined is given, 0 by default; the order stays.
+        """
+        Ts = poses_of(Ts_base_tool, 3)
+        most = inverse.MOST if self._closed[KIND] == NEITHER else lanes.LANES
+        rows, counts = np.zeros((len(Ts), most, inverse.KEY)), np.zeros(len(Ts), np.int64)
+        row, scratch = np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        goal = _NO_ANGLES if near is None else near_angles(near)
+        if inverse.inverse_batch(
+            self.table, self._closed, self._limits, Ts, goal, row, scratch, lanes.LANES, rows, counts
+        ):
+            raise pose_refusal(Ts)
+        state = rows[:, :, inverse.STATE]
+        there = np.arange(most) < counts[:, None]
+        return ManySolutions(
+            counts,
+            rows[:, :, :6],
+            rows[:, :, inverse.POSITION],
+            rows[:, :, inverse.ANGLE],
+            (state < inverse.OUTSIDE) & there,
+            state % inverse.OUTSIDE > 0,
+            rows[:, :, inverse.CONFIGURATION : inverse.STATE],
+        )
+
+    def _reason(self, bits: int, given: bool) -> str:
+        """Say what keeps solutions from being plain."""
+        value = "its value in near" if given else "0"
+        texts = _SINGULAR[self._closed[KIND] == PARALLEL]
+        parts = ["singular: " + text.format(value=value) for bit, text in texts.items() if bits & bit]
+        if bits & inverse.OUTSIDE:
+            parts.append("outside limits: every solution has a joint beyond its limits")
+        return "; ".join(parts)
+
+    def _nearest(self, T: Array, near: Array) -> Nearest:
+        """Return the pose within the limits that comes closest to one that cannot be had."""
+        q, rows, scratch = np.empty(6), np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        inverse.nearest(self.table, self._closed, self._limits, T, near, q, rows, scratch, lanes.LANES)
+        T_base_tool = self.forward(q)
+        turned = log_so3(T_base_tool[:3, :3].T @ T[:3, :3])
+        return Nearest(
+            q, T_base_tool, float(np.linalg.norm(T_base_tool[:3, 3] - T[:3, 3])), float(np.linalg.norm(turned))
+        )
+
     def within_limits(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Say whether joint angles (6,) or (N, 6), rad, are within the limits; () or (N,)."""
-        angles = _angles(q)
+        angles = angles_of(q)
         return np.asarray(((angles >= self.q_min) & (angles <= self.q_max)).all(axis=-1))
 
 
-_DEGREES = "are these degrees? give radians: numpy.deg2rad(...)"
+#: The value of ``near`` where none is given; shared, so it is not to be written to.
+_NO_ANGLES = np.zeros(6)
+#: What keeps a pose out of reach.
+_OUT_OF_REACH = {
+    SHOULDER: "the wrist would be nearer to axis 1 than the arm's offset from it allows",
+    ELBOW: "upper arm and forearm are too short for it, or cannot fold up so far",
+}
+#: What is singular, for an arm whose axes 2, 3 and 4 are parallel, and for one with a spherical wrist.
+_SINGULAR = {
+    False: {
+        SHOULDER: "shoulder: the wrist is as near to axis 1 as it can be; joint 1 is {value} if the wrist is on axis 1",
+        ELBOW: "elbow: the arm is stretched or folded, elbow up and down are one",
+        WRIST: "wrist: axes 4 and 6 are one, joints 4 and 6 are determined together only; joint 4 is {value}",
+    },
+    True: {
+        SHOULDER: "shoulder: the wrist is as near to axis 1 as it can be; joint 1 is {value} if the wrist is on axis 1",
+        ELBOW: "elbow: the arm is stretched or folded, elbow up and down are one",
+        WRIST: "wrist: axis 6 is parallel to axes 2, 3 and 4, which are not determined one by one; joint 6 is {value}, or "
+        "as close as the arm's reach lets it",
+    },
+}
 
 
-def _angles(q: ArrayLike, *, batch: bool = True) -> Array:
-    """Return joint angles as a new array, so that kernels see one type only."""
-    try:
-        angles = np.array(q, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"q must be numbers: {error}") from None
-    if angles.shape != (6,) and not (batch and angles.ndim == 2 and angles.shape[1] == 6):
-        raise InputError(f"q has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
-    return angles
-
-
-def _refusal(angles: Array) -> InputError:
-    """Tell what is wrong with joint angles that a kernel refused."""
-    if not np.isfinite(angles).all():
-        return InputError("q contains NaN or infinity; every joint angle must be a finite number")
-    row, joint = divmod(int(np.argmax(np.abs(angles) > chain.MOST_RADIANS)), 6)
-    where = f"joint {joint + 1}" + (f" of row {row}" if angles.ndim == 2 else "")
-    return InputError(f"q: {where} is at {angles.ravel()[6 * row + joint]:g} rad; {_DEGREES}")
+def _out_of_reach(missed: int) -> str:
+    """Say why there is no solution."""
+    parts = [text for bit, text in _OUT_OF_REACH.items() if missed & bit]
+    return "unreachable: " + (" and ".join(parts) or f"no joint angles found from {inverse.STARTS} starts")
 
 
 def _in_tool_axes(frame: str) -> bool:

@@ -37,20 +37,8 @@ def verdict(q: Array) -> int:
 @_kernel
 def first_frame(table: Array) -> Frame:
     """Return frame 0 in the base."""
-    return (
-        table[36],
-        table[40],
-        table[44],
-        table[37],
-        table[41],
-        table[45],
-        table[38],
-        table[42],
-        table[46],
-        table[39],
-        table[43],
-        table[47],
-    )
+    t = table
+    return (t[36], t[40], t[44], t[37], t[41], t[45], t[38], t[42], t[46], t[39], t[43], t[47])
 
 
 @_kernel
@@ -96,12 +84,12 @@ def after_link(table: Array, i: int, F: Frame) -> Frame:
 
 
 @_kernel
-def after_tool(table: Array, F: Frame) -> Frame:
-    """Carry frame 6 to the tool."""
+def after(table: Array, k: int, F: Frame) -> Frame:
+    """Carry a frame over the constant transform that stands at place k of the table."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
-    r00, r01, r02, t0 = table[48], table[49], table[50], table[51]
-    r10, r11, r12, t1 = table[52], table[53], table[54], table[55]
-    r20, r21, r22, t2 = table[56], table[57], table[58], table[59]
+    r00, r01, r02, t0 = table[k], table[k + 1], table[k + 2], table[k + 3]
+    r10, r11, r12, t1 = table[k + 4], table[k + 5], table[k + 6], table[k + 7]
+    r20, r21, r22, t2 = table[k + 8], table[k + 9], table[k + 10], table[k + 11]
     return (
         xx * r00 + yx * r10 + zx * r20,
         xy * r00 + yy * r10 + zy * r20,
@@ -115,6 +103,29 @@ def after_tool(table: Array, F: Frame) -> Frame:
         px + xx * t0 + yx * t1 + zx * t2,
         py + xy * t0 + yy * t1 + zy * t2,
         pz + xz * t0 + yz * t1 + zz * t2,
+    )
+
+
+@_kernel
+def before(table: Array, k: int, F: Frame) -> Frame:
+    """See a frame from where the constant transform at place k of the table maps to."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
+    r00, r01, r02, t0 = table[k], table[k + 1], table[k + 2], table[k + 3]
+    r10, r11, r12, t1 = table[k + 4], table[k + 5], table[k + 6], table[k + 7]
+    r20, r21, r22, t2 = table[k + 8], table[k + 9], table[k + 10], table[k + 11]
+    return (
+        r00 * xx + r01 * xy + r02 * xz,
+        r10 * xx + r11 * xy + r12 * xz,
+        r20 * xx + r21 * xy + r22 * xz,
+        r00 * yx + r01 * yy + r02 * yz,
+        r10 * yx + r11 * yy + r12 * yz,
+        r20 * yx + r21 * yy + r22 * yz,
+        r00 * zx + r01 * zy + r02 * zz,
+        r10 * zx + r11 * zy + r12 * zz,
+        r20 * zx + r21 * zy + r22 * zz,
+        r00 * px + r01 * py + r02 * pz + t0,
+        r10 * px + r11 * py + r12 * pz + t1,
+        r20 * px + r21 * py + r22 * pz + t2,
     )
 
 
@@ -134,7 +145,7 @@ def tool_frame(table: Array, q: Array) -> Frame:
     for i in range(6):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_turn(table, i, c, s, F))
-    return after_tool(table, F)
+    return after(table, 48, F)
 
 
 @_kernel
@@ -142,15 +153,6 @@ def forward(table: Array, q: Array, T: Array) -> int:
     """Write the tool's pose at joint angles (6,) into T_base_tool (4, 4); returns the verdict on q."""
     store(tool_frame(table, q), T)
     return verdict(q)
-
-
-@_kernel
-def forward_batch(table: Array, q: Array, Ts: Array) -> int:
-    """Write the tool's poses at joint angles (N, 6) into (N, 4, 4); returns the worst verdict."""
-    worst = GOOD
-    for n in range(q.shape[0]):
-        worst = max(worst, forward(table, q[n], Ts[n]))
-    return worst
 
 
 @_kernel
@@ -164,7 +166,7 @@ def links(table: Array, q: Array, Ts: Array) -> int:
         turned = after_turn(table, i, c, s, F)
         F = after_link(table, i, turned)
         store(turned if modified else F, Ts[i + 1])
-    store(after_tool(table, F), Ts[7])
+    store(after(table, 48, F), Ts[7])
     return verdict(q)
 
 
@@ -178,7 +180,7 @@ def _axes(table: Array, q: Array, J: Array) -> Frame:
         J[3, i], J[4, i], J[5, i] = way * F[6], way * F[7], way * F[8]
         s, c = sincos(way * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_turn(table, i, c, s, F))
-    return after_tool(table, F)
+    return after(table, 48, F)
 
 
 @_kernel

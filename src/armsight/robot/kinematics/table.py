@@ -4,6 +4,15 @@ Standard: ``A_i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i)``. Modified: ``A_i = R
 (with Craig's alpha_{i-1}, a_{i-1} standing in row i). A modified table is a standard one whose a and alpha sit one row
 earlier, after a constant first ``Rx(alpha_1) Tx(a_1)``, so the kernels know the standard form only. In both,
 ``theta_i = direction_i * q_i + offset_i``.
+
+A packed table (96,) holds, in this order:
+
+- 0 to 35: six rows of a, d, cos alpha, sin alpha, offset, direction;
+- 36 (BASE), 48 (TOOL): T_base_0 and T_6_tool, twelve numbers each, row by row;
+- 60 (MODIFIED): 1 for the modified convention, where a link's frame sits on its own joint's axis; 0 for the standard one;
+- 61 (KIND) to 63: the structure the closed-form inverse works on, and its forearm (see ``structure``);
+- 64 (UNBASE), 76 (UNTOOL): the inverses of T_base_0, and of everything that comes after joint 6's turn;
+- 88 on: the forearm's angle (see ``structure``); the rest is free.
 """
 
 from __future__ import annotations
@@ -11,10 +20,9 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import Array
+from armsight.geometry.pose import inverse
 
-#: Places in a packed table (64,): six rows of a, d, cos alpha, sin alpha, offset, direction; then two 3x4 transforms, row by
-#: row; then 1 for the modified convention, 0 for the standard one (where a link's frame sits); the rest is free.
-BASE, TOOL, MODIFIED, SIZE = 36, 48, 60, 64
+BASE, TOOL, MODIFIED, KIND, FOREARM, ACROSS, UNBASE, UNTOOL, BEND, SIZE = 36, 48, 60, 61, 62, 63, 64, 76, 88, 96
 
 
 def exact_cos_sin(angle: Array) -> tuple[Array, Array]:
@@ -23,6 +31,11 @@ def exact_cos_sin(angle: Array) -> tuple[Array, Array]:
     exact = np.abs(angle - quarter * (np.pi / 2)) < 1e-12
     cos, sin = np.cos(angle), np.sin(angle)
     return np.where(exact, np.rint(cos), cos), np.where(exact, np.rint(sin), sin)
+
+
+def link(a: float, d: float, cos: float, sin: float) -> Array:
+    """Return the constant part of a standard row, ``Tz(d) Tx(a) Rx(alpha)``, (4, 4)."""
+    return np.array([[1, 0, 0, a], [0, cos, -sin, 0], [0, sin, cos, d], [0, 0, 0, 1.0]])
 
 
 def packed(
@@ -49,16 +62,17 @@ def packed(
         modified: whether the table follows the modified convention.
 
     Returns:
-        (64,) the packed table.
+        (96,) the packed table.
     """
     cos, sin = exact_cos_sin(alpha)
     if modified:
-        first = np.array([[1, 0, 0, a[0]], [0, cos[0], -sin[0], 0], [0, sin[0], cos[0], 0], [0, 0, 0, 1]])
-        T_base_0 = T_base_0 @ first
+        T_base_0 = T_base_0 @ link(a[0], 0.0, cos[0], sin[0])
         a, cos, sin = np.append(a[1:], 0.0), np.append(cos[1:], 1.0), np.append(sin[1:], 0.0)
     table = np.zeros(SIZE)
     table[:BASE] = np.stack([a, d, cos, sin, offset, direction], axis=1).ravel()
-    table[BASE:TOOL] = T_base_0[:3].ravel()
-    table[TOOL:MODIFIED] = T_6_tool[:3].ravel()
+    table[BASE : BASE + 12] = T_base_0[:3].ravel()
+    table[TOOL : TOOL + 12] = T_6_tool[:3].ravel()
     table[MODIFIED] = modified
+    table[UNBASE : UNBASE + 12] = inverse(T_base_0)[:3].ravel()
+    table[UNTOOL : UNTOOL + 12] = inverse(link(a[5], d[5], cos[5], sin[5]) @ T_6_tool)[:3].ravel()
     return table

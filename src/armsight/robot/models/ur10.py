@@ -1,8 +1,8 @@
 """Universal Robots UR10 (CB3).
 
 Table: the maker's article "DH parameters for calculations of kinematics and dynamics" (universal-robots.com). Limits: the
-maker's user manual, +-360 degrees and 120 degrees/s on joints 1 and 2, 180 on the others. Accelerations and jerks are chosen: the maker publishes
-none.
+maker's user manual, +-360 degrees and 120 degrees/s on joints 1 and 2, 180 on the others. Accelerations and jerks are
+chosen: the maker publishes none.
 """
 
 import numpy as np

@@ -1,0 +1,269 @@
+"""All joint angles that bring the tool to a pose, in closed form, for the two structures that ``structure`` knows.
+
+Both begin alike: axis 2's direction h turns with joint 1, and the wrist point's distance along h is a constant of the arm,
+which gives joint 1 (two shoulders). Seen from link 1, what remains is a planar arm of two links and three turns about
+axes at right angles:
+
+- SPHERICAL: the wrist point is the planar arm's end (two elbows), then the wrist's three turns follow (two wrists);
+- PARALLEL: joints 2 + 3 + 4, 5 and 6 turn the tool (two wrists), then the end of the planar arm is known (two elbows).
+
+Each step solves what the steps before have left exactly, so that an angle which is badly determined near a singularity
+does not spoil the pose. Where an angle is not determined at all, it is given the value wanted (``near``, or 0). Pieper,
+"The kinematics of manipulators under computer control", 1968; for the chapter's arm: docs/chapter.md, "The 6R arm".
+
+Angles are carried as points (cosine, sine): the eight lanes' angles are taken all at once afterwards. Letters: c and s are
+a cosine and a sine, n o a the columns of the wanted rotation, w the wrist point.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from armsight.data import Array
+from armsight.robot.kinematics.chain import Frame
+from armsight.robot.kinematics.structure import PARALLEL
+from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND
+from armsight.robot.kinematics.trig import angle_of, sincos
+
+Point = tuple[float, float]
+
+#: Bits of a solution's state, and of what kept the pose out of reach.
+SHOULDER, ELBOW, WRIST = 1, 2, 4
+#: Lane arrays beside the angles: shoulder, elbow, wrist (+-1), state.
+TAGS = 4
+
+#: Below this distance, m, or sine, a joint is not determined: what it moves stays below 1e-10 m or rad.
+_FREE = 1e-10
+#: Reach may be missed by so much, m: rounding, not distance.
+_SLACK_M = 1e-11
+#: Two solutions whose half difference has a sine below this are one: rounding alone parts a double one by 2e-8.
+_SAME = 5e-8
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+
+
+@_kernel
+def _in_link1(x: float, y: float, z: float, c1: float, s1: float, sa: float) -> tuple[float, float, float]:
+    """Turn a vector from frame 0 into the axes of link 1, whose z axis lies square to frame 0's."""
+    return c1 * x + s1 * y, sa * z, sa * (s1 * x - c1 * y)
+
+
+@_kernel
+def _at(table: Array, i: int, near: Array) -> Point:
+    """Return joint i's theta at ``near`` as a point."""
+    s, c = sincos(table[6 * i + 5] * near[i] + table[6 * i + 4])
+    return c, s
+
+
+@_kernel
+def _put(y: Array, x: Array, i: int, lane: int, c: float, s: float) -> None:
+    """Write joint i's angle into a lane."""
+    x[8 * i + lane], y[8 * i + lane] = c, s
+
+
+@_kernel
+def _tag(tags: Array, lane: int, front: float, up: float, wrist: float, state: int) -> None:
+    """Write a lane's configuration and state."""
+    tags[lane], tags[8 + lane] = front, 1.0 if up >= 0.0 else -1.0
+    tags[16 + lane], tags[24 + lane] = 1.0 if wrist >= 0.0 else -1.0, state
+
+
+@_kernel
+def _bend(table: Array, tx: float, ty: float, clamp: bool) -> tuple[bool, float, float]:
+    """Return whether the planar arm reaches a point, and the angle between its links as a point with s >= 0."""
+    upper, fore = table[6], table[FOREARM]
+    far2 = tx * tx + ty * ty
+    far, most, least = math.sqrt(far2), abs(upper) + fore, abs(abs(upper) - fore)
+    c = (far2 - upper * upper - fore * fore) / (2.0 * upper * fore)
+    c = min(1.0, max(-1.0, c))
+    return clamp or (least - _SLACK_M <= far <= most + _SLACK_M), c, math.sqrt((1.0 - c) * (1.0 + c))
+
+
+@_kernel
+def _upper_arm(table: Array, tx: float, ty: float, c: float, s: float, near: Array) -> Point:
+    """Return theta2 for the planar arm's end and the angle between its links."""
+    along, across = table[6] + table[FOREARM] * c, table[FOREARM] * s
+    x, y = along * tx + across * ty, along * ty - across * tx
+    length = math.sqrt(x * x + y * y)
+    if length < _FREE * abs(table[6]):  # folded back onto the shoulder: any direction will do
+        return _at(table, 1, near)
+    return x / length, y / length
+
+
+@_kernel
+def _lower_arm(table: Array, c2: float, s2: float, c: float, s: float) -> tuple[float, float, float, float]:
+    """Return theta3, and theta2 + theta3, as points: the angle between the links less the forearm's own bend."""
+    cb, sb = table[BEND + 1], table[BEND + 2]
+    c3, s3 = c * cb + s * sb, s * cb - c * sb
+    return c3, s3, c2 * c3 - s2 * s3, s2 * c3 + c2 * s3
+
+
+@_kernel
+def _spherical(
+    table: Array,
+    B: Frame,
+    near: Array,
+    clamp: bool,
+    front: float,
+    state: int,
+    y: Array,
+    x: Array,
+    tags: Array,
+    lane: int,
+) -> tuple[int, int]:
+    """Fill the lanes of one shoulder of a SPHERICAL arm; B is the wrist in link 1. Returns the next lane, what missed."""
+    nx, ny, nz, ox, oy, oz, ax, ay, az, tx, ty, _ = B
+    reached, c, s = _bend(table, tx, ty, clamp)
+    if not reached:
+        return lane, ELBOW
+    ways = 1 if s < _SAME else 2
+    state |= ELBOW if ways == 1 else 0
+    ca, sa, sa4, sa5 = table[14], table[15], table[21], table[27]
+    for way in range(ways):
+        s = -s if way else s
+        c2, s2 = _upper_arm(table, tx, ty, c, s, near)
+        c3, s3, c23, s23 = _lower_arm(table, c2, s2, c, s)
+        # The wanted rotation in frame 3: turned back by theta2 + theta3, then by alpha3.
+        n0, n1 = c23 * nx + s23 * ny, ca * (c23 * ny - s23 * nx) + sa * nz
+        o0, o1 = c23 * ox + s23 * oy, ca * (c23 * oy - s23 * ox) + sa * oz
+        a0, across = c23 * ax + s23 * ay, c23 * ay - s23 * ax
+        a1, a2 = ca * across + sa * az, ca * az - sa * across
+        size = math.sqrt(a0 * a0 + a1 * a1)
+        free = size < _FREE
+        c4, s4 = _at(table, 3, near) if free else (sa5 * a0 / size, sa5 * a1 / size)
+        for flip in range(1 if free else 2):
+            c4, s4 = (-c4, -s4) if flip else (c4, s4)
+            s5 = sa5 * (c4 * a0 + s4 * a1)
+            _put(y, x, 1, lane, c2, s2)
+            _put(y, x, 2, lane, c3, s3)
+            _put(y, x, 3, lane, c4, s4)
+            _put(y, x, 4, lane, -sa4 * sa5 * a2, s5)
+            _put(y, x, 5, lane, sa4 * sa5 * (s4 * o0 - c4 * o1), sa4 * sa5 * (s4 * n0 - c4 * n1))
+            _tag(tags, lane, front, -front * table[3] * table[6] * s, s5, state | (WRIST if free else 0))
+            lane += 1
+    return lane, 0
+
+
+@_kernel
+def _helpful_turn(table: Array, wx: float, wy: float, c: float, s: float) -> float:
+    """Return the least turn of theta2 + theta3 + theta4 that brings a PARALLEL arm's planar end within reach; 10 if none.
+
+    The end lies at the wrist point (wx, wy) less a lever that turns with that sum.
+    """
+    upper, fore = abs(table[6]), table[FOREARM]
+    across = table[25] * table[21]
+    lx, ly = table[18] * c + across * s, table[18] * s - across * c
+    far2, lever2 = wx * wx + wy * wy, lx * lx + ly * ly
+    product = 2.0 * math.sqrt(far2 * lever2)
+    now = angle_of(wx * ly - wy * lx, wx * lx + wy * ly)  # from the wrist point's direction to the lever's
+    reach2 = far2 + lever2 - 2.0 * (wx * lx + wy * ly)
+    edge = upper + fore if reach2 > upper * upper + fore * fore else upper - fore
+    cosine = far2 + lever2 - edge * edge
+    if abs(cosine) > product or product == 0.0:
+        return 10.0
+    cosine /= product
+    wanted = angle_of(math.sqrt((1.0 - cosine) * (1.0 + cosine)), cosine)
+    return (-wanted if now < 0.0 else wanted) - now
+
+
+@_kernel
+def _parallel(
+    table: Array,
+    B: Frame,
+    near: Array,
+    clamp: bool,
+    front: float,
+    state: int,
+    y: Array,
+    x: Array,
+    tags: Array,
+    lane: int,
+) -> tuple[int, int]:
+    """Fill the lanes of one shoulder of a PARALLEL arm; B is the wrist in link 1. Returns the next lane, what missed."""
+    nx, ny, _, ox, oy, _, ax, ay, az, wx, wy, _ = B
+    a4, d5, sa4, sa5 = table[18], table[25], table[21], table[27]
+    missed, size = 0, math.sqrt(ax * ax + ay * ay)
+    free = size < _FREE
+    c, s = (1.0, 0.0) if free else (sa5 * ax / size, sa5 * ay / size)  # of theta2 + theta3 + theta4
+    if free:
+        c6, s6 = _at(table, 5, near)
+        c, s = -sa4 * sa5 * (s6 * ny + c6 * oy), sa4 * sa5 * (s6 * nx + c6 * ox)
+    for flip in range(1 if free else 2):
+        c, s = (-c, -s) if flip else (c, s)
+        cs, ss = c, s
+        tx, ty = wx - a4 * cs - d5 * sa4 * ss, wy - a4 * ss + d5 * sa4 * cs
+        reached, ce, se = _bend(table, tx, ty, clamp and not free)
+        if not reached:
+            # Near the wrist's singularity the sum is free to turn, as far as the tool does not feel it.
+            turn = _helpful_turn(table, wx, wy, cs, ss)
+            if turn < 10.0 and (free or size * abs(turn) < _FREE):
+                st, ct = sincos(turn)
+                cs, ss = cs * ct - ss * st, ss * ct + cs * st
+                tx, ty = wx - a4 * cs - d5 * sa4 * ss, wy - a4 * ss + d5 * sa4 * cs
+            elif not clamp:
+                missed |= ELBOW
+                continue
+            _, ce, se = _bend(table, tx, ty, True)
+        ways = 1 if se < _SAME else 2
+        s5 = sa5 * (cs * ax + ss * ay)
+        for way in range(ways):
+            se = -se if way else se
+            c2, s2 = _upper_arm(table, tx, ty, ce, se, near)
+            c3, s3, c23, s23 = _lower_arm(table, c2, s2, ce, se)
+            _put(y, x, 1, lane, c2, s2)
+            _put(y, x, 2, lane, c3, s3)
+            _put(y, x, 3, lane, cs * c23 + ss * s23, ss * c23 - cs * s23)
+            _put(y, x, 4, lane, -sa4 * sa5 * az, s5)
+            _put(y, x, 5, lane, sa4 * sa5 * (ss * ox - cs * oy), sa4 * sa5 * (ss * nx - cs * ny))
+            now = state | (WRIST if free else 0) | (ELBOW if ways == 1 else 0)
+            _tag(tags, lane, front, -front * table[3] * table[6] * se, s5, now)
+            lane += 1
+    return lane, missed
+
+
+@_kernel
+def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: Array, tags: Array) -> tuple[int, int]:
+    """Write the thetas of all solutions into lanes, one after the other.
+
+    Args:
+        table: (96,) a packed table whose KIND is PARALLEL or SPHERICAL.
+        M: the wanted frame just after joint 6's turn, in frame 0 of the table.
+        near: (6,) joint angles, rad: what an undetermined joint is given.
+        clamp: write the closest that a step can come where a pose is out of reach.
+        y: (48,) lanes of the angles' sines.
+        x: (48,) lanes of their cosines.
+        tags: (32,) lanes of shoulder, elbow, wrist (+-1) and state.
+
+    Returns:
+        how many lanes were filled, and bits of what kept solutions out of reach.
+    """
+    sa, offset = table[3], table[ACROSS]
+    wx, wy, wz = M[9], M[10], M[11] - table[1]
+    r = math.sqrt(wx * wx + wy * wy)
+    if r < abs(offset) - _SLACK_M and not clamp:
+        return 0, SHOULDER
+    e = math.sqrt(max((r - abs(offset)) * (r + abs(offset)), 0.0))
+    free = r < _FREE
+    single = free or e < _SAME * r
+    missed, lane = 0, 0
+    for way in range(1 if single else 2):
+        e = -e if way else e
+        c1, s1 = wx * e - wy * offset, wy * e + wx * offset
+        length = math.sqrt(c1 * c1 + s1 * s1)
+        c1, s1 = _at(table, 0, near) if free else (c1 / length, s1 / length)
+        nx, ny, nz = _in_link1(M[0], M[1], M[2], c1, s1, sa)
+        ox, oy, oz = _in_link1(M[3], M[4], M[5], c1, s1, sa)
+        ax, ay, az = _in_link1(M[6], M[7], M[8], c1, s1, sa)
+        px, py, pz = _in_link1(wx, wy, wz, c1, s1, sa)
+        B = (nx, ny, nz, ox, oy, oz, ax, ay, az, px - table[0], py, pz)
+        front, state, first = (-1.0 if way else 1.0), (SHOULDER if single else 0), lane
+        if table[KIND] == PARALLEL:
+            lane, out = _parallel(table, B, near, clamp, front, state, y, x, tags, lane)
+        else:
+            lane, out = _spherical(table, B, near, clamp, front, state, y, x, tags, lane)
+        missed |= out
+        for k in range(first, lane):
+            _put(y, x, 0, k, c1, s1)
+    return lane, missed

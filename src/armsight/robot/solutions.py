@@ -1,0 +1,147 @@
+"""What an arm answers when it is asked for the joint angles of a pose.
+
+A pose out of reach, or one where a joint is not determined, is an answer with a reason, not an error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Ids, Record
+from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Which of the up to eight ways an arm takes to a pose; docs/arm.md has pictures in words.
+
+    Attributes:
+        shoulder: "front" where the wrist is ahead of axis 1 along link 1's x axis, "back" where the arm reaches over.
+        elbow: "up" where the elbow is above the line from shoulder to wrist, seen with the wrist ahead.
+        wrist: "noflip" where sin(theta_5) is positive or 0, "flip" where it is negative.
+    """
+
+    shoulder: Literal["front", "back"]
+    elbow: Literal["up", "down"]
+    wrist: Literal["noflip", "flip"]
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest(Record):
+    """The pose within the joints' limits that comes closest to one that cannot be had.
+
+    1 mm of position counts as much as 1 mrad of orientation.
+
+    Attributes:
+        q: (6,) joint angles, rad.
+        T_base_tool: (4, 4) where they bring the tool, m.
+        off_m: how far that is from the wanted position, m.
+        off_rad: how far it is turned from the wanted orientation, rad.
+    """
+
+    q: Array
+    T_base_tool: Array
+    off_m: float
+    off_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """All joint angles that bring the tool to a pose; none of them twice.
+
+    Those within limits come first; then by distance from ``near`` where that was given. The columns of one table, which
+    is the quick way to make a record.
+
+    Attributes:
+        rows: (N, 13) a row for each solution, as ``kinematics.inverse`` writes it; the properties are its columns.
+        reason: what keeps the answer from being plain: "singular: ...", "outside limits: ...", "unreachable: ..."; None
+            where nothing does.
+        nearest: where no solution is within limits, the closest pose that is.
+    """
+
+    rows: Array
+    reason: str | None = None
+    nearest: Nearest | None = None
+
+    def __post_init__(self) -> None:
+        """Make the table read-only."""
+        self.rows.flags.writeable = False
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.rows)
+
+    @property
+    def q(self) -> Array:
+        """(N, 6) joint angles, rad; whole turns are taken so that a joint is within its limits where that can be."""
+        return self.rows[:, :POSITION]
+
+    @property
+    def residual_m(self) -> Array:
+        """(N,) distance of the tool from the wanted position, m."""
+        return self.rows[:, POSITION]
+
+    @property
+    def residual_rad(self) -> Array:
+        """(N,) angle between the tool and the wanted orientation, rad."""
+        return self.rows[:, ANGLE]
+
+    @property
+    def signs(self) -> Array:
+        """(N, 3) shoulder, elbow, wrist as +-1 (front, up, noflip: +1); 0 where the arm has no such structure."""
+        return self.rows[:, CONFIGURATION:STATE]
+
+    @property
+    def within_limits(self) -> NDArray[np.bool_]:
+        """(N,) whether every joint is within its limits."""
+        return np.asarray(self.rows[:, STATE] < OUTSIDE)
+
+    @property
+    def singular(self) -> NDArray[np.bool_]:
+        """(N,) whether a joint is not determined, or two solutions are one."""
+        return np.asarray(self.rows[:, STATE] % OUTSIDE > 0)
+
+    @property
+    def best(self) -> Array | None:
+        """(6,) the first solution, rad, if it is within limits; else None, for then none is."""
+        return self.rows[0, :POSITION] if len(self.rows) and self.rows[0, STATE] < OUTSIDE else None
+
+    @property
+    def configurations(self) -> tuple[Configuration | None, ...]:
+        """One for each solution; None where the arm has no such structure."""
+        return tuple(_configuration(*signs) for signs in self.signs.tolist())
+
+
+def _configuration(shoulder: float, elbow: float, wrist: float) -> Configuration | None:
+    if shoulder == 0:
+        return None
+    return Configuration(
+        "front" if shoulder > 0 else "back", "up" if elbow > 0 else "down", "noflip" if wrist > 0 else "flip"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ManySolutions(Record):
+    """The solutions of many poses; what stands beyond a pose's count is 0.
+
+    Attributes:
+        count: (N,) how many solutions each pose has.
+        q: (N, M, 6) joint angles, rad, those within limits first.
+        residual_m: (N, M) as in :class:`Solutions`.
+        residual_rad: (N, M) likewise.
+        within_limits: (N, M) likewise.
+        singular: (N, M) likewise.
+        signs: (N, M, 3) likewise.
+    """
+
+    count: Ids
+    q: Array
+    residual_m: Array
+    residual_rad: Array
+    within_limits: NDArray[np.bool_]
+    singular: NDArray[np.bool_]
+    signs: Array
