@@ -16,6 +16,8 @@ from armsight.errors import ArmsightError
 
 #: Command name -> module in this package that holds a click command called ``command``; loaded only when used.
 COMMANDS = {
+    "arm": "arm",
+    "body": "body",
     "calibrate": "calibrate",
     "cameras": "cameras",
     "demo": "demo",

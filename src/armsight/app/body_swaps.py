@@ -1,0 +1,196 @@
+"""Which discs of a body may be taken for which, whether that is told apart, and what would separate them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+
+from armsight.app.body_faults import SURROUND
+from armsight.app.body_verdict import Finding, Swap
+from armsight.app.body_words import pair_words, swap_words
+from armsight.data import Array, Ids
+from armsight.vision.disc_view import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
+from armsight.vision.foresight import FACING, look_direction, separation
+from armsight.vision.markers.body_check import on_one_line
+from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.relabel import Relabeling, flat, other_side, relabelings
+from armsight.vision.rig import StereoRig
+
+#: A wrong reading is told from the right one where it misses by so many standard deviations: the odds of a million that
+#: identification asks for take five, chance may favour the wrong one by three.
+TOLD = 8.0
+#: More discs than these are not searched for what may be taken for what; with one of them hidden; for a better place.
+SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 40, 10, 6
+#: Ways to take discs for others that are looked into, the closest first.
+_LOOKED_INTO = 60
+_MOVES_MM = (2, 3, 4, 6, 8, 10, 15, 20, 30, 40)
+_FLAT_M = 1e-4
+
+
+def told_sigma_px(rig: StereoRig, discs: DiscTarget, distance_m: float) -> float:
+    """Return how well identification takes a disc's place to be known, px: noise, and a body not made quite as drawn."""
+    made_m = UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(discs.body.points, axis=0)))
+    return float(np.hypot(np.hypot(rig.sigma_px, UNMODELLED_PX), made_m * rig.left.intrinsics[0] / distance_m))
+
+
+def alike(discs: DiscTarget) -> NDArray[np.bool_]:
+    """(M, M) whether two discs look alike: in brightness, and in size as far as identification relies on it."""
+    same = discs.bright[:, None] == discs.bright[None]
+    ratio = discs.radii_m[:, None] / discs.radii_m[None]
+    most = (1 + SIZE_TOLERANCE) / (1 - SIZE_TOLERANCE)
+    return np.asarray(same & (ratio <= most) & (ratio >= 1 / most))
+
+
+def search_tolerance_m(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...]) -> float:
+    """Return how much two lengths may differ and still be worth a closer look, m: by far more than is told apart."""
+    f, sigma = rig.left.intrinsics[0], told_sigma_px(rig, discs, max(distances_m))
+    depth = np.sqrt(2) * sigma * max(distances_m) ** 2 / (f * rig.baseline_m)
+    size = float(pdist(discs.body.points).max())
+    return float(min(TOLD * depth, 0.5 * size))
+
+
+def seen_together(discs: DiscTarget) -> list[Ids]:
+    """Return which discs are seen from in front of each face, and from where most are: rows, three or more off a line."""
+    points, normals = discs.body.points, discs.normals
+    known = normals[np.isfinite(normals[:, 0])]
+    found: dict[tuple[int, ...], Ids] = {}
+    for direction in np.vstack([look_direction(points, normals), known]):
+        rows = np.flatnonzero(~(normals @ direction <= FACING))
+        if len(rows) >= 3 and not on_one_line(points[rows]):
+            found.setdefault(tuple(rows), rows)
+    return list(found.values())
+
+
+def find_swaps(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], seen: Ids, hidden: int = -1
+) -> tuple[Swap, ...]:
+    """Find what may be taken for what where a distance is not told apart, or only the normals tell.
+
+    Args:
+        rig: the cameras.
+        discs: the body's discs.
+        distances_m: where the body is to be used.
+        seen: rows of the discs in view.
+        hidden: a disc that something hides; none where below zero.
+    """
+    points, normals = discs.body.points, discs.normals
+    far = max(distances_m)
+    sigma = told_sigma_px(rig, discs, far)
+    swaps = []
+    found = relabelings(points, alike(discs), seen, search_tolerance_m(rig, discs, distances_m))
+    for one in found[:_LOOKED_INTO]:
+        told = separation(rig, points, normals, one, far, sigma, hidden)
+        by_side = np.isinf(told) and _sideless(rig, points, one, far, sigma) < TOLD
+        if told < TOLD or by_side:
+            each = [separation(rig, points, normals, one, d, told_sigma_px(rig, discs, d), hidden) for d in distances_m]
+            swaps.append(Swap(one, np.array(each), flat(points[seen], _FLAT_M) and other_side(one, points)))
+    return tuple(swaps)
+
+
+def _sideless(rig: StereoRig, points: Array, one: Relabeling, distance_m: float, sigma: float) -> float:
+    """Tell by how many standard deviations discs taken for each other miss if it were not known which way they look."""
+    if set(one.seen.tolist()) != set(one.taken_for.tolist()):
+        return np.inf
+    count = len(one.seen)
+    here = Relabeling(np.arange(count), np.searchsorted(one.seen, one.taken_for), one.T, one.mirrored, one.off_m)
+    return separation(rig, points[one.seen], np.full((count, 3), np.nan), here, distance_m, sigma)
+
+
+def ambiguities(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: tuple[Swap, ...], coded: bool
+) -> list[Finding]:
+    """Say what may be taken for what, what settles it, and what would; ``coded``: whether a tag or a board is there too."""
+    names, points = discs.body.point_names, discs.body.points
+    unsettled = [swap for swap in swaps if (swap.told < TOLD).any()]
+    findings = [_ambiguity(rig, discs, distances_m, swap, coded) for swap in unsettled[:4]]
+    if len(unsettled) > 4:
+        findings.append(Finding("note", "swap", f"and {len(unsettled) - 4} more ways to take discs for others"))
+    if unsettled and not coded:
+        findings.append(Finding("note", "change", "", _what_separates(rig, discs, distances_m, unsettled)))
+    for swap in swaps:
+        if np.isinf(swap.told).all():
+            text = f"{swap_words(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
+            findings.append(Finding("note", "behind", text))
+    most = seen_together(discs)[0]
+    if unsettled or coded or not 4 <= len(most) <= SEARCHED_HIDDEN:
+        return findings
+    for hidden in most:
+        seen = most[most != hidden]
+        if on_one_line(points[seen]):
+            findings.append(Finding("weak", "hidden", f"where {names[hidden]} is hidden, the others lie on one line"))
+            continue
+        lost = [swap for swap in find_swaps(rig, discs, distances_m, seen, int(hidden)) if (swap.told < TOLD).any()]
+        if lost:
+            what = swap_words(lost[0].relabeling, names)
+            at = distances_m[int(np.flatnonzero(lost[0].told < TOLD)[0])]
+            text = f"where {names[hidden]} is hidden, {what} fits too from {at:g} m on: such a shot is missed"
+            findings.append(Finding("weak", "hidden", text))
+    return findings
+
+
+def _ambiguity(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swap: Swap, coded: bool) -> Finding:
+    """Say what one way to take discs for others means."""
+    what = swap_words(swap.relabeling, discs.body.point_names) + (", seen from behind," if swap.behind else "")
+    if swap.relabeling.off_m < 1e-6:
+        text = f"{what} is the same body"
+    else:
+        k = int(np.flatnonzero(swap.told < TOLD)[-1])
+        sigma = told_sigma_px(rig, discs, distances_m[k])
+        wanted = f"; {1e3 * swap.relabeling.off_m * TOLD / swap.told[k]:.1f} mm would do" if swap.told[k] > 0.1 else ""
+        lengths = pair_words(swap.relabeling, discs.body)
+        known = f"{sigma * swap.told[k] / TOLD:.2g} px (reckoned with: {sigma:.2g} px){wanted}"
+        only = f"told apart at {distances_m[k]:g} m only if a disc's place is known to {known}"
+        text = f"{what.rstrip(',')}: {lengths}, {only}"
+    if coded:
+        return Finding("note", "swap", f"{text}; a tag or a board in view settles it")
+    return Finding("bad", "ambiguous", text)
+
+
+def _what_separates(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: list[Swap]) -> str:
+    """Say how the discs can be told apart: by normals, or by moving one of them as little as will do."""
+    points, names = discs.body.points, discs.body.point_names
+    unknown = np.isnan(discs.normals)
+    normals = np.where(unknown, look_direction(points, discs.normals), discs.normals)
+    given = "give every disc its normal and " if unknown.any() else ""
+    if unknown.any() and _separate(rig, discs, max(distances_m), points, normals):
+        return "give every disc its normal: then its side tells which is which"
+    pairs = [(int(i), int(j)) for s in swaps for i, j in zip(s.relabeling.seen, s.relabeling.taken_for, strict=True)]
+    moved = sorted({i for i, j in pairs if i != j})
+    for step in _MOVES_MM if len(points) <= SEARCHED_MOVES else ():
+        for i in moved:
+            for direction in np.vstack([np.eye(3), -np.eye(3)]):
+                if abs(direction @ normals[i]) > FACING:
+                    continue
+                trial = points.copy()
+                trial[i] += 1e-3 * step * direction
+                if _separate(rig, discs, max(distances_m), trial, normals):
+                    axis = f"{'+' if direction.sum() > 0 else '-'}{'xyz'[int(np.abs(direction).argmax())]}"
+                    return f"{given}move {names[i]} by {step} mm along {axis}: then the distances differ enough"
+    return f"{given}place the discs so that no two distances are alike, or add a tag"
+
+
+def _separate(rig: StereoRig, discs: DiscTarget, distance_m: float, points: Array, normals: Array) -> bool:
+    """Whether no disc may be taken for another at a distance, with a margin of a tenth, were they at other places."""
+    if float(pdist(points).min()) < (2 + SURROUND) * float(discs.radii_m.max()):
+        return False
+    tolerance, sigma = search_tolerance_m(rig, discs, (distance_m,)), told_sigma_px(rig, discs, distance_m)
+    return all(
+        separation(rig, points, normals, one, distance_m, sigma) >= 1.1 * TOLD
+        for seen in seen_together(discs)
+        for one in relabelings(points, alike(discs), seen, tolerance)
+    )
+
+
+def single_camera(discs: DiscTarget) -> list[Finding]:
+    """Say what one camera alone cannot tell."""
+    points = discs.body.points
+    if flat(points, _FLAT_M):
+        text = "a flat body has two poses that one camera alone hardly tells apart; two cameras do"
+        return [Finding("note", "single", text)]
+    everything = np.arange(len(points))
+    mirrored = relabelings(points, alike(discs), everything, 1e-3, mirrored=True)
+    if not mirrored:
+        return []
+    what = swap_words(mirrored[0], discs.body.point_names)
+    return [Finding("note", "mirror", f"{what} is its mirror image: harmless to two cameras, not to one alone")]
