@@ -225,7 +225,9 @@ def rig_of(solution: Solution) -> StereoRig:
 def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
     """Scale a rig's uncertainty by what the held-out pairs show.
 
-    Up where residuals are not white, down where both cameras err alike and their points agree the better for it.
+    Up where residuals are not white, down where both cameras err alike and their points agree the better for it. Where
+    boards moved between the exposures, that is most of what held-out pairs show: the corners' noise is then left as each
+    camera's agreement with itself tells it.
 
     Raises:
         CalibrationError: the held-out residuals say nothing.
@@ -233,4 +235,5 @@ def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
     factor = heldout.normalised_rms
     if not (np.isfinite(factor) and factor > 0):
         raise CalibrationError("the left-out shots do not tell how noisy the detections are: take more pairs")
-    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * factor)
+    corners = factor if heldout.motion_rms_m == 0 else 1.0
+    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * corners)
