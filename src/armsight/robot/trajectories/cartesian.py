@@ -19,7 +19,7 @@ from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, w
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, sample
-from armsight.robot.trajectories.walk import Obstacle, Walk, columns, derivatives, solve, walk
+from armsight.robot.trajectories.walk import Obstacle, Walk, columns, derivatives, refined, walk
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -59,17 +59,9 @@ class PathMotion:
         """Return the joints (N, 6) at times (N,), s."""
         share, speed, acceleration = (part[:, :1] for part in sample(self.law, t_s))
         places = self.path.at(share[:, 0])
-        nears = self.guide.near(share[:, 0])
-        q = np.array([self._joints(T, near) for T, near in zip(places.T_base_tool, nears, strict=True)])
+        q = refined(self.arm, places.T_base_tool, self.guide.near(share[:, 0]))
         q1, q2 = derivatives(self.arm, q, places)
         return Joints(q, q1 * speed, q1 * acceleration + q2 * speed**2)
-
-    def _joints(self, T_base_tool: Array, q_near: Array) -> Array:
-        """Return the joint angles (6,) of a pose on the path."""
-        q = solve(self.arm, T_base_tool, q_near)
-        if isinstance(q, str):
-            raise InputError(f"a pose on the path has no joint angles: {q}")
-        return q
 
 
 def follow(

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
+from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.path import Path, Places
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import (
@@ -30,6 +30,7 @@ from armsight.robot.trajectories.trajectory import (
     clamped,
     sample,
 )
+from armsight.robot.trajectories.walk import behind
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -106,22 +107,34 @@ def resolved_rate(
     if gap > tolerance_m:
         raise InputError(f"q_start does not put the tool at the start of the path: it is {1e3 * gap:.3f} mm away")
     wanted_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
-    for _ in range(ROUNDS):
+    tried: list[tuple[float, float]] = []
+    while True:
         law = _law(wanted_s)
         run = _track(arm, start.q, path, law)
         motion = _motion(run)
         t_s = check_times(motion.duration_s)
-        joints = sample(motion, t_s)
-        most = worst(arm, t_s, joints)
+        most = worst(arm, t_s, sample(motion, t_s))
         if most.ratio <= 1 + ROUNDING or run.off_m[-1] > tolerance_m:  # no slower motion mends a goal that is missed
             _check(arm, path, law, run, tolerance_m)
             return motion
-        if duration_s is not None:
+        if duration_s is not None or len(tried) == ROUNDS:
             raise _refused(path, law, most.what, float(t_s[most.row]))
-        wanted_s *= min(most.stretch, 4.0) * 1.01
-    raise InputError(
-        "the tracked motion could not be brought within the arm's limits; start further from the singularity"
-    )
+        tried.append((wanted_s, most.ratio))
+        wanted_s *= _slower(tried, most)
+
+
+def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
+    """Return by how much to slow down after durations and ratios that were tried.
+
+    Away from singularities all goes with a power of the duration. Close to them the damping keeps its own time, and the
+    power is taken from the last two tries.
+    """
+    factor = most.stretch
+    if len(tried) > 1:
+        (s_a, ratio_a), (s_b, ratio_b) = tried[-2:]
+        power = np.log(ratio_a / ratio_b) / np.log(s_b / s_a)
+        factor = most.ratio ** (1 / np.clip(power, 0.5, 3.0))
+    return float(min(factor, 4.0)) * 1.01
 
 
 def _law(duration_s: float) -> Profile:
@@ -148,12 +161,6 @@ def _speeds(arm: Arm, J: Array, V: Array) -> tuple[Array, float]:
     return Vt.T @ (s / (s**2 + (DAMPING * soft) ** 2) * (U.T @ (V / scale))), float(s[-1])
 
 
-def _off(T_ref: Array, T: Array) -> Array:
-    """Return how far a pose (4, 4) is behind another: [m; rad], base axes, for small turns."""
-    turn = np.cross(T[:3, :3], T_ref[:3, :3], axis=0).sum(axis=1) / 2
-    return np.concatenate([T_ref[:3, 3] - T[:3, 3], turn])
-
-
 def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
     """Run the tracker in steps of 1 ms, by the midpoint rule."""
     steps = int(np.ceil(law.duration_s * CHECK_RATE_HZ))
@@ -172,12 +179,12 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
         q = q + dt * _step(arm, q + dt / 2 * qd, places, V_ref, 2 * k + 1)[0]
     qs, offs, leasts = (np.array(part) for part in zip(*rows, strict=True))
     off_m, off_rad = (np.asarray(np.linalg.norm(part, axis=1)) for part in (offs[:, :3], offs[:, 3:]))
-    return _Run(np.arange(len(qs)) * dt, qs, off_m, off_rad, leasts)
+    return _Run(np.linspace(0, (len(qs) - 1) * dt, len(qs)), qs, off_m, off_rad, leasts)
 
 
 def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int) -> tuple[Array, Array, float]:
     """Return the joint speeds (6,) wanted now, how far the tool is behind (6,), and the smallest singular value."""
-    off = _off(places.T_base_tool[row], arm.forward(q))
+    off = behind(places.T_base_tool[row : row + 1], arm.forward(q)[None])[0]
     qd, least = _speeds(arm, arm.jacobian(q), V_ref[row] + GAIN * off)
     return qd, off, least
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from armsight.data import Array
+from armsight.errors import InputError
 from armsight.robot.trajectories.limits import outside
 from armsight.robot.trajectories.path import TURN_M, Path, Places
 
@@ -26,6 +27,8 @@ SLOW = 10 * SINGULAR
 STEP_M, STEPS = 1e-3, (100, 5000)
 #: Halvings of a step that find where a reason begins: to 1e-12 of the way.
 HALVINGS = 30
+#: Newton steps from a place of the walk to one beside it, and what they may leave, m and rad.
+NEWTON, REFINED = 3, 1e-10
 
 
 class Walk(NamedTuple):
@@ -67,22 +70,33 @@ def columns(x: Array, at: Array, values: Array) -> Array:
     return np.stack([np.interp(x, at, column) for column in values.T], axis=1)
 
 
-def solve(arm: Arm, T_base_tool: Array, q_near: Array) -> Array | str:
-    """Return the joint angles (6,) of a pose that are nearest to others, inside the limits or not; or why not."""
-    found = arm.inverse(T_base_tool, near=q_near)
-    if not found.solutions:
-        return str(found.reason)
-    q = np.array([solution.q for solution in found.solutions])
-    q += 2 * np.pi * np.round((q_near - q) / (2 * np.pi))
-    return np.asarray(q[np.argmin(np.abs(q - q_near).max(axis=1))])
+def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
+    """Return the joint angles (N, 6) of poses (N, 4, 4) from ones close by, by Newton's method.
+
+    Raises:
+        InputError: they were not close, or the poses are singular.
+    """
+    q = q_near
+    for _ in range(NEWTON):
+        off = behind(T_base_tool, arm.forward(q))
+        q = q + np.linalg.solve(arm.jacobian(q), off[..., None])[..., 0]
+    if np.abs(behind(T_base_tool, arm.forward(q))).max() > REFINED:
+        raise InputError("the joint angles on the path could not be found: it comes too near to a singularity")
+    return q
+
+
+def behind(T_goal: Array, T: Array) -> Array:
+    """Return how far poses (N, 4, 4) are behind others, (N, 6): [m; rad], base axes, for small turns."""
+    turn = np.cross(T[:, :3, :3], T_goal[:, :3, :3], axis=1).sum(axis=2) / 2
+    return np.concatenate([T_goal[:, :3, 3] - T[:, :3, 3], turn], axis=1)
 
 
 def derivatives(arm: Arm, q: Array, places: Places) -> tuple[Array, Array]:
     """Return q', q'' (N, 6) by the share of the way at joint angles (N, 6)."""
     J = arm.jacobian(q)
-    q1 = np.linalg.solve(J, places.twist[..., None])[..., 0]
+    q1 = np.asarray(np.linalg.solve(J, places.twist[..., None])[..., 0], np.float64)
     turning = np.array([arm.jacobian_rate(a, b) @ b for a, b in zip(q, q1, strict=True)])
-    return q1, np.linalg.solve(J, (places.bend - turning)[..., None])[..., 0]
+    return q1, np.asarray(np.linalg.solve(J, (places.bend - turning)[..., None])[..., 0], np.float64)
 
 
 def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
@@ -115,7 +129,8 @@ def walk(arm: Arm, path: Path, q_start: Array) -> tuple[Walk, Obstacle | None]:
         # An arm that stretches out becomes singular just before it cannot reach: then the reach is what is in the way.
         stretched = reason is not None and bool((smallest[good:] < 4 * SINGULAR).all())
         last = max((len(q) if stretched else good) - 1, 0)
-        obstacle = _obstacle(arm, path, (share[last], share[min(last + 1, len(share) - 1)]), q[last], sign[0])
+        low, high = share[last], share[min(last + 1, len(share) - 1)]
+        obstacle = _obstacle(arm, path, (low, high), q[last], None if stretched else sign[0])
         if good == 0:
             obstacle = Obstacle(0.0, _problem(arm, q[0], sign[0]) or obstacle.reason)
         slow = smallest[:good] < SLOW
@@ -133,14 +148,26 @@ def _steps(path: Path) -> Array:
 
 
 def _chain(arm: Arm, places: Places, q_start: Array) -> tuple[Array, str | None]:
-    """Return joint angles (K, 6) from place to place, and why they end before the path does."""
+    """Return joint angles (K, 6) from place to place, and why they end where the reach does; they end at a limit too."""
     chain = [q_start]
     for T in places.T_base_tool[1:]:
-        q = solve(arm, T, chain[-1])
+        q = _solve(arm, T, chain[-1])
         if isinstance(q, str):
             return np.array(chain), q
         chain.append(q)
+        if outside(arm, q) is not None:
+            break
     return np.array(chain), None
+
+
+def _solve(arm: Arm, T_base_tool: Array, q_near: Array) -> Array | str:
+    """Return the joint angles (6,) of a pose nearest to others, inside the limits or not; or why there are none."""
+    found = arm.inverse(T_base_tool, near=q_near)
+    if not len(found):
+        return f"the path leaves the reach of the arm ({found.reason})"
+    # Those outside the limits come last, though one of them may be the way the arm goes on.
+    q = found.q + 2 * np.pi * np.round((q_near - found.q) / (2 * np.pi))
+    return np.asarray(q[np.argmin(np.abs(q - q_near).max(axis=1))])
 
 
 def _problem(arm: Arm, q: Array, sign: float) -> str | None:
@@ -156,14 +183,14 @@ def _problem(arm: Arm, q: Array, sign: float) -> str | None:
     return f"a singularity: joints {named} can turn with hardly any motion of the tool"
 
 
-def _obstacle(arm: Arm, path: Path, between: tuple[float, float], q_good: Array, sign: float) -> Obstacle:
-    """Find where between two shares, of which the first is good, a reason begins."""
+def _obstacle(arm: Arm, path: Path, between: tuple[float, float], q_good: Array, sign: float | None) -> Obstacle:
+    """Find where between two shares, of which the first is good, a reason begins; without a sign only the reach is one."""
     low, high = between
     reason = "the configuration cannot be kept"
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        q = solve(arm, path.at(np.array([middle])).T_base_tool[0], q_good)
-        problem = q if isinstance(q, str) else _problem(arm, q, sign)
+        q = _solve(arm, path.at(np.array([middle])).T_base_tool[0], q_good)
+        problem = q if isinstance(q, str) else None if sign is None else _problem(arm, q, sign)
         if problem is None:
             low, q_good = middle, np.asarray(q)
         else:
