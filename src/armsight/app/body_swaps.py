@@ -124,7 +124,7 @@ def ambiguities(
         if lost:
             what = swap_words(lost[0].relabeling, names)
             at = distances_m[int(np.flatnonzero(lost[0].told < TOLD)[0])]
-            text = f"where {names[hidden]} is hidden, {what} fits too from {at:g} m on: such a shot is missed"
+            text = f"where {names[hidden]} is hidden, {what} fits as well or nearly from {at:g} m on: it may be missed"
             findings.append(Finding("weak", "hidden", text))
     return findings
 

@@ -198,10 +198,24 @@ def test_a_board_that_cannot_be_named_on_a_body_is_refused(tmp_path, spec, words
     assert "\n" not in str(error.value)
 
 
-def test_two_boards_of_a_body_that_look_alike_are_refused(tmp_path):
-    more = BOARD.format(spec="chessboard:7x4:10mm", turn="quaternion_wxyz = [1, 0, 0, 0]").replace('"B"', '"C"')
-    with pytest.raises(InputError, match=r"marker 2 \(C\).*may be taken for 'B'"):
-        open_target(boarded(tmp_path, "chessboard:9x6:25mm", more=more))
+@pytest.mark.parametrize(
+    ("one", "other", "good"),
+    [
+        ("chessboard:9x6:25mm", "chessboard:7x4:10mm", False),
+        ("charuco:8x5:15mm:11mm:DICT_5X5_100", "charuco:4x3:20mm:15mm:5X5_100", False),
+        ("charuco:4x3:20mm:15mm:tag36h11", "aprilgrid:3x2:20mm:0.3", False),
+        ("charuco:8x5:15mm:11mm:DICT_5X5_100", "charuco:4x3:20mm:15mm:4X4_50", True),
+        ("chessboard:9x6:25mm", "aprilgrid:3x2:20mm:0.3", True),
+    ],
+)
+def test_two_boards_of_a_body_that_look_alike_are_refused(tmp_path, one, other, good):
+    more = BOARD.format(spec=other, turn="quaternion_wxyz = [1, 0, 0, 0]").replace('"B"', '"C"')
+    path = boarded(tmp_path, one, more=more)
+    if good:
+        assert len(open_target(path).boards) == 2
+    else:
+        with pytest.raises(InputError, match=r"marker 2 \(C\).*may be taken for 'B'"):
+            open_target(path)
 
 
 def test_a_tag_that_is_on_a_board_too_is_refused(tmp_path):
@@ -209,6 +223,8 @@ def test_a_tag_that_is_on_a_board_too_is_refused(tmp_path):
         '[[markers]]\nname = "T"\nposition_mm = [200, 0, 0]\nnormal = [0, 0, -1]\nx_axis = [1, 0, 0]\n'
         'tag = { family = "tag36h11", id = 5, size_mm = 40 }\n'
     )
-    with pytest.raises(InputError, match=r"marker 2 \(T\).*id 5.*'B'"):
-        read_layout(boarded(tmp_path, "aprilgrid:3x2:20mm:0.3", more=tag))
-    read_layout(boarded(tmp_path, "aprilgrid:3x2:20mm:0.3", more=tag.replace("id = 5", "id = 6")))
+    for opened in (open_target, read_layout):
+        for board in ("aprilgrid:3x2:20mm:0.3", "charuco:4x3:20mm:15mm:DICT_APRILTAG_36h11"):
+            with pytest.raises(InputError, match=r"marker 2 \(T\).*id 5.*'B'"):
+                opened(boarded(tmp_path, board, more=tag))
+            opened(boarded(tmp_path, board, more=tag.replace("id = 5", "id = 6")))

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
-from armsight.vision.markers.aprilgrid import AprilGrid
+from armsight.vision.markers.aprilgrid import FAMILY, AprilGrid
+from armsight.vision.markers.aruco import APRILTAGS, family_name
 from armsight.vision.markers.board import Board, open_board
 from armsight.vision.markers.body_file import Marker
+from armsight.vision.markers.charuco import Charuco
 
 #: From a frame whose y runs up and whose z points out of the face to the marker's.
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -74,7 +76,7 @@ class BoardTarget(Record):
                 if _alike(board, other.board):
                     raise marker.error(
                         f"{board.body.name} may be taken for {other.name!r}, {other.board.body.name}: boards of one body "
-                        "need to be of different kinds, or charuco boards of different families"
+                        "need to be of different kinds, and their tags of different families"
                     )
             T = marker.pose()
             boards.append(
@@ -111,7 +113,41 @@ def _checked(spec: str) -> str:
     return spec
 
 
+def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
+    """Refuse a tag that is on a board of the same body too: it would be seen twice, and neither could be told.
+
+    Args:
+        tags: entries of kind ``tag``, already found good.
+        boards: entries of kind ``board``, already found good.
+
+    Raises:
+        InputError: such a tag; the message names it and the board.
+    """
+    for entry in boards:
+        family, count = _codes(open_board(entry.fields["spec"]))
+        for tag in tags:
+            if _dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] < count:
+                raise tag.error(
+                    f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids 0 to "
+                    f"{count - 1}: take another id or family"
+                )
+
+
+def _codes(board: Board) -> tuple[str, int]:
+    """Return the dictionary of a board's tags and how many it has, counted from 0; of none where it has no tags."""
+    if isinstance(board, AprilGrid):
+        return _dictionary(FAMILY), board.columns * board.rows
+    if isinstance(board, Charuco):
+        return _dictionary(board.family), board.columns * board.rows // 2
+    return "", 0
+
+
+def _dictionary(family: str) -> str:
+    """Return the one name of families that hold the same tags."""
+    return APRILTAGS.get(family, family)
+
+
 def _alike(one: Board, other: Board) -> bool:
-    """Whether the finder of one board may find the other: two of a kind, unless their markers are of two families."""
-    families = getattr(one, "family", None), getattr(other, "family", None)
-    return type(one) is type(other) and families[0] == families[1]
+    """Whether the finder of one board may find the other: tags of one dictionary, or two of a kind without tags."""
+    families = _codes(one)[0], _codes(other)[0]
+    return families[0] == families[1] if any(families) else type(one) is type(other)

@@ -10,10 +10,9 @@ import numpy as np
 
 from armsight.data import Array, Body, Record
 from armsight.errors import InputError
-from armsight.vision.markers.aprilgrid import FAMILY, AprilGrid
-from armsight.vision.markers.board_marker import BoardTarget
+from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.body_check import check_points
-from armsight.vision.markers.body_file import Marker, read_body_file
+from armsight.vision.markers.body_file import read_body_file
 from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.markers.tag import TagTarget
 
@@ -81,18 +80,5 @@ def read_layout(path: str | Path) -> Layout:
         BoardTarget.from_markers(name, of["board"]) if of["board"] else None,
     )
     check_points(path, layout.body)
-    _check_codes(layout, of["tag"])
+    check_codes(of["tag"], of["board"])
     return layout
-
-
-def _check_codes(layout: Layout, entries: list[Marker]) -> None:
-    """Raise InputError where a tag of the body is on one of its boards too."""
-    if layout.tags is None or layout.boards is None:
-        return
-    for entry, tag in zip(entries, layout.tags.tags, strict=True):
-        for placed in layout.boards.boards:
-            count = len(placed.board.body.points) // 4 if isinstance(placed.board, AprilGrid) else 0
-            if tag.family == FAMILY and tag.identity < count:
-                raise entry.error(
-                    f"{tag.family} id {tag.identity} is on the board {placed.name!r} too: give it another"
-                )

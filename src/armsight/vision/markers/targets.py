@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board import BOARDS, open_board
-from armsight.vision.markers.board_marker import BoardTarget
+from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.bodies import load_body_csv
 from armsight.vision.markers.body_check import check_points
 from armsight.vision.markers.body_file import Marker, read_body_file
@@ -84,6 +84,7 @@ def load_body_toml(path: str | Path) -> Target:
     discs = DiscTarget.from_markers(name, of_kind[DISC]) if of_kind[DISC] else None
     target = parts[0] if len(parts) == 1 and discs is None else Composite(name, parts, discs)
     check_points(path, target.body)
+    check_codes(of_kind["tag"], of_kind["board"])
     return target
 
 
