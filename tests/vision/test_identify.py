@@ -209,6 +209,18 @@ def test_misses_count_what_was_found():
     assert "no three have its distances" in identify(rig, PLATE, left, elsewhere).reason
 
 
+def test_a_disc_found_twice_is_one():
+    rig, rng = hd_rig(), np.random.default_rng(0)
+    left, right, owner = views(rig, PLATE, [someplace(rng)], rng)
+    twice = Discs(
+        np.vstack([left.uv, left.uv[:2] + 0.01]),
+        *(np.concatenate([a, a[:2]]) for a in (left.cov_uv, left.shape, left.bright)),
+    )
+    result = identify(rig, PLATE, twice, right)
+    assert isinstance(result, Identified)
+    assert wrong(result, owner) == []
+
+
 @pytest.mark.parametrize("points", [[[0, 0, 0], [0.1, 0, 0]], [[0, 0, 0], [0.05, 0, 0], [0.1, 0, 0]]])
 def test_a_body_that_fixes_no_pose_is_told(points):
     rig, rng = hd_rig(), np.random.default_rng(0)

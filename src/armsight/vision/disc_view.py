@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from armsight.data import Array, Discs, Ids, Record
 from armsight.vision.expected import Expected
@@ -30,7 +31,7 @@ class DiscView(Record):
         target: the body's discs.
         discs: what the left and the right camera saw.
         cov_uv: per camera (N, 2, 2) covariance of the centres with all that adds to what the image tells, px^2.
-        radius_px: per camera (N,) longer half axes.
+        radius_px: per camera (N,) longer half axes; NaN, which fits nothing, where a disc was found a second time.
         slack_px: per camera (N,) how far noise alone may take a half axis.
         rig_root: (P, R) with rig_root @ rig_root.T the rig's covariance, without the directions that are exact.
         unmade_m: standard deviation of a disc's place on the body as it was made, m.
@@ -55,7 +56,7 @@ class DiscView(Record):
             target,
             (left, right),
             (left.cov_uv + more, right.cov_uv + more),
-            (left.radius_px, right.radius_px),
+            (_radius_once(left), _radius_once(right)),
             (next(slack), next(slack)),
             _root(rig.cov),
             UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(target.body.points, axis=0))),
@@ -89,6 +90,18 @@ class DiscView(Record):
         return np.asarray(
             self.cov_uv[side][rows] + made[:, None, None] ** 2 * np.eye(2) + expected.cov_bias[m, side], np.float64
         )
+
+
+def _radius_once(discs: Discs) -> Array:
+    """Return (N,) longer half axes, NaN where a disc as large lies within half of it: that is the same disc again."""
+    radius = discs.radius_px
+    if len(radius) < 2:
+        return radius
+    one, again = cKDTree(discs.uv).query_pairs(radius.max() / 2, output_type="ndarray").T
+    near = np.linalg.norm(discs.uv[one] - discs.uv[again], axis=1) < radius[one] / 2
+    same = near & (np.abs(radius[one] - radius[again]) < SIZE_TOLERANCE * radius[one])
+    radius[again[same & (discs.bright[one] == discs.bright[again])]] = np.nan
+    return radius
 
 
 def _root(cov: Array) -> Array:

@@ -175,8 +175,7 @@ def _too_few(target: DiscTarget, discs: tuple[Discs, Discs]) -> str:
     for side, seen in zip(SIDES, discs, strict=True):
         text = f"{side}: {len(seen.uv)} disc{'' if len(seen.uv) == 1 else 's'} found"
         if seen.rejected:
-            why, _ = Counter(r.reason for r in seen.rejected).most_common(1)[0]
-            many = len(seen.rejected)
-            text += f", {many} looked like one and {'is' if many == 1 else 'are'} none ({why})"
+            many, first = len(seen.rejected), seen.rejected[0].reason  # the one that looks most like a disc
+            text += f", {many} looked like one and {'is' if many == 1 else 'are'} none ({first})"
         parts.append(text)
     return f"{'; '.join(parts)}; {target.body.name} has {len(target.radii_m)}"
