@@ -14,7 +14,11 @@ import pytest
 from armsight.app import body_draw
 from armsight.app.body_judge import judge
 from armsight.app.body_swaps import TOLD
-from armsight.vision.foresight import plain_rig
+from armsight.data import Discs, Missed
+from armsight.geometry.pose import inverse, transform
+from armsight.vision.conic import project_discs
+from armsight.vision.foresight import plain_rig, view
+from armsight.vision.identify import identify
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from cli_runs import refused
@@ -167,6 +171,39 @@ def test_what_could_be_better_is_said_and_the_body_is_usable(armsight, body):
     assert "known least: the turn about the body's x axis" in slim.out
     far = armsight("body", "check", body([(x, y, 400) for x, y, _ in TRIANGLE]))
     assert "the body's origin lies 401 mm from the markers' middle" in far.out
+
+
+def named(rig, target, distance, rng):
+    """What identification makes of a body's discs at five turns: right, wrong or missed; places as good as they get."""
+    words = []
+    for turn in ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7)):
+        T = view(rig, target.body.points, target.normals, distance, turn).T_left_body
+        sides = []
+        for camera, T_camera_body in ((rig.left, T), (rig.right, inverse(rig.T_left_right) @ T)):
+            p, n = transform(T_camera_body, target.body.points), target.normals @ T_camera_body[:3, :3].T
+            uv, shape, _, _ = project_discs(camera, p, n, target.radii_m)
+            order = rng.permutation(len(uv))
+            noisy = uv[order] + rng.normal(0, 0.02, uv.shape)
+            sides.append(Discs(noisy, np.tile(4e-4 * np.eye(2), (len(uv), 1, 1)), shape[order], target.bright[order]))
+        found = identify(rig, target, *sides)
+        if isinstance(found, Missed):
+            words.append(found.reason.split(":")[0])
+        else:
+            off = transform(found.T_left_body, target.body.points) - transform(T, target.body.points)
+            # Depth is known to sqrt(2) 0.02 z^2 / (f b) = 0.2 mm at 1.2 m; another naming is 100 mm off.
+            words.append("right" if np.abs(off).max() < 2e-3 else "wrong")
+    return words
+
+
+@pytest.mark.parametrize(
+    "places", [TRIANGLE, regular(3), [(64, 0, 0), *regular(3)[1:]], [(-55, 0, 0), (55.4, 0, 0), (0, 95, 0)]]
+)
+def test_identification_names_what_is_called_usable_and_misses_what_is_called_ambiguous(armsight, body, places):
+    path = body(places)
+    for distance in (0.6, 1.2):
+        said = armsight("body", "check", path, "--distance", distance, "--json")
+        words = set(named(plain_rig(), read_layout(path).discs, distance, np.random.default_rng(5)))
+        assert words == {"right" if facts(said)["verdict"] == "usable" else "ambiguous"}
 
 
 def test_one_hidden_disc_is_looked_into(armsight, body):

@@ -115,3 +115,5 @@ def test_separation_is_the_least_that_scipy_finds_over_the_turns(distance):
         least = min(least, 2 * least_squares(residuals, np.zeros(6), x_scale=1e-2, xtol=1e-12, ftol=1e-12).cost)
     assert separation(rig, points, NO_FACE, one, distance, sigma) == pytest.approx(np.sqrt(least), rel=1e-4)
     assert separation(rig, points, FACE, one, distance, sigma) == np.inf  # it shows the other side
+    assert np.isnan(separation(rig, points, FACE, one, 0.02, sigma))  # both cameras look at it edge-on
+    assert np.isnan(separation(rig, points, -FACE * [[1], [1], [-1]], one, distance, sigma))  # never seen together

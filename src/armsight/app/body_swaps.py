@@ -109,7 +109,7 @@ def ambiguities(
     if unsettled and not coded:
         findings.append(Finding("note", "change", "", _what_separates(rig, discs, distances_m, unsettled)))
     for swap in swaps:
-        if np.isinf(swap.told).all():
+        if swap.by_side:
             text = f"{swap_words(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
             findings.append(Finding("note", "behind", text))
     most = seen_together(discs)[0]

@@ -63,13 +63,19 @@ class Swap(Record):
 
     Attributes:
         relabeling: which for which.
-        told: (D,) by how many standard deviations it misses at each distance; infinite where the discs' faces tell.
+        told: (D,) by how many standard deviations it misses at each distance; infinite where the discs' faces tell, NaN
+            where these discs are not in view.
         behind: whether it shows the other side of a flat body, so that normals settle it.
     """
 
     relabeling: Relabeling
     told: Array
     behind: bool
+
+    @property
+    def by_side(self) -> bool:
+        """Whether the normals alone settle it."""
+        return bool(np.isinf(self.told).any() and not np.isfinite(self.told).any())
 
 
 @dataclass(frozen=True, eq=False)

@@ -184,19 +184,20 @@ def separation(
         hidden: a disc that something hides; none where below zero.
 
     Returns:
-        The root of the weighted sum of squares that the wrong reading leaves; infinity where its discs would be seen from
-        behind, at every turn at which those in view are seen and no others.
+        The root of the weighted sum of squares that the wrong reading leaves; infinity where its discs would always be seen
+        from behind, NaN where there is no turn at which the discs in view are seen and no others.
     """
     seen, taken = relabeling.seen, relabeling.taken_for
     others = np.setdiff1d(np.arange(len(points)), [*seen, hidden])
-    worst = np.inf
+    worst = np.nan
     for turn in ((0.0, 0.0), (_TURN, 0.0), (-_TURN, 0.0), (0.0, _TURN), (0.0, -_TURN)):
         true = view(rig, points[seen], normals[seen], distance_m, turn)
-        start = true.T_left_body @ inverse(relabeling.T)
-        read = ((true.T_left_body, seen), (start, taken))
-        if not all(_facing(rig, T, points[ids], normals[ids]).all() for T, ids in read):
+        here = np.asarray(_facing(rig, true.T_left_body, points, normals).all(axis=1))
+        if not here[seen].all() or here[others].any():
             continue
-        if _facing(rig, true.T_left_body, points[others], normals[others]).all(axis=1).any():
+        worst = np.fmin(worst, np.inf)
+        start = true.T_left_body @ inverse(relabeling.T)
+        if not _facing(rig, start, points[taken], normals[taken]).all():
             continue
         p = transform(true.T_left_body, points[seen])
         uv = np.concatenate([rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))])
@@ -206,5 +207,5 @@ def separation(
         )
         fit = fit_pose(rig.cameras, rig.T_left_right, points, sightings, start, robust=False)
         if fit is not None:
-            worst = min(worst, float(np.sqrt(fit.cost)))
-    return worst
+            worst = np.fmin(worst, np.sqrt(fit.cost))
+    return float(worst)

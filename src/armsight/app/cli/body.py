@@ -150,7 +150,8 @@ def _unique(layout: Layout, verdict: Verdict) -> str:
         return "yes, where a tag or a board is in view"
     if any(f.grade == "bad" and f.kind == "ambiguous" for f in verdict.findings):
         return "no"
-    if any(f.kind in ("view", "overlap") for f in verdict.findings):
+    unseen = all(np.isnan(one.cov).any() for one in verdict.outlooks)
+    if unseen or any(f.kind in ("view", "overlap") for f in verdict.findings):
         return "not judged"
     if any(f.kind == "behind" for f in verdict.findings):
         return "yes, by distances and normals"
@@ -198,9 +199,9 @@ def _facts(path: str, layout: Layout, rig: StereoRig, cameras: str, verdict: Ver
             "words": swap_words(swap.relabeling, layout.body.point_names),
             "off_mm": 1e3 * swap.relabeling.off_m,
             "from_behind": swap.behind,
-            "settled_by_normals": bool(np.isinf(swap.told).all()),
+            "settled_by_normals": swap.by_side,
             "told_apart_sigmas": [_number(sigmas) for sigmas in swap.told],
-            "told_apart": bool((swap.told >= TOLD).all()),
+            "told_apart": not bool((swap.told < TOLD).any()),
         }
         for swap in verdict.swaps
     ]
