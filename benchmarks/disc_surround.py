@@ -56,19 +56,43 @@ def _through_lens(image: np.ndarray, blur: float) -> np.ndarray:
 TEXTURES = {"plaster": plaster, "wood": wood, "bricks": bricks}
 
 
-def clutter(rng: np.random.Generator, width: int = WIDTH, items: int = 90, blur: float = 0.8) -> np.ndarray:
+def clutter(
+    rng: np.random.Generator,
+    width: int = WIDTH,
+    items: int = 90,
+    blur: float = 0.8,
+    discs: int = 0,
+    radius: float = 9.0,
+) -> np.ndarray:
     """Return the light (HEIGHT, width) of things that are no discs, drawn at twice the size and averaged.
 
-    Text, lines, boxes, squares, half and cut discs, rings, merged and touching discs, glints, chessboard corners.
+    Text, lines, boxes, squares, half and cut discs, rings, merged and touching discs, glints, chessboard corners; and on
+    top so many loose bright discs of a radius, for those who ask for them.
     """
     scale = 2
     canvas = np.full((scale * HEIGHT, scale * width), int(rng.integers(60, 160)), np.uint8)
     for kind in rng.integers(0, len(ITEMS), items):
         middle = rng.uniform((0, 0), (scale * width, scale * HEIGHT))
-        radius = scale * np.exp(rng.uniform(np.log(4), np.log(25)))
-        ITEMS[kind](canvas, middle, radius, float(rng.uniform(15, 240)), rng)
+        size = scale * np.exp(rng.uniform(np.log(4), np.log(25)))
+        ITEMS[kind](canvas, middle, size, float(rng.uniform(15, 240)), rng)
+    for middle in rng.uniform((0, 0), (scale * width, scale * HEIGHT), (discs, 2)):
+        _fill(canvas, _circle(middle, scale * (radius + 12), rng), 40.0)
+        _fill(canvas, _circle(middle, scale * radius, rng), 220.0)
     image = cv2.resize(canvas, (width, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(image, (0, 0), blur)
+
+
+def one_kind(kind: int, rng: np.random.Generator, blur: float = 0.8) -> tuple[np.ndarray, int]:
+    """Return the light of things of one kind, apart from each other, 5 to 25 px in radius, and how many there are."""
+    pitch = 120
+    canvas = np.full((2 * HEIGHT, 2 * WIDTH), 130, np.uint8)
+    places = [(u, v) for v in range(pitch // 2, HEIGHT, pitch) for u in range(pitch // 2, WIDTH, pitch)]
+    for u, v in places:
+        grey = 130.0 + (1 if rng.random() < 0.5 else -1) * rng.uniform(50, 115)
+        middle = 2 * (np.array([u, v]) + rng.uniform(-5, 5, 2))
+        ITEMS[kind](canvas, middle, 2 * np.exp(rng.uniform(np.log(5), np.log(25))), grey, rng)
+    image = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.GaussianBlur(image, (0, 0), blur), len(places)
 
 
 def _fill(canvas: np.ndarray, points: np.ndarray, grey: float) -> None:

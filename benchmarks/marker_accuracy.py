@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,9 +13,9 @@ from armsight.data import Discs, Missed
 from armsight.vision.markers.disc import DiscTarget
 from disc_bound import picture_bound
 from disc_images import WIDTH, Picture, disc_picture, exposed
-from disc_surround import TEXTURES, clutter
+from disc_surround import ITEMS, TEXTURES, clutter, one_kind
 from marker_plate import parallel_rig
-from marker_report import Report, disc_target, lacking
+from marker_report import Report, disc_target, lacking, without_numbers
 
 BINS = {
     "radius px": (4, 6, 9, 14, 20),
@@ -38,10 +37,10 @@ class Errors:
         cases: name of BINS -> (N,).
         uv: (N, 2) truth.
         slope: (N, 2) of the surround.
+        bright: (N,) whether a disc is.
         count: how many true discs there were.
         found_false: discs found where none is.
         reasons: why true ones were thrown out.
-        share_found: (count,) whether each was found, with ``all_cases`` beside it.
     """
 
     e: np.ndarray
@@ -50,6 +49,7 @@ class Errors:
     cases: dict[str, np.ndarray]
     uv: np.ndarray
     slope: np.ndarray
+    bright: np.ndarray
     count: int
     found_false: int
     reasons: Counter
@@ -73,9 +73,7 @@ def why_not(picture: Picture, discs: Discs, found: np.ndarray) -> Counter:
         distance = np.linalg.norm(places - picture.uv[i], axis=1)
         near = distance.argmin() if len(distance) else -1
         seen = near >= 0 and distance[near] < picture.axes[i, 0]
-        reasons[
-            re.sub(r"[-+]?\d[\d.e+-]*", "#", discs.rejected[near].reason) if seen else "not seen by the search"
-        ] += 1
+        reasons[without_numbers(discs.rejected[near].reason) if seen else "not seen by the search"] += 1
     return reasons
 
 
@@ -106,12 +104,13 @@ def run(pictures, targets: dict[bool, DiscTarget]) -> Errors:
                 ),
                 picture.uv[i],
                 picture.slope * n[:, None],
+                np.full(len(i), bright),
             )
         )
-    e, bound, cov, cases, uv, slope = (
+    e, bound, cov, cases, uv, slope, is_bright = (
         np.concatenate(p, axis=1 if k == 3 else 0) for k, p in enumerate(zip(*parts, strict=True))
     )
-    return Errors(e, bound, cov, dict(zip(BINS, cases, strict=True)), uv, slope, count, false, reasons)
+    return Errors(e, bound, cov, dict(zip(BINS, cases, strict=True)), uv, slope, is_bright, count, false, reasons)
 
 
 def over_bound(e: np.ndarray, bound: np.ndarray) -> float:
@@ -145,7 +144,9 @@ def biases(errors: Errors, rng: np.random.Generator) -> dict[str, tuple[float, f
         "with the place in the pixel, v": bias(errors, v, np.sin(2 * np.pi * errors.uv[:, 1])),
     }
     if np.abs(errors.slope).max() > 0:
-        out["along the gradient"] = bias(errors, errors.slope / np.linalg.norm(errors.slope, axis=1, keepdims=True))
+        way = errors.slope / np.linalg.norm(errors.slope, axis=1, keepdims=True)
+        for name, which in (("bright", errors.bright), ("dark", ~errors.bright)):
+            out[f"along the gradient, {name} discs"] = bias(errors, way, which.astype(float))
     return out
 
 
@@ -225,29 +226,47 @@ def textured(seed: int, report: Report, images: int = 12, count: int = 80) -> No
         report.figure("textured: kept", kept, ">= 90", form=".1f", unit="%", good=kept >= 90)
 
 
+def by_kind(seed: int, report: Report, images: int = 6) -> None:
+    """Say which kinds of clutter pass for discs, each thing alone on a plain ground."""
+    rng, targets = np.random.default_rng(seed + 3), (disc_target(), disc_target(False))
+    shares = {}
+    for kind, item in enumerate(ITEMS):
+        accepted = count = 0
+        for _ in range(images):
+            light, things = one_kind(kind, rng)
+            image = exposed(light, 2.0, 0.0, rng)
+            accepted, count = accepted + sum(len(t.find(image).uv) for t in targets), count + things
+        shares[item.__name__.strip("_").replace("_", " ")] = accepted / count
+    told = ", ".join(f"{name} {share:.2f}" for name, share in sorted(shares.items(), key=lambda pair: -pair[1]))
+    report.say(f"  discs accepted for one thing alone, by its kind: {told}")
+
+
 def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
     """Clutter on a wall before a stereo rig, so that all of it keeps the epipolar line; no disc and no plate is there."""
-    rng, rig, target = np.random.default_rng(seed + 2), parallel_rig(), disc_target()
+    rig, target = parallel_rig(), disc_target()
     targets = (target, disc_target(False))
     no_identify = lacking("identify")
     if no_identify is None:
         from armsight.vision.identify import identify
-    discs = poses = 0
-    for _ in range(pairs):
-        disparity = round(rig.left.intrinsics[0] * rig.baseline_m / rng.uniform(0.6, 1.2))
-        light = clutter(rng, WIDTH + disparity)
-        views = [exposed(light[:, start : start + WIDTH], rng.uniform(1, 4), 0.0, rng) for start in (0, disparity)]
-        for which in targets:
-            found = [which.find(view) for view in views]
-            discs += sum(len(f.uv) for f in found)
-            if no_identify is None:
-                poses += not isinstance(identify(rig, which, *found), Missed)
-    said = f"{2 * pairs} cluttered images: discs accepted (either brightness)"
-    report.say(f"  {said:62s} {discs}, {discs / (2 * pairs):.2f} an image")
-    if no_identify is not None:
-        report.say(f"  accepted into a pose: {no_identify}")
-    else:
-        report.figure("false discs accepted into a pose, pairs of views", poses, "0", form="d", good=poses == 0)
+    for label, number, loose in (("", pairs, 0), (", 12 loose discs of the plate's size in each", pairs // 5, 12)):
+        rng, discs, poses = np.random.default_rng(seed + 2 + loose), 0, 0
+        for _ in range(number):
+            depth = rng.uniform(0.6, 1.2)
+            disparity = round(rig.left.intrinsics[0] * rig.baseline_m / depth)
+            radius = rig.left.intrinsics[0] * target.radii_m[0] / depth
+            light = clutter(rng, WIDTH + disparity, discs=loose, radius=radius)
+            views = [exposed(light[:, start : start + WIDTH], rng.uniform(1, 4), 0.0, rng) for start in (0, disparity)]
+            for which in targets:
+                found = [which.find(view) for view in views]
+                discs += sum(len(f.uv) for f in found)
+                if no_identify is None:
+                    poses += not isinstance(identify(rig, which, *found), Missed)
+        said = f"{2 * number} cluttered images{label}"
+        report.say(f"  {said}: {discs / (2 * number):.1f} accepted as discs an image")
+        if no_identify is not None:
+            report.say(f"  accepted into a pose: {no_identify}")
+        else:
+            report.figure(f"{said}: poses", poses, "0", form="d", good=poses == 0)
 
 
 def figure(seed: int, report: Report) -> None:
@@ -257,4 +276,5 @@ def figure(seed: int, report: Report) -> None:
         return
     plain(seed, report)
     textured(seed, report)
+    by_kind(seed, report)
     cluttered(seed, report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import exposed
 from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, parallel_rig, views
-from marker_report import Report, disc_target, lacking
+from marker_report import Report, disc_target, lacking, opened, without_numbers
 
 RATE_HZ, SPEED, NOISE = 60.0, 0.5, 2.0
 Follow = Callable[[np.ndarray, np.ndarray], PoseEstimate | Missed]
@@ -27,10 +28,11 @@ WRONG_QUANTILE, WRONG_RAD = 1 - 1e-7, np.radians(5.0)
 def follower(rig: StereoRig, target: DiscTarget) -> Follow:
     """Return what measures pair after pair, 1/60 s apart: following where armsight can, else searching every shot."""
     if lacking("follow") is not None:
-        return lambda left, right: measure(rig, target, Shot("", left, right))
+        whole = opened(target)
+        return lambda left, right: measure(rig, whole, Shot("", left, right))
     from armsight.vision.follow import Follower
 
-    following, count = Follower(rig, target), [0]
+    following, count = Follower(rig, opened(target)), [0]
 
     def follow(left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
         count[0] += 1
@@ -124,7 +126,7 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
     # Shots since the whole plate shows, whether the last one gave no pose, and how many whole shots each regain took.
     run, lost, regained = 0, False, []
     wrong = losses = measured_in_part = in_part = missed_whole = 0
-    nees, reasons = [], set()
+    nees, reasons = [], Counter()
     for moment in moments(rig, target, shots, rng):
         result = follow(*moment.images)
         run = run + 1 if moment.whole else 0
@@ -132,7 +134,7 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
         if isinstance(result, Missed):
             losses, missed_whole = losses + (not lost), missed_whole + moment.whole
             lost = True
-            reasons.add(result.reason)
+            reasons[without_numbers(result.reason)] += 1
             continue
         if lost and run:
             regained.append(run)
@@ -156,4 +158,5 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
     if nees:
         report.figure("mean NEES (6 is honest)", np.mean(nees), form=".2f")
     if reasons:
-        report.say(f"  reasons of misses: {'; '.join(sorted(reasons)[:5])}")
+        for reason, times in reasons.most_common(5):
+            report.say(f"    missed {times} times: {reason}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -32,7 +33,7 @@ from marker_plate import (
     rim,
     shot,
 )
-from marker_report import Report, disc_target, lacking
+from marker_report import Report, disc_target, lacking, opened, without_numbers
 
 NOISE = 2.0
 Images = tuple[np.ndarray, np.ndarray]
@@ -59,9 +60,9 @@ def judge(
     label: str, rig: StereoRig, target: DiscTarget, shots: Iterator[tuple[np.ndarray, Images]], report: Report
 ) -> None:
     """Measure shots and print errors over the bound, NEES and coverage."""
-    xi, bound, nees, missed = [], [], [], []
+    xi, bound, nees, missed, whole = [], [], [], [], opened(target)
     for T, images in shots:
-        result = measure(rig, target, Shot("", *images))
+        result = measure(rig, whole, Shot("", *images))
         if isinstance(result, Missed):
             missed.append(result.reason)
             continue
@@ -69,8 +70,9 @@ def judge(
         bound.append(pose_bound(rig, target, T, NOISE))
         nees.append(xi[-1] @ np.linalg.solve(result.cov, xi[-1]))
     n = len(xi)
-    why = f"; missed: {'; '.join(sorted(set(missed))[:3])}" if missed else ""
-    report.say(f" {label}: {n} of {n + len(missed)} shots measured{why}")
+    report.say(f" {label}: {n} of {n + len(missed)} shots measured")
+    for reason, times in Counter(map(without_numbers, missed)).most_common(4):
+        report.say(f"    missed {times} times: {reason}")
     if not n:
         return
     e, b, d2 = np.array(xi), np.array(bound), np.array(nees)
@@ -100,8 +102,8 @@ def figure(seed: int, report: Report, count: int = 1000) -> None:
     target = disc_target()
     for label, lens, number, by_renderer in (
         ("pinhole", None, count, False),
-        ("lens with distortion", LENS, count // 2, False),
-        ("lens, armsight's renderer", LENS, count // 8, True),
+        ("lens with distortion", LENS, count // 3, False),
+        ("lens, armsight's renderer", LENS, count // 16, True),
     ):
         rng = np.random.default_rng(seed + number)
         rig = parallel_rig(lens, 3.0)
@@ -177,12 +179,12 @@ def plate_at_half_a_metre(seed: int, report: Report, count: int = 200) -> None:
         report.say(f"  pose of a plate of such discs: {missing}")
         return
     rng, rig, target = np.random.default_rng(seed + 9), parallel_rig(None, 8.0), disc_target(radius_m=0.015)
-    errors = []
+    errors, whole = [], opened(target)
     for k in range(count):
         around = 2 * np.pi * k / count
         R = exp_so3(np.pi / 4 * np.array([np.cos(around), np.sin(around), 0.0]))
         T = pose(R, np.array([0.11, 0.0, 0.5]) - R @ target.body.points.mean(axis=0))
-        result = measure(rig, target, Shot("", *shot(rig, target, T, 1.0, rng)))
+        result = measure(rig, whole, Shot("", *shot(rig, target, T, 1.0, rng)))
         if not isinstance(result, Missed):
             # Perspective moves centres along the tilt: the error in the frame of the cameras, turned to it.
             e = R @ log_se3(inverse(result.T_left_body) @ T)[:3]

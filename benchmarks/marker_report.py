@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,8 +13,10 @@ from pathlib import Path
 import numba
 import numpy as np
 
+from armsight import open_target
 from armsight.data import Body
 from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.marker import Target
 
 HD = (1280, 720)
 
@@ -43,6 +47,25 @@ def disc_target(bright: bool = True, radius_m: float = 0.008, count: int = 3) ->
     return DiscTarget(body, np.full(count, radius_m), np.full(count, bright), np.tile([0.0, 0.0, -1.0], (count, 1)))
 
 
+def opened(target: DiscTarget) -> Target:
+    """Return what ``measure`` takes: the same plate by way of a body file, as a user opens it."""
+    lines = [f'name = "{target.body.name}"']
+    for name, p, r, bright, n in zip(
+        target.body.point_names, target.body.points, target.radii_m, target.bright, target.normals, strict=True
+    ):
+        lines += [
+            "[[markers]]",
+            f'name = "{name}"',
+            f"position_mm = {(1e3 * p).tolist()}",
+            f"normal = {n.tolist()}",
+            f"disc = {{ radius_mm = {1e3 * r}, bright = {str(bool(bright)).lower()} }}",
+        ]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "plate.toml"
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return open_target(str(file))
+
+
 def lacking(*needs: str) -> str | None:
     """Say which of ``find``, ``identify``, ``measure`` and ``follow`` armsight does not have yet, or None."""
     for need in needs:
@@ -54,6 +77,11 @@ def lacking(*needs: str) -> str | None:
         elif importlib.util.find_spec(f"armsight.vision.{need}") is None:
             return f"armsight.vision.{need} is not there yet"
     return None
+
+
+def without_numbers(reason: str) -> str:
+    """Return a reason with its numbers taken out, to count how often it is given."""
+    return re.sub(r"[-+]?\d[\d.e+-]*", "#", reason)
 
 
 def last_level_cache_bytes() -> int:
