@@ -1,0 +1,271 @@
+"""Following a body of discs from shot to shot: once seen, only the places where it should be are looked at.
+
+The pose is carried on with the velocity of the last two; each disc is searched within a margin that follows how wrong the
+last predictions were, and everything from pixels to covariance is one compiled call
+(:mod:`~armsight.vision.follow_kernel`). What does not fit, and any first shot, goes the slow way through
+:func:`~armsight.vision.measure.measure`, which searches the whole image and takes no hint from the past.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.vision.expected import bias_normals
+from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, SEEN, TURNED_AWAY, Found, Scene, follow_pair
+from armsight.vision.image import grey
+from armsight.vision.locate import misfit_limit
+from armsight.vision.markers import disc_search
+from armsight.vision.markers.disc_fit import REASONS
+from armsight.vision.markers.disc_model import workspace
+from armsight.vision.markers.targets import Composite
+from armsight.vision.measure import measure
+from armsight.vision.rig import StereoRig
+
+Way = Literal["followed", "searched", "lost"]
+
+#: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
+#: least and at the most; and in sizes of the last errors of prediction.
+_MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
+#: A prediction older than so many shots is none.
+_OLDEST_SHOTS = 3
+#: A detection so many standard deviations off the pose sends the pair the slow way.
+_OFF_SIGMAS = 6.0
+#: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
+_JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
+_WORDS = {
+    **REASONS,
+    TURNED_AWAY: "turned away from the camera",
+    OUTSIDE: "outside the image",
+    NOT_THERE: "not where it should be",
+    OTHER_SIZE: "not of the size it should have",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Record):
+    """What is known of a body's motion.
+
+    Attributes:
+        T_left_body: (4, 4) last pose.
+        twist: (6,) its velocity in the body's axes, per second, or per shot where shots carry no time.
+        t_s: time of the last pose, or the number of its shot.
+        shots: how many shots ago it was seen.
+        margin_px: how far off predictions may be.
+        moving: whether the twist is known.
+    """
+
+    T_left_body: Array
+    twist: Array
+    t_s: float
+    shots: int
+    margin_px: float
+    moving: bool
+
+    def predicted(self, t_s: float) -> Array:
+        """Return the pose (4, 4) at a time."""
+        return self.T_left_body @ exp_se3(self.twist * (t_s - self.t_s))
+
+
+class Follower:
+    """Measures a body of discs shot after shot.
+
+    Attributes:
+        way: how the last shot was measured.
+        jump: what was unbelievable about the last pose, seen from the ones before; None where nothing was.
+    """
+
+    way: Way
+    jump: str | None
+
+    def __init__(self, rig: StereoRig, target: Composite) -> None:
+        """Make ready to follow; compiles where that was not done on this machine yet (about 30 s, once).
+
+        Args:
+            rig: the calibrated pair.
+            target: a body whose markers are discs and nothing else, with the normals of all known.
+        """
+        self.rig, self.target = rig, target
+        self.way, self.jump = "lost", None
+        self._track: Track | None = None
+        self._count = 0
+        discs = target.discs
+        if not follows(target) or discs is None:
+            raise ValueError(
+                f"{target.name} cannot be followed: it needs three discs or more with known normals, and no codes"
+            )
+        kernel = [camera.kernel_arguments() for camera in rig.cameras]
+        sizes = [camera.parameters.size for camera in rig.cameras]
+        self._scene = Scene(
+            np.array([k[0] for k in kernel]),
+            np.stack([k[1] for k in kernel]),
+            np.stack([k[2] for k in kernel]),
+            np.array([0, sizes[0]]),
+            np.array(sizes),
+            inverse(rig.T_left_right),
+            np.array(rig.cov),
+            max(rig.sigma_px, 1e-6) ** 2,
+            np.array(discs.body.points),
+            bias_normals(discs),
+            np.isfinite(discs.normals[:, 0]),
+            np.array(discs.radii_m),
+            np.where(discs.bright, 1, -1),
+        )
+        self._found = _room(len(discs.radii_m), rig.parameter_count)
+        self._cov_noise = np.empty((6, 6))
+        self._work, self._outline = workspace(), disc_search.workspace()
+        self._noise = 1.0
+        blank = np.zeros((16, 16), np.uint8)
+        self._found.T[:, :] = np.eye(4)
+        self._pair(blank, blank, 1.0)
+
+    def measure(self, shot: Shot) -> PoseEstimate | Missed:
+        """Measure one shot; shots come in the order of their time."""
+        self._count += 1
+        t_s = float(self._count) if shot.t_s is None else shot.t_s
+        self.jump = None
+        result: PoseEstimate | Missed | None = None
+        track = self._track
+        usable = shot.left is not None and shot.right is not None and shot.problem is None
+        if usable and track is not None and track.shots < _OLDEST_SHOTS and t_s > track.t_s:
+            result = self._followed(shot, track, t_s)
+        if isinstance(result, PoseEstimate):
+            self.way = "followed"
+            return result
+        result = measure(self.rig, self.target, shot)
+        if isinstance(result, Missed):
+            self.way = "lost"
+            if track is not None:
+                self._track = Track(
+                    track.T_left_body, track.twist, track.t_s, track.shots + 1, _MARGIN_MOST_PX, track.moving
+                )
+            return result
+        self.way = "searched"
+        self._begin(shot, result, track, t_s)
+        return result
+
+    def _begin(self, shot: Shot, result: PoseEstimate, track: Track | None, t_s: float) -> None:
+        """Take up the track at a pose that was found by searching."""
+        assert shot.left is not None
+        self._noise = disc_search.noise_of(np.ascontiguousarray(grey(shot.left)))
+        self._found.contrast[:] = 0.0
+        if track is not None and track.moving and track.shots < _OLDEST_SHOTS:
+            before = track.predicted(t_s)
+            xi = log_se3(inverse(before) @ result.T_left_body)
+            px = (
+                self.rig.left.intrinsics[0] * float(np.linalg.norm(xi[:3])) / max(float(result.T_left_body[2, 3]), 1e-3)
+            )
+            turned = float(np.linalg.norm(xi[3:]))
+            if turned > _JUMP_RAD or px > _JUMP_PX:
+                self.jump = (
+                    f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(turned):.0f} degrees from where it was "
+                    "expected"
+                )
+        self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, False)
+
+    def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
+        """Measure where the body should be; None where that gives nothing to be believed."""
+        assert shot.left is not None
+        assert shot.right is not None
+        left, right = grey(shot.left), grey(shot.right)
+        for camera, image in zip(self.rig.cameras, (left, right), strict=True):
+            if (image.shape[1], image.shape[0]) != camera.image_size_px:
+                return None
+        found = self._found
+        found.T[:, :] = track.predicted(t_s)
+        both, cost, chi_square = self._pair(left, right, track.margin_px)
+        if both < 3 or not np.isfinite(cost) or np.abs(found.whitened).max() > _OFF_SIGMAS * self._scale():
+            return None
+        codes = found.codes
+        good = codes == SEEN
+        off = found.uv - found.predicted
+        wrong = float(np.sqrt((off[good] ** 2).sum(axis=1).max()))
+        margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
+        T = found.T.copy()
+        twist = log_se3(inverse(track.T_left_body) @ T) / (t_s - track.t_s)
+        self._track = Track(T, twist, t_s, 0, margin, True)
+        return self._estimate(T, good, chi_square)
+
+    def _pair(self, left: NDArray[np.uint8], right: NDArray[np.uint8], margin: float) -> tuple[int, float, float]:
+        """Run the compiled call."""
+        least = max(disc_search.LEAST_CONTRAST, 5.0 * self._noise)
+        arguments = (self._scene, margin, self._noise, least, self._found, self._cov_noise, self._work, self._outline)
+        both, cost, chi_square = follow_pair(left, right, *arguments)
+        return both, cost, chi_square
+
+    def _scale(self) -> float:
+        """How many times larger than noise makes them whitened residuals may be, the calibration being wrong: the most."""
+        J_rig = self._found.J_rig
+        return float(np.sqrt(1.0 + np.einsum("ip,pq,iq->i", J_rig, self.rig.cov, J_rig).max()))
+
+    def _estimate(self, T: Array, good: NDArray[np.bool_], chi_square: float) -> PoseEstimate:
+        """Make the record of what the compiled call found."""
+        found, discs = self._found, self.target.discs
+        assert discs is not None
+        freedom = 2 * int(good.sum()) - 6
+        misfit = max(chi_square / freedom, 1.0) if chi_square > misfit_limit(freedom) else 1.0
+        seen = np.flatnonzero(good.any(axis=1))
+        both = np.flatnonzero(good.all(axis=1))
+        names = discs.body.point_names
+        dropped = tuple(
+            Dropped(names[m], f"{side}: {_WORDS[int(found.codes[m, c])]}")
+            for c, side in enumerate(("left", "right"))
+            for m in np.flatnonzero(~good[:, c])
+        )
+        uv = np.where(good[..., None], found.uv - found.bias, np.nan)[seen]
+        cov_uv = np.where(good[..., None, None], found.cov_uv, 0.0)[seen]
+        p_left = found.p_left[both]
+        gap = p_left - (discs.body.points[both] @ T[:3, :3].T + T[:3, 3])
+        noise = self._cov_noise * misfit
+        return PoseEstimate(
+            T,
+            found.cov + noise,
+            noise,
+            float(np.sqrt((gap**2).sum(axis=1).mean())),
+            float(np.sqrt((found.residual[good] ** 2).sum(axis=1).mean())),
+            float(np.sqrt(misfit)),
+            Points(
+                both,
+                p_left,
+                found.cov_p[both],
+                found.by_rig[both],
+                Correspondences(seen, uv, cov_uv, dropped),
+                dropped,
+            ),
+            dropped,
+        )
+
+
+def follows(target: object) -> bool:
+    """Whether a target can be followed: three discs or more and nothing else, their normals known or of no account."""
+    if not isinstance(target, Composite) or target.parts or target.discs is None:
+        return False
+    return len(target.discs.radii_m) >= 3 and bool(np.isfinite(bias_normals(target.discs)).all())
+
+
+def _room(count: int, parameters: int) -> Found:
+    """Return arrays for the results of one pair."""
+    return Found(
+        np.full((count, 2), NOT_THERE),
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2, 2, 2)),
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2)),
+        np.zeros((count, 2, 2)),
+        np.eye(4),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, parameters)),
+        np.zeros(4 * count),
+        np.zeros((4 * count, 6)),
+        np.zeros((4 * count, parameters)),
+        np.zeros((count, 2, 2)),
+    )

@@ -1,0 +1,406 @@
+"""One pair of images to a pose, in one compiled call: windows, centres, pose, points and covariances.
+
+Everything is searched where a predicted pose says, so a pair costs what its few discs cost. The pose minimises the whitened
+distance of the ellipses' centres to where the discs' ellipses would have theirs (the perspective bias is in the model, not
+corrected afterwards); the discs' images vote on nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.vision.camera import distort
+from armsight.vision.conic import disc_image
+from armsight.vision.markers.disc_fit import fit, shape_of
+from armsight.vision.markers.disc_model import Work
+from armsight.vision.markers.disc_search import Room, outline
+from armsight.vision.posefit import moved
+
+#: What came of one disc in one image; other codes are those of disc_fit.REASONS.
+SEEN, TURNED_AWAY, OUTSIDE, NOT_THERE, OTHER_SIZE = 0, 20, 21, 22, 23
+#: Cosine between a disc's normal and its direction to the camera below which it is not looked for: 78 degrees.
+_FACING = 0.2
+#: How much larger or smaller than predicted a disc may look.
+_SIZE = 1.35
+_STEPS = 8
+
+
+class Scene(NamedTuple):
+    """What does not change from pair to pair.
+
+    Attributes:
+        fisheye: (2,) whether a camera is a fisheye.
+        k: (2, 4) intrinsics.
+        d: (2, 8) distortion.
+        first: (2,) where a camera's parameters begin in the rig's.
+        sizes: (2,) how many parameters a camera has.
+        T_right_left: (4, 4).
+        cov_rig: (P, P) covariance of the rig's parameters.
+        variance: of a centre beyond what the image tells, px^2.
+        points: (M, 3) centres of the discs, m.
+        normals: (M, 3) their normals, for the bias.
+        faces: (M,) whether the normal's side is known.
+        radii: (M,) m.
+        signs: (M,) 1 bright, -1 dark.
+    """
+
+    fisheye: NDArray[np.bool_]
+    k: Array
+    d: Array
+    first: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    T_right_left: Array
+    cov_rig: Array
+    variance: float
+    points: Array
+    normals: Array
+    faces: NDArray[np.bool_]
+    radii: Array
+    signs: NDArray[np.int64]
+
+
+class Found(NamedTuple):
+    """What one pair gives; M discs, two cameras.
+
+    Attributes:
+        codes: (M, 2) what came of each.
+        uv: (M, 2, 2) centres of the ellipses, raw px.
+        cov_uv: (M, 2, 2, 2) from the image alone, px^2.
+        shape: (M, 2, 3) ellipses, px^2.
+        predicted: (M, 2, 2) where they were looked for.
+        contrast: (M, 2) grey levels, kept from pair to pair; 0 where not known.
+        residual: (M, 2, 2) of the pose, px.
+        T: (4, 4) pose, begun with the prediction.
+        H: (6, 6) information.
+        cov: (6, 6) with the rig's share; the noise's share alone is the inverse of H.
+        p_left: (M, 3) points, of those both cameras saw.
+        cov_p: (M, 3, 3) their covariance from the pixel noise, m^2.
+        by_rig: (M, 3, P) their derivative by the rig.
+        whitened: (4 M,) residuals.
+        J: (4 M, 6) whitened.
+        J_rig: (4 M, P) whitened.
+        bias: (M, 2, 2) centre of ellipse less image of centre, px.
+    """
+
+    codes: NDArray[np.int64]
+    uv: Array
+    cov_uv: Array
+    shape: Array
+    predicted: Array
+    contrast: Array
+    residual: Array
+    T: Array
+    H: Array
+    cov: Array
+    p_left: Array
+    cov_p: Array
+    by_rig: Array
+    whitened: Array
+    J: Array
+    J_rig: Array
+    bias: Array
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _surround(image: NDArray[np.uint8], x: int, y: int, shape: Array) -> float:
+    """Return the mean level of eight places on a ring around an ellipse at (x, y)."""
+    height, width = image.shape
+    grow = 1.3 + 2.5 / np.sqrt(np.sqrt(max(shape[0] * shape[2] - shape[1] * shape[1], 1.0)))
+    l11 = np.sqrt(shape[0])
+    l21 = shape[1] / l11
+    l22 = np.sqrt(max(shape[2] - l21 * l21, 0.0))
+    total = 0.0
+    for k in range(8):
+        c, s = np.cos(0.7853981633974483 * k), np.sin(0.7853981633974483 * k)
+        i, j = int(np.rint(x + grow * l11 * c)), int(np.rint(y + grow * (l21 * c + l22 * s)))
+        total += image[min(max(j, 0), height - 1), min(max(i, 0), width - 1)]
+    return total / 8
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _seek(
+    image: NDArray[np.uint8], uv: Array, shape: Array, margin: float, least: float, contrast: float, sign: int,
+    theta: Array, room: Room,
+) -> int:  # fmt: skip
+    """Find a disc near its predicted place and make a start for its fit."""
+    height, width = image.shape
+    x, y = int(np.rint(uv[0])), int(np.rint(uv[1]))
+    reach_x, reach_y = margin + np.sqrt(shape[0]), margin + np.sqrt(shape[2])
+    if x < 0 or y < 0 or x >= width or y >= height:
+        return OUTSIDE
+    code = NOT_THERE
+    low = _surround(image, x, y, shape)
+    if sign * (image[y, x] - low) >= least:
+        code = outline(image, x, y, int(low), sign, theta, room)
+        if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 <= margin * margin:
+            return 0
+    # Not there: of the pixels in the window that stand out by half the contrast, the one nearest to the prediction.
+    det = shape[0] * shape[2] - shape[1] * shape[1]
+    step = max(1, int(0.7 * np.sqrt(det / max(shape[0], shape[2]))))
+    beyond = max(least, 0.5 * contrast)
+    best, x1, y1 = np.inf, -1, -1
+    for j in range(max(0, int(y - reach_y)), min(height, int(y + reach_y) + 1), step):
+        for i in range(max(0, int(x - reach_x)), min(width, int(x + reach_x) + 1), step):
+            far = (i - uv[0]) ** 2 + (j - uv[1]) ** 2
+            if far < best and sign * (image[j, i] - low) >= beyond:
+                best, x1, y1 = far, i, j
+    if x1 < 0:
+        return code
+    low = _surround(image, x1, y1, shape)
+    code = outline(image, x1, y1, int(low), sign, theta, room)
+    if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 > margin * margin:
+        return NOT_THERE
+    return code
+
+
+@numba.njit(cache=True, error_model="numpy")
+def look(
+    image: NDArray[np.uint8], side: int, scene: Scene, margin: float, noise: float, least: float, found: Found, work: Work,
+    room: Room,
+) -> int:  # fmt: skip
+    """Find the discs of one image around where the pose ``found.T`` has them; return how many were found."""
+    T = scene.T_right_left @ found.T if side == 1 else found.T
+    P, n = np.empty(3), np.empty(3)
+    theta, expected, J_P, J_n = np.empty(10), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
+    seen = 0
+    for m in range(len(scene.radii)):
+        for i in range(3):
+            P[i] = T[i, 3]
+            n[i] = 0.0
+            for j in range(3):
+                P[i] += T[i, j] * scene.points[m, j]
+                n[i] += T[i, j] * scene.normals[m, j]
+        uv = found.predicted[m, side]
+        distance = np.sqrt(P[0] * P[0] + P[1] * P[1] + P[2] * P[2])
+        if scene.faces[m] and -(P[0] * n[0] + P[1] * n[1] + P[2] * n[2]) < _FACING * distance:
+            found.codes[m, side] = TURNED_AWAY
+            continue
+        if not disc_image(
+            scene.fisheye[side], scene.k[side], scene.d[side], P, n, scene.radii[m], uv, expected, J_P, J_n
+        ):
+            found.codes[m, side] = TURNED_AWAY
+            continue
+        code = _seek(image, uv, expected, margin, least, found.contrast[m, side], scene.signs[m], theta, room)
+        if code == 0:
+            code = fit(image, noise, theta, found.cov_uv[m, side], work)
+        if code == 0:
+            shape = found.shape[m, side]
+            shape_of(theta, shape)
+            ratio = (shape[0] * shape[2] - shape[1] * shape[1]) / (
+                expected[0] * expected[2] - expected[1] * expected[1]
+            )
+            if not 1.0 / _SIZE**4 < ratio < _SIZE**4:
+                code = OTHER_SIZE
+        found.codes[m, side] = code
+        if code == 0:
+            found.uv[m, side, 0], found.uv[m, side, 1] = theta[0], theta[1]
+            found.contrast[m, side] = abs(theta[6])
+            seen += 1
+    return seen
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _linearise(scene: Scene, T_left: Array, found: Found, rig: bool) -> float:
+    """Fill residuals and whitened J at a pose, by the rig too where asked; return the sum of squares or, behind, inf."""
+    P, n, e = np.empty(3), np.empty(3), np.empty(3)
+    uv, shape, J_P, J_n = np.empty(2), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
+    xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))
+    cost = 0.0
+    T_right = scene.T_right_left @ T_left
+    last = scene.cov_rig.shape[0] - 6
+    for m in range(len(scene.radii)):
+        p, b = scene.points[m], scene.normals[m]
+        for side in range(2):
+            row = 4 * m + 2 * side
+            found.whitened[row : row + 2] = 0.0
+            found.J[row : row + 2] = 0.0
+            if found.codes[m, side] != SEEN:
+                continue
+            T = T_right if side == 1 else T_left
+            for i in range(3):
+                P[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
+                n[i] = T[i, 0] * b[0] + T[i, 1] * b[1] + T[i, 2] * b[2]
+            k = scene.k[side]
+            if not disc_image(scene.fisheye[side], k, scene.d[side], P, n, scene.radii[m], uv, shape, J_P, J_n):
+                return np.inf
+            # Whitening: the lower triangle of the inverse of the covariance's Cholesky factor.
+            c = found.cov_uv[m, side]
+            l00 = np.sqrt(c[0, 0] + scene.variance)
+            l10 = c[1, 0] / l00
+            l11 = np.sqrt(c[1, 1] + scene.variance - l10 * l10)
+            r0, r1 = found.uv[m, side, 0] - uv[0], found.uv[m, side, 1] - uv[1]
+            found.residual[m, side, 0], found.residual[m, side, 1] = r0, r1
+            a = r0 / l00
+            found.whitened[row], found.whitened[row + 1] = a, (r1 - l10 * a) / l11
+            cost += found.whitened[row] ** 2 + found.whitened[row + 1] ** 2
+            for i in range(2):
+                for j in range(3):
+                    by_place = J_P[i, 0] * T[0, j] + J_P[i, 1] * T[1, j] + J_P[i, 2] * T[2, j]
+                    found.J[row + i, j] = by_place
+                    e[j] = J_n[i, 0] * T[0, j] + J_n[i, 1] * T[1, j] + J_n[i, 2] * T[2, j]
+                g = found.J[row + i]
+                g[3] = g[2] * p[1] - g[1] * p[2] + e[2] * b[1] - e[1] * b[2]
+                g[4] = g[0] * p[2] - g[2] * p[0] + e[0] * b[2] - e[2] * b[0]
+                g[5] = g[1] * p[0] - g[0] * p[1] + e[1] * b[0] - e[0] * b[1]
+            for j in range(6):
+                a = found.J[row, j] / l00
+                found.J[row, j] = a
+                found.J[row + 1, j] = (found.J[row + 1, j] - l10 * a) / l11
+            if not rig:
+                continue
+            distort(scene.fisheye[side], scene.d[side], P, xy, J_p, J_d)
+            found.bias[m, side, 0], found.bias[m, side, 1] = uv[0] - k[0] * xy[0] - k[2], uv[1] - k[1] * xy[1] - k[3]
+            first, count = scene.first[side], scene.sizes[side]
+            for i in range(2):
+                G = found.J_rig[row + i]
+                G[:] = 0.0
+                G[first + i], G[first + 2 + i] = xy[i], 1.0
+                for j in range(count - 4):
+                    G[first + 4 + j] = k[i] * J_d[i, j]
+                if side == 1:
+                    for j in range(3):
+                        G[last + j] = -J_P[i, j]
+                    G[last + 3] = J_P[i, 1] * P[2] - J_P[i, 2] * P[1]
+                    G[last + 4] = J_P[i, 2] * P[0] - J_P[i, 0] * P[2]
+                    G[last + 5] = J_P[i, 0] * P[1] - J_P[i, 1] * P[0]
+            for j in range(last + 6):
+                a = found.J_rig[row, j] / l00
+                found.J_rig[row, j] = a
+                found.J_rig[row + 1, j] = (found.J_rig[row + 1, j] - l10 * a) / l11
+    return cost
+
+
+@numba.njit(cache=True, error_model="numpy")
+def settle(scene: Scene, found: Found) -> float:
+    """Minimise over the pose ``found.T``; return the sum of the squared whitened residuals, infinite without a minimum."""
+    trial, H, g = np.empty((4, 4)), found.H, np.empty(6)
+    cost = _linearise(scene, found.T, found, False)
+    for _ in range(_STEPS):
+        if not np.isfinite(cost):
+            return np.inf
+        H[:, :] = found.J.T @ found.J
+        g[:] = found.J.T @ found.whitened
+        if not np.linalg.cond(H) < 1e14:
+            return np.inf
+        xi = np.linalg.solve(H, g).astype(np.float64)
+        moved(found.T, xi, trial)
+        new = _linearise(scene, trial, found, False)
+        if not new <= cost * (1 + 1e-9) + 1e-9:
+            return np.inf  # from a prediction that good a full step goes down; else the slow way is taken
+        done = cost - new <= 1e-7 * (1.0 + new)
+        found.T[:, :] = trial
+        cost = new
+        if done:
+            return _linearise(scene, found.T, found, True)
+    return np.inf
+
+
+@numba.njit(cache=True, error_model="numpy")
+def uncertainty(scene: Scene, found: Found, cov_noise: Array) -> float:
+    """Fill covariances; return the residuals' chi-square with what a wrong calibration explains taken off.
+
+    The rig's share goes through the same fit: gain = H^-1 J^T J_rig. Chi-square: residuals weighted by the inverse of
+    I + B cov_rig B^T with B the part of J_rig that no pose explains (Woodbury's identity), as in ``locate``.
+    """
+    J, J_rig = found.J, found.J_rig
+    for row in range(len(found.whitened)):
+        if found.codes[row // 4, (row // 2) % 2] != SEEN:
+            J_rig[row] = 0.0
+    found.H[:, :] = J.T @ J
+    cov_noise[:, :] = np.linalg.inv(found.H)
+    gain = cov_noise @ (J.T @ J_rig)
+    found.cov[:, :] = gain @ scene.cov_rig @ gain.T
+    B = J_rig - J @ gain
+    v = B.T @ found.whitened
+    M = np.eye(len(scene.cov_rig)) + scene.cov_rig @ (B.T @ B)
+    explained = v @ np.linalg.solve(M, scene.cov_rig @ v)
+    return float(found.whitened @ found.whitened - explained)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def triangulated(scene: Scene, found: Found) -> None:
+    """Fill the points of the discs that both cameras saw: Gauss-Newton on four whitened coordinates from the pose's."""
+    xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))
+    A, r, P = np.zeros((4, 3)), np.zeros(4), np.empty(3)
+    R = scene.T_right_left
+    for m in range(len(scene.radii)):
+        if found.codes[m, 0] != SEEN or found.codes[m, 1] != SEEN:
+            continue
+        p = found.p_left[m]
+        for i in range(3):
+            p[i] = found.T[i, 3]
+            for j in range(3):
+                p[i] += found.T[i, j] * scene.points[m, j]
+        H = np.empty((3, 3))
+        for step in range(3):
+            for side in range(2):
+                for i in range(3):
+                    P[i] = p[i] if side == 0 else R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2] + R[i, 3]
+                distort(scene.fisheye[side], scene.d[side], P, xy, J_p, J_d)
+                c = found.cov_uv[m, side]
+                l00 = np.sqrt(c[0, 0] + scene.variance)
+                l10 = c[1, 0] / l00
+                l11 = np.sqrt(c[1, 1] + scene.variance - l10 * l10)
+                for i in range(2):
+                    k = scene.k[side]
+                    r[2 * side + i] = found.uv[m, side, i] - found.bias[m, side, i] - k[i] * xy[i] - k[2 + i]
+                    for j in range(3):
+                        if side == 0:
+                            A[i, j] = k[i] * J_p[i, j]
+                        else:
+                            A[2 + i, j] = k[i] * (J_p[i, 0] * R[0, j] + J_p[i, 1] * R[1, j] + J_p[i, 2] * R[2, j])
+                a = 2 * side
+                r[a] /= l00
+                r[a + 1] = (r[a + 1] - l10 * r[a]) / l11
+                for j in range(3):
+                    A[a, j] /= l00
+                    A[a + 1, j] = (A[a + 1, j] - l10 * A[a, j]) / l11
+            H[:, :] = A.T @ A
+            if step < 2:
+                p += np.linalg.solve(H, A.T @ r)
+        found.cov_p[m] = np.linalg.inv(H)
+        found.by_rig[m] = -found.cov_p[m] @ (A.T @ found.J_rig[4 * m : 4 * m + 4])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def follow_pair(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], scene: Scene, margin: float, noise: float, least: float,
+    found: Found, cov_noise: Array, work: Work, room: Room,
+) -> tuple[int, float, float]:  # fmt: skip
+    """Measure one pair around a predicted pose.
+
+    Args:
+        left: (H, W) grey.
+        right: (H, W) grey.
+        scene: what does not change.
+        margin: how far a disc may be from where it is predicted, px.
+        noise: standard deviation of the images' noise, grey levels.
+        least: least contrast of a disc, grey levels.
+        found: room for the result; ``found.T`` is the predicted pose (4, 4).
+        cov_noise: (6, 6) filled with the covariance from the pixel noise alone.
+        work: room for fits.
+        room: room for outlines.
+
+    Returns:
+        How many discs both cameras saw; the sum of the squared whitened residuals, infinite where no pose was found; the
+        same with what a wrong calibration explains taken off.
+    """
+    look(left, 0, scene, margin, noise, least, found, work, room)
+    look(right, 1, scene, margin, noise, least, found, work, room)
+    both, single = 0, 0
+    for m in range(len(scene.radii)):
+        both += found.codes[m, 0] == SEEN and found.codes[m, 1] == SEEN
+        single += found.codes[m, 0] == SEEN or found.codes[m, 1] == SEEN
+    if both < 3:
+        return both, np.inf, np.inf
+    cost = settle(scene, found)
+    if not np.isfinite(cost):
+        return both, np.inf, np.inf
+    chi_square = uncertainty(scene, found, cov_noise)
+    triangulated(scene, found)
+    return both, cost, chi_square
