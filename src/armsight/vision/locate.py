@@ -18,9 +18,8 @@ from scipy.stats import chi2
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
-from armsight.vision.bundle import Model, Observations, State, predict
 from armsight.vision.pnp import consensus_poses
-from armsight.vision.posefit import PoseFit, Sightings, fit_pose
+from armsight.vision.posefit import PoseFit, Sightings, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
 #: A detection whose whitened squared distance from a robust fit is beyond this share of the chi-square distribution is
@@ -70,7 +69,7 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     good, fit = _without_outliers(rig, body, best, sightings)
     if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    reason = _unbelievable(rig, body, points, fit, sightings.select(good))
+    reason = _unbelievable(rig, body, points, fit, _chosen(sightings, good))
     return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
 
 
@@ -84,8 +83,9 @@ def _unlocatable(body: Body, points: Points) -> str | None:
 
 def _on_one_line(points: Array) -> bool:
     """Whether points (N, 3), N >= 3, lie on one line, which can turn about itself unseen."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= _COLLINEAR * spread[0])
+    centred = points - points.mean(axis=0)
+    spread = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(spread[1] <= _COLLINEAR**2 * spread[2])
 
 
 def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
@@ -93,12 +93,12 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
 
     The scale is that of a similarity fit; its sigma holds pixel noise and the rig's calibration.
     """
-    p_body = body.points[points.ids] - body.points[points.ids].mean(axis=0)
-    p = p_body @ fit_rigid(body.points[points.ids], points.p_left)[:3, :3].T
+    p_body = body.points[points.ids]
+    p = (p_body - p_body.mean(axis=0)) @ fit_rigid(p_body, points.p_left)[:3, :3].T
     spread = float((p**2).sum())
     by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
     variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
-    scale = fit_scale(body.points[points.ids], points.p_left)
+    scale = float((p * points.p_left).sum()) / spread
     if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * np.sqrt(variance)):
         return None
     return (
@@ -109,13 +109,14 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
 
 def _unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
     """Say why a fit is no measurement of the body, or None."""
-    if _on_one_line(body.points[np.unique(used.point)]):
+    count = np.bincount(used.point, minlength=len(body.points))
+    if _on_one_line(body.points[count > 0]):
         return "the points that agree with one pose of the body lie on one line"
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
     off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
-    if fit.cost <= misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
-        both = np.bincount(used.point, minlength=len(body.points))[points.ids] == 2
+    if fit.cost <= _misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
+        both = count[points.ids] == 2
         if both.sum() < 3 or _on_one_line(body.points[points.ids[both]]):
             return None
         arrays = (points.ids[both], points.p_left[both], points.cov[both], points.calibration[both])
@@ -177,16 +178,16 @@ def _without_outliers(
     good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
         now = d2 <= _LIMIT * max(1.0, float(np.median(d2)) / _MEDIAN)
-        if now.sum() < max(3, _AGREEING * len(now)) or len(np.unique(sightings.point[now])) < 3:
+        if now.sum() < max(3, _AGREEING * len(now)) or np.count_nonzero(np.bincount(sightings.point[now])) < 3:
             return now, None
         if fit is not None and (now == good).all():
             break
         good = now
-        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings.select(good), T, robust=False)
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, _chosen(sightings, good), T, robust=False)
         if fit is None:
             return good, None
         T = fit.T_left_body
-        d2 = _distances(rig, body, T, sightings)[1]
+        d2 = fit.distance2 if good.all() else _distances(rig, body, T, sightings)[1]
     return good, fit
 
 
@@ -202,27 +203,12 @@ def _estimate(
     rig: StereoRig, body: Body, points: Points, fit: PoseFit, sightings: Sightings, good: NDArray[np.bool_]
 ) -> PoseEstimate:
     """Assemble the estimate with its covariance: pixel noise, and the rig's calibration through the same fit."""
-    used, T = sightings.select(good), fit.T_left_body
-    state = State(rig.cameras, rig.T_left_right, T[None], np.zeros(0))
-    rows = Observations(np.zeros(len(used.point), np.int64), used.camera, used.point, used.uv, used.cov_uv, 1)
-    _, J_rig, J_pose = predict(Model(body.points, np.zeros((0, len(body.points), 3)), 1.0, False), state, rows)
-    W = np.linalg.inv(np.linalg.cholesky(used.cov_uv))
-    A, B = (W @ J_pose).reshape(-1, 6), (W @ J_rig).reshape(-1, rig.parameter_count)
+    used, T = _chosen(sightings, good), fit.T_left_body
+    W, A, B = whitened(rig.cameras, rig.T_left_right, body.points, used, T)
     noise = np.linalg.inv(fit.information).astype(np.float64)
     gain = noise @ (A.T @ B)
     misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
-    distance = _distances(rig, body, T, sightings)[0]
-    dropped = tuple(
-        Dropped(
-            body.point_names[sightings.point[i]],
-            f"{distance[i]:.1f} px off the body in the {SIDES[sightings.camera[i]]} image",
-        )
-        for i in np.flatnonzero(~good)
-    )
-    kept = ~np.isin(points.ids, sightings.point[~good])
-    points = Points(
-        points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept], points.seen, points.dropped
-    )
+    points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, sightings, good)
     gap = points.p_left - transform(T, body.points[points.ids])
     return PoseEstimate(
         T,
@@ -234,6 +220,28 @@ def _estimate(
         points,
         points.dropped + dropped,
     )
+
+
+def _thinned(
+    rig: StereoRig, body: Body, points: Points, T: Array, sightings: Sightings, good: NDArray[np.bool_]
+) -> tuple[Points, tuple[Dropped, ...]]:
+    """Return the points whose detections are all good, and the others' names with how far off they are."""
+    distance = _distances(rig, body, T, sightings)[0]
+    dropped = tuple(
+        Dropped(
+            body.point_names[sightings.point[i]],
+            f"{distance[i]:.1f} px off the body in the {SIDES[sightings.camera[i]]} image",
+        )
+        for i in np.flatnonzero(~good)
+    )
+    kept = ~np.isin(points.ids, sightings.point[~good])
+    arrays = (points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept])
+    return Points(*arrays, points.seen, points.dropped), dropped
+
+
+def _chosen(sightings: Sightings, good: NDArray[np.bool_]) -> Sightings:
+    """Return the good ones."""
+    return sightings if good.all() else sightings.select(good)
 
 
 def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
@@ -251,10 +259,10 @@ def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
     freedom, v = len(residuals) - 6, by_rig.T @ residuals
     explained = v @ np.linalg.solve(np.eye(len(cov_rig)) + cov_rig @ (by_rig.T @ by_rig), cov_rig @ v)
     chi_square = float(residuals @ residuals - explained)
-    return chi_square / freedom if chi_square > misfit_limit(freedom) else 1.0
+    return chi_square / freedom if chi_square > _misfit_limit(freedom) else 1.0
 
 
 @lru_cache(maxsize=256)
-def misfit_limit(freedom: int) -> float:
+def _misfit_limit(freedom: int) -> float:
     """Sum of squares beyond which residuals are a misfit, not chance."""
     return float(chi2.ppf(_MISFIT_QUANTILE, freedom)) if freedom > 0 else np.inf

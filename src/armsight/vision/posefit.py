@@ -97,7 +97,8 @@ def fit_pose(
     (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
     T, p = np.array(start), np.ascontiguousarray(points[sightings.point])
     n = len(p)
-    weight = np.linalg.inv(sightings.cov_uv)
+    weight = np.empty((n, 2, 2))
+    _invert(np.array(sightings.cov_uv), weight)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
     arguments: tuple[Any, ...] = (
         np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), inverse(T_left_right), p,
@@ -108,6 +109,84 @@ def fit_pose(
     except np.linalg.LinAlgError:
         return None
     return PoseFit(T, residuals, d2, H, cost) if np.isfinite(cost) else None
+
+
+def whitened(
+    cameras: tuple[Camera, Camera], T_left_right: Array, points: Array, sightings: Sightings, T_left_body: Array
+) -> tuple[Array, Array, Array]:
+    """Differentiate the projections of all sightings, in standard deviations of each.
+
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame.
+        points: (M, 3) points of the body, m.
+        sightings: N detections.
+        T_left_body: (4, 4) the pose, with every point before its camera.
+
+    Returns:
+        (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the
+        pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
+    """
+    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
+    n, counts = len(sightings.point), np.array([camera.distortion.size for camera in cameras])
+    W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))
+    _differentiate(
+        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), counts, inverse(T_left_right),
+        np.ascontiguousarray(points[sightings.point]), np.array(sightings.camera), np.array(sightings.cov_uv),
+        np.array(T_left_body), W, by_pose, by_rig,
+    )  # fmt: skip
+    return W, by_pose, by_rig
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _invert(cov: Array, weight: Array) -> None:
+    """Fill the inverses of covariances (N, 2, 2)."""
+    for n in range(len(cov)):
+        det = cov[n, 0, 0] * cov[n, 1, 1] - cov[n, 0, 1] * cov[n, 1, 0]
+        weight[n, 0, 0], weight[n, 1, 1] = cov[n, 1, 1] / det, cov[n, 0, 0] / det
+        weight[n, 0, 1], weight[n, 1, 0] = -cov[n, 0, 1] / det, -cov[n, 1, 0] / det
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _differentiate(
+    fisheye: Array, k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array, T: Array,
+    W: Array, by_pose: Array, by_rig: Array,
+) -> None:  # fmt: skip
+    """Fill what :func:`whitened` returns."""
+    xy, J_p, J_d, M, q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty((4, 4)), np.empty(3)
+    T_right, starts, rig = T_right_left @ T, (0, 4 + counts[0]), 8 + counts[0] + counts[1]
+    for n in range(len(p)):
+        c = camera[n]
+        M[:, :] = T_right if c == 1 else T
+        for i in range(3):
+            q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
+        distort(fisheye[c], d[c], q, xy, J_p, J_d)
+        pose, shared = by_pose[2 * n : 2 * n + 2], by_rig[2 * n : 2 * n + 2]
+        for i in range(2):
+            J_p[i] *= k[c, i]
+            for j in range(3):
+                pose[i, j] = J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j]
+            pose[i, 3] = pose[i, 2] * p[n, 1] - pose[i, 1] * p[n, 2]
+            pose[i, 4] = pose[i, 0] * p[n, 2] - pose[i, 2] * p[n, 0]
+            pose[i, 5] = pose[i, 1] * p[n, 0] - pose[i, 0] * p[n, 1]
+            start = starts[c]
+            shared[i, start + i], shared[i, start + 2 + i] = xy[i], 1.0
+            for j in range(counts[c]):
+                shared[i, start + 4 + j] = k[c, i] * J_d[i, j]
+            if c == 1:
+                for j in range(3):
+                    shared[i, rig + j] = -J_p[i, j]
+                shared[i, rig + 3] = J_p[i, 1] * q[2] - J_p[i, 2] * q[1]
+                shared[i, rig + 4] = J_p[i, 2] * q[0] - J_p[i, 0] * q[2]
+                shared[i, rig + 5] = J_p[i, 0] * q[1] - J_p[i, 1] * q[0]
+        first = np.sqrt(cov[n, 0, 0])  # the Cholesky factor of the covariance, inverted
+        across = cov[n, 1, 0] / first
+        second = np.sqrt(cov[n, 1, 1] - across * across)
+        W[n, 0, 0], W[n, 1, 0], W[n, 1, 1] = 1.0 / first, -across / (first * second), 1.0 / second
+        for J in (pose, shared):
+            for j in range(J.shape[1]):
+                J[1, j] = W[n, 1, 0] * J[0, j] + W[n, 1, 1] * J[1, j]
+                J[0, j] *= W[n, 0, 0]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -155,7 +234,7 @@ def _assemble(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def moved(T: Array, xi: Array, out: Array) -> None:
+def _moved(T: Array, xi: Array, out: Array) -> None:
     """Move a pose by a tangent, on the right; to first order T exp(xi), and a pose exactly."""
     angle = np.sqrt(xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
@@ -192,7 +271,7 @@ def _fit(
         for i in range(6):
             damped[i, i] += damping * H[i, i] + 1e-300
         xi = np.linalg.solve(damped, g).astype(np.float64)
-        moved(T, xi, trial)
+        _moved(T, xi, trial)
         new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
         if new <= cost:
             done = cost - new <= _DONE * new

@@ -6,18 +6,20 @@ Minimises the covariance-weighted pixel distance in both images (the maximum-lik
 
 from __future__ import annotations
 
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences, Dropped, Points
-from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import skew
+from armsight.data import Array, Body, Correspondences, Dropped, Ids, Points
+from armsight.geometry.pose import inverse
+from armsight.vision.camera import distort
 from armsight.vision.rig import StereoRig
 
 _STEPS = 10
 _DONE = 1e-12  # relative to the depth
 #: A minimum is reached when one more step would gain less than this, in units of chi-square.
 _REACHED = 1e-6
+#: A pivot of the normal equations below this share of its diagonal leaves a direction open.
+_SINGULAR = 1e-15
 #: Cosine of the angle, 8 degrees, within which a point must lie of the ray of its pixel.
 _LOOKING = 0.99
 
@@ -33,15 +35,30 @@ def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
     Returns:
         (N, 3) points, m, left frame; NaN where the rays are parallel or come closest behind a camera.
     """
-    a, b = rig.left.unproject(uv_left), rig.right.unproject(uv_right) @ rig.T_left_right[:3, :3].T
-    t = rig.T_left_right[:3, 3]
-    ab = np.einsum("ni,ni->n", a, b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along_a = (a @ t - ab * (b @ t)) / (1 - ab**2)
-        along_b = (ab * (a @ t) - b @ t) / (1 - ab**2)
-        p = (along_a[:, None] * a + t + along_b[:, None] * b) / 2
-    p[~((along_a > 0) & (along_b > 0) & np.isfinite(p).all(axis=1))] = np.nan
-    return np.asarray(p)
+    p = np.empty((len(uv_left), 3))
+    _between(rig.left.unproject(uv_left), rig.right.unproject(uv_right), np.array(rig.T_left_right), p)
+    return p
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _between(rays_left: Array, rays_right: Array, T: Array, p: Array) -> None:
+    """Fill p (N, 3) with the points halfway between rays (N, 3), each in its camera's frame; T is T_left_right."""
+    for n in range(len(p)):
+        a = rays_left[n]
+        b0, b1, b2 = rays_right[n]
+        bx = T[0, 0] * b0 + T[0, 1] * b1 + T[0, 2] * b2
+        by = T[1, 0] * b0 + T[1, 1] * b1 + T[1, 2] * b2
+        bz = T[2, 0] * b0 + T[2, 1] * b1 + T[2, 2] * b2
+        tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
+        ab = a[0] * bx + a[1] * by + a[2] * bz
+        at, bt = a[0] * tx + a[1] * ty + a[2] * tz, bx * tx + by * ty + bz * tz
+        along_a, along_b = (at - ab * bt) / (1.0 - ab * ab), (ab * at - bt) / (1.0 - ab * ab)
+        if along_a > 0.0 and along_b > 0.0 and np.isfinite(along_a + along_b):
+            p[n, 0] = (along_a * a[0] + tx + along_b * bx) / 2.0
+            p[n, 1] = (along_a * a[1] + ty + along_b * by) / 2.0
+            p[n, 2] = (along_a * a[2] + tz + along_b * bz) / 2.0
+        else:
+            p[n] = np.nan
 
 
 def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Array, Array]:
@@ -56,59 +73,166 @@ def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Arr
         (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
         pixel noise, m^2; (N, 3, P) derivative by the rig's parameters.
     """
-    p = midpoints(rig, uv[:, 0], uv[:, 1])
-    weight = np.asarray(np.linalg.inv(cov_uv), np.float64)
-    for _ in range(_STEPS):
-        g, H, _, _ = _normal(rig, p, uv, weight)
-        step = _solve(H, g)
-        p = p + step
-        if not (np.abs(step) > _DONE * np.abs(p[:, 2:])).any():
-            break
-    g, H, JW, J_rig = _normal(rig, p, uv, weight)
-    good = (np.einsum("ni,ni->n", g, _solve(H, g)) <= _REACHED) & _ahead(rig, p, uv)
-    cov, by_rig = np.full((len(p), 3, 3), np.nan), np.full((len(p), 3, J_rig.shape[2]), np.nan)
-    cov[good] = np.linalg.inv(H[good])
-    by_rig[good] = -cov[good] @ JW[good] @ J_rig[good]
-    p[~good] = np.nan
+    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in rig.cameras)
+    T, n = np.array(rig.T_left_right), len(uv)
+    rays = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
+    counts = np.array([camera.distortion.size for camera in rig.cameras])
+    p, cov, by_rig = np.empty((n, 3)), np.full((n, 3, 3), np.nan), np.full((n, 3, rig.parameter_count), np.nan)
+    _between(*rays, T, p)
+    _minimise(
+        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), counts, inverse(T),
+        np.ascontiguousarray(uv, dtype=np.float64), np.ascontiguousarray(cov_uv, dtype=np.float64), *rays, p, cov, by_rig,
+    )  # fmt: skip
     return p, cov, by_rig
 
 
-def _ahead(rig: StereoRig, p_left: Array, uv: Array) -> NDArray[np.bool_]:
-    """(N,) whether points lie where their pixels look, and not behind a camera or where the distortion folds back."""
-    p_right = transform(inverse(rig.T_left_right), p_left)
-    rays_left, rays_right = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
-    along_left, along_right = np.einsum("ni,ni->n", rays_left, p_left), np.einsum("ni,ni->n", rays_right, p_right)
-    left = along_left > _LOOKING * np.linalg.norm(p_left, axis=1)
-    return np.asarray(left & (along_right > _LOOKING * np.linalg.norm(p_right, axis=1)))
+@numba.njit(cache=True, error_model="numpy")
+def _to_right(T_right_left: Array, p: Array) -> Array:
+    """Return a point p (3,) of the left frame in the right one."""
+    q = np.empty(3)
+    for i in range(3):
+        q[i] = T_right_left[i, 0] * p[0] + T_right_left[i, 1] * p[1] + T_right_left[i, 2] * p[2] + T_right_left[i, 3]
+    return q
 
 
-def _normal(rig: StereoRig, p: Array, uv: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the normal equations at p (N, 3): (N, 3) gradient, (N, 3, 3) H, (N, 3, 4) J^T W, and J by the rig."""
-    residual, J, J_rig = _linearise(rig, p, uv)
-    JW = np.einsum("ncij,ncik->njck", J, weight).reshape(len(p), 3, 4)
-    return np.einsum("nij,nj->ni", JW, residual.reshape(len(p), 4)), JW @ J.reshape(len(p), 4, 3), JW, J_rig
+@numba.njit(cache=True, error_model="numpy")
+def _linearise(
+    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, uv: Array, r: Array, J: Array, xy: Array,
+    J_p: Array, J_d: Array,
+) -> None:  # fmt: skip
+    """Fill the residuals r (2, 2) of a point p of the left frame and their Jacobian J (2, 2, 3) by it.
+
+    Of both cameras: xy (2, 2) where it is in focal lengths, J_p (2, 2, 3) pixel by the point in the camera's own frame,
+    J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
+    """
+    for c in range(2):
+        q = _to_right(T_right_left, p) if c == 1 else p
+        if q[2] <= 0.0 and not fisheye[c]:
+            r[c] = np.nan
+            continue
+        distort(fisheye[c], d[c], q, xy[c], J_p[c], J_d[c])
+        for i in range(2):
+            r[c, i] = uv[c, i] - (k[c, i] * xy[c, i] + k[c, 2 + i])
+            J_p[c, i] *= k[c, i]
+            J_d[c, i] *= k[c, i]
+            for j in range(3):
+                J[c, i, j] = J_p[c, i, j]
+                if c == 1:
+                    J[c, i, j] = 0.0
+                    for m in range(3):
+                        J[c, i, j] += J_p[c, i, m] * T_right_left[m, j]
 
 
-def _solve(H: Array, g: Array) -> Array:
-    """Solve (N, 3, 3) systems; NaN where a point has left the cameras' view."""
-    step = np.full_like(g, np.nan)
-    good = np.asarray(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(g).all(axis=1))
-    good[good] = np.linalg.cond(H[good]) < 1e15
-    step[good] = np.linalg.solve(H[good], g[good][..., None])[..., 0]
-    return step
+@numba.njit(cache=True, error_model="numpy")
+def _step(weight: Array, r: Array, J: Array, JW: Array, H: Array, L: Array, g: Array, step: Array) -> bool:
+    """Fill the normal equations of one point and solve them; False where they do not determine it."""
+    for j in range(3):
+        for c in range(2):
+            for m in range(2):
+                JW[j, 2 * c + m] = J[c, 0, j] * weight[c, 0, m] + J[c, 1, j] * weight[c, 1, m]
+    for j in range(3):
+        g[j] = 0.0
+        for c in range(2):
+            for i in range(2):
+                g[j] += JW[j, 2 * c + i] * r[c, i]
+        for m in range(3):
+            H[j, m] = 0.0
+            for c in range(2):
+                for i in range(2):
+                    H[j, m] += JW[j, 2 * c + i] * J[c, i, m]
+    for j in range(3):
+        for m in range(j + 1):
+            s = H[j, m]
+            for i in range(m):
+                s -= L[j, i] * L[m, i]
+            if j != m:
+                L[j, m] = s / L[m, m]
+            elif s > _SINGULAR * H[j, j]:
+                L[j, j] = np.sqrt(s)
+            else:
+                return False
+    _back(L, g, step)
+    return bool(np.isfinite(step.sum()))
 
 
-def _linearise(rig: StereoRig, p_left: Array, uv: Array) -> tuple[Array, Array, Array]:
-    """Return residuals (N, 2, 2), their Jacobian by the point (N, 2, 2, 3) and by the rig (N, 4, P)."""
-    T_right_left = inverse(rig.T_left_right)
-    p_right = transform(T_right_left, p_left)
-    uv_l, J_l, K_l = rig.left.project_jacobians(p_left)
-    uv_r, J_r, K_r = rig.right.project_jacobians(p_right)
-    n_left, n = K_l.shape[2], K_l.shape[2] + K_r.shape[2]
-    J_rig = np.zeros((len(p_left), 4, n + 6))
-    J_rig[:, :2, :n_left], J_rig[:, 2:, n_left:n] = K_l, K_r
-    J_rig[:, 2:, n:] = np.concatenate([-J_r, J_r @ skew(p_right)], axis=2)
-    return uv - np.stack([uv_l, uv_r], axis=1), np.stack([J_l, J_r @ T_right_left[:3, :3]], axis=1), J_rig
+@numba.njit(cache=True, error_model="numpy")
+def _back(L: Array, g: Array, x: Array) -> None:
+    """Solve L L^T x = g of three unknowns."""
+    x[0] = g[0] / L[0, 0]
+    x[1] = (g[1] - L[1, 0] * x[0]) / L[1, 1]
+    x[2] = (g[2] - L[2, 0] * x[0] - L[2, 1] * x[1]) / (L[2, 2] * L[2, 2])
+    x[1] = (x[1] - L[2, 1] * x[2]) / L[1, 1]
+    x[0] = (x[0] - L[1, 0] * x[1] - L[2, 0] * x[2]) / L[0, 0]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _minimise(
+    fisheye: Array, k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array, rays_left: Array,
+    rays_right: Array, p: Array, cov: Array, by_rig: Array,
+) -> None:  # fmt: skip
+    """Take points p from their start to the minimum, NaN where there is none, and fill covariances and derivatives."""
+    r, J, xy, J_p, J_d = (
+        np.empty((2, 2)),
+        np.empty((2, 2, 3)),
+        np.empty((2, 2)),
+        np.empty((2, 2, 3)),
+        np.empty((2, 2, 8)),
+    )
+    weight, JW, H, L = np.empty((2, 2, 2)), np.empty((3, 4)), np.empty((3, 3)), np.empty((3, 3))
+    g, step, J_rig = np.empty(3), np.empty(3), np.empty((4, by_rig.shape[2]))
+    for n in range(len(p)):
+        for c in range(2):
+            C = cov_uv[n, c]
+            det = C[0, 0] * C[1, 1] - C[0, 1] * C[1, 0]
+            weight[c, 0, 0], weight[c, 1, 1] = C[1, 1] / det, C[0, 0] / det
+            weight[c, 0, 1], weight[c, 1, 0] = -C[0, 1] / det, -C[1, 0] / det
+        good = False
+        for _ in range(_STEPS + 1):
+            _linearise(fisheye, k, d, T_right_left, p[n], uv[n], r, J, xy, J_p, J_d)
+            if not (np.isfinite(r.sum()) and _step(weight, r, J, JW, H, L, g, step)):
+                good = False
+                break
+            good = g[0] * step[0] + g[1] * step[1] + g[2] * step[2] <= _REACHED
+            if np.abs(step).max() <= _DONE * abs(p[n, 2]):
+                break
+            p[n] += step
+        if not (good and _ahead(p[n], rays_left[n], T_right_left, rays_right[n])):
+            p[n] = np.nan
+            continue
+        for j in range(3):
+            g[:] = 0.0
+            g[j] = 1.0
+            _back(L, g, cov[n, j])
+        _rig_jacobian(counts, T_right_left, p[n], xy, J_p, J_d, J_rig)
+        by_rig[n] = -(cov[n] @ JW) @ J_rig
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rig_jacobian(counts: Ids, T_right_left: Array, p: Array, xy: Array, J_p: Array, J_d: Array, J_rig: Array) -> None:
+    """Fill J_rig (4, P), the pixels of a point by the rig's parameters."""
+    J_rig[:] = 0.0
+    start = 0
+    for c in range(2):
+        for i in range(2):
+            row = J_rig[2 * c + i]
+            row[start + i], row[start + 2 + i] = xy[c, i], 1.0
+            row[start + 4 : start + 4 + counts[c]] = J_d[c, i, : counts[c]]
+        start += 4 + counts[c]
+    q = _to_right(T_right_left, p)
+    for i in range(2):
+        a, b, c_ = J_p[1, i]
+        row = J_rig[2 + i]
+        row[start], row[start + 1], row[start + 2] = -a, -b, -c_
+        row[start + 3], row[start + 4], row[start + 5] = b * q[2] - c_ * q[1], c_ * q[0] - a * q[2], a * q[1] - b * q[0]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _ahead(p: Array, ray_left: Array, T_right_left: Array, ray_right: Array) -> bool:
+    """Whether a point lies where its pixels look, and not behind a camera or where the distortion folds back."""
+    q = _to_right(T_right_left, p)
+    along_left, along_right = np.dot(ray_left, p), np.dot(ray_right, q)
+    left = along_left > _LOOKING * np.sqrt(np.dot(p, p))
+    return bool(left and along_right > _LOOKING * np.sqrt(np.dot(q, q)))
 
 
 def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
