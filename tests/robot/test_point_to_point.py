@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from arm_motions import within
 from armsight.errors import InputError
 from armsight.robot.models import MODELS
 from armsight.robot.trajectories import MotionRefused, point_to_point
-from armsight.robot.trajectories.trajectory import check_times, sample
+from armsight.robot.trajectories.trajectory import check_times
 
 SIX_R = MODELS["six_r"]
 EVEN = replace(SIX_R, q_min=np.full(6, -3.0), q_max=np.full(6, 3.0), qd_max=np.ones(6))
@@ -27,23 +28,6 @@ def shortest_s(way, speed, acceleration, jerk):
         t = acceleration / jerk
         return t + np.sqrt(t**2 + 4 * way / acceleration)
     return 4 * (way / (2 * jerk)) ** (1 / 3)
-
-
-def within(arm, motion):
-    """Hold a motion against every limit, by its own derivatives and by finite differences of its angles."""
-    t = check_times(motion.duration_s)
-    q, qd, qdd = sample(motion, t)
-    assert (q >= arm.q_min - 1e-9).all()
-    assert (q <= arm.q_max + 1e-9).all()
-    assert (np.abs(qd) <= arm.qd_max * (1 + 1e-9)).all()
-    assert (np.abs(qdd) <= arm.qdd_max * (1 + 1e-9)).all()
-    h = np.diff(t)[:, None]
-    full = h[:, 0] > 5e-4
-    # Over a step the angles move by the mean of the speeds, but for what a jerk within its limit adds: h^3 j / 12.
-    moved = np.diff(q, axis=0) - h * (qd[1:] + qd[:-1]) / 2
-    assert (np.abs(moved) <= h**3 * arm.qddd_max / 6 + 1e-12).all()
-    assert (np.abs(np.diff(qd, axis=0)) <= h * arm.qdd_max * (1 + 1e-9) + 1e-12).all()
-    assert (np.abs(np.diff(qdd, axis=0))[full] <= (h * arm.qddd_max * (1 + 1e-6) + 1e-12)[full]).all()
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -63,7 +47,7 @@ def test_a_motion_keeps_every_limit_and_arrives_at_rest(name):
 def test_joints_move_in_proportion_from_rest():
     a, b = np.zeros(6), np.array([0.3, -0.5, 1.0, 0.2, -0.1, 0.0])
     motion = point_to_point(SIX_R, a, b)
-    q = sample(motion, check_times(motion.duration_s)).q
+    q = motion.at(check_times(motion.duration_s)).q
     np.testing.assert_allclose(q, q[:, [2]] * b, atol=1e-9)
 
 

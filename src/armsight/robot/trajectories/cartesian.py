@@ -18,7 +18,7 @@ from armsight.errors import InputError
 from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.profile import Profile, plan_profile
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, sample
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped
 from armsight.robot.trajectories.walk import Obstacle, Walk, columns, derivatives, refined, walk
 
 if TYPE_CHECKING:
@@ -51,17 +51,15 @@ class PathMotion:
         """How long the motion takes, s."""
         return self.law.duration_s
 
-    def at(self, t_s: float) -> Joints:
-        """Return the joints (6,) ``t_s`` seconds after the start."""
-        return Joints(*(part[0] for part in self.sample(np.array([t_s]))))
-
-    def sample(self, t_s: Array) -> Joints:
-        """Return the joints (N, 6) at times (N,), s."""
-        share, speed, acceleration = (part[:, :1] for part in sample(self.law, t_s))
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
+        times = clamped(t_s, self.duration_s)
+        share, speed, acceleration = (part[:, :1] for part in self.law.at(times.ravel()))
         places = self.path.at(share[:, 0])
         q = refined(self.arm, places.T_base_tool, self.guide.near(share[:, 0]))
         q1, q2 = derivatives(self.arm, q, places)
-        return Joints(q, q1 * speed, q1 * acceleration + q2 * speed**2)
+        joints = (q, q1 * speed, q1 * acceleration + q2 * speed**2)
+        return Joints(*(part.reshape(*times.shape, 6) for part in joints))
 
 
 def follow(
@@ -101,7 +99,7 @@ def follow(
     for _ in range(ROUNDS):
         motion = PathMotion(arm, path, law, guide)
         t_s = check_times(law.duration_s)
-        joints = motion.sample(t_s)
+        joints = motion.at(t_s)
         _check_whole(arm, path, motion, t_s, joints)
         most = worst(arm, t_s, joints)
         if most.ratio <= 1 + ROUNDING:
@@ -156,7 +154,7 @@ def _fit(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> tupl
     law = _law(guide, arm, start, k, None)
     for _ in range(ROUNDS):
         t_s = check_times(law.duration_s)
-        share, speed, acceleration = (part[:, :1] for part in sample(law, t_s))
+        share, speed, acceleration = (part[:, :1] for part in law.at(t_s))
         q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
         stretch = worst(arm, t_s, Joints(q1, q1 * speed, q1 * acceleration + q2 * speed**2)).stretch
         if 1 - CLOSE <= stretch <= 1:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times, sample
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -114,7 +114,7 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
         MotionRefused: at the first instant outside the joint limits, or where another limit is passed furthest.
     """
     t_s = check_times(trajectory.duration_s)
-    joints = sample(trajectory, t_s)
+    joints = trajectory.at(t_s)
     over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
     if over.any():
         row = int(np.argmax(over))

@@ -31,9 +31,11 @@ class Profile:
     duration_s: float
     solved: ruckig.Trajectory
 
-    def at(self, t_s: float) -> Joints:
-        """Return the axes' positions, speeds and accelerations (n,) ``t_s`` seconds after the start."""
-        return Joints(*map(np.array, self.solved.at_time(clamped(t_s, self.duration_s))))
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the axes' positions, speeds and accelerations, (n,) or (N, n), ``t_s`` seconds after the start."""
+        times = clamped(t_s, self.duration_s)
+        states = [self.solved.at_time(t) for t in times.ravel().tolist()]
+        return Joints(*np.array(states).transpose(1, 0, 2).reshape(3, *times.shape, -1))
 
     def first_time_s(self, axis: int, position: float) -> float:
         """Return when an axis first is at a position; the duration where it never is."""

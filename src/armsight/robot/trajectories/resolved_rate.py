@@ -28,7 +28,6 @@ from armsight.robot.trajectories.trajectory import (
     check_duration,
     check_times,
     clamped,
-    sample,
 )
 from armsight.robot.trajectories.walk import behind
 
@@ -67,10 +66,10 @@ class TrackedMotion:
     least_singular_t_s: float
     spline: CubicSpline
 
-    def at(self, t_s: float) -> Joints:
-        """Return the joints (6,) ``t_s`` seconds after the start."""
-        t_s = clamped(t_s, self.duration_s)
-        return Joints(*(np.asarray(self.spline(t_s, order)) for order in range(3)))
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
+        times = clamped(t_s, self.duration_s)
+        return Joints(*(np.asarray(self.spline(times, order)) for order in range(3)))
 
 
 class _Run(NamedTuple):
@@ -113,7 +112,7 @@ def resolved_rate(
         run = _track(arm, start.q, path, law)
         motion = _motion(run)
         t_s = check_times(motion.duration_s)
-        most = worst(arm, t_s, sample(motion, t_s))
+        most = worst(arm, t_s, motion.at(t_s))
         if most.ratio <= 1 + ROUNDING or run.off_m[-1] > tolerance_m:  # no slower motion mends a goal that is missed
             _check(arm, path, law, run, tolerance_m)
             return motion
@@ -166,7 +165,7 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
     steps = int(np.ceil(law.duration_s * CHECK_RATE_HZ))
     most = steps + int(SETTLE_S * CHECK_RATE_HZ)
     dt = law.duration_s / steps
-    moved = sample(law, np.arange(2 * most + 1) * dt / 2)
+    moved = law.at(np.arange(2 * most + 1) * dt / 2)
     places = path.at(moved.q[:, 0])
     V_ref = places.twist * moved.qd
     rows: list[tuple[Array, Array, float]] = []

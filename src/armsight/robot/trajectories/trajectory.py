@@ -40,8 +40,11 @@ class Trajectory(Protocol):
     def duration_s(self) -> float:
         """How long the motion takes, s."""
 
-    def at(self, t_s: float) -> Joints:
-        """Return the joints ``t_s`` seconds after the start; before it the first state stands, after the end the last."""
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the joints ``t_s`` seconds after the start, at one time or at (N,) of them.
+
+        Before the start the first state stands, after the end the last.
+        """
 
 
 class MotionRefused(InputError):
@@ -63,15 +66,16 @@ class MotionRefused(InputError):
         )
 
 
-def clamped(t_s: float, duration_s: float) -> float:
-    """Return a time within the motion.
+def clamped(t_s: float | Array, duration_s: float) -> Array:
+    """Return times, () or (N,), within the motion.
 
     Raises:
         InputError: not a number.
     """
-    if not np.isfinite(t_s):
+    times = np.asarray(t_s, dtype=np.float64)
+    if not np.isfinite(times).all():
         raise InputError(f"t_s is {t_s}; it must be a finite number of seconds")
-    return min(max(float(t_s), 0.0), duration_s)
+    return np.clip(times, 0.0, duration_s)
 
 
 def check_duration(duration_s: float | None) -> float | None:
@@ -90,9 +94,3 @@ def check_duration(duration_s: float | None) -> float | None:
 def check_times(duration_s: float) -> Array:
     """Return (N,) the times at which a motion is checked, s: 1 kHz, its first and its last instant."""
     return np.append(np.arange(0.0, duration_s, 1 / CHECK_RATE_HZ), duration_s)
-
-
-def sample(trajectory: Trajectory, t_s: Array) -> Joints:
-    """Return the joints at times (N,), s."""
-    states = [trajectory.at(float(t)) for t in t_s]
-    return Joints(*(np.array(part) for part in zip(*states, strict=True)))
