@@ -9,7 +9,7 @@ last predictions were, and everything from pixels to covariance is one compiled 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from armsight.vision.locate import misfit_limit
 from armsight.vision.markers import disc_search
 from armsight.vision.markers.disc_fit import REASONS
 from armsight.vision.markers.disc_model import workspace
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from armsight.vision.rig import StereoRig
@@ -120,9 +121,9 @@ class Follower:
         self._cov_noise = np.empty((6, 6))
         self._work, self._outline = workspace(), disc_search.workspace()
         self._noise = 1.0
-        blank = np.zeros((16, 16), np.uint8)
-        self._found.T[:, :] = np.eye(4)
-        self._pair(blank, blank, 1.0)
+        blank = [np.zeros(camera.image_size_px[::-1], np.uint8) for camera in rig.cameras]
+        self._pair(blank[0], blank[1], 1.0)
+        measure(rig, target, Shot("", blank[0], blank[1]))
 
     def measure(self, shot: Shot) -> PoseEstimate | Missed:
         """Measure one shot; shots come in the order of their time."""
@@ -241,7 +242,7 @@ class Follower:
         )
 
 
-def follows(target: object) -> bool:
+def follows(target: Target) -> TypeGuard[Composite]:
     """Whether a target can be followed: three discs or more and nothing else, their normals known or of no account."""
     if not isinstance(target, Composite) or target.parts or target.discs is None:
         return False

@@ -115,7 +115,7 @@ def _unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
     off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
-    if fit.cost <= _misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
+    if fit.cost <= misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
         both = count[points.ids] == 2
         if both.sum() < 3 or _on_one_line(body.points[points.ids[both]]):
             return None
@@ -259,10 +259,10 @@ def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
     freedom, v = len(residuals) - 6, by_rig.T @ residuals
     explained = v @ np.linalg.solve(np.eye(len(cov_rig)) + cov_rig @ (by_rig.T @ by_rig), cov_rig @ v)
     chi_square = float(residuals @ residuals - explained)
-    return chi_square / freedom if chi_square > _misfit_limit(freedom) else 1.0
+    return chi_square / freedom if chi_square > misfit_limit(freedom) else 1.0
 
 
 @lru_cache(maxsize=256)
-def _misfit_limit(freedom: int) -> float:
+def misfit_limit(freedom: int) -> float:
     """Sum of squares beyond which residuals are a misfit, not chance."""
     return float(chi2.ppf(_MISFIT_QUANTILE, freedom)) if freedom > 0 else np.inf

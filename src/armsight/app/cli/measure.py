@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,15 @@ from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.vision.detections import read_detections
+from armsight.vision.follow import Follower, follows
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
 
-#: Shot name, time, result.
-Result = tuple[str, float | None, PoseEstimate | Missed]
+#: Shot name, time, result, and where a body is followed how it was found and what is odd about that.
+Result = tuple[str, float | None, PoseEstimate | Missed, dict[str, Any]]
 
 
 @click.command("measure")
@@ -69,13 +72,13 @@ def command(
         if detections is not None:
             body = open_body(target)
             shots = read_detections(detections, body)
-            results, total = ((s.name, None, measure_seen(stereo, body, s)) for s in shots), len(shots)
+            results, total = ((s.name, None, measure_seen(stereo, body, s), {}) for s in shots), len(shots)
         else:
             found = open_target(target)
             body = found.body
             opened = PairsSource(left, right) if left is not None and right is not None else open_source(str(source))
             stack.enter_context(contextlib.closing(opened))
-            results = ((s.name, s.t_s, measure(stereo, found, s)) for s in _shots(opened, stereo, rig))
+            results = _measured(stereo, found, _shots(opened, stereo, rig))
             total = len(getattr(opened, "pairs", ())) or None
         try:
             _run(results, total, body, records, as_json)
@@ -97,13 +100,27 @@ def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
         yield shot
 
 
+def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator[Result]:
+    """Measure shot after shot; a body of discs is followed from one to the next."""
+    if not follows(target):
+        yield from ((shot.name, shot.t_s, measure(rig, target, shot), {}) for shot in shots)
+        return
+    click.echo("getting ready to follow (compiles for about a minute the first time on a machine)", err=True)
+    follower = Follower(rig, target)
+    for shot in shots:
+        begun = time.perf_counter()
+        result = follower.measure(shot)
+        way = {"way": follower.way, "jump": follower.jump, "took_ms": 1e3 * (time.perf_counter() - begun)}
+        yield shot.name, shot.t_s, result, way
+
+
 def _run(
     results: Iterator[Result], total: int | None, body: Body, records: list[dict[str, Any]], as_json: bool
 ) -> None:
     """Measure every shot, print its line and keep its record."""
     with bar("measuring", total) as advance:
-        for name, t_s, result in results:
-            records.append(pose_record(name, t_s, body, result))
+        for name, t_s, result, way in results:
+            records.append({**pose_record(name, t_s, body, result), **way})
             click.echo(json.dumps(records[-1]) if as_json else _line(records[-1]))
             advance()
 
@@ -123,6 +140,7 @@ def _line(record: dict[str, Any]) -> str:
     turned = np.degrees(np.linalg.norm(sigma[3:]))
     note = f", {len(record['dropped'])} points dropped" if record["dropped"] else ""
     note += f", misfit {record['misfit']:.1f}" if record["misfit"] > 1 else ""
+    note += f", {record['jump']}" if record.get("jump") else ""
     singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""
     return f"{record['shot']}: {position} mm, {angles} deg ± {turned:.3f}{singular}, {len(record['points_m'])} points{note}"
 
@@ -139,6 +157,12 @@ def _close(records: list[dict[str, Any]], seconds: float, out: Path | None) -> N
         )
     summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
     summary += f", {len(missed)} missed (their lines say why)" if missed else ""
+    ways = Counter(r["way"] for r in records if "way" in r)
+    if ways:
+        took = {way: np.median([r["took_ms"] for r in records if r["way"] == way]) for way in ways}
+        summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
+    if jumps := [r["shot"] for r in records if r.get("jump")]:
+        summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
     if odd := sum(r["misfit"] > 1 for r in good):
         summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma holds it)"
     click.echo(summary + (f"; written to {out}" if out is not None else ""), err=True)
