@@ -121,6 +121,12 @@ def test_the_side_of_a_body_with_a_tag_is_told_by_the_tag(armsight, body):
     assert got["coded"]
 
 
+def test_a_mirror_image_is_harmless_and_said(armsight, body):
+    said = armsight("body", "check", body([*TRIANGLE, (0, 30, -40)], normal=""))
+    assert said.code == 0
+    assert "note  P1 and P2 exchanged is its mirror image: harmless to two cameras, not to one alone" in said.out
+
+
 def test_nearly_equal_distances_are_told_apart_near_and_not_far(armsight, body):
     path = body(((-55, 0, 0), (61, 0, 0), (0, 95, 0)))
     near, far = (facts(armsight("body", "check", path, "--distance", d, "--json")) for d in (0.4, 1.6))

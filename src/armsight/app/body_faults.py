@@ -11,6 +11,7 @@ from armsight.geometry.rotation import skew
 from armsight.vision.foresight import FACING, look_direction, view
 from armsight.vision.markers.body_check import on_one_line
 from armsight.vision.markers.body_layout import Layout
+from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter in an image that can be used, px.
@@ -40,12 +41,11 @@ def neighbours(layout: Layout) -> list[Finding]:
             elif gap < SURROUND * max(radii[i], radii[j]):
                 text = f"{names[i]} and {names[j]} leave only {1e3 * gap:.1f} mm of plain surround between them"
                 findings.append(Finding("weak", "surround", text, apart))
-    return findings + _on_squares(layout)
+    return findings + _on_squares(layout, layout.discs)
 
 
-def _on_squares(layout: Layout) -> list[Finding]:
-    """Say which discs lie on a tag or on a board."""
-    assert layout.discs is not None
+def _on_squares(layout: Layout, discs: DiscTarget) -> list[Finding]:
+    """Say which discs lie on a tag or on a board, or near one."""
     squares: list[tuple[str, Array, Array]] = []
     for tag in () if layout.tags is None else layout.tags.tags:
         half = np.full(2, tag.size_m / 2)
@@ -55,11 +55,17 @@ def _on_squares(layout: Layout) -> list[Finding]:
         squares.append((placed.name, placed.T_body_board, np.stack([flat_points.min(axis=0), flat_points.max(axis=0)])))
     findings = []
     for name, T, (low, high) in squares:
-        p = (layout.discs.body.points - T[:3, 3]) @ T[:3, :3]
+        p = (discs.body.points - T[:3, 3]) @ T[:3, :3]
         outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - p[:, :2], p[:, :2] - high)), axis=1)
-        for i in np.flatnonzero((np.abs(p[:, 2]) < layout.discs.radii_m) & (outside < layout.discs.radii_m)):
-            disc = layout.discs.body.point_names[i]
-            findings.append(Finding("bad", "overlap", f"the disc {disc} lies on {name}", f"move {disc} off {name}"))
+        for i in np.flatnonzero(np.abs(p[:, 2]) < discs.radii_m):
+            disc, radius = discs.body.point_names[i], float(discs.radii_m[i])
+            gap = float(outside[i]) - radius
+            apart = f"move {disc} {1e3 * (SURROUND * radius - gap):.1f} mm or more away from {name}"
+            if gap < 0:
+                findings.append(Finding("bad", "overlap", f"the disc {disc} lies on {name}", apart))
+            elif gap < SURROUND * radius:
+                text = f"{disc} and {name} leave only {1e3 * gap:.1f} mm of plain surround between them"
+                findings.append(Finding("weak", "surround", text, apart))
     return findings
 
 

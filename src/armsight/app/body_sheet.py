@@ -25,6 +25,7 @@ from armsight.vision.markers.body_layout import Layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
+from armsight.vision.markers.disc import DiscTarget
 
 #: A bright disc's dark surround reaches to so many radii; where another marker is in the way, to fewer.
 RING, RING_MIN = 2.0, 1.5
@@ -140,7 +141,7 @@ def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_Placed]:
     normals = np.array(discs.normals)
     unknown = np.isnan(normals[:, 0])
     if unknown.any():
-        normals[unknown] = _face(path, layout, unknown)
+        normals[unknown] = _face(path, layout, discs, unknown)
         notes.append(
             f"{', '.join(np.array(discs.body.point_names)[unknown][:4])}: no normal given; drawn as seen from "
             f"({', '.join(f'{c + 0.0:.2g}' for c in normals[unknown][0])}), the other side is the mirror image"
@@ -153,14 +154,13 @@ def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_Placed]:
     ]
 
 
-def _face(path: str | Path, layout: Layout, unknown: NDArray[np.bool_]) -> Array:
+def _face(path: str | Path, layout: Layout, discs: DiscTarget, unknown: NDArray[np.bool_]) -> Array:
     """Return the normal (3,) of the one plane in which all markers lie, those whose normal is unknown included."""
     normal, points = look_direction(layout.body.points, layout.normals), layout.body.points
-    assert layout.discs is not None
     known = layout.normals[np.isfinite(layout.normals[:, 0])]
     level = 1e3 * (points - points.mean(axis=0)) @ normal
     if np.abs(level).max() > _LEVEL_MM or (len(known) and (known @ normal).min() < _PARALLEL):
-        name = layout.discs.body.point_names[int(np.flatnonzero(unknown)[0])]
+        name = discs.body.point_names[int(np.flatnonzero(unknown)[0])]
         raise InputError(f"{path}: the body is not flat, so {name} needs its normal to be drawn: normal = [x, y, z]")
     return normal
 
