@@ -135,6 +135,8 @@ def walk(arm: Arm, path: Path, q_start: Array) -> tuple[Walk, Obstacle | None]:
             obstacle = Obstacle(0.0, _problem(arm, q[0], sign[0]) or obstacle.reason)
         slow = smallest[:good] < SLOW
         obstacle = obstacle._replace(clear=max(1, int(np.argmax(slow)) if slow.any() else good))
+    if good == 0:
+        return Walk(share[:0], q[:0], q[:0], q[:0]), obstacle
     kept = Places(*(part[:good] for part in places))
     q1, q2 = derivatives(arm, q[:good], kept)
     return Walk(share[:good], q[:good], q1, q2), obstacle
