@@ -13,8 +13,9 @@ from armsight.robot.trajectories import MotionRefused, arc, circle, line, waypoi
 from armsight.robot.trajectories.trajectory import check_times
 
 SIX_R = MODELS["six_r"]
-#: Joint angles, deg, and 300 mm that each arm has room for. The tool of six_r goes tangentially: its joints are slow.
+#: Joint angles, deg, and 300 mm that each arm has room for. The tool of six_r goes across in front of it.
 FIGURE_3 = {
+    "six_r": ((-26, -68.9, 79.4, -10.5, -64, 90), (0, 0.3, 0)),
     "puma560": ((0, 60, -150, 20, 60, 10), (0, 0, -0.3)),
     "ur5": ((0, -90, 90, -80, -90, 20), (0, 0.3, 0)),
     "ur10": ((0, -90, 90, -80, -90, 20), (-0.2, 0.2, 0.1)),

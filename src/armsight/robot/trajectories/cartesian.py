@@ -1,9 +1,4 @@
-"""Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz.
-
-The share of the way moves under limits of its own speed, acceleration and jerk. They are scaled as time is (1/k, 1/k^2,
-1/k^3) until the fastest joint, by speed, acceleration or jerk, is just at its limit; from rest that is exact, because the
-whole motion then is the same one, k times slower.
-"""
+"""Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz."""
 
 from __future__ import annotations
 
@@ -15,19 +10,18 @@ from numpy.typing import ArrayLike
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.robot.trajectories.law import CLOSE, ROUNDS, fit_law, share_law, slower
 from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
-from armsight.robot.trajectories.profile import Profile, plan_profile
+from armsight.robot.trajectories.profile import Profile
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped
-from armsight.robot.trajectories.walk import Obstacle, Walk, columns, derivatives, refined, walk
+from armsight.robot.trajectories.walk import Obstacle, Walk, derivatives, refined, walk
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
 
-#: Rounds of scaling; from rest the second is exact up to where the samples fall.
-ROUNDS = 12
-#: How near to its limit the fastest joint is brought, and how far from the path a start's speeds may point.
-CLOSE, ALONG = 1e-3, 1e-6
+#: How far from the path a start's speeds and accelerations may point, as a share of the limits.
+ALONG = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +86,10 @@ def follow(
         raise _refused(path, obstacle, 0.0)
     share = _share_state(start, guide, arm)
     if obstacle is not None:
-        law, _ = _fit(arm, Walk(*(part[: obstacle.clear] for part in guide)), share, None)
-        slower = 1.0 if duration_s is None else duration_s / law.duration_s
-        raise _refused(path, obstacle, slower * law.first_time_s(0, obstacle.share))
-    law, k = _fit(arm, guide, share, duration_s)
+        law, _ = fit_law(arm, Walk(*(part[: obstacle.clear] for part in guide)), share, None)
+        scale = 1.0 if duration_s is None else duration_s / law.duration_s
+        raise _refused(path, obstacle, scale * law.first_time_s(0, obstacle.share))
+    law, limits = fit_law(arm, guide, share, duration_s)
     for _ in range(ROUNDS):
         motion = PathMotion(arm, path, law, guide)
         t_s = check_times(law.duration_s)
@@ -107,8 +101,8 @@ def follow(
         if duration_s is not None or start.qd.any():
             at_s = float(t_s[most.row])
             raise _refused(path, Obstacle(float(law.at(at_s).q[0]), most.what), at_s)
-        k *= most.stretch * (1 + CLOSE / 10)
-        law = _law(guide, arm, share, k, None)
+        limits = slower(limits, most.stretch * (1 + CLOSE / 10))
+        law = share_law(share, limits)
     raise InputError("the motion could not be brought within the arm's limits of speed, acceleration and jerk")
 
 
@@ -132,43 +126,6 @@ def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
     if speed < 0:
         raise InputError("qd_start carries the tool backwards on the path")
     return Joints(np.zeros(1), np.array([speed]), np.array([acceleration]))
-
-
-def _law(guide: Walk, arm: Arm, start: Joints, k: float, duration_s: float | None) -> Profile:
-    """Return the share over time under the limits of the joints along the way, scaled ``k`` times slower."""
-    one, two = np.abs(guide.q1), np.abs(guide.q2)
-    with np.errstate(divide="ignore"):
-        speed = min(float((arm.qd_max / one).min()), float(np.sqrt(arm.qdd_max / two).min()))
-        acceleration, jerk = float((arm.qdd_max / one).min()), float((arm.qddd_max / one).min())
-    limits = (np.array([speed / k]), np.array([acceleration / k**2]), np.array([jerk / k**3]))
-    law = plan_profile(start, np.ones(1), *limits, duration_s)
-    low, high = law.extrema(0)
-    if low < -ROUNDING or high > 1 + ROUNDING:
-        raise InputError("from this moving start the tool cannot stop at the end of the path within the arm's limits")
-    return law
-
-
-def _fit(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> tuple[Profile, float]:
-    """Return the share over time that just keeps the limits by the walk's derivatives, and its scale."""
-    k = 1.0
-    law = _law(guide, arm, start, k, None)
-    for _ in range(ROUNDS):
-        t_s = check_times(law.duration_s)
-        share, speed, acceleration = (part[:, :1] for part in law.at(t_s))
-        q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
-        stretch = worst(arm, t_s, Joints(q1, q1 * speed, q1 * acceleration + q2 * speed**2)).stretch
-        if 1 - CLOSE <= stretch <= 1:
-            break
-        k *= stretch / (1 - CLOSE / 2)
-        law = _law(guide, arm, start, k, None)
-    if duration_s is None:
-        return law, k
-    if duration_s < law.duration_s:
-        raise InputError(
-            f"duration_s is {duration_s:.6g}; within the arm's limits this motion takes {law.duration_s:.6g} s"
-        )
-    k *= duration_s / law.duration_s
-    return _law(guide, arm, start, k, duration_s), k
 
 
 def _check_whole(arm: Arm, path: Path, motion: PathMotion, t_s: Array, joints: Joints) -> None:
