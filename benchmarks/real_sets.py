@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from armsight.data import Correspondences
+from armsight.data import Correspondences, PoseEstimate
 from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
@@ -18,6 +18,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
+from armsight.vision.measure import measure_detections
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource
 
@@ -173,11 +174,27 @@ def normalised_residuals() -> None:
         ours = calibrate_boards(s.board, [p for p in s.pairs if parity(p.name) == 0], (s.size, s.size))
         shots = ours_of([p for p in s.pairs if parity(p.name)])
         points = s.board.body.points
-        everything = errors_on(ours.rig, points, list(shots.values()), ours.body.points, ours.motion).normalised_rms
         good = [c for k, c in shots.items() if k not in s.bad]
-        chosen = errors_on(ours.rig, points, good, ours.body.points, ours.motion).normalised_rms
+        rig, found = ours.rig, ours.body.points
+        if ours.motion is not None:
+            rig = replace(rig, sigma_px=ours.solution.sigma_px)  # the rig's own holds the motion, as measuring needs it
+        everything, chosen = (
+            errors_on(rig, points, part, found, ours.motion).normalised_rms for part in (list(shots.values()), good)
+        )
         print(
             f"  {name}: {everything:.3f} on all odd pairs, {chosen:.3f} without those a person would throw out{said(ours)}"
+        )
+        filed = errors_on(ours.rig, points, list(shots.values()), found).normalised_rms
+        estimates = [
+            r
+            for p in s.pairs
+            if parity(p.name)
+            and isinstance(r := measure_detections(ours.rig, ours.body, p.left, p.right), PoseEstimate)
+        ]
+        print(
+            f"    with the rig file's sigma_px of {ours.rig.sigma_px:.3f} px and no motion: {filed:.3f}; measured with it: "
+            f"{len(estimates)} of {len(shots)}, misfit {np.mean([r.misfit for r in estimates]):.2f} mean, "
+            f"{max(r.misfit for r in estimates):.2f} at most"
         )
 
 

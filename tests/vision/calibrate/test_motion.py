@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from armsight.geometry.pose import pose, transform
+from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.bundle import Model, Observations, State, minimise
 from armsight.vision.calibrate import choose
@@ -13,6 +14,7 @@ from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.calibrate.motion import Motion
 from armsight.vision.match import join, renamed
+from armsight.vision.measure import measure_detections
 from armsight.vision.triangulate import optimal_points
 from board_views import SIZES, bench, board_pairs, rig_error
 from views import both_pixels
@@ -92,13 +94,28 @@ def test_what_is_predicted_for_other_pairs_holds_their_motion(moved):
     _, board, Ts = bench(count=24, seed=8)
     pairs = unsynchronised(true, board, Ts, motions_of(len(Ts), seed=12, far=(0, 9)), seed=1)
     rows = Observations.from_shots([join(p.left, p.right) for p in pairs])
+    corners = replace(c.rig, sigma_px=c.solution.sigma_px)
     with_motion, without = (
-        summary(pair_errors(c.rig, board.body.points, rows, motion=motion), 1).normalised_rms
+        summary(pair_errors(corners, board.body.points, rows, motion=motion), 1).normalised_rms
         for motion in (c.motion, None)
     )
     assert 0.8 < with_motion < 1.25
     assert without > 2
     assert 0.8 < c.heldout.normalised_rms < 1.25
+    # Who measures with the rig's file knows of no motion: its noise holds it, as if it were the corners'.
+    assert 0.8 < summary(pair_errors(c.rig, board.body.points, rows), 1).normalised_rms < 1.25
+
+
+def test_a_body_at_rest_is_measured_within_the_sigma_of_a_rig_of_moving_boards(moved):
+    true, _, c = moved
+    _, board, Ts = bench(count=24, seed=8)
+    nees = []
+    for T, pair in zip(Ts, unsynchronised(true, board, Ts, 0 * motions_of(len(Ts)), seed=2), strict=True):
+        r = measure_detections(c.rig, board.body, pair.left, pair.right)
+        e = log_se3(inverse(T) @ r.T_left_body)
+        nees.append(e @ np.linalg.solve(r.cov, e))
+    # Errors of one rig are common to all shots: a bound on their mean as wide as that of a single chi-square of six.
+    assert np.mean(nees) < chi2.ppf(0.999, 6)
 
 
 def test_a_motion_seen_from_a_camera_moves_points_as_it_does():

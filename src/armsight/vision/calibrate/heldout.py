@@ -67,13 +67,13 @@ def pair_errors(
         row = _pair_error(rig, drawing, found, correspondences(observations, shot), motion)
         if row is not None:
             rows.append((float(shot), *row))
-    return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
+    return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 1 + len(_FIELDS)).T)
 
 
 def _pair_error(
     rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences, motion: Motion | None
 ) -> tuple[float, ...] | None:
-    """Return epipolar px, rigid m, scale, weight, normalised of one shot; None where it has too little."""
+    """Return one shot's figures in the order of _FIELDS; None where it has too little."""
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
     cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
     p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
@@ -97,6 +97,7 @@ def _pair_error(
         fit_scale(board, p),
         float(len(good)),
         _normalised(transform(T_found, found), p, cov_p, by_rig, cov_rig),
+        _normalised(transform(T_found, found), p, cov_p, by_rig, np.zeros_like(cov_rig)),
     )
 
 
@@ -157,7 +158,7 @@ def cross_validate(
     return PairErrors(*merged[:, np.argsort(merged[0])])
 
 
-_FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised")
+_FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised", "over_noise")
 
 
 def summary(errors: PairErrors, folds: int, motion: Motion | None = None) -> HeldOut:
@@ -178,6 +179,7 @@ def summary(errors: PairErrors, folds: int, motion: Motion | None = None) -> Hel
         rms["rigid_m"],
         float(errors.scale.mean() - 1),
         rms["normalised"],
+        rms["over_noise"],
         0.0 if motion is None else motion.rms_m,
         0.0 if motion is None else motion.rms_rad,
     )
@@ -226,8 +228,8 @@ def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
     """Scale a rig's uncertainty by what the held-out pairs show.
 
     Up where residuals are not white, down where both cameras err alike and their points agree the better for it. Where
-    boards moved between the exposures, that is most of what held-out pairs show: the corners' noise is then left as each
-    camera's agreement with itself tells it.
+    boards moved between the exposures, the rig's ``sigma_px`` holds that motion as if it were noise of the detections:
+    who measures with these cameras does not know whether a body moves before them.
 
     Raises:
         CalibrationError: the held-out residuals say nothing.
@@ -235,5 +237,5 @@ def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
     factor = heldout.normalised_rms
     if not (np.isfinite(factor) and factor > 0):
         raise CalibrationError("the left-out shots do not tell how noisy the detections are: take more pairs")
-    corners = factor if heldout.motion_rms_m == 0 else 1.0
-    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * corners)
+    noise = factor if heldout.motion_rms_m == 0 else heldout.over_noise_rms
+    return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * noise)

@@ -29,6 +29,7 @@ class PairErrors(Record):
         scale: (S,) how many times larger than the perfect board the triangulated one is.
         weight: (S,) matched points of the pair.
         normalised: (S,) RMS of the rigid residual over its predicted sigma.
+        over_noise: (S,) RMS of the rigid residual over the sigma that the corners' noise alone gives it.
     """
 
     pair: Array
@@ -37,6 +38,7 @@ class PairErrors(Record):
     scale: Array
     weight: Array
     normalised: Array
+    over_noise: Array
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class HeldOut:
         rigid_rms_m: triangulated board against the perfect one, after a rigid fit, m.
         scale_error: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%.
         normalised_rms: rigid residual over its predicted sigma; 1 where the uncertainty is honest.
+        over_noise_rms: rigid residual over the sigma that the corners' noise alone gives it, without calibration or motion.
         motion_rms_m: how far the board is expected to move along an axis between the exposures of a left-out pair, m; 0
             where boards stand still.
         motion_rms_rad: by how much it is expected to turn about an axis, rad.
@@ -59,6 +62,7 @@ class HeldOut:
     rigid_rms_m: float
     scale_error: float
     normalised_rms: float
+    over_noise_rms: float
     motion_rms_m: float = 0.0
     motion_rms_rad: float = 0.0
 

@@ -117,8 +117,9 @@ def _moved(calibration: Calibration, motion: Motion) -> str:
     return (
         f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2f} mm and "
         f"{1e3 * motion.rms_rad:.1f} mrad RMS along and about each axis ({way_px:.2f} px{most}): the cameras are not "
-        "synchronised. The rig's sigma allows for it, but what moves like that while it is measured is off by as much: "
-        "hold it still, or trigger both cameras together"
+        f"synchronised. The rig's noise of {calibration.rig.sigma_px:.2f} px allows for a body that moves like that, the "
+        f"corners alone have {calibration.solution.sigma_px:.2f} px: hold still what is measured, or trigger both cameras "
+        "together"
     )
 
 
