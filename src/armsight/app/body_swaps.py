@@ -21,7 +21,7 @@ from armsight.vision.rig import StereoRig
 #: identification asks for take five, chance may favour the wrong one by three.
 TOLD = 8.0
 #: More discs than these are not searched for what may be taken for what; with one of them hidden; for a better place.
-SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 40, 10, 6
+SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 25, 10, 6
 #: Ways to take discs for others that are looked into, the closest first.
 _LOOKED_INTO = 60
 _MOVES_MM = (2, 3, 4, 6, 8, 10, 15, 20, 30, 40)

@@ -60,6 +60,7 @@ def relabelings(
     wanted = [np.linalg.norm(points[base[a]] - points[base[b]]) for a, b in ((0, 1), (0, 2), (1, 2))]
     all_ids = range(len(points))
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    own = distance[seen][:, list(base)]
     found: dict[tuple[int, ...], Relabeling] = {}
     for a, b in permutations(all_ids, 2):
         if abs(distance[a, b] - wanted[0]) > tolerance_m:
@@ -72,6 +73,10 @@ def relabelings(
                 or abs(distance[b, c] - wanted[2]) > tolerance_m
                 or not alike[list(base), list(triple)].all()
             ):
+                continue
+            # Every disc in view needs one whose distances from the three are right: cheap to see, and few triples have it.
+            fits = np.abs(own[:, None] - distance[:, triple]).max(axis=2) <= tolerance_m
+            if not (fits & alike[seen]).any(axis=1).all():
                 continue
             T = fit_rigid(p[list(base)], points[list(triple)])
             taken = _nearest(transform(T, p[seen]), points, alike, seen, _LEVER * tolerance_m)
