@@ -19,6 +19,7 @@ from armsight.geometry.rotation import log_so3
 from armsight.robot.checks import DEGREES, angle_refusal, angles_of, near_angles, pose_refusal, poses_of
 from armsight.robot.kinematics import chain, inverse, lanes
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
+from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised
 from armsight.robot.kinematics.table import KIND, packed
 from armsight.robot.solutions import ManySolutions, Nearest, Solutions
@@ -235,7 +236,7 @@ class Arm(Record):
         """
         T = poses_of(T_base_tool, 2)
         goal = _NO_ANGLES if near is None else near_angles(near)
-        rows, scratch = np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        rows, scratch = np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
         count, missed, bits = inverse.inverse(
             self.table, self._closed, self._limits, T, goal, near is not None, rows, scratch, lanes.LANES
         )
@@ -243,7 +244,7 @@ class Arm(Record):
             raise pose_refusal(T[None])
         if count and not bits:
             return Solutions(rows[:count])
-        lost = count == 0 or bits >= inverse.OUTSIDE
+        lost = count == 0 or bits >= OUTSIDE
         reason = self._reason(bits, near is not None) if count else _out_of_reach(missed)
         return Solutions(rows[:count], reason, self._nearest(T, goal) if lost else None)
 
@@ -255,24 +256,24 @@ class Arm(Record):
             near: (6,) joint angles, rad: what a joint that is not determined is given, 0 by default; the order stays.
         """
         Ts = poses_of(Ts_base_tool, 3)
-        most = inverse.MOST if self._closed[KIND] == NEITHER else lanes.LANES
-        rows, counts = np.zeros((len(Ts), most, inverse.KEY)), np.zeros(len(Ts), np.int64)
-        row, scratch = np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        most = MOST if self._closed[KIND] == NEITHER else lanes.LANES
+        rows, counts = np.zeros((len(Ts), most, KEY)), np.zeros(len(Ts), np.int64)
+        row, scratch = np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
         goal = _NO_ANGLES if near is None else near_angles(near)
         if inverse.inverse_batch(
             self.table, self._closed, self._limits, Ts, goal, row, scratch, lanes.LANES, rows, counts
         ):
             raise pose_refusal(Ts)
-        state = rows[:, :, inverse.STATE]
+        state = rows[:, :, STATE]
         there = np.arange(most) < counts[:, None]
         return ManySolutions(
             counts,
             rows[:, :, :6],
-            rows[:, :, inverse.POSITION],
-            rows[:, :, inverse.ANGLE],
-            (state < inverse.OUTSIDE) & there,
-            state % inverse.OUTSIDE > 0,
-            rows[:, :, inverse.CONFIGURATION : inverse.STATE],
+            rows[:, :, POSITION],
+            rows[:, :, ANGLE],
+            (state < OUTSIDE) & there,
+            state % OUTSIDE > 0,
+            rows[:, :, CONFIGURATION:STATE],
         )
 
     def _reason(self, bits: int, given: bool) -> str:
@@ -280,13 +281,13 @@ class Arm(Record):
         value = "its value in near" if given else "0"
         texts = _SINGULAR[self._closed[KIND] == PARALLEL]
         parts = ["singular: " + text.format(value=value) for bit, text in texts.items() if bits & bit]
-        if bits & inverse.OUTSIDE:
+        if bits & OUTSIDE:
             parts.append("outside limits: every solution has a joint beyond its limits")
         return "; ".join(parts)
 
     def _nearest(self, T: Array, near: Array) -> Nearest:
         """Return the pose within the limits that comes closest to one that cannot be had."""
-        q, rows, scratch = np.empty(6), np.empty((inverse.MOST, inverse.WIDTH)), np.zeros(inverse.SCRATCH)
+        q, rows, scratch = np.empty(6), np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
         inverse.nearest(self.table, self._closed, self._limits, T, near, q, rows, scratch, lanes.LANES)
         T_base_tool = self.forward(q)
         turned = log_so3(T_base_tool[:3, :3].T @ T[:3, :3])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
+from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Solutions:
     is the quick way to make a record.
 
     Attributes:
-        rows: (N, 13) a row for each solution, as ``kinematics.inverse`` writes it; the properties are its columns.
+        rows: (N, 13) a row for each solution, as ``kinematics.rows`` tells; the properties are its columns.
         reason: what keeps the answer from being plain: "singular: ...", "outside limits: ...", "unreachable: ..."; None
             where nothing does.
         nearest: where no solution is within limits, the closest pose that is.

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from armsight.data import Array
 from armsight.robot.kinematics.chain import Frame
@@ -31,15 +32,25 @@ Point = tuple[float, float]
 
 #: Bits of a solution's state, and of what kept the pose out of reach.
 SHOULDER, ELBOW, WRIST = 1, 2, 4
+#: Beside them: what the arm missed may be what rounding did to badly determined angles.
+DOUBT = 16
 #: Lane arrays beside the angles: shoulder, elbow, wrist (+-1), state.
 TAGS = 4
 
-#: Below this distance, m, or sine, a joint is not determined: what it moves stays below 1e-10 m or rad.
-_FREE = 1e-10
+#: Below this distance, m, or sine, a joint is not determined: what it moves stays below 1e-12 m or rad.
+_FREE = 1e-12
+#: A turn that moves the tool by less than this, m or rad, is allowed to bring the arm within reach; the polish undoes it.
+_UNFELT = 1e-10
 #: Reach may be missed by so much, m: rounding, not distance.
 _SLACK_M = 1e-11
+#: What rounding does to a wrist point, m, or an axis: divided by a sine or a distance that is an error of an angle.
+_ROUNDING = 1e-14
+#: If that moves the planar arm's end by more than this, m, a miss is in doubt.
+_DOUBTFUL_M = 1e-10
+#: How many places are tried for joint 1 where the wrist point lies on axis 1, and how far apart, rad.
+_TRIES, _TRY_RAD = 144, 2.0 * np.pi / 144.0
 #: Two solutions whose half difference has a sine below this are one: rounding alone parts a double one by 2e-8.
-_SAME = 5e-8
+_SAME = 1e-7
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
@@ -71,14 +82,14 @@ def _tag(tags: Array, lane: int, front: float, up: float, wrist: float, state: i
 
 
 @_kernel
-def _bend(table: Array, tx: float, ty: float, clamp: bool) -> tuple[bool, float, float]:
-    """Return whether the planar arm reaches a point, and the angle between its links as a point with s >= 0."""
+def _bend(table: Array, tx: float, ty: float, slack: float) -> tuple[bool, float, float]:
+    """Return whether the planar arm reaches a point but for a slack, and the angle between its links, s >= 0."""
     upper, fore = table[6], table[FOREARM]
     far2 = tx * tx + ty * ty
     far, most, least = math.sqrt(far2), abs(upper) + fore, abs(abs(upper) - fore)
     c = (far2 - upper * upper - fore * fore) / (2.0 * upper * fore)
     c = min(1.0, max(-1.0, c))
-    return clamp or (least - _SLACK_M <= far <= most + _SLACK_M), c, math.sqrt((1.0 - c) * (1.0 + c))
+    return least - slack <= far <= most + slack, c, math.sqrt((1.0 - c) * (1.0 + c))
 
 
 @_kernel
@@ -105,7 +116,7 @@ def _spherical(
     table: Array,
     B: Frame,
     near: Array,
-    clamp: bool,
+    slack: float,
     front: float,
     state: int,
     y: Array,
@@ -115,7 +126,7 @@ def _spherical(
 ) -> tuple[int, int]:
     """Fill the lanes of one shoulder of a SPHERICAL arm; B is the wrist in link 1. Returns the next lane, what missed."""
     nx, ny, nz, ox, oy, oz, ax, ay, az, tx, ty, _ = B
-    reached, c, s = _bend(table, tx, ty, clamp)
+    reached, c, s = _bend(table, tx, ty, slack)
     if not reached:
         return lane, ELBOW
     ways = 1 if s < _SAME else 2
@@ -173,7 +184,7 @@ def _parallel(
     table: Array,
     B: Frame,
     near: Array,
-    clamp: bool,
+    slack: float,
     front: float,
     state: int,
     y: Array,
@@ -194,18 +205,20 @@ def _parallel(
         c, s = (-c, -s) if flip else (c, s)
         cs, ss = c, s
         tx, ty = wx - a4 * cs - d5 * sa4 * ss, wy - a4 * ss + d5 * sa4 * cs
-        reached, ce, se = _bend(table, tx, ty, clamp and not free)
+        # An uncertain sum moves the planar end: what rounding did is put right afterwards, by the polish.
+        loose = slack + (abs(a4) + abs(d5)) * _ROUNDING / max(size, _FREE)
+        reached, ce, se = _bend(table, tx, ty, 0.0 if free else loose)
         if not reached:
             # Near the wrist's singularity the sum is free to turn, as far as the tool does not feel it.
             turn = _helpful_turn(table, wx, wy, cs, ss)
-            if turn < 10.0 and (free or size * abs(turn) < _FREE):
+            if turn < 10.0 and (free or size * abs(turn) < _UNFELT):
                 st, ct = sincos(turn)
                 cs, ss = cs * ct - ss * st, ss * ct + cs * st
                 tx, ty = wx - a4 * cs - d5 * sa4 * ss, wy - a4 * ss + d5 * sa4 * cs
-            elif not clamp:
-                missed |= ELBOW
+            reached, ce, se = _bend(table, tx, ty, loose)
+            if not reached:
+                missed |= ELBOW | (DOUBT if loose > _DOUBTFUL_M else 0)
                 continue
-            _, ce, se = _bend(table, tx, ty, True)
         ways = 1 if se < _SAME else 2
         s5 = sa5 * (cs * ax + ss * ay)
         for way in range(ways):
@@ -220,6 +233,37 @@ def _parallel(
             now = state | (WRIST if free else 0) | (ELBOW if ways == 1 else 0)
             _tag(tags, lane, front, -front * table[3] * table[6] * se, s5, now)
             lane += 1
+    return lane, missed
+
+
+@_kernel
+def _one_shoulder(
+    table: Array,
+    M: Frame,
+    c1: float,
+    s1: float,
+    near: Array,
+    slack: float,
+    front: float,
+    state: int,
+    y: Array,
+    x: Array,
+    tags: Array,
+    first: int,
+) -> tuple[int, int]:
+    """Fill the lanes of one theta1. Returns the next lane, and what missed."""
+    sa = table[3]
+    nx, ny, nz = _in_link1(M[0], M[1], M[2], c1, s1, sa)
+    ox, oy, oz = _in_link1(M[3], M[4], M[5], c1, s1, sa)
+    ax, ay, az = _in_link1(M[6], M[7], M[8], c1, s1, sa)
+    px, py, pz = _in_link1(M[9], M[10], M[11] - table[1], c1, s1, sa)
+    B = (nx, ny, nz, ox, oy, oz, ax, ay, az, px - table[0], py, pz)
+    if table[KIND] == PARALLEL:
+        lane, missed = _parallel(table, B, near, slack, front, state, y, x, tags, first)
+    else:
+        lane, missed = _spherical(table, B, near, slack, front, state, y, x, tags, first)
+    for k in range(first, lane):
+        _put(y, x, 0, k, c1, s1)
     return lane, missed
 
 
@@ -239,31 +283,29 @@ def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: A
     Returns:
         how many lanes were filled, and bits of what kept solutions out of reach.
     """
-    sa, offset = table[3], table[ACROSS]
-    wx, wy, wz = M[9], M[10], M[11] - table[1]
+    offset, wx, wy = table[ACROSS], M[9], M[10]
     r = math.sqrt(wx * wx + wy * wy)
     if r < abs(offset) - _SLACK_M and not clamp:
         return 0, SHOULDER
     e = math.sqrt(max((r - abs(offset)) * (r + abs(offset)), 0.0))
     free = r < _FREE
     single = free or e < _SAME * r
+    slack = np.inf if clamp else _SLACK_M + (abs(table[18]) + abs(table[25])) * _ROUNDING / max(e, 1e-6 * r, _FREE)
+    state = SHOULDER if single else 0
     missed, lane = 0, 0
     for way in range(1 if single else 2):
         e = -e if way else e
         c1, s1 = wx * e - wy * offset, wy * e + wx * offset
         length = math.sqrt(c1 * c1 + s1 * s1)
         c1, s1 = _at(table, 0, near) if free else (c1 / length, s1 / length)
-        nx, ny, nz = _in_link1(M[0], M[1], M[2], c1, s1, sa)
-        ox, oy, oz = _in_link1(M[3], M[4], M[5], c1, s1, sa)
-        ax, ay, az = _in_link1(M[6], M[7], M[8], c1, s1, sa)
-        px, py, pz = _in_link1(wx, wy, wz, c1, s1, sa)
-        B = (nx, ny, nz, ox, oy, oz, ax, ay, az, px - table[0], py, pz)
-        front, state, first = (-1.0 if way else 1.0), (SHOULDER if single else 0), lane
-        if table[KIND] == PARALLEL:
-            lane, out = _parallel(table, B, near, clamp, front, state, y, x, tags, lane)
-        else:
-            lane, out = _spherical(table, B, near, clamp, front, state, y, x, tags, lane)
+        first, out = lane, 0
+        # With the wrist point on axis 1, joint 1 is free as far as the rest then reaches: near, and on either side of it.
+        for k in range(_TRIES if free else 1):
+            st, ct = sincos((k + 1) // 2 * (1.0 if k & 1 else -1.0) * _TRY_RAD)
+            ck, sk = c1 * ct - s1 * st, s1 * ct + c1 * st
+            front = -1.0 if way else 1.0
+            lane, out = _one_shoulder(table, M, ck, sk, near, slack, front, state, y, x, tags, lane)
+            if lane > first:
+                break
         missed |= out
-        for k in range(first, lane):
-            _put(y, x, 0, k, c1, s1)
     return lane, missed

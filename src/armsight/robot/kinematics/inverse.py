@@ -13,89 +13,39 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.robot.kinematics.chain import Frame, after, before, tool_frame
-from armsight.robot.kinematics.closed import closed_form
+from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
 from armsight.robot.kinematics.descent import WORK, descend, pose_error
 from armsight.robot.kinematics.lanes import errors, frames, thetas
+from armsight.robot.kinematics.rigid import rigid
+from armsight.robot.kinematics.rows import (
+    ANGLE,
+    CONFIGURATION,
+    KEY,
+    MOST,
+    OUTSIDE,
+    POSITION,
+    STATE,
+    known,
+    place,
+    placed,
+    sort,
+    wrap,
+)
 from armsight.robot.kinematics.table import KIND, UNBASE, UNTOOL
 from armsight.robot.kinematics.trig import angle_of_each, sincos_each
 
-#: Most solutions that are looked for: eight where there is a closed form; a general arm has up to sixteen.
-MOST = 16
-#: Columns of a row: six joint angles, position error, orientation error, shoulder, elbow, wrist (+-1, or 0 where the arm
-#: has no structure), state, and the key by which rows are ordered.
-POSITION, ANGLE, CONFIGURATION, STATE, KEY, WIDTH = 6, 7, 8, 11, 12, 13
 #: Size of a call's workspace: the lanes' sines, cosines, angles, thetas, frames, tags, errors; and that of the descent.
 SCRATCH = 4 * 48 + 96 + 32 + 16 + 6 * WORK
 _LANES = SCRATCH - 6 * WORK
-#: Bit of a row's state beside those of ``closed``: a joint is beyond its limits.
-OUTSIDE = 8
-#: Verdicts on a pose, in the place of a count.
-NOT_FINITE, NOT_RIGID = -1, -2
-
 #: A solution is polished where its pose is off by more than this, m or rad, and dropped where the polish leaves more.
 _POLISHED, _WRONG = 1e-12, 3e-10
-#: Two solutions that differ less than this in every joint, rad, are one.
-_SAME_RAD = 1e-7
-#: A rotation may be off by this much and is then put right.
-_NEARLY_RIGID = 1e-6
 #: How many places damped least squares starts from for an arm without structure; steps from there, in a polish, and towards
 #: the nearest pose; starts for that beside the closed form's.
 STARTS, _STEPS, _POLISH_STEPS, _NEAREST_STEPS, _NEAREST_STARTS = 64, 60, 20, 200, 8
-_TURN = 2.0 * np.pi
+#: Bounds of a joint that has none, rad.
 _FAR = 1e9
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-
-
-@_kernel
-def _rigid(T: Array) -> tuple[int, Frame]:
-    """Return the verdict on a transform (4, 4), and its frame with the rotation put right."""
-    total = 0.0
-    for i in range(4):
-        for j in range(4):
-            total += T[i, j] * 0.0
-    xx, xy, xz, yx, yy, yz = T[0, 0], T[1, 0], T[2, 0], T[0, 1], T[1, 1], T[2, 1]
-    zx, zy, zz, px, py, pz = T[0, 2], T[1, 2], T[2, 2], T[0, 3], T[1, 3], T[2, 3]
-    verdict = 0
-    if total != 0.0:
-        verdict = NOT_FINITE
-    else:
-        handed = (xy * yz - xz * yy) * zx + (xz * yx - xx * yz) * zy + (xx * yy - xy * yx) * zz
-        if handed < 0.0 or T[3, 0] != 0.0 or T[3, 1] != 0.0 or T[3, 2] != 0.0 or T[3, 3] != 1.0:
-            verdict = NOT_RIGID
-    for _ in range(2):
-        a, b = 0.5 * (xx * xx + xy * xy + xz * xz - 1.0), 0.5 * (yx * yx + yy * yy + yz * yz - 1.0)
-        c, d = 0.5 * (zx * zx + zy * zy + zz * zz - 1.0), 0.5 * (xx * yx + xy * yy + xz * yz)
-        e, f = 0.5 * (xx * zx + xy * zy + xz * zz), 0.5 * (yx * zx + yy * zy + yz * zz)
-        off = max(max(abs(a), abs(b), abs(c)), max(abs(d), abs(e), abs(f)))
-        if off > _NEARLY_RIGID and verdict == 0:
-            verdict = NOT_RIGID
-        if off < 1e-15 or verdict != 0:
-            break
-        # R (3 I - R^T R) / 2 has the same rotation and the square of the error (Bjorck and Bowie, 1971).
-        xx, yx, zx = xx - a * xx - d * yx - e * zx, yx - d * xx - b * yx - f * zx, zx - e * xx - f * yx - c * zx
-        xy, yy, zy = xy - a * xy - d * yy - e * zy, yy - d * xy - b * yy - f * zy, zy - e * xy - f * yy - c * zy
-        xz, yz, zz = xz - a * xz - d * yz - e * zz, yz - d * xz - b * yz - f * zz, zz - e * xz - f * yz - c * zz
-    return verdict, (xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz)
-
-
-@_kernel
-def _wrap(q: float) -> float:
-    """Bring an angle into (-pi, pi]."""
-    turns: float = np.ceil((q - np.pi) / _TURN)
-    return q - _TURN * turns
-
-
-@_kernel
-def _placed(q: float, low: float, high: float, goal: float) -> tuple[float, bool]:
-    """Return the angle, whole turns apart, that lies within the limits and nearest a goal; and whether there is one."""
-    least, most = np.ceil((low - q) / _TURN - 1e-13), np.floor((high - q) / _TURN + 1e-13)
-    wanted = np.floor((goal - q) / _TURN + 0.5)
-    inside = least <= most
-    held = min(most, max(least, wanted))
-    turned = q + _TURN * (held if inside else wanted)
-    # A joint that rounding put over its limit is put on it.
-    return (min(high, max(low, turned)) if inside else turned), inside
 
 
 @_kernel
@@ -106,50 +56,11 @@ def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool
         q[i], work[17, i], work[18, i] = row[i], -_FAR, _FAR
     descend(table, F, q, work[17], work[18], steps, work)
     for i in range(6):
-        row[i] = _wrap(q[i])
+        row[i] = wrap(q[i])
     pose_error(tool_frame(table, row), F, e)
     row[POSITION] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     row[ANGLE] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
     return bool(max(row[POSITION], row[ANGLE]) < _WRONG)
-
-
-@_kernel
-def _known(rows: Array, count: int) -> bool:
-    """Say whether row ``count`` stands among the rows before it."""
-    for k in range(count):
-        same = True
-        for i in range(6):
-            apart = abs(_wrap(rows[k, i] - rows[count, i]))
-            if apart > _SAME_RAD:
-                same = False
-                break
-        if same:
-            return True
-    return False
-
-
-@_kernel
-def _place(limits: Array, near: Array, ordered: bool, row: Array) -> None:
-    """Turn a row's joints within the limits, and write its state and key."""
-    outside, distance = False, 0.0
-    for i in range(6):
-        row[i], inside = _placed(row[i], limits[0, i], limits[1, i], near[i])
-        outside = outside or not inside
-        distance += (row[i] - near[i]) ** 2
-    if outside:
-        row[STATE] += OUTSIDE
-    row[KEY] = (distance if ordered else 0.0) + (_FAR if outside else 0.0)
-
-
-@_kernel
-def _sort(rows: Array, count: int) -> None:
-    """Order rows by their keys; equal ones keep their order."""
-    for k in range(1, count):
-        j = k
-        while j > 0 and rows[j - 1, KEY] > rows[j, KEY]:
-            for i in range(WIDTH):
-                rows[j - 1, i], rows[j, i] = rows[j, i], rows[j - 1, i]
-            j -= 1
 
 
 @_kernel
@@ -162,15 +73,15 @@ def _start(n: int, near: Array, q: Array) -> None:
 
 
 @_kernel
-def _from_everywhere(table: Array, F: Frame, near: Array, rows: Array, work: Array) -> int:
-    """Write what damped least squares finds from many starts; returns how many rows."""
+def _from_everywhere(table: Array, F: Frame, near: Array, most: int, steps: int, rows: Array, work: Array) -> int:
+    """Write what damped least squares finds from many starts, at most so many; returns how many rows."""
     count = 0
     for n in range(STARTS):
-        if count == MOST:
+        if count == most:
             break
         rows[count] = 0.0
         _start(n, near, rows[count])
-        if _polish(table, F, rows[count], _STEPS, work) and not _known(rows, count):
+        if _polish(table, F, rows[count], steps, work) and not known(rows, count):
             count += 1
     return count
 
@@ -182,7 +93,6 @@ def _to_rows(lanes: Array, found: int, rows: Array) -> None:
     for k in range(found):
         for i in range(6):
             rows[k, i] = q[8 * i + k]
-        rows[k, KEY] = 0.0
         rows[k, POSITION], rows[k, ANGLE] = off[k], off[8 + k]
         for i in range(4):
             rows[k, CONFIGURATION + i] = tags[8 * i + k]
@@ -194,9 +104,39 @@ def _lane_angles(closed: Array, limits: Array, near: Array, lanes: Array, n: int
     y, x, q, theta = lanes[:48], lanes[48:96], lanes[96:144], lanes[144:192]
     angle_of_each(y, x, theta, 6 * n)
     for i in range(6):
-        way, offset, low, high, goal = closed[6 * i + 5], closed[6 * i + 4], limits[0, i], limits[1, i], near[i]
+        way, offset, low, high, goal = (closed[6 * i + 5], closed[6 * i + 4], limits[0, i], limits[1, i], near[i])
         for k in range(n):
-            q[8 * i + k], _ = _placed(way * (theta[8 * i + k] - offset), low, high, goal)
+            q[8 * i + k], _ = placed(way * (theta[8 * i + k] - offset), low, high, goal)
+
+
+@_kernel
+def _in_doubt(
+    table: Array,
+    closed: Array,
+    limits: Array,
+    F: Frame,
+    near: Array,
+    rows: Array,
+    already: int,
+    lanes: Array,
+    work: Array,
+    n: int,
+) -> int:
+    """Add what descent finds from where the steps of the closed form come closest; returns how many rows there are."""
+    y, x = lanes[:48], lanes[48:96]
+    M = after(closed, UNTOOL, before(closed, UNBASE, F))
+    found, _ = closed_form(closed, M, near, True, y, x, lanes[288:320])
+    _lane_angles(closed, limits, near, lanes, n)
+    _to_rows(lanes, found, rows[n:])
+    count = already
+    for k in range(found):
+        rows[count] = rows[n + k]
+        if count < n and _polish(table, F, rows[count], _NEAREST_STEPS, work) and not known(rows, count):
+            count += 1
+    if count == 0:
+        count = _from_everywhere(table, F, near, 1, _NEAREST_STEPS, rows, work)
+        rows[0, STATE] = SHOULDER | WRIST
+    return count
 
 
 @_kernel
@@ -214,17 +154,18 @@ def _from_closed_form(
     frames(table, y, x, lanes[192:288], n)
     errors(lanes[192:288], F, lanes[320:328], lanes[328:336], n)
     _to_rows(lanes, found, rows)
-    count = 0
+    count, moved = 0, False
     for k in range(found):
         if k != count:
             rows[count] = rows[k]
         good = max(rows[count, POSITION], rows[count, ANGLE]) <= _POLISHED
         if not good:
-            good = _polish(table, F, rows[count], _POLISH_STEPS, work)
-            rows[count, KEY] = 1.0
-        # Only a solution that was moved can have come upon another.
-        if good and not (rows[count, KEY] > 0.0 and _known(rows, count)):
+            good, moved = _polish(table, F, rows[count], _POLISH_STEPS, work), True
+        # Only solutions that were moved can come upon each other.
+        if good and not (moved and known(rows, count)):
             count += 1
+    if missed & DOUBT:
+        count = _in_doubt(table, closed, limits, F, near, rows, count, lanes, work, n)
     return count, missed
 
 
@@ -257,19 +198,19 @@ def inverse(
         how many rows were written, or a verdict on T; bits of what kept solutions out of reach; and those of all rows'
         states together, OUTSIDE only where every row is.
     """
-    verdict, F = _rigid(T)
+    verdict, F = rigid(T)
     if verdict != 0:
         return verdict, 0, 0
     missed, lanes, work = 0, scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
     if closed[KIND] == 0.0:
-        count = _from_everywhere(table, F, near, rows, work)
+        count = _from_everywhere(table, F, near, MOST, _STEPS, rows, work)
     else:
         count, missed = _from_closed_form(table, closed, limits, F, near, rows, lanes, work, n)
     bits = 0
     for k in range(count):
         bits |= int(rows[k, STATE])
-        _place(limits, near, ordered, rows[k])
-    _sort(rows, count)
+        place(limits, near, ordered, rows[k])
+    sort(rows, count)
     if count > 0 and rows[0, STATE] >= OUTSIDE:
         bits |= OUTSIDE
     return count, missed, bits
@@ -302,18 +243,10 @@ def inverse_batch(
 
 @_kernel
 def nearest(
-    table: Array,
-    closed: Array,
-    limits: Array,
-    T: Array,
-    near: Array,
-    q: Array,
-    rows: Array,
-    scratch: Array,
-    n: int,
+    table: Array, closed: Array, limits: Array, T: Array, near: Array, q: Array, rows: Array, scratch: Array, n: int
 ) -> None:
     """Write the joint angles (6,) within the limits whose pose comes closest to T, as far as descent finds them."""
-    _, F = _rigid(T)
+    _, F = rigid(T)
     count, lanes, work = 0, scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
     if closed[KIND] != 0.0:
         M = after(closed, UNTOOL, before(closed, UNBASE, F))
@@ -327,7 +260,7 @@ def nearest(
         else:
             _start(k - count, near, trial)
         for i in range(6):
-            turned, _ = _placed(trial[i], limits[0, i], limits[1, i], near[i])
+            turned, _ = placed(trial[i], limits[0, i], limits[1, i], near[i])
             trial[i] = min(limits[1, i], max(limits[0, i], turned))
         cost = descend(table, F, trial, limits[0], limits[1], _NEAREST_STEPS, work)
         if cost < best:
