@@ -77,6 +77,7 @@ def views(rig, target, Ts, rng=None, sigma=SIGMA, clutter=0, hidden=(), radii=(4
                 for m in range(len(p))
                 if (b, m, side) not in hidden
                 and np.isfinite(at[m, 0])
+                and p[m] @ T[:3, :3] @ normals[m] < 0
                 and (at[m] > 0).all()
                 and (at[m] < np.array(SIZE) - 1).all()
             ]

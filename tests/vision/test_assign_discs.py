@@ -69,16 +69,20 @@ def test_a_disc_that_one_camera_sees_is_named_there():
 
 
 def test_two_that_compete_are_dropped_by_name():
+    """Along the epipolar line and by less than the pose is known: nothing tells them apart, if not the other discs."""
     rig = hd_rig()
-    left, right, owner = views(rig, PLATE, [T_FRONT])
-    row = row_of(owner[0], 1)
-    # Along the epipolar line and by less than the pose is known: nothing tells them apart.
-    left = added(left, left.uv[row] + [0.3, 0.0], row)
-    seen = assign(rig, PLATE, T_FRONT, SURE, left, right)
-    assert seen.ids.tolist() == [0, 2]
-    (dropped,) = seen.dropped
-    assert dropped.point == "P2"
-    assert "2 in the left image, 1 in the right image" in dropped.reason
+    loose = np.diag([6e-3, 6e-3, 0.02, 4e-3, 4e-3, 4e-3]) ** 2
+    for hidden, named in (([0, 2], []), ([], [0, 1, 2])):
+        left, right, owner = views(rig, PLATE, [T_FRONT], hidden=[(0, m, s) for m in hidden for s in (0, 1)])
+        row = row_of(owner[0], 1)
+        seen = assign(rig, PLATE, T_FRONT, loose, added(left, left.uv[row] + [6.0, 0.0], row), right)
+        if named:
+            assert seen.ids.tolist() == named
+            assert (seen.uv[1, 0] == left.uv[row]).all()
+        else:
+            assert seen == Missed(
+                "ambiguous: P2: several detections may be it: 2 in the left image, 1 in the right image"
+            )
 
 
 @pytest.mark.parametrize(

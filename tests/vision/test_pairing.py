@@ -110,9 +110,9 @@ def test_too_many_pairs_are_told():
     rig, n = hd_rig(known=True), int(np.sqrt(MOST_PAIRS)) + 20
     rng = np.random.default_rng(0)
     z = rng.uniform(0.8, 0.81, n)
-    uv = both_pixels(rig, np.column_stack([rng.uniform(-0.1, 0.3, n), np.full(n, 0.05), z]))
+    uv = both_pixels(rig, np.column_stack([rng.uniform(-0.1, 0.3, n), rng.uniform(-0.1, 0.1, n), z]))
     sides = [
-        Discs(uv[:, s], np.tile(100.0 * np.eye(2), (n, 1, 1)), np.tile([81.0, 0, 81.0], (n, 1)), np.ones(n, bool))
+        Discs(uv[:, s], np.tile(1e4 * np.eye(2), (n, 1, 1)), np.tile([81.0, 0, 81.0], (n, 1)), np.ones(n, bool))
         for s in (0, 1)
     ]
     assert pair(DiscView.of(rig, PLATE, *sides)) is None

@@ -20,6 +20,8 @@ from armsight.vision.conic import project_discs
 from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.rig import StereoRig
 
+#: A disc turned further away than this cosine is not found, and its back is not seen.
+LEAST_FACING = 0.09
 #: Points this share of their spread off a plane still count as in it.
 _FLAT = 1e-3
 
@@ -132,8 +134,8 @@ def centred(
 
 
 def visible(rig: StereoRig, expected: Expected) -> NDArray[np.bool_]:
-    """(M, 2) whether a disc's ellipse lies wholly in a camera's image and its face, where known, is turned to it."""
+    """(M, 2) whether a disc's ellipse lies wholly in a camera's image and its face, where known, is turned to it enough."""
     size = np.array([camera.image_size_px for camera in rig.cameras])
     low, high = expected.uv - expected.radius_px[..., None], expected.uv + expected.radius_px[..., None]
     inside = ((low >= -0.5) & (high <= size - 0.5)).all(axis=2)
-    return np.asarray(inside & ~(expected.facing <= 0.0))
+    return np.asarray(inside & ~(expected.facing < LEAST_FACING))

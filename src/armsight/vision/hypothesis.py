@@ -1,10 +1,11 @@
 """How likely it is that given discs are those of a body at one pose, rather than discs of something else.
 
-The score is the logarithm of the Bayes factor of the two explanations: the body at some pose, of which nothing is known
-beforehand, against discs of the same size and brightness strewn as densely as the image has them (Bar-Shalom and Li,
-"Multitarget-Multisensor Tracking", 1995, 6: association likelihoods). Pose and calibration are integrated out in Laplace's
-approximation. It weighs in one number how well the discs fit, how many there are, how sharply they could have contradicted,
-and how easily clutter would do the same.
+The score is the logarithm of a Bayes factor: the body at some pose, of which nothing is known beforehand, against the
+better of two other explanations, discs of the same looks strewn as densely over each image as it shows them, and real discs
+strewn in space as densely as pairs are found that the body does not explain (Bar-Shalom and Li, "Multitarget-Multisensor
+Tracking", 1995, 6: association likelihoods). What each explanation leaves open, a pose or places, is integrated out in
+Laplace's approximation. It weighs in one number how well the discs fit, how many there are, how sharply they could have
+contradicted, and how easily something else would do the same.
 """
 
 from __future__ import annotations
@@ -16,18 +17,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from armsight.data import Array, Correspondences, Ids, Record
-from armsight.geometry.pose import exp_se3
+from armsight.geometry.pose import exp_se3, transform
 from armsight.vision.assign_discs import correspondences, settle
 from armsight.vision.disc_view import SIZE_SIGMAS, SIZE_TOLERANCE, DiscView
-from armsight.vision.expected import Expected, expect, visible
-from armsight.vision.pairing import DEPTHS_M
+from armsight.vision.expected import LEAST_FACING, Expected, expect, visible
+from armsight.vision.pairing import DEPTHS_M, Pairs
 
 #: A disc in view is found with this probability.
 FOUND = 0.9
 #: One standard deviation of an ellipse's size about the disc's, as a share, beside its noise.
 SIZE_SHARE = SIZE_TOLERANCE / 3
-#: A disc turned further away than this cosine is not found, and its back is not seen.
-LEAST_FACING = 0.09
 #: Discs that fit worse than this quantile of chi-square are not those of the body.
 FIT_QUANTILE = 1.0 - 1e-5
 _STEPS, _DONE = 12, 1e-4
@@ -70,19 +69,20 @@ class Hypothesis(Record):
 
 @dataclass(frozen=True, eq=False)
 class _Fit(Record):
-    """A least-squares pose: with its covariance, chi-square, and log-determinant of the residuals' covariance."""
+    """A least-squares pose, the covariance of its tangent, chi-square, and the inverse covariance of the residuals."""
 
     T_left_body: Array
     cov: Array
     chi2: float
-    log_det: float
+    weight: Array
 
 
-def hypothesis(view: DiscView, T_left_body: Array, rows: Ids) -> Hypothesis | str:
+def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> Hypothesis | str:
     """Grow a few named detections into a hypothesis over all discs.
 
     Args:
         view: what both cameras saw.
+        pairs: all pairs of discs that may be one disc of the body.
         T_left_body: (4, 4) about the pose.
         rows: (M, 2) detections of three discs or more, -1 elsewhere.
 
@@ -106,7 +106,7 @@ def hypothesis(view: DiscView, T_left_body: Array, rows: Ids) -> Hypothesis | st
     sizes = _size_chi2(view, expected, found.rows)
     if sizes is None:
         return "the discs do not look as the body's would"
-    score = _score(view, expected, found.rows, fit) - sizes / 2
+    score = _score(view, pairs, expected, found.rows, fit) - sizes / 2
     return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(view, found), score)
 
 
@@ -139,7 +139,7 @@ def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
         step = cov @ (J.T @ W @ gap)
         left = float(step @ information @ step)
         if left < _DONE:
-            return _Fit(T, cov, float(gap @ W @ gap) - left, float(np.linalg.slogdet(S)[1]))
+            return _Fit(T, cov, float(gap @ W @ gap) - left, np.asarray(W, np.float64))
         T = T @ exp_se3(step)
     return None
 
@@ -156,20 +156,57 @@ def _size_chi2(view: DiscView, expected: Expected, rows: Ids) -> float | None:
     return total
 
 
-def _score(view: DiscView, expected: Expected, rows: Ids, fit: _Fit) -> float:
+def _score(view: DiscView, pairs: Pairs, expected: Expected, rows: Ids, fit: _Fit) -> float:
     """Return the logarithm of the Bayes factor of the centres; see the module."""
-    named = rows >= 0
-    count = int(named.sum())
-    evidence = -fit.chi2 / 2 - fit.log_det / 2 - count * np.log(2 * np.pi)
-    # The prior: any direction, anywhere in view, and no distance likelier than another on a logarithmic scale.
-    camera, z = view.rig.left, max(float(fit.T_left_body[2, 3]), DEPTHS_M[0])
-    width, height = camera.image_size_px
-    area = z**2 * width * height / float(camera.intrinsics[0] * camera.intrinsics[1])
-    prior = -np.log(8 * np.pi**2 * area * z * np.log(DEPTHS_M[1] / DEPTHS_M[0]))
+    side, m = np.nonzero(rows.T >= 0)
+    lost = int((visible(view.rig, expected) & (rows < 0)).sum())
+    # Any direction, anywhere in view, and no distance likelier than another on a logarithmic scale.
+    z = max(float(fit.T_left_body[2, 3]), DEPTHS_M[0])
+    prior = -np.log(8 * np.pi**2 * 3 * _volume(view, z) * np.log(DEPTHS_M[1] / DEPTHS_M[0]))
     pose = 3 * np.log(2 * np.pi) + np.linalg.slogdet(fit.cov)[1] / 2 + prior
-    lost = int((visible(view.rig, expected) & ~named).sum())
-    clutter = sum(np.log(_density(view, expected, rows[:, side], m, side)) for m, side in np.argwhere(named).tolist())
-    return float(evidence + pose + count * np.log(FOUND) + lost * np.log(1 - FOUND) - clutter)
+    seen = len(m) * np.log(FOUND) + lost * np.log(1 - FOUND)
+    in_image = np.log(
+        [_density(view, expected, rows[:, s], i, s) for i, s in zip(m.tolist(), side.tolist(), strict=True)]
+    )
+    flat = _left_open(fit.weight, np.eye(2 * len(m))) + in_image.sum()
+    both = np.asarray((rows >= 0).all(axis=1))
+    ids = np.flatnonzero(both)
+    places = np.zeros((len(m), 2, 3 * len(ids)))  # derivative of what is seen by the places of the discs seen twice
+    for n, i in enumerate(ids):
+        places[m == i, :, 3 * n : 3 * n + 3] = expected.J[i, side[m == i], :, :3]
+    once = np.eye(2 * len(m)).compress(np.repeat(~both[m], 2), axis=1)
+    J = np.hstack([places.reshape(2 * len(m), -1), once])
+    solid = (
+        _left_open(fit.weight, J) + in_image[~both[m]].sum() + len(ids) * np.log(_pairs_density(view, pairs, rows, fit))
+    )
+    return float(pose + seen - fit.chi2 / 2 - max(flat, solid))
+
+
+def _left_open(weight: Array, J: Array) -> float:
+    """Return the logarithm of what integrating over parameters with Jacobian J (N, K) gives, at the best of them."""
+    return float(J.shape[1] * np.log(2 * np.pi) - np.linalg.slogdet(J.T @ weight @ J)[1]) / 2
+
+
+def _volume(view: DiscView, z: float) -> float:
+    """Return the volume that the left camera sees up to a distance, m^3, its lens taken as straight."""
+    camera = view.rig.left
+    width, height = camera.image_size_px
+    return float(width * height / (camera.intrinsics[0] * camera.intrinsics[1]) * z**3 / 3)
+
+
+def _pairs_density(view: DiscView, pairs: Pairs, rows: Ids, fit: _Fit) -> float:
+    """Return how many pairs of discs a cubic metre has that the body does not explain.
+
+    In view, to twice the body's distance at the least, and one more than are seen; or about the body if denser there.
+    """
+    points = view.target.body.points
+    middle = points.mean(axis=0)
+    reach = float(np.linalg.norm(points - middle, axis=1).max())
+    other = ~(np.isin(pairs.left, rows[:, 0]) | np.isin(pairs.right, rows[:, 1]))
+    near = np.linalg.norm(pairs.p_left - transform(fit.T_left_body, middle), axis=1) <= reach
+    about = int((other & near).sum()) / (4 / 3 * np.pi * reach**3)
+    farthest = max(2 * float(fit.T_left_body[2, 3]), float(pairs.p_left[other, 2].max(initial=0.0)))
+    return max((int(other.sum()) + 1) / _volume(view, farthest), about)
 
 
 def _density(view: DiscView, expected: Expected, mine: Ids, m: int, side: int) -> float:

@@ -34,6 +34,8 @@ ERROR_ODDS = 1e6
 MOST_HYPOTHESES = 64
 #: A triple whose discs a rough rigid fit turns away by more than this (cosine) is not looked at more closely.
 _ROUGHLY_AWAY = -0.3
+#: How many times more a disc may count elsewhere: nearer to the cameras, or with less clutter about it.
+_ALLOWANCE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +93,14 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
     reasons: Counter[str] = Counter()
     grown: list[Hypothesis] = []
     both = np.stack([pairs.left, pairs.right], axis=1)
-    possible = np.flatnonzero(_turned_to(view, found))
+    possible = np.flatnonzero(_turned_to(view, found)).tolist()
     many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} in more than {MOST_HYPOTHESES} places or turns")
     if len(possible) > MOST_HYPOTHESES * comb(count, 3):  # each body has so many triples, and no more
         return many
     tried = 0
     for n in possible:
+        if _settled(grown, int(found.most[n])):
+            return grown
         ids, detections = found.ids[n], both[found.rows[n]]
         if any((h.rows[ids] == detections).all() for h in grown):
             continue
@@ -105,11 +109,13 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
         tried += 1
         rows = np.full((count, 2), -1)
         rows[ids] = detections
-        result = hypothesis(view, found.Ts_left_body[n], rows)
+        result = hypothesis(view, pairs, found.Ts_left_body[n], rows)
         if isinstance(result, str):
             reasons[result] += 1
         elif not any((h.rows == result.rows).all() for h in grown):
             grown.append(result)
+    if found.left_out and not _settled(grown, found.left_out):
+        return many
     if grown:
         return grown
     what = f"{len(pairs.left)} pairs of discs may be of {target.body.name}"
@@ -118,6 +124,18 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
     if len(found.ids):
         return Missed(f"{what}, but three with its distances would be seen from behind")
     return Missed(f"{what}, but no three have its distances; {_too_few(target, discs)}")
+
+
+def _settled(grown: list[Hypothesis], most: int) -> bool:
+    """Whether no hypothesis of at most so many discs can come near the best one.
+
+    A score is about proportional to the number of discs, less what the pose costs; half as much again is allowed for.
+    """
+    best = max(grown, key=lambda h: h.score, default=None)
+    if best is None:
+        return False
+    count = int((best.rows >= 0).all(axis=1).sum())
+    return bool((1 - _ALLOWANCE * most / count) * best.score > np.log(ERROR_ODDS))
 
 
 def _turned_to(view: DiscView, found: Triples) -> Array:

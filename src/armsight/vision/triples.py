@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -22,8 +23,8 @@ from armsight.vision.pairing import Pairs
 DISTANCE_SIGMAS = 4.5
 #: Three discs whose height is less than this share of their longest side fix no pose.
 SLIM = 0.05
-#: More edges, corners or triangles than these are not looked at.
-MOST_EDGES, MOST_CORNERS, MOST_TRIPLES = 500_000, 2_000_000, 20_000
+#: More edges than these are not looked at, and no more triples are listed.
+MOST_EDGES, MOST_TRIPLES = 500_000, 5_000
 _NONE = np.zeros(0, np.int64)
 
 
@@ -35,34 +36,50 @@ class Triples(Record):
         ids: (T, 3) rows of the body's discs.
         rows: (T, 3) rows of the pairs.
         Ts_left_body: (T, 4, 4) the rigid fits.
+        most: (T,) how many of the body's discs can be seen at most where this triple is right.
+        left_out: the same for the triples that were too many to be listed; 0 where none were.
     """
 
     ids: Ids
     rows: Ids
     Ts_left_body: Array
+    most: Ids
+    left_out: int
 
 
 def triples(view: DiscView, pairs: Pairs) -> Triples | None:
-    """Find every triple of pairs with the body's distances; None where there are too many."""
-    target = view.target
+    """Find the triples of pairs with the body's distances; None where there are too many pairs alone."""
     edges = _edges(view, pairs)
     if edges is None:
         return None
     nodes, first, second, chi2 = edges
-    found = _triangles(first, second, len(nodes))
-    if found is None:
-        return None
-    a, b, c, e = found
-    ids, rows = nodes[np.stack([a, b, c], axis=1), 1], nodes[np.stack([a, b, c], axis=1), 0]
-    good = spread(target.body.points[ids])
-    ids, rows, cost = ids[good], rows[good], chi2[e[good]].sum(axis=1)
-    Ts = _rigid(target.body.points[ids], pairs.p_left[rows])
-    shared = np.bincount(
-        np.stack([a, b, c]).ravel(), minlength=len(nodes)
-    )  # of a body's discs, each is in many triples
-    support = np.min([shared[a], shared[b], shared[c]], axis=0)[good]
-    order = np.lexsort([cost, -support])
-    return Triples(ids[order], rows[order], Ts[order]) if len(order) <= MOST_TRIPLES else None
+    key = first * len(nodes) + second
+    order = np.argsort(key)
+    first, second, chi2 = first[order], second[order], chi2[order]
+    start = np.searchsorted(first, np.arange(len(nodes) + 1))
+    shared = np.zeros(len(nodes), np.int64)
+    _triangles(start, second, shared, 0, np.empty((0, 5), np.int64))
+    # A triple's least shared node; the most shared are listed. One node of n that fit together is in C(n - 1, 2) triples.
+    enough = 1
+    while (
+        count := _triangles(start, second, shared, enough, found := np.empty((MOST_TRIPLES, 5), np.int64))
+    ) > MOST_TRIPLES:
+        enough = 2 * enough
+    found = found[:count]
+    ids, rows = nodes[found[:, :3], 1], nodes[found[:, :3], 0]
+    good = spread(view.target.body.points[ids])
+    found, ids, rows = found[good], ids[good], rows[good]
+    support = shared[found[:, :3]].min(axis=1, initial=np.iinfo(np.int64).max)
+    third = np.searchsorted(first * len(nodes) + second, found[:, 1] * len(nodes) + found[:, 2])
+    order = np.lexsort([chi2[found[:, 3]] + chi2[found[:, 4]] + chi2[third], -support])
+    ids, rows = ids[order], rows[order]
+    Ts = _rigid(view.target.body.points[ids], pairs.p_left[rows])
+    return Triples(ids, rows, Ts, _most(support[order]), int(_most(np.array([enough - 1]))[0]))
+
+
+def _most(support: Ids) -> Ids:
+    """Return the most nodes that can all be joined where each is in so many triangles: (n - 1)(n - 2) / 2 at the least."""
+    return np.where(support > 0, (3 + np.sqrt(1 + 8 * support)) // 2, 0).astype(np.int64)
 
 
 def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
@@ -108,23 +125,45 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     return nodes, np.concatenate(first), np.concatenate(second), np.concatenate(chi2)
 
 
-def _triangles(first: Ids, second: Ids, count: int) -> tuple[Ids, Ids, Ids, Ids] | None:
-    """Return nodes a < b < c (T,) of every triangle and its edges (T, 3); None where there are too many to look at."""
-    key = first.astype(np.int64) * count + second
-    order = np.argsort(key)
-    first, second, key = first[order], second[order], key[order]
-    after = np.searchsorted(first, first, side="right")
-    place = np.arange(len(first))
-    more = after - place - 1  # edges of the same first node that follow
-    if more.sum() > MOST_CORNERS:
-        return None
-    e1 = np.repeat(place, more)
-    e2 = e1 + 1 + np.arange(len(e1)) - np.repeat(np.cumsum(more) - more, more)
-    want = second[e1] * count + second[e2]
-    e3 = np.minimum(np.searchsorted(key, want), max(len(key) - 1, 0))
-    closed = key[e3] == want if len(key) else np.zeros(0, bool)
-    e1, e2, e3 = e1[closed], e2[closed], e3[closed]
-    return first[e1], second[e1], second[e2], order[np.stack([e1, e2, e3], axis=1)]
+@numba.njit(cache=True, error_model="numpy")
+def _triangles(start: Ids, second: Ids, shared: Ids, enough: int, found: Ids) -> int:
+    """List triangles of nodes a < b < c that are all shared by ``enough`` of them; return how many there are.
+
+    Args:
+        start: (V + 1,) where each node's edges to higher nodes begin.
+        second: (E,) the higher nodes, rising from each.
+        shared: (V,) in how many triangles each node is; with ``enough`` zero it is counted here.
+        enough: least of ``shared``.
+        found: (T, 5) is filled with nodes a, b, c and the edges ab and ac, as far as it reaches.
+    """
+    count = 0
+    for a in range(len(start) - 1):
+        if enough and shared[a] < enough:
+            continue
+        for e in range(start[a], start[a + 1]):
+            b = second[e]
+            if enough and shared[b] < enough:
+                continue
+            i, k = e + 1, start[b]
+            while i < start[a + 1] and k < start[b + 1]:
+                if second[i] < second[k]:
+                    i += 1
+                elif second[i] > second[k]:
+                    k += 1
+                else:
+                    c = second[i]
+                    if not enough:
+                        shared[a] += 1
+                        shared[b] += 1
+                        shared[c] += 1
+                    elif shared[c] >= enough:
+                        if count < len(found):
+                            found[count, 0], found[count, 1], found[count, 2] = a, b, c
+                            found[count, 3], found[count, 4] = e, i
+                        count += 1
+                    i += 1
+                    k += 1
+    return count
 
 
 def spread(p: Array) -> NDArray[np.bool_]:
