@@ -146,18 +146,22 @@ def _law(duration_s: float) -> Profile:
 def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
     """Return a duration that the speeds and accelerations of the joints at the start would allow."""
     twist = path.at(np.zeros(1)).twist[0]
-    q1 = np.abs(_speeds(arm, arm.jacobian(q), twist)[0])
+    q1 = np.abs(_speeds(arm.jacobian(q), twist, _scale(arm))[0])
     slowest = max(float((SHAPE[0] * q1 / arm.qd_max).max()), float(np.sqrt((SHAPE[1] * q1 / arm.qdd_max).max())))
     return max(slowest, 1e-2)
 
 
-def _speeds(arm: Arm, J: Array, V: Array) -> tuple[Array, float]:
+def _speeds(J: Array, V: Array, scale: Array) -> tuple[Array, float]:
     """Return joint speeds (6,) for a tool velocity (6,), damped, and the smallest singular value."""
-    size_m = float(np.hypot(arm.a, arm.d).sum())
-    scale = np.array([size_m, size_m, size_m, 1, 1, 1])
     U, s, Vt = np.linalg.svd(J / scale[:, None])
     soft = max(0.0, 1 - (s[-1] / SOFT) ** 2)
-    return Vt.T @ (s / (s**2 + (DAMPING * soft) ** 2) * (U.T @ (V / scale))), float(s[-1])
+    return (s / (s**2 + (DAMPING * soft) ** 2) * ((V / scale) @ U)) @ Vt, float(s[-1])
+
+
+def _scale(arm: Arm) -> Array:
+    """Return what the rows of the Jacobian (6,) are divided by: the arm's size for the linear ones."""
+    size_m = float(np.hypot(arm.a, arm.d).sum())
+    return np.array([size_m, size_m, size_m, 1, 1, 1])
 
 
 def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
@@ -167,24 +171,24 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
     dt = law.duration_s / steps
     moved = law.at(np.arange(2 * most + 1) * dt / 2)
     places = path.at(moved.q[:, 0])
-    V_ref = places.twist * moved.qd
+    V_ref, scale = places.twist * moved.qd, _scale(arm)
     rows: list[tuple[Array, Array, float]] = []
     q = q_start
     for k in range(most):
-        qd, off, least = _step(arm, q, places, V_ref, 2 * k)
+        qd, off, least = _step(arm, q, places, V_ref, 2 * k, scale)
         rows.append((q, off, least))
         if k >= steps and (np.abs(qd) < SETTLED * arm.qd_max).all():
             break
-        q = q + dt * _step(arm, q + dt / 2 * qd, places, V_ref, 2 * k + 1)[0]
+        q = q + dt * _step(arm, q + dt / 2 * qd, places, V_ref, 2 * k + 1, scale)[0]
     qs, offs, leasts = (np.array(part) for part in zip(*rows, strict=True))
     off_m, off_rad = (np.asarray(np.linalg.norm(part, axis=1)) for part in (offs[:, :3], offs[:, 3:]))
     return _Run(np.linspace(0, (len(qs) - 1) * dt, len(qs)), qs, off_m, off_rad, leasts)
 
 
-def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int) -> tuple[Array, Array, float]:
+def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
     """Return the joint speeds (6,) wanted now, how far the tool is behind (6,), and the smallest singular value."""
-    off = behind(places.T_base_tool[row : row + 1], arm.forward(q)[None])[0]
-    qd, least = _speeds(arm, arm.jacobian(q), V_ref[row] + GAIN * off)
+    off = behind(places.T_base_tool[row], arm.forward(q))
+    qd, least = _speeds(arm.jacobian(q), V_ref[row] + GAIN * off, scale)
     return qd, off, least
 
 

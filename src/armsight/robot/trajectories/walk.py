@@ -86,9 +86,14 @@ def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
 
 
 def behind(T_goal: Array, T: Array) -> Array:
-    """Return how far poses (N, 4, 4) are behind others, (N, 6): [m; rad], base axes, for small turns."""
-    turn = np.cross(T[:, :3, :3], T_goal[:, :3, :3], axis=1).sum(axis=2) / 2
-    return np.concatenate([T_goal[:, :3, 3] - T[:, :3, 3], turn], axis=1)
+    """Return how far poses (..., 4, 4) are behind others, (..., 6): [m; rad], base axes, for small turns."""
+    M = T_goal[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
+    off = np.empty((*T.shape[:-2], 6))
+    off[..., :3] = T_goal[..., :3, 3] - T[..., :3, 3]
+    off[..., 3] = (M[..., 2, 1] - M[..., 1, 2]) / 2
+    off[..., 4] = (M[..., 0, 2] - M[..., 2, 0]) / 2
+    off[..., 5] = (M[..., 1, 0] - M[..., 0, 1]) / 2
+    return off
 
 
 def derivatives(arm: Arm, q: Array, places: Places) -> tuple[Array, Array]:
