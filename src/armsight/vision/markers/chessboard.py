@@ -32,6 +32,8 @@ MORE_SHARE = 0.7
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, is not of a
 #: clean corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
 MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
+#: The four outermost lines of a grid (rows, columns), each with the one next to it.
+_ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +181,9 @@ def goes_on(
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
     squares = local_squares(uv)[0]
     sign = np.sign((fits.contrast * parity)[kept].sum()) * parity.reshape(shape)
-    for turned in range(4):
-        grid, sides, colour = (np.rot90(array, turned) for array in (uv, squares, sign))
-        beyond = 2 * grid[0] - grid[1]
-        known = np.isfinite(beyond[:, 0])
-        least = max(3.0, MORE_SHARE * np.count_nonzero(known))
-        beyond, sides, colour = beyond[known], np.ascontiguousarray(sides[0][known]), -colour[0][known]
+    for end, inner in _ENDS:
+        beyond, sides, colour = 2 * uv[end] - uv[inner], squares[end], -sign[end]
+        least = max(3.0, MORE_SHARE * np.count_nonzero(np.isfinite(beyond[:, 0])))
         if np.count_nonzero(crossed(image, beyond, sides) == colour) < least:
             continue
         more = refine_corners(image, beyond, sides, rough=True)

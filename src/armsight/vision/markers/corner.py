@@ -194,7 +194,13 @@ def _refine(
             verdict[i] = _KEPT
 
 
-@numba.njit(cache=True, error_model="numpy")
+def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image as all kernels get it: contiguous and read-only, so that they are compiled once."""
+    pixels = np.ascontiguousarray(image).view()
+    pixels.flags.writeable = False
+    return pixels
+
+
 def crossed(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
     """Tell where squares of two colours may cross, at a glance.
 
@@ -207,10 +213,18 @@ def crossed(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
         (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
         both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
     """
-    out, means = np.zeros(len(uv)), np.empty((2, 2))
+    out = np.zeros(len(uv))
+    _glance(_pixels(image), uv, squares, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _glance(image: NDArray[np.uint8], uv: Array, squares: Array, out: Array) -> None:
+    """Fill what :func:`crossed` returns, out (N,) being zero."""
+    means = np.empty((2, 2))
     for n in range(len(uv)):
-        inside = True
-        for i in range(2):
+        inside = np.isfinite(uv[n].sum() + squares[n].sum())
+        for i in range(2 if inside else 0):
             for j in range(2):
                 p = uv[n] + 0.25 * ((1 - 2 * i) * squares[n, 0] + (1 - 2 * j) * squares[n, 1])
                 x, y = int(np.rint(p[0])), int(np.rint(p[1]))
@@ -222,7 +236,6 @@ def crossed(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
             out[n] = 1.0
         elif inside and max(means[0, 0], means[1, 1]) < min(means[0, 1], means[1, 0]):
             out[n] = -1.0
-    return out
 
 
 def refine_corners(
@@ -260,5 +273,5 @@ def refine_corners(
     else:
         known, models = like.kept, np.array(like.models)
     cov, residual, verdict = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
-    _refine(np.ascontiguousarray(image), uv, squares, bows, arm, rough, known, models, cov, residual, verdict)
+    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, residual, verdict)
     return CornerFits(models, cov, residual, verdict)

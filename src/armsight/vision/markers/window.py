@@ -17,7 +17,7 @@ WINDOW_SHARE, WINDOW_MAX_PX = 0.42, 12.0
 #: Where squares carry a print, this much more room is left beside it, px, for its blur.
 ARM_GAP_PX = 1.5
 #: A fit with many more pixels near edges than this is first made with about so many.
-PIXELS_FIRST = 96
+PIXELS_FIRST = 64
 
 
 @numba.njit(cache=True, error_model="numpy")
