@@ -135,6 +135,14 @@ def test_discs_name_themselves_where_the_code_is_not_seen():
     assert missed.reason == ("left: no tag; right: no tag; left: 0 discs found; right: 0 discs found; plate has 3")
 
 
+def test_exchanged_cameras_are_told():
+    rig, rng = hd_rig(), np.random.default_rng(0)
+    left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
+    assert alone(rig, PLATE, right, left).reason.startswith(
+        "left and right are exchanged: the discs fit the rig the other"
+    )
+
+
 class Discerning:
     """A DiscTarget that finds what the test tells it to."""
 

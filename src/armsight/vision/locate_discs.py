@@ -11,7 +11,7 @@ import numpy as np
 from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs, Ids, Missed, PoseEstimate
 from armsight.vision.assign_discs import assign
 from armsight.vision.expected import centred
-from armsight.vision.identify import identify
+from armsight.vision.identify import Identified, identify
 from armsight.vision.locate import locate
 from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.match import match
@@ -53,11 +53,11 @@ def locate_composite(
         return locate_discs(rig, body, target, names, seen, by_code.T_left_body, by_code.cov)
     found = identify(rig, target, *discs)
     if isinstance(found, Missed):
-        if len(body.points) == len(target.body.points):
-            return found
+        if isinstance(identify(rig, target, discs[1], discs[0]), Identified):
+            return Missed(f"left and right are exchanged: the discs fit the rig the other way round ({found.reason})")
         told = [f"{side}: {d.problem}" for side, d in zip(SIDES, coded, strict=True) if d.problem]
         told += [by_code.reason] if by_code is not None and not told else []
-        return Missed("; ".join([*told, found.reason]))
+        return Missed("; ".join([*told, found.reason]) if len(body.points) > len(target.body.points) else found.reason)
     return locate_discs(rig, body, target, names, found.seen, found.T_left_body, found.cov)
 
 
