@@ -234,7 +234,7 @@ def _assemble(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _moved(T: Array, xi: Array, out: Array) -> None:
+def moved(T: Array, xi: Array, out: Array) -> None:
     """Move a pose by a tangent, on the right; to first order T exp(xi), and a pose exactly."""
     angle = np.sqrt(xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
@@ -271,7 +271,7 @@ def _fit(
         for i in range(6):
             damped[i, i] += damping * H[i, i] + 1e-300
         xi = np.linalg.solve(damped, g).astype(np.float64)
-        _moved(T, xi, trial)
+        moved(T, xi, trial)
         new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
         if new <= cost:
             done = cost - new <= _DONE * new

@@ -46,7 +46,7 @@ REASONS = {
     5: "its rim is not that of an ellipse",
     6: "too faint against the noise",
     7: "smaller than 4 px across",
-    8: "its inside is not even",
+    8: "its inside is not even: smeared by motion, or no disc",
     9: "open on one side",
 }
 #: Reasons that only the fit gives: such a place has a closed rim.

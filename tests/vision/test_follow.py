@@ -1,0 +1,123 @@
+"""Following: the same answers as searching, regained after a loss, jumps told, and honest covariances."""
+
+import numpy as np
+import pytest
+
+from armsight.data import Missed, PoseEstimate, Shot
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.vision.follow import Follower, follows
+from armsight.vision.markers.targets import Composite
+from armsight.vision.measure import measure
+from disc_painter import grey, light_of, pair_of
+from disc_views import PLATE, discs_of, hd_rig, someplace
+
+RIG = hd_rig()
+BODY = Composite(PLATE.body.name, (), PLATE)
+TWIST = np.array([0.4, -0.2, 0.1, 0.5, -0.4, 0.8])
+
+
+def shots(target, count, seed, hidden=None, start=None):
+    """A body that moves at constant twist, 60 shots a second."""
+    rng = np.random.default_rng(seed)
+    T = someplace(rng, z=(0.75, 0.85), tilt=0.4) if start is None else start
+    for k in range(count):
+        truth = T @ exp_se3(TWIST * k / 60)
+        left, right = pair_of(RIG, target, truth, rng, hidden=(hidden or {}).get(k, ()))
+        yield truth, Shot(str(k), left, right, k / 60)
+
+
+def test_following_gives_what_searching_gives():
+    follower = Follower(RIG, BODY)
+    ways = []
+    for _, shot in shots(PLATE, 8, 0):
+        result, slow = follower.measure(shot), measure(RIG, BODY, shot)
+        ways.append(follower.way)
+        assert isinstance(result, PoseEstimate)
+        assert isinstance(slow, PoseEstimate)
+        sigma = np.sqrt(np.diag(slow.cov_noise))
+        # The same pixels but for the window's first guess, the same model: a small part of the noise apart.
+        assert (np.abs(log_se3(inverse(slow.T_left_body) @ result.T_left_body)) < 0.3 * sigma).all()
+        assert np.allclose(np.sqrt(np.diag(result.cov)), np.sqrt(np.diag(slow.cov)), rtol=0.1)
+        assert np.allclose(result.points.p_left, slow.points.p_left, atol=1e-4)
+        assert np.allclose(
+            result.points.calibration, slow.points.calibration, atol=0.02 * np.abs(slow.points.calibration).max()
+        )
+        assert np.allclose(result.points.seen.uv, slow.points.seen.uv, atol=0.02)
+    assert ways == ["searched"] + ["followed"] * 7
+
+
+def test_lost_and_regained():
+    hidden = {3: ((0, 0),), 4: ((0, 0), (0, 1)), 5: [(m, c) for m in range(3) for c in range(2)]}
+    follower, ways = Follower(RIG, BODY), []
+    for truth, shot in shots(PLATE, 9, 1, hidden):
+        result = follower.measure(shot)
+        ways.append(follower.way)
+        if isinstance(result, PoseEstimate):
+            assert np.linalg.norm(result.T_left_body[:3, 3] - truth[:3, 3]) < 2e-3
+    assert ways[:6] == ["searched", "followed", "followed", "lost", "lost", "lost"]
+    assert set(ways[6:]) <= {"searched", "followed"}
+
+
+def test_one_of_four_discs_may_be_missing():
+    four = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0.085, 0], [0.03, 0.04, 0]], names=("A", "B", "C", "D"))
+    follower = Follower(RIG, Composite("four", (), four))
+    for k, (_, shot) in enumerate(shots(four, 5, 2, {3: ((1, 0),)})):
+        result = follower.measure(shot)
+        assert isinstance(result, PoseEstimate)
+        assert follower.way == ("followed" if k else "searched")
+        if k == 3:
+            assert [d.point for d in result.dropped] == ["B"]
+            assert result.dropped[0].reason.startswith("left: ")
+
+
+def test_a_jump_is_told():
+    follower = Follower(RIG, BODY)
+    start = someplace(np.random.default_rng(3), z=(0.8, 0.8), tilt=0.2)
+    for _, shot in shots(PLATE, 3, 3, start=start):
+        follower.measure(shot)
+        assert follower.jump is None
+    away = start @ exp_se3(np.array([0.05, 0.04, 0.0, 0.0, 0.0, 1.5]))
+    left, right = pair_of(RIG, PLATE, away, np.random.default_rng(4))
+    result = follower.measure(Shot("away", left, right, 3 / 60))
+    assert isinstance(result, PoseEstimate)
+    assert follower.way == "searched"
+    assert follower.jump is not None
+    assert "jumped" in follower.jump
+
+
+def test_shots_without_time_and_shots_without_images():
+    follower = Follower(RIG, BODY)
+    ways = []
+    for k, (_, shot) in enumerate(shots(PLATE, 4, 5)):
+        ways.append((follower.measure(Shot(shot.name, shot.left, shot.right)), follower.way)[1])
+        if k == 1:
+            assert isinstance(follower.measure(Shot("bad", None, None, problem="unplugged")), Missed)
+            assert follower.way == "lost"
+    assert ways == ["searched", "followed", "followed", "followed"]
+
+
+def test_covariance_is_honest():
+    """NEES of followed poses against truth, the rig exactly known, over fresh noise."""
+    rig = hd_rig(known=True)
+    rng, squares = np.random.default_rng(6), []
+    for _ in range(6):
+        T = someplace(rng, z=(0.7, 1.0), tilt=0.5)
+        light = light_of(rig, PLATE, T)
+        follower = Follower(rig, BODY)
+        for k in range(25):
+            result = follower.measure(Shot(str(k), *(grey(side, 2.0, rng) for side in light), k / 60))
+            assert isinstance(result, PoseEstimate)
+            xi = log_se3(inverse(result.T_left_body) @ T)
+            squares.append(xi @ np.linalg.solve(result.cov, xi))
+        assert follower.way == "followed"
+    # Mean of 150 chi-squares of 6 degrees: 6 +- sqrt(12 / 150) = 0.28; its own search aside all are followed.
+    assert abs(np.mean(squares) - 6) < 4 * 0.28
+
+
+def test_what_can_be_followed():
+    assert follows(BODY)
+    assert not follows(Composite("two", (), discs_of([[0, 0, 0], [0.1, 0, 0]])))
+    bent = discs_of([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], normal=None)
+    assert not follows(Composite("bent", (), bent))
+    with pytest.raises(ValueError, match="cannot be followed"):
+        Follower(RIG, Composite("bent", (), bent))
