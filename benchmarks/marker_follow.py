@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,25 +19,33 @@ from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, para
 from marker_report import Report, disc_target, lacking, opened, without_numbers
 
 RATE_HZ, SPEED, NOISE = 60.0, 0.5, 2.0
-Follow = Callable[[np.ndarray, np.ndarray], PoseEstimate | Missed]
 #: A pose is wrong where its squared distance from truth in sigmas is beyond chance, or it is turned by so much.
 WRONG_QUANTILE, WRONG_RAD = 1 - 1e-7, np.radians(5.0)
 
 
-def follower(rig: StereoRig, target: DiscTarget) -> Follow:
-    """Return what measures pair after pair, 1/60 s apart: following where armsight can, else searching every shot."""
-    if lacking("follow") is not None:
-        whole = opened(target)
-        return lambda left, right: measure(rig, whole, Shot("", left, right))
-    from armsight.vision.follow import Follower
+class Following:
+    """Measures pair after pair, 1/60 s apart: following where armsight can, else searching every shot.
 
-    following, count = Follower(rig, opened(target)), [0]
+    Attributes:
+        way: how the last shot was measured: followed, searched or lost.
+    """
 
-    def follow(left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
-        count[0] += 1
-        return following.measure(Shot(str(count[0]), left, right, count[0] / RATE_HZ))
+    def __init__(self, rig: StereoRig, target: DiscTarget) -> None:
+        self.way = "searched"
+        self._rig, self._target, self._count, self._follower = rig, opened(target), 0, None
+        if lacking("follow") is None:
+            from armsight.vision.follow import Follower
 
-    return follow
+            self._follower = Follower(rig, self._target)
+
+    def __call__(self, left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
+        self._count += 1
+        shot = Shot(str(self._count), left, right, self._count / RATE_HZ)
+        if self._follower is None:
+            return measure(self._rig, self._target, shot)
+        result = self._follower.measure(shot)
+        self.way = self._follower.way
+        return result
 
 
 @dataclass
@@ -121,14 +128,15 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
     if without is not None:
         report.say(f"  {without}: every shot is searched anew")
     rng, rig, target = np.random.default_rng(seed), parallel_rig(LENS, 3.0), disc_target()
-    follow = follower(rig, target)
+    follow = Following(rig, target)
     limit = chi2.ppf(WRONG_QUANTILE, 6)
     # Shots since the whole plate shows, whether the last one gave no pose, and how many whole shots each regain took.
     run, lost, regained = 0, False, []
     wrong = losses = measured_in_part = in_part = missed_whole = 0
-    nees, reasons = [], Counter()
+    nees, reasons, ways = [], Counter(), Counter()
     for moment in moments(rig, target, shots, rng):
         result = follow(*moment.images)
+        ways[follow.way] += 1
         run = run + 1 if moment.whole else 0
         in_part += not moment.whole
         if isinstance(result, Missed):
@@ -149,6 +157,7 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
         f"  {shots} shots, {SPEED} m/s at {RATE_HZ:g} Hz: {shots - in_part} with the whole plate in both images, "
         f"{missed_whole} of them missed; of {in_part} with something covered {measured_in_part} measured; {losses} losses"
     )
+    report.say(f"  {', '.join(f'{times} {way}' for way, times in ways.most_common())}")
     report.figure("wrong poses", wrong, "0", form="d", good=wrong == 0)
     if regained:
         most = max(regained)
