@@ -193,9 +193,9 @@ def _minimise(
                 good = False
                 break
             good = g[0] * step[0] + g[1] * step[1] + g[2] * step[2] <= _REACHED
+            p[n] += step
             if np.abs(step).max() <= _DONE * abs(p[n, 2]):
                 break
-            p[n] += step
         if not (good and _ahead(p[n], rays_left[n], T_right_left, rays_right[n])):
             p[n] = np.nan
             continue
