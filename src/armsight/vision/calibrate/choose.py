@@ -27,9 +27,9 @@ from armsight.vision.shape import smooth
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which no other program takes for
 #: an ordinary lens, by more.
 WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
-#: Motion between the exposures must lower the corners' noise by this share to be believed: synchronised cameras lower it
-#: by chance alone, a part in a hundred, and what a lens model lacks by a little more.
-MOTION_WORTH = 0.10
+#: Motion between the exposures must lower the corners' noise by this share to be believed: a fifth less is a sigma that
+#: was 1.25 times too large. Synchronised cameras lower it by a hundredth, by chance; what a lens model lacks, by a tenth.
+MOTION_WORTH = 0.2
 #: Degree of the polynomials in which a printed board may differ from its drawing.
 BOARD_DEGREE = 4
 #: How far a board is thought to differ from its drawing at first, RMS of one mode, as a share of its diagonal, and the
