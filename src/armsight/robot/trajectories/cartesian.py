@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.law import CLOSE, ROUNDS, fit_law, share_law, slower
+from armsight.robot.trajectories.law import CLOSE, ROUNDS, fit_law, share_law, slower, time_of
 from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.profile import Profile
@@ -88,7 +88,7 @@ def follow(
     if obstacle is not None:
         law, _ = fit_law(arm, Walk(*(part[: obstacle.clear] for part in guide)), share, None)
         scale = 1.0 if duration_s is None else duration_s / law.duration_s
-        raise _refused(path, obstacle, scale * law.first_time_s(0, obstacle.share))
+        raise _refused(path, obstacle, scale * time_of(law, obstacle.share))
     law, limits = fit_law(arm, guide, share, duration_s)
     for _ in range(ROUNDS):
         motion = PathMotion(arm, path, law, guide)

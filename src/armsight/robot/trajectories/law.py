@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ROUNDS = 12
 #: How near to its limit the fastest joint is brought.
 CLOSE = 1e-3
+#: Halvings of a duration that find an instant.
+HALVINGS = 40
 #: Proportions of speed, acceleration and jerk that are tried, and at how many instants each is judged.
 SHAPES, INSTANTS = tuple(product((1.0, 0.7, 0.5, 0.3), (1.0, 0.6, 0.3), (1.0, 0.5, 0.2))), 200
 
@@ -77,6 +79,15 @@ def share_law(start: Joints, limits: Array, duration_s: float | None = None) -> 
     if low < -ROUNDING or high > 1 + ROUNDING:
         raise InputError("from this moving start the tool cannot stop at the end of the path within the arm's limits")
     return law
+
+
+def time_of(law: Profile, share: float) -> float:
+    """Return when a share of the way that only rises is reached, s."""
+    early, late = 0.0, law.duration_s
+    for _ in range(HALVINGS):
+        middle = (early + late) / 2
+        early, late = (middle, late) if law.at(middle).q[0] < share else (early, middle)
+    return late
 
 
 def _bounds(arm: Arm, guide: Walk) -> Array:

@@ -37,11 +37,6 @@ class Profile:
         states = [self.solved.at_time(t) for t in times.ravel().tolist()]
         return Joints(*np.array(states).transpose(1, 0, 2).reshape(3, *times.shape, -1))
 
-    def first_time_s(self, axis: int, position: float) -> float:
-        """Return when an axis first is at a position; the duration where it never is."""
-        t_s = self.solved.get_first_time_at_position(axis, position)
-        return self.duration_s if t_s is None else float(t_s)
-
     def extrema(self, axis: int) -> tuple[float, float]:
         """Return the smallest and the largest position of an axis on the way."""
         bound = self.solved.position_extrema[axis]
