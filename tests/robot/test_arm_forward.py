@@ -1,0 +1,91 @@
+"""Where the tool is and how it moves: against products of matrices and against differences."""
+
+import arms
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from armsight.geometry.rotation import log_so3
+from armsight.robot.kinematics.trig import angle_of, sincos
+from asserts import numeric_jacobian
+from strategies import vectors
+
+every = pytest.mark.parametrize("arm", arms.ALL, ids=arms.names(arms.ALL))
+#: Rounding of some hundred products and sums of numbers below 4 (m or 1).
+ROUNDING = 1e-14
+
+
+def draw(seed, n=50):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, 6))
+
+
+@every
+def test_forward_and_links_are_the_products_of_the_table(arm):
+    for q in draw(1):
+        wanted = arms.frames(arm, q)
+        np.testing.assert_allclose(arm.forward(q), wanted[-1], rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(arm.links(q), wanted, rtol=0, atol=ROUNDING)
+
+
+@given(st.sampled_from(arms.ALL), vectors(-20, 20, 6))
+def test_forward_holds_for_any_angles(arm, q):
+    # An angle of 20 rad is rounded 16 times coarser than one of 1, and moves the tool by up to 3 m/rad.
+    np.testing.assert_allclose(arm.forward(q), arms.forward(arm, q), rtol=0, atol=6 * ROUNDING)
+
+
+@every
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 33])
+def test_a_batch_is_its_single_calls(arm, n):
+    q = draw(2, n)
+    single = np.array([arm.forward(row) for row in q]).reshape(n, 4, 4)
+    np.testing.assert_allclose(arm.forward(q), single, rtol=0, atol=ROUNDING)
+    for frame in ("base", "tool"):
+        single = np.array([arm.jacobian(row, frame) for row in q]).reshape(n, 6, 6)
+        np.testing.assert_array_equal(arm.jacobian(q, frame), single)
+
+
+@every
+def test_jacobian_is_the_derivative_of_forward(arm):
+    for q in draw(3, 10):
+        T = arms.forward(arm, q)
+
+        def moved(p, T=T):
+            Tp = arms.forward(arm, p)
+            return np.concatenate([Tp[:3, 3], log_so3(Tp[:3, :3] @ T[:3, :3].T)])
+
+        # Richardson's error is of order step^4 = 1e-12; rounding leaves 1e-15 / 1e-3 times a few.
+        wanted = numeric_jacobian(moved, q, 1e-3)
+        np.testing.assert_allclose(arm.jacobian(q), wanted, rtol=0, atol=3e-11)
+        turn = np.kron(np.eye(2), T[:3, :3].T)
+        np.testing.assert_allclose(arm.jacobian(q, "tool"), turn @ arm.jacobian(q), rtol=0, atol=ROUNDING)
+
+
+@every
+@pytest.mark.parametrize("frame", ["base", "tool"])
+def test_jacobian_rate_is_its_derivative_by_time(arm, frame):
+    for q, qd in zip(draw(4, 10), draw(5, 10), strict=True):
+        wanted = numeric_jacobian(lambda t, q=q, qd=qd: arm.jacobian(q + t[0] * qd, frame), np.zeros(1), 3e-4)[..., 0]
+        # Richardson's error: step^4 times the fifth derivative, below (6 pi)^5 x 3 m.
+        np.testing.assert_allclose(arm.jacobian_rate(q, qd, frame), wanted, rtol=0, atol=1e-8)
+
+
+@every
+def test_manipulability_is_the_volume_of_the_velocity_ellipsoid(arm):
+    q = draw(6, 20)
+    wanted = [np.prod(np.linalg.svd(J)[1]) for J in arm.jacobian(q)]
+    np.testing.assert_allclose(arm.manipulability(q), wanted, rtol=0, atol=1e-13)
+    assert arm.manipulability(q[0]) == arm.manipulability(q)[0]
+
+
+@given(st.floats(-4000, 4000))
+def test_sine_and_cosine_are_within_two_last_places(x):
+    s, c = sincos(x)
+    assert abs(s - np.sin(x)) <= 2 * np.spacing(max(abs(np.sin(x)), 1e-300)) + 1e-19
+    assert abs(c - np.cos(x)) <= 2 * np.spacing(max(abs(np.cos(x)), 1e-300)) + 1e-19
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
+def test_the_angle_of_a_point_is_within_two_last_places(y, x):
+    y, x = (0.0 if abs(v) < 1e-150 else v for v in (y, x))
+    assert abs(angle_of(y, x) - np.arctan2(y + 0.0, x + 0.0)) <= 2 * np.spacing(abs(np.arctan2(y, x)))
