@@ -37,7 +37,12 @@ class Report:
         mark = "" if good is None else "  yes" if good else "  NO"
         beside = f"   (wanted {wanted}{mark})" if wanted else ""
         self.say(f"  {name:62s} {value:{form}}{' ' + unit if unit else ''}{beside}")
-        self.found[name] = {"value": float(value), "unit": unit, "wanted": wanted, "good": good}
+        self.found[name] = {
+            "value": float(value),
+            "unit": unit,
+            "wanted": wanted,
+            "good": None if good is None else bool(good),
+        }
 
 
 def disc_target(bright: bool = True, radius_m: float = 0.008, count: int = 3) -> DiscTarget:
