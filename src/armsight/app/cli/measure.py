@@ -15,19 +15,21 @@ import numpy as np
 
 from armsight.app.cli.progress import bar
 from armsight.app.poses import csv_text, pose_record
+from armsight.app.view import CHART, View, view_folder
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.vision.detections import read_detections
 from armsight.vision.follow import Follower, follows
+from armsight.vision.markers.disc import DiscTarget
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.markers.targets import Composite, open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
 
-#: Shot name, time, result, and where a body is followed how it was found and what is odd about that.
-Result = tuple[str, float | None, PoseEstimate | Missed, dict[str, Any]]
+#: Shot, result, and where a body is followed how it was found and what is odd about that.
+Result = tuple[Shot, PoseEstimate | Missed, dict[str, Any]]
 
 
 @click.command("measure")
@@ -40,6 +42,7 @@ Result = tuple[str, float | None, PoseEstimate | Missed, dict[str, Any]]
 @click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
 @click.option("--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections instead of images.")
 @click.option("-o", "--out", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(
     rig: Path,
@@ -49,6 +52,7 @@ def command(
     source: str | None,
     detections: Path | None,
     out: Path | None,
+    view_dir: Path | None,
     as_json: bool,
 ) -> None:
     """Say where a target is and how it is turned, in the left camera's frame, with its uncertainty.
@@ -61,31 +65,37 @@ def command(
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
     stereo = StereoRig.load(rig)
     if out is not None:
-        check_writable(out, apart_from=(rig, target, detections))
+        check_writable(out, apart_from=(rig, target, detections, view_dir and view_dir / CHART))
+    folder = None if view_dir is None else view_folder(view_dir)
     if not stereo.cov.any():
         click.echo(f"note: {rig} does not say how well it is known: every ± is the pixel noise's share alone", err=True)
     records: list[dict[str, Any]] = []
     started = time.perf_counter()
     results: Iterator[Result]
     total: int | None
+    discs: DiscTarget | None = None
     with contextlib.ExitStack() as stack:
         if detections is not None:
             body = open_body(target)
             shots = read_detections(detections, body)
-            results, total = ((s.name, None, measure_seen(stereo, body, s), {}) for s in shots), len(shots)
+            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), {}) for s in shots)
+            total = len(shots)
         else:
             found = open_target(target)
-            body = found.body
+            body, discs = found.body, found.discs if isinstance(found, Composite) else None
             opened = PairsSource(left, right) if left is not None and right is not None else open_source(str(source))
             stack.enter_context(contextlib.closing(opened))
             results = _measured(stereo, found, _shots(opened, stereo, rig))
             total = len(getattr(opened, "pairs", ())) or None
+        view = None if folder is None else View(folder, stereo, body, discs, total)
         try:
-            _run(results, total, body, records, as_json)
+            _run(results, total, body, records, as_json, view)
         finally:
             if out is not None and records:
                 write_text(out, csv_text(records))
-    _close(records, time.perf_counter() - started, out)
+            if view is not None:
+                view.finish(records)
+    _close(records, time.perf_counter() - started, out, view)
 
 
 def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
@@ -103,7 +113,7 @@ def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
 def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator[Result]:
     """Measure shot after shot; a body of discs is followed from one to the next."""
     if not follows(target):
-        yield from ((shot.name, shot.t_s, measure(rig, target, shot), {}) for shot in shots)
+        yield from ((shot, measure(rig, target, shot), {}) for shot in shots)
         return
     click.echo("getting ready to follow (compiles for about a minute the first time on a machine)", err=True)
     follower = Follower(rig, target)
@@ -111,17 +121,24 @@ def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator
         begun = time.perf_counter()
         result = follower.measure(shot)
         way = {"way": follower.way, "jump": follower.jump, "took_ms": 1e3 * (time.perf_counter() - begun)}
-        yield shot.name, shot.t_s, result, way
+        yield shot, result, way
 
 
 def _run(
-    results: Iterator[Result], total: int | None, body: Body, records: list[dict[str, Any]], as_json: bool
+    results: Iterator[Result],
+    total: int | None,
+    body: Body,
+    records: list[dict[str, Any]],
+    as_json: bool,
+    view: View | None,
 ) -> None:
-    """Measure every shot, print its line and keep its record."""
+    """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
-        for name, t_s, result, way in results:
-            records.append({**pose_record(name, t_s, body, result), **way})
+        for shot, result, way in results:
+            records.append({**pose_record(shot.name, shot.t_s, body, result), **way})
             click.echo(json.dumps(records[-1]) if as_json else _line(records[-1]))
+            if view is not None:
+                view.add(shot, result, records[-1])
             advance()
 
 
@@ -145,7 +162,7 @@ def _line(record: dict[str, Any]) -> str:
     return f"{record['shot']}: {position} mm, {angles} deg ± {turned:.3f}{singular}, {len(record['points_m'])} points{note}"
 
 
-def _close(records: list[dict[str, Any]], seconds: float, out: Path | None) -> None:
+def _close(records: list[dict[str, Any]], seconds: float, out: Path | None, view: View | None) -> None:
     """Say on stderr what was measured and missed; raise where nothing was."""
     good = [r for r in records if r["status"] == "ok"]
     missed = [r for r in records if r["status"] == "missed"]
@@ -165,4 +182,5 @@ def _close(records: list[dict[str, Any]], seconds: float, out: Path | None) -> N
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
     if odd := sum(r["misfit"] > 1 for r in good):
         summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma holds it)"
+    summary += f"; {view.summary()}" if view is not None else ""
     click.echo(summary + (f"; written to {out}" if out is not None else ""), err=True)
