@@ -17,7 +17,7 @@ from armsight.data import Array
 from armsight.vision.camera import distort
 from armsight.vision.conic import disc_image
 from armsight.vision.markers.disc_fit import fit, shape_of
-from armsight.vision.markers.disc_model import Work
+from armsight.vision.markers.disc_model import Work, factor, solve
 from armsight.vision.markers.disc_search import Room, outline
 from armsight.vision.posefit import moved
 
@@ -28,6 +28,8 @@ _FACING = 0.2
 #: How much larger or smaller than predicted a disc may look.
 _SIZE = 1.35
 _STEPS = 8
+#: A step that changes the cost by less than this share is the last.
+_REACHED = 1e-5
 
 
 class Scene(NamedTuple):
@@ -278,21 +280,22 @@ def _linearise(scene: Scene, T_left: Array, found: Found, rig: bool) -> float:
 @numba.njit(cache=True, error_model="numpy")
 def settle(scene: Scene, found: Found) -> float:
     """Minimise over the pose ``found.T``; return the sum of the squared whitened residuals, infinite without a minimum."""
-    trial, H, g = np.empty((4, 4)), found.H, np.empty(6)
+    trial, H, g, xi = np.empty((4, 4)), found.H, np.empty(6), np.empty(6)
+    L, scale = np.empty((6, 6)), np.empty(6)
     cost = _linearise(scene, found.T, found, False)
     for _ in range(_STEPS):
         if not np.isfinite(cost):
             return np.inf
         H[:, :] = found.J.T @ found.J
         g[:] = found.J.T @ found.whitened
-        if not np.linalg.cond(H) < 1e14:
+        if not factor(H, L, scale):
             return np.inf
-        xi = np.linalg.solve(H, g).astype(np.float64)
+        solve(L, scale, g, xi)
         moved(found.T, xi, trial)
         new = _linearise(scene, trial, found, False)
-        if not new <= cost * (1 + 1e-9) + 1e-9:
+        if not new <= cost + _REACHED * (1.0 + cost):
             return np.inf  # from a prediction that good a full step goes down; else the slow way is taken
-        done = cost - new <= 1e-7 * (1.0 + new)
+        done = abs(cost - new) <= _REACHED * (1.0 + cost)
         found.T[:, :] = trial
         cost = new
         if done:

@@ -34,8 +34,10 @@ _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
 _BLUR_LEAST_PX = 0.2
 #: A step of the centre after which the residuals away from the rim tell the surround's variance, px.
 _WEIGH_PX = 0.3
-#: A gradient of so many standard deviations is one.
-_GRADIENT_SIGMAS = 3.0
+#: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
+_SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
+#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, STRAY).
+_KINDS = (0.6, 0.3, 0.1)
 
 #: Why a place is no disc: code -> words. 0 is a disc.
 REASONS = {
@@ -217,6 +219,58 @@ def _slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> flo
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _significance(theta: Array, first: int, work: Work) -> float:
+    """Return the squared distance from zero of two neighbouring unknowns, in units of the noise's variance."""
+    cov = work.shapes
+    _pair(first, work, cov)
+    a, b = theta[first], theta[first + 1]
+    det = cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
+    return float((cov[1, 1] * a * a - 2 * cov[0, 1] * a * b + cov[0, 0] * b * b) / det)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _average(n: int, theta: Array, x0: float, y0: float, noise_sigma: float, cov: Array, work: Work) -> None:
+    """Replace centre and covariance by the mean over the kinds of gradient, each by how likely it is (model averaging).
+
+    A kind that cannot be told from another pulls the centre by up to its own standard deviation: the spread between the
+    kinds is part of the covariance.
+    """
+    trial, start = work.trial, work.start
+    start[:] = theta
+    results, block = np.zeros((3, 7)), np.empty((2, 2))
+    least = np.inf
+    for kind in (LIGHT, SURROUND, STRAY):
+        trial[:] = start
+        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
+        results[kind, 0] = np.inf
+        if square >= 0.0:
+            _pair(0, work, block)
+            variance = square / (n - UNKNOWNS)
+            results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
+            results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
+            results[kind, 3:6] *= variance
+            least = min(least, square)
+    if not least < np.inf:
+        return
+    total = 0.0
+    for kind in range(3):
+        results[kind, 6] = _KINDS[kind] * np.exp(-0.5 * (results[kind, 0] - least) * (n - UNKNOWNS) / least)
+        total += results[kind, 6]
+    theta[0], theta[1] = 0.0, 0.0
+    for kind in range(3):
+        theta[0] += results[kind, 6] / total * results[kind, 1]
+        theta[1] += results[kind, 6] / total * results[kind, 2]
+    cov[:, :] = 0.0
+    for kind in range(3):
+        w, u, v = results[kind, 6] / total, results[kind, 1] - theta[0], results[kind, 2] - theta[1]
+        if w > 0.0:
+            cov[0, 0] += w * (results[kind, 3] + u * u)
+            cov[0, 1] += w * (results[kind, 4] + u * v)
+            cov[1, 1] += w * (results[kind, 5] + v * v)
+    cov[1, 0] = cov[0, 1]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: Work) -> int:
     """Fit one disc.
 
@@ -243,18 +297,6 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2
-    if _slope_inside(n, theta, x0, y0, work) > _GRADIENT_SIGMAS**2 * square / (n - UNKNOWNS):
-        trial, start, best, square = work.trial, work.start, SURROUND, np.inf
-        start[:] = theta
-        for slope in (SURROUND, LIGHT, STRAY):
-            trial[:] = start
-            other, _ = _minimise(n, trial, x0, y0, slope, noise_sigma, False, work)
-            if 0.0 <= other < square - (0.0 if slope == SURROUND else 9.0 * other / (n - UNKNOWNS)):
-                square, best = other, slope
-                theta[:] = trial
-        square, texture = _minimise(n, theta, x0, y0, best, noise_sigma, True, work)
-        if square < 0.0:
-            return 2
     variance = square / (n - UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
     half = (theta[2] + theta[4]) / 2
@@ -274,12 +316,17 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
+    uneven = _slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance or _significance(theta, 8, work) > (
+        _SLOPE_OUTSIDE * variance
+    )
     _pair(0, work, cov)
     if texture > 0.0:
         variance *= _texture_factor(n, theta[5], texture, work)
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
+    if uneven and texture == 0.0:
+        _average(n, theta, x0, y0, noise_sigma, cov, work)
     return 0
 
 
