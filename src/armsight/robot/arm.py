@@ -7,6 +7,7 @@ the functions in ``kinematics``; here stands what is checked once at the public 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -246,7 +247,7 @@ class Arm(Record):
             return Solutions(rows[:count])
         lost = count == 0 or bits >= OUTSIDE
         reason = self._reason(bits, near is not None) if count else _out_of_reach(missed)
-        return Solutions(rows[:count], reason, self._nearest(T, goal) if lost else None)
+        return Solutions(rows[:count], reason, partial(self._nearest, T, goal) if lost else None)
 
     def inverse_batch(self, Ts_base_tool: ArrayLike, near: ArrayLike | None = None) -> ManySolutions:
         """Return all joint angles for many poses, without reasons and nearest poses.

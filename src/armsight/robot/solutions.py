@@ -5,7 +5,9 @@ A pose out of reach, or one where a joint is not determined, is an answer with a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -60,16 +62,21 @@ class Solutions:
         rows: (N, 13) a row for each solution, as ``kinematics.rows`` tells; the properties are its columns.
         reason: what keeps the answer from being plain: "singular: ...", "outside limits: ...", "unreachable: ..."; None
             where nothing does.
-        nearest: where no solution is within limits, the closest pose that is.
+        find_nearest: how to find ``nearest``; None where a solution is within limits.
     """
 
     rows: Array
     reason: str | None = None
-    nearest: Nearest | None = None
+    find_nearest: Callable[[], Nearest] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Make the table read-only."""
         self.rows.flags.writeable = False
+
+    @cached_property
+    def nearest(self) -> Nearest | None:
+        """Where no solution is within limits, the closest pose that is; found when first asked for, in milliseconds."""
+        return self.find_nearest() if self.find_nearest else None
 
     def __len__(self) -> int:
         """Return how many there are."""

@@ -1,0 +1,214 @@
+"""Kinematics beside pinocchio, EAIK and roboticstoolbox in one run, one thread.
+
+    python benchmarks/kinematics.py            both figures, 1,000,000 poses
+    python benchmarks/kinematics.py 100000     both figures, fewer poses
+
+Figure 1, time: forward kinematics, Jacobian and all solutions of the inverse. "kernel" is the compiled function called
+from compiled code, "call" is the public method called from Python, "batch" is the public method on 100,000 at once.
+pinocchio's and EAIK's C++ is called from Python, as their users do: their figures hold that call's share. Least of
+several runs of the processor's own time, so that other work on the machine counts little.
+
+Figure 2, exactness: over seeded random poses, as many near singularities as elsewhere, the errors of every solution
+returned (measured anew through ``forward``), doubles, NaN, and what EAIK finds and armsight does not.
+
+Peers are optional: pip install pin EAIK roboticstoolbox-python.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import time
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[name] = "1"
+# The peers' wrappers and the sampling near singularities are the tests' own.
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "robot"))
+
+import arms  # noqa: E402
+import numba  # noqa: E402
+import numpy as np  # noqa: E402
+import peers  # noqa: E402
+
+from armsight.robot.kinematics import chain, inverse, lanes  # noqa: E402
+from armsight.robot.kinematics.rows import MOST, WIDTH  # noqa: E402
+from armsight.robot.models import MODELS  # noqa: E402
+
+POSES, BATCH, CHUNK = 1_000_000, 100_000, 20_000
+
+
+def have(module):
+    return importlib.util.find_spec(module) is not None
+
+
+def least(work, times, runs=7):
+    """Least processor time of one of ``times`` rounds of ``work``, us."""
+    work()
+    best = np.inf
+    for _ in range(runs):
+        start = time.process_time()
+        for _ in range(times):
+            work()
+        best = min(best, time.process_time() - start)
+    return best / times * 1e6
+
+
+@numba.njit
+def forwards(table, q, T, rounds):
+    for _ in range(rounds):
+        for row in q:
+            chain.forward(table, row, T)
+
+
+@numba.njit
+def jacobians(table, q, J, rounds):
+    for _ in range(rounds):
+        for row in q:
+            chain.jacobian(table, row, False, J)
+
+
+@numba.njit
+def inverses(table, closed, limits, Ts, near, rows, scratch, n, rounds):
+    for _ in range(rounds):
+        for T in Ts:
+            inverse.inverse(table, closed, limits, T, near, False, rows, scratch, n)
+
+
+def figure_1(rng):
+    print("figure 1: time, us; wanted: forward 0.4 kernel, 6 call, 0.08 batch; jacobian 0.6 kernel; inverse 3, 15, 2")
+    print(f"{'':19}{'kernel':>8}{'call':>8}{'batch':>8}   peers, called from Python")
+    for arm in MODELS.values():
+        q = rng.uniform(-np.pi, np.pi, (1000, 6))
+        Ts = arm.forward(q)
+        each, eachT = iter_forever(list(q)), iter_forever(list(Ts))
+        ours, beside = our_times(arm, q, Ts, each, eachT, rng), peer_times(arm, each, eachT, Ts)
+        for k, (name, times) in enumerate(ours.items()):
+            print(
+                f"{arm.name if k == 0 else '':9}{name:10}" + "".join(f"{t:8.3f}" for t in times) + f"   {beside[name]}"
+            )
+
+
+def our_times(arm, q, Ts, each, eachT, rng):
+    many = rng.uniform(-np.pi, np.pi, (BATCH, 6))
+    manyTs = arm.forward(many)
+    near, rows, scratch = np.zeros(6), np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
+    T, J = np.empty((4, 4)), np.empty((6, 6))
+    tables = arm.table, arm._closed, arm._limits
+    return {
+        "forward": (
+            least(lambda: forwards(arm.table, q, T, 20), 1) / 20_000,
+            least(lambda: arm.forward(next(each)), 5000),
+            least(lambda: arm.forward(many), 1) / BATCH,
+        ),
+        "jacobian": (
+            least(lambda: jacobians(arm.table, q, J, 20), 1) / 20_000,
+            least(lambda: arm.jacobian(next(each)), 5000),
+            least(lambda: arm.jacobian(many), 1) / BATCH,
+        ),
+        "inverse": (
+            least(lambda: inverses(*tables, Ts, near, rows, scratch, lanes.LANES, 5), 1) / 5000,
+            least(lambda: arm.inverse(next(eachT)), 3000),
+            least(lambda: arm.inverse_batch(manyTs), 1, 4) / BATCH,
+        ),
+    }
+
+
+def iter_forever(items):
+    while True:
+        yield from items
+
+
+def peer_times(arm, each, eachT, Ts):
+    out = {"forward": [], "jacobian": [], "inverse": []}
+    if have("pinocchio"):
+        peer = peers.Pinocchio(arm)
+        out["forward"].append(f"pinocchio {least(lambda: peer.forward(next(each)), 5000):.2f}")
+        out["jacobian"].append(f"pinocchio {least(lambda: peer.jacobian(next(each)), 5000):.2f}")
+    if have("eaik"):
+        robot = peers.Eaik(arm).robot
+        out["inverse"].append(f"EAIK {least(lambda: robot.IK(next(eachT)), 3000):.2f}")
+        listed = list(Ts)
+        out["inverse"].append(f"batch {least(lambda: robot.IK_batched(listed, 1), 5) / len(listed):.2f}")
+    if have("roboticstoolbox"):
+        toolbox = peers.Toolbox(arm)
+        out["forward"].append(f"roboticstoolbox {least(lambda: toolbox.forward(next(each)), 300):.2f}")
+        out["jacobian"].append(f"roboticstoolbox {least(lambda: toolbox.jacobian(next(each)), 300):.2f}")
+        out["inverse"].append(f"roboticstoolbox {least(lambda: toolbox.inverse(next(eachT)), 5, 3):.0f} (one solution)")
+    return {name: ", ".join(told) or "none installed" for name, told in out.items()}
+
+
+def figure_2(rng, poses):
+    print(f"\nfigure 2: {poses} poses, half of them near singularities; wanted: below 1e-9 m and rad, 0 of the others")
+    print(
+        f"{'':9}{'poses':>8}{'solutions':>11}{'worst m':>10}{'worst rad':>10}{'NaN':>5}{'twice':>6}"
+        f"{'none':>6}{'EAIK finds':>12}{'of a family':>13}{'missed':>8}"
+    )
+    each = poses // len(MODELS) // 2
+    for arm in MODELS.values():
+        total = np.zeros(8, dtype=np.int64)  # poses, solutions, NaN, twice, none, EAIK's, of a family, missed
+        worst = np.zeros(2)
+        for start in range(0, each, CHUNK // 2):
+            n = min(CHUNK // 2, each - start)
+            q = np.concatenate([rng.uniform(-np.pi, np.pi, (n, 6)), arms.near_singular(arm, n, rng)])
+            counts, errors = one_chunk(arm, arm.forward(q))
+            total += counts
+            worst = np.maximum(worst, errors)
+        print(
+            f"{arm.name:9}{total[0]:8}{total[1]:11}{worst[0]:10.1e}{worst[1]:10.1e}{total[2]:5}{total[3]:6}{total[4]:6}"
+            + (f"{total[5]:12}{total[6]:13}{total[7]:8}" if have("eaik") else "  EAIK is not installed")
+        )
+
+
+def one_chunk(arm, Ts):
+    many = arm.inverse_batch(Ts)
+    width = many.q.shape[1]
+    there = np.arange(width) < many.count[:, None]
+    far, turned = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
+    twice = sum(
+        (arms.apart(many.q[:, i], many.q[:, j]) < 1e-7)[there[:, i] & there[:, j]].sum()
+        for i in range(width)
+        for j in range(i)
+    )
+    counts = [len(Ts), many.count.sum(), np.isnan(many.q).sum(), twice, (many.count == 0).sum(), 0, 0, 0]
+    if have("eaik"):
+        counts[5:] = beside_eaik(arm, Ts, many, there)
+    return np.array(counts), (far.max(), turned.max())
+
+
+def beside_eaik(arm, Ts, many, there):
+    """How many exact solutions EAIK finds; how many are other members of a singular pose's family; how many are missed.
+
+    On a singularity joint angles are a family of which each of us returns a few: a member counts as found if ours, asked
+    for the one near it, is the same.
+    """
+    theirs = peers.Eaik(arm).inverse_batch(Ts)
+    pose = np.repeat(np.arange(len(Ts)), [len(found) for found in theirs])
+    q = (np.concatenate(theirs) + np.pi) % (2 * np.pi) - np.pi
+    exact = np.max(arms.off(arm.forward(q), Ts[pose]), axis=0) < 1e-9
+    pose, q = pose[exact], q[exact]
+    ours = np.where(there[..., None], many.q, np.inf)
+    with np.errstate(invalid="ignore"):
+        apart = np.nan_to_num(arms.apart(ours[pose], q[:, None]), nan=np.inf).min(axis=1)
+    doubtful = np.flatnonzero(apart > 1e-7)
+    smallest = np.linalg.svd(arm.jacobian(q[doubtful]), compute_uv=False)[:, -1] if len(doubtful) else np.zeros(0)
+    # Near a singularity joint angles are known as well as the pose, divided by the Jacobian's smallest singular value.
+    allowed = 1e-7 + 1e-12 / np.maximum(smallest, 1e-12)
+    family = missed = 0
+    for k, limit in zip(doubtful, allowed, strict=True):
+        if apart[k] > limit:
+            near = arm.inverse(Ts[pose[k]], near=q[k])
+            same = len(near) and arms.apart(near.q, q[k]).min() < limit
+            family, missed = family + bool(same), missed + (not same)
+    return len(q), family, missed
+
+
+def main() -> None:
+    rng = np.random.default_rng(20)
+    figure_1(rng)
+    figure_2(rng, int(sys.argv[1]) if len(sys.argv) > 1 else POSES)
+
+
+if __name__ == "__main__":
+    main()

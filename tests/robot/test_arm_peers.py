@@ -1,0 +1,68 @@
+"""The arm beside pinocchio, EAIK and roboticstoolbox, where they are installed."""
+
+import arms
+import numpy as np
+import peers
+import pytest
+
+from armsight.robot.models import MODELS
+
+models = pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
+
+
+def draw(seed, n):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, 6))
+
+
+@models
+def test_pinocchio_has_the_same_pose_jacobian_and_rate(arm):
+    pytest.importorskip("pinocchio", reason="pinocchio is not installed (pip install pin)")
+    peer = peers.Pinocchio(arm)
+    for q, qd in zip(draw(1, 100), draw(2, 100), strict=True):
+        np.testing.assert_allclose(arm.forward(q), peer.forward(q), rtol=0, atol=1e-14)
+        for frame in ("base", "tool"):
+            np.testing.assert_allclose(arm.jacobian(q, frame), peer.jacobian(q, frame), rtol=0, atol=1e-14)
+            # speeds of up to pi rad/s on all joints: 20 times larger numbers
+            rate = peer.jacobian_rate(q, qd, frame)
+            np.testing.assert_allclose(arm.jacobian_rate(q, qd, frame), rate, rtol=0, atol=2e-13)
+
+
+@models
+def test_roboticstoolbox_has_the_same_pose_and_jacobian(arm):
+    pytest.importorskip(
+        "roboticstoolbox", reason="roboticstoolbox is not installed (pip install roboticstoolbox-python)"
+    )
+    peer = peers.Toolbox(arm)
+    for q in draw(3, 20):
+        np.testing.assert_allclose(arm.forward(q), peer.forward(q), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(arm.jacobian(q), peer.jacobian(q), rtol=0, atol=1e-14)
+
+
+@models
+def test_no_solution_is_missed_that_eaik_finds(arm):
+    pytest.importorskip("eaik", reason="EAIK is not installed (pip install EAIK)")
+    peer = peers.Eaik(arm)
+    missed = found = ours = 0
+    for q in draw(4, 1500):
+        T = arm.forward(q)
+        theirs, answer = peer.inverse(T), arm.inverse(T)
+        missed += len(peers.unmatched(arm, theirs, answer))
+        found, ours = found + len(theirs), ours + len(answer)
+    assert missed == 0
+    assert ours >= found > 6000
+
+
+@models
+def test_near_singularities_what_eaik_finds_is_found_too(arm):
+    pytest.importorskip("eaik", reason="EAIK is not installed (pip install EAIK)")
+    peer, found, missed = peers.Eaik(arm), 0, 0
+    for q in arms.near_singular(arm, 500, np.random.default_rng(5)):
+        T = arm.forward(q)
+        theirs = peer.inverse(T)
+        theirs = theirs[np.max(arms.off(arm.forward(theirs), T), axis=0) < 1e-9] if len(theirs) else theirs
+        found += len(theirs)
+        for other in peers.unmatched(arm, theirs, arm.inverse(T)):
+            # On a singularity joint angles are a family of which each returns a few; asked for, theirs is ours too.
+            assert np.linalg.svd(arm.jacobian(other))[1][-1] < 1e-5
+            missed += len(peers.unmatched(arm, [other], arm.inverse(T, near=other)))
+    assert missed <= 1e-3 * found  # wrist, elbow and shoulder singular at once: what rounding leaves of it is a lottery
