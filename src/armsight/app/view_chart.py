@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _GREEN, _PURPLE, _LOST = "#3f8f5f", "#7b52ab", "#f6dcdc"
+TIME, SHOT = "time since the first shot, s", "shot"
 #: How a shot was found -> its colour in the band, the usual ones first.
 _WAYS = {"followed": _GREEN, "measured": BLUE, "searched": ORANGE, "lost": RED, "missed": RED}
 _STRIPS = 9
@@ -70,7 +71,7 @@ def run_of(records: Sequence[Mapping[str, Any]]) -> Run:
     way = tuple(str(r.get("way") or ("measured" if r["status"] == "ok" else "missed")) for r in records)
     jumped = np.array([bool(r.get("jump")) for r in records], bool)
     along = times - times[0] if timed else np.arange(1.0, count + 1)
-    return Run(along, "time since the first shot, s" if timed else "shot", way, jumped, pose, sigma, turn, rms[:, 0])
+    return Run(along, TIME if timed else SHOT, way, jumped, pose, sigma, turn, rms[:, 0])
 
 
 def chart(records: Sequence[Mapping[str, Any]]) -> bytes:
@@ -88,6 +89,8 @@ def chart(records: Sequence[Mapping[str, Any]]) -> bytes:
 
 def _figure(run: Run) -> Figure:
     """Draw the band, and nine strips below it that share its axis."""
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(11.5)
     grid = figure.add_gridspec(_STRIPS + 1, 1, height_ratios=[0.3, *[1.0] * _STRIPS])
     top = figure.add_subplot(grid[0])
@@ -110,6 +113,7 @@ def _figure(run: Run) -> Figure:
         if not np.isfinite(run.rms_px).any():
             axes.set_yticks([])
     strips[-1].set_xlabel(run.label)
+    strips[-1].xaxis.set_major_locator(MaxNLocator(integer=run.label == SHOT))
     figure.align_ylabels(strips)
     return figure
 
@@ -164,7 +168,13 @@ def _band(axes: Axes, run: Run) -> None:
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
         handles.append(Line2D([], [], label=f"{run.jumped.sum()} jumped", **style))
     place: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.15), "borderaxespad": 0.0, "handlelength": 1.2}
-    axes.legend(handles=handles, ncols=len(handles), title=f"{len(run.way)} shots", alignment="left", **place)
+    axes.legend(
+        handles=handles,
+        ncols=len(handles),
+        title=f"shots: {len(run.way)}",
+        alignment="left",
+        **place,
+    )
     axes.set_ylim(0.0, 1.0)
     low, high = _edges(run.along)
     axes.set_xlim(float(low[0]), float(high[-1]))

@@ -47,12 +47,12 @@ def angle_sigmas_deg(record: Mapping[str, Any]) -> Array:
     """Return (3,) one sigma of roll, pitch and yaw of a measured shot, degrees; NaN where the pitch is singular.
 
     A turn of the body by the rotation vector w along the left camera's axes changes the angles by J^-1 w; the columns of
-    J are the axes that roll, pitch and yaw turn about, R = Rz(yaw) Ry(pitch) Rx(roll).
+    J are the axes that roll, pitch and yaw turn about, R = R_z(roll) R_y(pitch) R_x(yaw).
     """
     if record["pitch_singular"]:
         return np.full(3, np.nan)
-    _, pitch, yaw = np.radians(record["roll_pitch_yaw_deg"])
-    of_yaw, of_pitch = exp_so3(np.array([0.0, 0.0, yaw])), exp_so3(np.array([0.0, pitch, 0.0]))
-    J = np.column_stack([(of_yaw @ of_pitch)[:, 0], of_yaw[:, 1], [0.0, 0.0, 1.0]])
+    roll, pitch, _ = np.radians(record["roll_pitch_yaw_deg"])
+    of_roll, of_pitch = exp_so3(np.array([0.0, 0.0, roll])), exp_so3(np.array([0.0, pitch, 0.0]))
+    J = np.column_stack([[0.0, 0.0, 1.0], of_roll[:, 1], (of_roll @ of_pitch)[:, 0]])
     back = np.linalg.inv(J)
     return np.asarray(np.degrees(np.sqrt(np.diag(back @ np.array(record["covariance"])[3:, 3:] @ back.T))))

@@ -64,9 +64,9 @@ def command(
     if sum(given) != 1 or (left is None) != (right is None):
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
     stereo = StereoRig.load(rig)
-    if out is not None:
-        check_writable(out, apart_from=(rig, target, detections, view_dir and view_dir / CHART))
     folder = None if view_dir is None else view_folder(view_dir)
+    if out is not None:
+        check_writable(out, apart_from=(rig, target, detections, folder and folder / CHART))
     if not stereo.cov.any():
         click.echo(f"note: {rig} does not say how well it is known: every ± is the pixel noise's share alone", err=True)
     records: list[dict[str, Any]] = []
@@ -88,13 +88,12 @@ def command(
             results = _measured(stereo, found, _shots(opened, stereo, rig))
             total = len(getattr(opened, "pairs", ())) or None
         view = None if folder is None else View(folder, stereo, body, discs, total)
-        try:
-            _run(results, total, body, records, as_json, view)
-        finally:
-            if out is not None and records:
-                write_text(out, csv_text(records))
-            if view is not None:
-                view.finish(records)
+        # What was measured is written whatever ends the run, and the one where the other cannot be.
+        if view is not None:
+            stack.callback(view.finish, records)
+        if out is not None:
+            stack.callback(_write, out, records)
+        _run(results, total, body, records, as_json, view)
     _close(records, time.perf_counter() - started, out, view)
 
 
@@ -140,6 +139,12 @@ def _run(
             if view is not None:
                 view.add(shot, result, records[-1])
             advance()
+
+
+def _write(out: Path, records: list[dict[str, Any]]) -> None:
+    """Write the poses, where there are any."""
+    if records:
+        write_text(out, csv_text(records))
 
 
 def _line(record: dict[str, Any]) -> str:
