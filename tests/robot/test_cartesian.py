@@ -63,8 +63,12 @@ def test_a_motion_without_a_duration_is_brought_to_a_limit():
     used = [(np.abs(a) / b).max() for a, b in ((qd, SIX_R.qd_max), (qdd, SIX_R.qdd_max), (jerk, SIX_R.qddd_max))]
     assert 0.99 < max(used) <= 1 + 1e-9
     assert (q[0] == start("six_r")).all()
-    with pytest.raises(InputError, match=f"within the arm's limits this motion takes {motion.duration_s:.6g} s"):
-        line(SIX_R, start("six_r"), shifted(SIX_R.forward(start("six_r")), [0.0, 0.1, 0.0]), duration_s=0.5)
+    goal = shifted(SIX_R.forward(start("six_r")), [0.0, 0.1, 0.0])
+    with pytest.raises(InputError, match=r"duration_s is 0\.5; within the arm's limits this motion takes") as found:
+        line(SIX_R, start("six_r"), goal, duration_s=0.5)
+    told = float(str(found.value).split()[-2])
+    assert motion.duration_s <= told < motion.duration_s + 3e-4
+    assert line(SIX_R, start("six_r"), goal, duration_s=told).duration_s == pytest.approx(told, abs=1e-8)
 
 
 def test_a_full_circle_comes_back_and_keeps_its_radius():
@@ -121,6 +125,43 @@ def test_waypoints_are_passed_without_stopping():
         assert np.linalg.norm(p[near] - corner[:3, 3]) < 3 / 16 * np.sqrt(2) * blend_m + 1e-3
         assert speed[near] > 0.05
     np.testing.assert_allclose(p[-1], corners[-1][:3, 3], atol=1e-9)
+
+
+def test_bends_are_passed_at_a_steady_pace_and_lines_faster():
+    arm, q = MODELS["ur5"], start("ur5")
+    T = arm.forward(q)
+    corners = [shifted(T, [0.0, 0.15, 0.0]), shifted(T, [0.0, 0.15, -0.15]), shifted(T, [0.0, 0.0, -0.15])]
+    motion = waypoints(arm, q, corners, blend_m=0.02)
+    p = arm.forward(motion.at(check_times(motion.duration_s)).q)[:, :3, 3]
+    moved = np.linalg.norm(np.diff(p, axis=0), axis=1)[:-1] / 1e-3
+    middle = (p[1:-1] + p[:-2]) / 2
+    for corner in corners[:-1]:
+        # Within 10 mm of the corner the bend cuts it by up to 3/16 sqrt(2) 20 mm and its length by a fifth.
+        pace = moved[np.linalg.norm(middle - corner[:3, 3], axis=1) < 0.012]
+        assert len(pace) > 10
+        assert 0.15 < pace.min() / moved.max() < pace.max() / moved.max() < 0.7
+    slow = waypoints(arm, q, corners, blend_m=0.02, duration_s=2 * motion.duration_s)
+    assert slow.duration_s == pytest.approx(2 * motion.duration_s)
+    within(arm, slow)
+    with pytest.raises(InputError, match="this motion takes"):
+        waypoints(arm, q, corners, blend_m=0.02, duration_s=0.9 * motion.duration_s)
+
+
+def test_waypoints_are_taken_up_from_a_moving_state():
+    arm, q = MODELS["ur5"], start("ur5")
+    T = arm.forward(q)
+    first = line(arm, q, shifted(T, [0.0, 0.3, 0.0]))
+    now = first.at(0.2 * first.duration_s)
+    corners = [shifted(T, [0.0, 0.3, 0.0]), shifted(T, [0.0, 0.3, -0.1])]
+    motion = waypoints(arm, now.q, corners, blend_m=0.03, qd_start=now.qd, qdd_start=now.qdd)
+    within(arm, motion)
+    for before, after in zip(now, motion.at(0.0), strict=True):
+        np.testing.assert_allclose(before, after, atol=1e-7)
+    with pytest.raises(InputError, match="duration_s cannot be asked for"):
+        waypoints(arm, now.q, corners, blend_m=0.03, qd_start=now.qd, qdd_start=now.qdd, duration_s=5.0)
+    near = [arm.forward(first.at(0.23 * first.duration_s).q), corners[1]]
+    with pytest.raises(InputError, match="cannot reach the pace of the first bend"):
+        waypoints(arm, now.q, near, blend_m=0.001, qd_start=now.qd, qdd_start=now.qdd)
 
 
 # Refusals: where and when.
@@ -234,7 +275,7 @@ def test_a_start_that_moves_elsewhere_is_refused():
     with pytest.raises(InputError, match="carries the tool backwards"):
         line(arm, now.q, T, qd_start=now.qd, qdd_start=now.qdd)
     ahead = arm.forward(first.at(0.41 * first.duration_s).q)
-    with pytest.raises(InputError, match="cannot stop at the end of the path"):
+    with pytest.raises(InputError, match="no motion to the end of the path keeps"):
         line(arm, now.q, ahead, qd_start=now.qd, qdd_start=now.qdd)
 
 

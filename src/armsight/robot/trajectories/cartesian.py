@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.law import CLOSE, ROUNDS, fit_law, share_law, slower, time_of
-from armsight.robot.trajectories.limits import ROUNDING, outside, start_state, worst
+from armsight.robot.trajectories.chain import fit_chain
+from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, time_of
+from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
-from armsight.robot.trajectories.profile import Profile
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped
 from armsight.robot.trajectories.walk import Obstacle, Walk, derivatives, refined, walk
 
@@ -37,7 +37,7 @@ class PathMotion:
 
     arm: Arm
     path: Path
-    law: Profile
+    law: Law
     guide: Walk
 
     @property
@@ -64,6 +64,7 @@ def follow(
     qd_start: ArrayLike | None = None,
     qdd_start: ArrayLike | None = None,
     duration_s: float | None = None,
+    cruises: Array | None = None,
 ) -> PathMotion:
     """Plan to travel a path of the tool, in the configuration of the start.
 
@@ -74,6 +75,7 @@ def follow(
         qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
         qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
+        cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
 
     Raises:
         MotionRefused: the path leaves the reach or the joint limits, or meets a singularity.
@@ -81,29 +83,64 @@ def follow(
     """
     check_duration(duration_s)
     start = start_state(arm, q_start, qd_start, qdd_start)
-    guide, obstacle = walk(arm, path, start.q)
+    guide, obstacle = walk(arm, path, start.q, np.zeros((0, 2)) if cruises is None else cruises)
     if obstacle is not None and obstacle.share == 0:
         raise _refused(path, obstacle, 0.0)
     share = _share_state(start, guide, arm)
+    if start.qd.any() or start.qdd.any():
+        return _from_moving(arm, path, guide, obstacle, share, duration_s, cruises)
+    law: Law
     if obstacle is not None:
-        law, _ = fit_law(arm, Walk(*(part[: obstacle.clear] for part in guide)), share, None)
+        clear = Walk(*(part[: obstacle.clear] for part in guide))
+        law = fit_law(arm, clear) if cruises is None else fit_chain(arm, clear, share, cruises)
         scale = 1.0 if duration_s is None else duration_s / law.duration_s
         raise _refused(path, obstacle, scale * time_of(law, obstacle.share))
-    law, limits = fit_law(arm, guide, share, duration_s)
-    for _ in range(ROUNDS):
+    law = fit_law(arm, guide) if cruises is None else fit_chain(arm, guide, share, cruises)
+    motion = PathMotion(arm, path, law, guide)
+    while (most := _check_whole(motion)).ratio > 1 + ROUNDING:
+        motion = replace(motion, law=motion.law.slower(most.stretch * (1 + CLOSE / 10)))
+    return motion if duration_s is None else _lasting(motion, duration_s)
+
+
+def _from_moving(
+    arm: Arm,
+    path: Path,
+    guide: Walk,
+    obstacle: Obstacle | None,
+    start: Joints,
+    duration_s: float | None,
+    cruises: Array | None,
+) -> PathMotion:
+    """Plan to travel a path from a moving start, (1,) as a share of the way."""
+    if duration_s is not None and cruises is not None:
+        raise InputError("duration_s cannot be asked for on way-points from a moving start")
+    if obstacle is not None:
+        # How it would be travelled from here cannot be said where its end cannot be reached: at the pace of the start.
+        raise _refused(path, obstacle, obstacle.share / float(start.qd[0]) if start.qd[0] > 0 else 0.0)
+    laws: list[Law] = [fit_chain(arm, guide, start, cruises)] if cruises is not None else []
+    for law in laws or moving_laws(arm, guide, start, duration_s):
         motion = PathMotion(arm, path, law, guide)
-        t_s = check_times(law.duration_s)
-        joints = motion.at(t_s)
-        _check_whole(arm, path, motion, t_s, joints)
-        most = worst(arm, t_s, joints)
-        if most.ratio <= 1 + ROUNDING:
+        if (most := _check_whole(motion)).ratio <= 1 + ROUNDING:
             return motion
-        if duration_s is not None or start.qd.any():
-            at_s = float(t_s[most.row])
-            raise _refused(path, Obstacle(float(law.at(at_s).q[0]), most.what), at_s)
-        limits = slower(limits, most.stretch * (1 + CLOSE / 10))
-        law = share_law(share, limits)
-    raise InputError("the motion could not be brought within the arm's limits of speed, acceleration and jerk")
+    at_s = float(check_times(motion.duration_s)[most.row])
+    raise _refused(path, Obstacle(float(motion.law.at(at_s).q[0]), most.what), at_s)
+
+
+def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
+    """Return a motion from rest slowed down to a duration.
+
+    Raises:
+        InputError: that is shorter than the shortest.
+    """
+    k = duration_s / shortest.duration_s
+    motion = replace(shortest, law=shortest.law.slower(k)) if k >= 1 else shortest
+    if k < 1 or _check_whole(motion).ratio > 1 + ROUNDING:
+        # Rounded up, so that what is read here can be asked for.
+        shortest_s = np.ceil(1e4 * (1 + CLOSE / 10) * shortest.duration_s) / 1e4
+        raise InputError(
+            f"duration_s is {duration_s:.6g}; within the arm's limits this motion takes {shortest_s:.6g} s"
+        )
+    return motion
 
 
 def _refused(path: Path, obstacle: Obstacle, t_s: float) -> MotionRefused:
@@ -128,14 +165,22 @@ def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
     return Joints(np.zeros(1), np.array([speed]), np.array([acceleration]))
 
 
-def _check_whole(arm: Arm, path: Path, motion: PathMotion, t_s: Array, joints: Joints) -> None:
-    """Refuse a motion whose joints leave their limits or jump from one configuration to another."""
+def _check_whole(motion: PathMotion) -> Worst:
+    """Return where a motion comes nearest to a limit of speed, acceleration or jerk at 1 kHz.
+
+    Raises:
+        MotionRefused: its joints leave their limits or jump from one configuration to another.
+    """
+    arm, t_s = motion.arm, check_times(motion.duration_s)
+    joints = motion.at(t_s)
     steps = np.diff(t_s)[:, None]
     moved = np.diff(joints.q, axis=0) - steps * (joints.qd[1:] + joints.qd[:-1]) / 2
     jumps = np.append((np.abs(moved) > steps**2 * arm.qdd_max + ROUNDING).any(axis=1), False)
-    reasons = [outside(arm, row) for row in joints.q]
-    row = next((i for i, reason in enumerate(reasons) if reason is not None or jumps[i]), None)
-    if row is not None:
-        reason = reasons[row] or "the arm would have to change its configuration"
-        share = float(motion.law.at(float(t_s[row])).q[0])
-        raise _refused(path, Obstacle(share, reason), float(t_s[row]))
+    beyond = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
+    most = worst(arm, t_s, joints)
+    if (bad := beyond | jumps).any():
+        row = int(np.argmax(bad))
+        reason = outside(arm, joints.q[row]) or "the arm would have to change its configuration"
+        at_s = float(t_s[row])
+        raise _refused(motion.path, Obstacle(float(motion.law.at(at_s).q[0]), reason), at_s)
+    return most

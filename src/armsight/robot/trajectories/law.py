@@ -7,14 +7,15 @@ rest that is exact, because the whole motion then is the same one, k times slowe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.limits import ROUNDING, Worst, worst
+from armsight.robot.trajectories.limits import ROUNDING, worst
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, check_times
 from armsight.robot.trajectories.walk import Walk, columns
@@ -26,14 +27,73 @@ if TYPE_CHECKING:
 ROUNDS = 12
 #: How near to its limit the fastest joint is brought.
 CLOSE = 1e-3
+#: From a moving start these scales are tried too, and at most so many of what is found are looked at closely.
+SCALES, TRIED = (1.03, 1.0, 0.97, 0.93, 0.87, 0.8, 0.7, 0.6, 0.5, 0.4), 20
 #: Halvings of a duration that find an instant.
 HALVINGS = 40
 #: Proportions of speed, acceleration and jerk that are tried, and at how many instants each is judged.
 SHAPES, INSTANTS = tuple(product((1.0, 0.7, 0.5, 0.3), (1.0, 0.6, 0.3), (1.0, 0.5, 0.2))), 200
 
 
-def fit_law(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> tuple[Profile, Array]:
-    """Return the share over time that just keeps the limits by the walk's derivatives, and its own limits (3,).
+class Law(Protocol):
+    """The share of the way over time."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the motion takes, s."""
+
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the share, its speed and its acceleration, (1,) or (N, 1), ``t_s`` seconds after the start."""
+
+    def slower(self, k: float) -> Law:
+        """Return the law of the same motion from rest, ``k`` times as long."""
+
+
+@dataclass(frozen=True, eq=False)
+class SingleLaw:
+    """One jerk-limited rise of the share.
+
+    Attributes:
+        start: (1,) the share to start from, its speed and acceleration.
+        limits: (3,) of the share's speed, acceleration and jerk.
+        profile: the share over time.
+    """
+
+    start: Joints
+    limits: Array
+    profile: Profile
+
+    @property
+    def duration_s(self) -> float:
+        """How long the motion takes, s."""
+        return self.profile.duration_s
+
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the share, its speed and its acceleration ``t_s`` seconds after the start."""
+        return self.profile.at(t_s)
+
+    def slower(self, k: float) -> SingleLaw:
+        """Return the law of the same motion from rest, ``k`` times as long."""
+        return single_law(self.start, slower(self.limits, k))
+
+
+def fit_law(arm: Arm, guide: Walk) -> SingleLaw:
+    """Return the share over time, from rest, that just keeps the limits by the walk's derivatives."""
+    start = Joints(np.zeros(1), np.zeros(1), np.zeros(1))
+    limits = bounds(arm, guide)
+    limits = min((_tried(arm, guide, start, limits * shape) for shape in SHAPES), key=lambda found: found[0])[1]
+    law = single_law(start, limits)
+    for _ in range(ROUNDS):
+        t_s = check_times(law.duration_s)
+        stretch = worst(arm, t_s, along(guide, law, t_s)).stretch
+        if 1 - CLOSE <= stretch <= 1:
+            break
+        law = law.slower(stretch / (1 - CLOSE / 2))
+    return law
+
+
+def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> list[SingleLaw]:
+    """Return shares over time from a moving start that keep the limits by the walk's derivatives, the shortest first.
 
     Args:
         arm: the arm, for its limits.
@@ -42,25 +102,24 @@ def fit_law(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> t
         duration_s: how long it is to take, s; None for as short as possible.
 
     Raises:
-        InputError: the duration is too short, or a moving start cannot stop on the path.
+        InputError: none of those tried does.
     """
-    limits = _bounds(arm, guide)
-    if not start.qd.any() and not start.qdd.any():
-        limits = min((_tried(arm, guide, start, limits * shape) for shape in SHAPES), key=lambda found: found[0])[1]
-    law = share_law(start, limits)
-    for _ in range(ROUNDS):
-        stretch = _worst(arm, guide, law, check_times(law.duration_s)).stretch
-        if 1 - CLOSE <= stretch <= 1:
-            break
-        limits = slower(limits, stretch / (1 - CLOSE / 2))
-        law = share_law(start, limits)
-    if duration_s is None:
-        return law, limits
-    if duration_s < law.duration_s:
-        shortest = f"within the arm's limits this motion takes {law.duration_s:.6g} s"
-        raise InputError(f"duration_s is {duration_s:.6g}; {shortest}")
-    limits = slower(limits, duration_s / law.duration_s)
-    return share_law(start, limits, duration_s), limits
+    rest = Joints(start.q, np.zeros(1), np.zeros(1))
+    found = []
+    for shape in SHAPES:
+        _, limits = _tried(arm, guide, rest, bounds(arm, guide) * shape)
+        for scale in SCALES:
+            try:
+                law = single_law(start, slower(limits, 1 / scale), duration_s)
+            except InputError:
+                continue
+            t_s = np.linspace(0, law.duration_s, INSTANTS)
+            if worst(arm, t_s, along(guide, law, t_s)).ratio <= 1 + ROUNDING:
+                found.append(law)
+    if not found:
+        asked = "" if duration_s is None else f" in {duration_s:g} s"
+        raise InputError(f"from this moving start no motion to the end of the path{asked} keeps the arm's limits")
+    return sorted(found, key=lambda law: law.duration_s)[:TRIED]
 
 
 def slower(limits: Array, k: float) -> Array:
@@ -68,20 +127,20 @@ def slower(limits: Array, k: float) -> Array:
     return np.asarray(limits / np.array([k, k**2, k**3]))
 
 
-def share_law(start: Joints, limits: Array, duration_s: float | None = None) -> Profile:
+def single_law(start: Joints, limits: Array, duration_s: float | None = None) -> SingleLaw:
     """Return the share over time under limits (3,) of its speed, acceleration and jerk.
 
     Raises:
         InputError: a moving start cannot stop on the path, or the duration cannot be met.
     """
-    law = plan_profile(start, np.ones(1), limits[:1], limits[1:2], limits[2:], duration_s)
-    low, high = law.extrema(0)
+    profile = plan_profile(start, np.ones(1), limits[:1], limits[1:2], limits[2:], duration_s)
+    low, high = profile.extrema(0)
     if low < -ROUNDING or high > 1 + ROUNDING:
         raise InputError("from this moving start the tool cannot stop at the end of the path within the arm's limits")
-    return law
+    return SingleLaw(start, limits, profile)
 
 
-def time_of(law: Profile, share: float) -> float:
+def time_of(law: Law, share: float) -> float:
     """Return when a share of the way that only rises is reached, s."""
     early, late = 0.0, law.duration_s
     for _ in range(HALVINGS):
@@ -90,7 +149,7 @@ def time_of(law: Profile, share: float) -> float:
     return late
 
 
-def _bounds(arm: Arm, guide: Walk) -> Array:
+def bounds(arm: Arm, guide: Walk) -> Array:
     """Return limits (3,) that no motion along the way can use up altogether."""
     one, two = np.abs(guide.q1), np.abs(guide.q2)
     with np.errstate(divide="ignore"):
@@ -99,15 +158,16 @@ def _bounds(arm: Arm, guide: Walk) -> Array:
     return np.array([speed, acceleration, jerk])
 
 
-def _tried(arm: Arm, guide: Walk, start: Joints, limits: Array) -> tuple[float, Array]:
-    """Return how long a motion from rest takes once it is slow enough, s, and its limits."""
-    law = share_law(start, limits)
-    stretch = _worst(arm, guide, law, np.linspace(0, law.duration_s, INSTANTS)).stretch
-    return law.duration_s * stretch, slower(limits, stretch)
-
-
-def _worst(arm: Arm, guide: Walk, law: Profile, t_s: Array) -> Worst:
-    """Return where the joints come nearest to a limit, between the places of the walk by interpolation."""
+def along(guide: Walk, law: Law, t_s: Array) -> Joints:
+    """Return the joints (N, 6) at times (N,), between the places of the walk by interpolation; angles are left at 0."""
     share, speed, acceleration = (part[:, :1] for part in law.at(t_s))
     q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
-    return worst(arm, t_s, Joints(q1, q1 * speed, q1 * acceleration + q2 * speed**2))
+    return Joints(np.zeros_like(q1), q1 * speed, q1 * acceleration + q2 * speed**2)
+
+
+def _tried(arm: Arm, guide: Walk, start: Joints, limits: Array) -> tuple[float, Array]:
+    """Return how long a motion from rest takes once it is slow enough, s, and its limits."""
+    law = single_law(start, limits)
+    t_s = np.linspace(0, law.duration_s, INSTANTS)
+    stretch = worst(arm, t_s, along(guide, law, t_s)).stretch
+    return law.duration_s * stretch, slower(limits, stretch)

@@ -88,23 +88,32 @@ def outside(arm: Arm, q: Array) -> str | None:
 
 def worst(arm: Arm, t_s: Array, joints: Joints) -> Worst:
     """Return where samples (N, 6) at times (N,) come nearest to a limit of speed, acceleration or jerk."""
+    found = []
+    for order, (name, unit, ratios, limit) in enumerate(_ratios(arm, t_s, joints), start=1):
+        row, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        ratio, most = float(ratios[row, i]), float(np.degrees(limit[i]))
+        what = f"joint {i + 1} would need a {name} of {ratio * most:.4g} {unit}, its limit is {most:.4g}"
+        found.append(Worst(ratio, ratio ** (1 / order), what, int(row)))
+    return max(found, key=lambda w: w.stretch)
+
+
+def stretches(arm: Arm, t_s: Array, joints: Joints) -> Array:
+    """Return how many times longer the motion would have to take for each of its samples (N,) to be at a limit."""
+    ratios = [ratios.max(axis=1) ** (1 / order) for order, (_, _, ratios, _) in enumerate(_ratios(arm, t_s, joints), 1)]
+    return np.asarray(np.max(ratios, axis=0))
+
+
+def _ratios(arm: Arm, t_s: Array, joints: Joints) -> list[tuple[str, str, Array, Array]]:
+    """Return name, unit, ratio (N, 6) to the limit, and limit (6,), of speed, acceleration and jerk."""
     steps = np.diff(t_s)
     full = steps > 0.5 * np.median(steps) if len(steps) else np.zeros(0, bool)  # the last one may be a sliver
     jerk = np.zeros_like(joints.qdd)
     jerk[:-1][full] = np.diff(joints.qdd, axis=0)[full] / steps[full, None]
-    found = []
-    for name, order, unit, value, limit in (
-        ("speed", 1, "deg/s", joints.qd, arm.qd_max),
-        ("acceleration", 2, "deg/s^2", joints.qdd, arm.qdd_max),
-        ("jerk", 3, "deg/s^3", jerk, arm.qddd_max),
-    ):
-        ratios = np.abs(value) / limit
-        row, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-        had, most = np.degrees(abs(value[row, i])), np.degrees(limit[i])
-        what = f"joint {i + 1} would need a {name} of {had:.4g} {unit}, its limit is {most:.4g}"
-        ratio = float(ratios[row, i])
-        found.append(Worst(ratio, ratio ** (1 / order), what, int(row)))
-    return max(found, key=lambda w: w.stretch)
+    return [
+        ("speed", "deg/s", np.abs(joints.qd) / arm.qd_max, arm.qd_max),
+        ("acceleration", "deg/s^2", np.abs(joints.qdd) / arm.qdd_max, arm.qdd_max),
+        ("jerk", "deg/s^3", np.abs(jerk) / arm.qddd_max, arm.qddd_max),
+    ]
 
 
 def check_limits(arm: Arm, trajectory: Trajectory) -> None:

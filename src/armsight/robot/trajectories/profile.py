@@ -44,9 +44,15 @@ class Profile:
 
 
 def plan_profile(
-    start: Joints, goal: Array, speed: Array, acceleration: Array, jerk: Array, duration_s: float | None = None
+    start: Joints,
+    goal: Array,
+    speed: Array,
+    acceleration: Array,
+    jerk: Array,
+    duration_s: float | None = None,
+    goal_speed: Array | None = None,
 ) -> Profile:
-    """Plan axes to come to rest at a goal, together, as fast as their limits allow.
+    """Plan axes to arrive at a goal, together, as fast as their limits allow.
 
     Args:
         start: (n,) positions, speeds and accelerations to start from; a speed beyond its limit is braked first.
@@ -55,6 +61,7 @@ def plan_profile(
         acceleration: see ``speed``.
         jerk: see ``speed``.
         duration_s: how long it is to take instead; None for as short as possible.
+        goal_speed: (n,) speeds to arrive with; None for rest.
 
     Raises:
         InputError: the duration is shorter than the limits allow, or cannot be met from this moving start.
@@ -63,6 +70,8 @@ def plan_profile(
     asked = ruckig.InputParameter(n)
     asked.current_position, asked.current_velocity, asked.current_acceleration = (list(map(float, x)) for x in start)
     asked.target_position = list(map(float, goal))
+    if goal_speed is not None:
+        asked.target_velocity = list(map(float, goal_speed))
     asked.max_velocity, asked.max_acceleration, asked.max_jerk = (
         list(map(float, limit)) for limit in (speed, acceleration, jerk)
     )

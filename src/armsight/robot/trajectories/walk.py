@@ -25,6 +25,10 @@ SINGULAR = 5e-3
 SLOW = 10 * SINGULAR
 #: The walk's steps, m, with turns counted as in :data:`TURN_M`, and the bounds of how many there are.
 STEP_M, STEPS = 1e-3, (100, 5000)
+#: How far a joint may turn from one place of the walk to the next, rad; by more only beside a singularity.
+FAR_RAD = 0.2
+#: In how many steps a bend is walked at least.
+BEND_STEPS = 50
 #: Halvings of a step that find where a reason begins: to 1e-12 of the way.
 HALVINGS = 30
 #: Newton steps from a place of the walk to one beside it, and what they may leave, m and rad.
@@ -77,10 +81,14 @@ def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
         InputError: they were not close, or the poses are singular.
     """
     q = q_near
+    off = behind(T_base_tool, arm.forward(q))
     for _ in range(NEWTON):
+        step = np.linalg.solve(arm.jacobian(q), off[..., None])[..., 0]
+        if np.abs(step).max() > FAR_RAD:
+            break
+        q = q + step
         off = behind(T_base_tool, arm.forward(q))
-        q = q + np.linalg.solve(arm.jacobian(q), off[..., None])[..., 0]
-    if np.abs(behind(T_base_tool, arm.forward(q))).max() > REFINED:
+    if np.abs(off).max() > REFINED:
         raise InputError("the joint angles on the path could not be found: it comes too near to a singularity")
     return q
 
@@ -112,22 +120,24 @@ def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
     return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), np.asarray(np.sign(np.linalg.det(J)))
 
 
-def walk(arm: Arm, path: Path, q_start: Array) -> tuple[Walk, Obstacle | None]:
+def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obstacle | None]:
     """Walk along a path as far as it can be travelled.
 
     Args:
         arm: the arm.
         path: the path.
         q_start: (6,) joint angles at its start, rad.
+        bends: (C, 2) shares between which steps are to be smaller.
 
     Returns:
         The walk up to the first obstacle, and that; None where there is none.
     """
-    share = _steps(path)
+    share = _steps(path, bends)
     places = path.at(share)
     q, reason = _chain(arm, places, q_start)
     smallest, sign = singular_values(arm, q)
     bad = (smallest < SINGULAR) | (sign != sign[0]) | np.array([outside(arm, row) is not None for row in q])
+    bad[1:] |= (np.abs(np.diff(q, axis=0)) > FAR_RAD).any(axis=1)
     good = int(np.argmax(bad)) if bad.any() else len(q)
     obstacle = None
     if good < len(share):
@@ -147,11 +157,14 @@ def walk(arm: Arm, path: Path, q_start: Array) -> tuple[Walk, Obstacle | None]:
     return Walk(share[:good], q[:good], q1, q2), obstacle
 
 
-def _steps(path: Path) -> Array:
-    """Return (K,) shares in steps of about :data:`STEP_M`."""
+def _steps(path: Path, bends: Array) -> Array:
+    """Return (K,) shares in steps of about :data:`STEP_M`, each bend in :data:`BEND_STEPS` at least."""
     coarse = path.at(np.linspace(0, 1, 65)).twist
     length = np.maximum(np.linalg.norm(coarse[:, :3], axis=1), TURN_M * np.linalg.norm(coarse[:, 3:], axis=1)).mean()
-    return np.linspace(0, 1, int(np.clip(length / STEP_M, *STEPS)) + 1)
+    even = np.linspace(0, 1, int(np.clip(length / STEP_M, *STEPS)) + 1)
+    return np.unique(
+        np.concatenate([even, *(np.linspace(begin, end, BEND_STEPS + 1) for begin, end in bends.tolist())])
+    )
 
 
 def _chain(arm: Arm, places: Places, q_start: Array) -> tuple[Array, str | None]:
@@ -193,7 +206,7 @@ def _problem(arm: Arm, q: Array, sign: float) -> str | None:
 def _obstacle(arm: Arm, path: Path, between: tuple[float, float], q_good: Array, sign: float | None) -> Obstacle:
     """Find where between two shares, of which the first is good, a reason begins; without a sign only the reach is one."""
     low, high = between
-    reason = "the configuration cannot be kept"
+    reason = f"close to a singularity: a joint would turn by {np.degrees(FAR_RAD):.0f} deg within a step of the path"
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         q = _solve(arm, path.at(np.array([middle])).T_base_tool[0], q_good)

@@ -112,7 +112,8 @@ def waypoints(
         )
     Ts = [arm.forward(q_start), *(checked_pose(T, f"way-point {i + 1}") for i, T in enumerate(given))]
     path = blended(np.array(Ts), blend_m)
-    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
+    cruises = (path.corners_m[:, None] + path.blends_m[:, None] * [-1.0, 1.0]) / path.length_m
+    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s, cruises=cruises)
 
 
 def blended(Ts_base_tool: Array, blend_m: float) -> BlendedPath:
