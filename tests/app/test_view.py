@@ -104,6 +104,17 @@ def test_a_disc_that_one_camera_does_not_see_is_drawn_with_its_reason():
     assert (canvas == (40, 40, 200)).all(axis=2).any(), "something is red"
 
 
+def test_what_neither_camera_sees_is_shown_too_but_not_on_the_far_side():
+    rig, result = located(FIVE, hidden=[(0, 1, 0), (0, 1, 1)])
+    marks = marks_of(rig, FIVE.body, FIVE, result)
+    assert marks.names == FIVE.body.point_names
+    assert marks.seen.tolist() == [[True, True], [False, False], [True, True], [True, True], [True, True]]
+    assert np.isfinite(marks.shape[1]).all()
+    turned = replace(FIVE, normals=FIVE.normals * np.array([[1], [-1], [1], [1], [1]]))
+    assert np.isnan(marks_of(rig, FIVE.body, turned, result).shape[1]).all()
+    assert draw_shot([], None, (blank(), blank()), (SIZE, SIZE), marks).shape[1] == WIDTH
+
+
 @pytest.mark.parametrize(
     ("reasons", "sides", "said"),
     [
@@ -210,7 +221,7 @@ def test_a_short_run_is_drawn_whole_and_a_long_one_in_part(stub, tmp_path):
     view, drawn = run_of_shots(tmp_path / "b", 150, 150, odd={7, 8, 100})
     assert drawn == {*range(0, 150, 3), 7, 8, 100}
     assert "53 of 150 shots" in view.summary()
-    assert "every 3th other" in view.summary()
+    assert "one in 3 of the others" in view.summary()
     assert run_of_shots(tmp_path / "c", 150, 150, odd={7, 8}, way="searched")[1] == {*range(0, 150, 3), 7, 8}
     # Without an end in sight: all of 60, then every 2nd up to 120, every 4th up to 240.
     assert run_of_shots(tmp_path / "d", None, 200)[1] == {*range(60), *range(60, 120, 2), *range(120, 200, 4)}
@@ -333,7 +344,7 @@ def test_every_shot_has_its_picture_and_foreign_files_stay(start, arm, armsight,
     said = armsight(*start, *images(arm), "--view", out, "-o", out / "poses.csv")
     assert said.code == 0, said.err
     assert "pictures of 2 of 2 shots" in said.err
-    assert "1 pictures there are of an earlier run" in said.err
+    assert "of an earlier run there are left: 1" in said.err
     names = {"notes.txt", "view-left999.png", "poses.csv", CHART, "view-left000.png", "view-left005.png"}
     assert set(os.listdir(out)) == names
     assert (out / "notes.txt").read_text() == "mine"

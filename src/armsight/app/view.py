@@ -121,10 +121,12 @@ class View:
         said = f"{CHART} and pictures of {drawn} of {self._shots} shots are in {self.folder}"
         if drawn < self._shots:
             kind = "every one" if self._odd <= ODD_UP_TO else "many"
-            often = f"every {self._every}th other" if self._every else "fewer and fewer of the others as it went on"
+            often = (
+                f"one in {self._every} of the others" if self._every else "fewer and fewer of the others as it went on"
+            )
             said += f": {kind} that was missed, searched or jumped, and {often}"
         old = len((self._earlier or set()) - self._written)
-        return said + (f"; {old} pictures there are of an earlier run" if old else "")
+        return said + (f"; of an earlier run there are left: {old}" if old else "")
 
     def _file_name(self, shot: str) -> str:
         """Return a name of its own for a shot's picture, of characters that any file system takes."""

@@ -26,6 +26,7 @@ from armsight.app.view_paint import (
     paper,
     paragraph,
     segment,
+    text_width,
     wrapped,
     write,
 )
@@ -106,13 +107,16 @@ class _Panel:
             if np.isfinite(marks.found[i, side]).all():
                 cross(self.canvas, at + self.scale * marks.residual[i, side], 3.0, RED if bad else _CROSS)
             arrow(self.canvas, at, at + factor * marks.residual[i, side], RED if bad else _ARROW)
-        for i in named:
-            if np.isfinite(places[i]).all() and (np.abs(places[i]) < 2 * WIDTH).all():
-                right = float(np.sqrt(np.nan_to_num(marks.shape[i, side, 0]))) * self.scale
-                at = (round(float(places[i, 0]) + right) + 7, round(float(places[i, 1])) - 7)
-                write(
-                    self.canvas, plain(marks.names[i], 24), at, _PALE if marks.dropped[i, side] else PAPER, 0.5, rim=INK
-                )
+        good = np.asarray((np.abs(np.nan_to_num(places, nan=np.inf)) < 2 * WIDTH).all(axis=1))
+        middle = places[good].mean(axis=0) if good.any() else np.zeros(2)
+        for i in (i for i in named if good[i]):
+            # Away from the middle of the body, where the other names are.
+            away = (places[i] - middle) / max(float(np.linalg.norm(places[i] - middle)), 1.0)
+            wide = float(np.sqrt(np.nan_to_num(marks.shape[i, side, 0]))) * self.scale
+            text, at = plain(marks.names[i], 24), places[i] + (wide + 10.0) * away
+            left = round(float(at[0])) - (text_width(text, 0.5) if away[0] < 0 else 0)
+            colour = _PALE if marks.dropped[i, side] else PAPER
+            write(self.canvas, text, (left, round(float(at[1])) + 5), colour, 0.5, rim=INK)
 
     def titled(self) -> Canvas:
         """Return the image with the name of its side in the corner."""
@@ -193,7 +197,7 @@ def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canva
     ]
     canvas, x, y = paper(3 * LINE, WIDTH), _GAP, 17
     for colour, text in entries:
-        width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0]
+        width = text_width(text, 0.5)
         if x + 26 + width > WIDTH - _GAP:
             x, y = _GAP, y + LINE
         cv2.rectangle(canvas, (x, y - 11), (x + 16, y - 1), colour, -1)
@@ -212,6 +216,10 @@ def _unshown(marks: Marks, shown: list[int]) -> list[Canvas]:
     count, lines = len(marks.names), []
     if len(shown) < count:
         lines.append(f"enlarged: the worst {len(shown)} of {count} points, dropped ones first")
+    unseen = [marks.names[i] for i in np.flatnonzero(~marks.seen.any(axis=1) & ~marks.dropped.any(axis=1))]
+    if unseen:
+        more = f" and {len(unseen) - 20} more" if len(unseen) > 20 else ""
+        lines.append(f"seen by neither camera: {', '.join(unseen[:20])}{more}")
     rest = [
         f"{marks.names[i]} ({marks.reasons[i]})" for i in np.flatnonzero(marks.dropped.any(axis=1)) if i not in shown
     ]

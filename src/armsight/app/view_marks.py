@@ -21,11 +21,12 @@ from armsight.vision.rig import StereoRig
 
 @dataclass(frozen=True, eq=False)
 class Marks(Record):
-    """N points of a measured shot that were seen or dropped; camera 0 is left, 1 right. NaN where there is none.
+    """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none.
 
     Attributes:
         names: what the points are called.
-        at: (N, 2, 2) where the located pose puts a point, or the centre of a disc's ellipse, raw px.
+        at: (N, 2, 2) where the located pose puts a point, or the centre of a disc's ellipse, raw px; NaN where that is
+            not seen and looks away from the camera.
         shape: (N, 2, 3) S11, S12, S22 of the ellipse that a disc has at the located pose, px^2.
         found: (N, 2, 2) where a camera saw it, raw px; of a disc the centre of its ellipse.
         cov: (N, 2, 2, 2) covariance of that, px^2.
@@ -48,6 +49,11 @@ class Marks(Record):
         """(N, 2, 2) detection less the pose's projection, px."""
         return np.asarray(self.found - self.at)
 
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N, 2) whether a camera saw a point."""
+        return np.asarray(np.isfinite(self.found[..., 0]))
+
     def worst(self, most: int) -> list[int]:
         """Return the rows to show enlarged: all where that is at most ``most``, else the dropped and the worst."""
         if len(self.names) <= most:
@@ -66,36 +72,34 @@ def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: Pos
         discs: the body's plain discs, None where it has none.
         estimate: what was measured.
     """
-    at, shape, bias = _expected(rig, body, discs, estimate.T_left_body)
+    at, shape, bias, away = _expected(rig, body, discs, estimate.T_left_body)
     seen = estimate.points.seen
     found, cov = np.full_like(at, np.nan), np.zeros((len(at), 2, 2, 2))
     found[seen.ids] = seen.uv + np.nan_to_num(bias[seen.ids])
     cov[seen.ids] = seen.cov_uv + rig.sigma_px**2 * np.eye(2)
+    hidden = away & ~np.isfinite(found[..., 0])
+    at[hidden], shape[hidden] = np.nan, np.nan
     reasons, others = _reasons(body, estimate.dropped)
-    rows = np.array(sorted({*seen.ids.tolist(), *reasons}), np.int64)
+    rows = range(len(at))
+    dropped = np.array([_sides(reasons.get(i, [])) for i in rows], bool)
     return Marks(
-        tuple(body.point_names[i] for i in rows),
-        at[rows],
-        shape[rows],
-        found[rows],
-        cov[rows],
-        np.array([_sides(reasons.get(i, [])) for i in rows.tolist()], bool).reshape(-1, 2),
-        tuple(_together(reasons.get(i, [])) for i in rows.tolist()),
-        others,
+        body.point_names, at, shape, found, cov, dropped, tuple(_together(reasons.get(i, [])) for i in rows), others
     )
 
 
-def _expected(rig: StereoRig, body: Body, discs: DiscTarget | None, T: Array) -> tuple[Array, Array, Array]:
-    """Return where a pose puts all M points (M, 2, 2), their ellipses (M, 2, 3) and their biases (M, 2, 2)."""
+def _expected(
+    rig: StereoRig, body: Body, discs: DiscTarget | None, T: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return where a pose puts all M points (M, 2, 2), their ellipses (M, 2, 3), biases (M, 2, 2), and what looks away."""
     p_left, count = transform(T, body.points), len(body.points)
     p_right = transform(inverse(rig.T_left_right), p_left)
     at = np.stack([camera.project(p) for camera, p in zip(rig.cameras, (p_left, p_right), strict=True)], axis=1)
-    shape, bias = np.full((count, 2, 3), np.nan), np.zeros((count, 2, 2))
+    shape, bias, away = np.full((count, 2, 3), np.nan), np.zeros((count, 2, 2)), np.zeros((count, 2), bool)
     if discs is not None:
         first, expected = count - len(discs.radii_m), expect(rig, discs, T)
         at[first:] = np.where(np.isfinite(expected.uv), expected.uv, at[first:])
-        shape[first:], bias[first:] = expected.shape, expected.bias
-    return at, shape, bias
+        shape[first:], bias[first:], away[first:] = expected.shape, expected.bias, expected.facing <= 0.0
+    return at, shape, bias, away
 
 
 def _reasons(body: Body, dropped: tuple[Dropped, ...]) -> tuple[dict[int, list[str]], tuple[str, ...]]:

@@ -38,17 +38,19 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
     """Break a text into lines of at most ``width`` px, between words where that is possible."""
     lines = [""]
     for word in ascii_text(text).split():
-        if _width(f"{lines[-1]} {word}", size) > width and lines[-1]:
+        if text_width(f"{lines[-1]} {word}", size) > width and lines[-1]:
             lines.append("")
-        while _width(word, size) > width:
-            fits = max(n for n in range(1, len(word)) if n == 1 or _width(word[:n], size) <= width)
+        while text_width(word, size) > width:
+            fits = max(n for n in range(1, len(word)) if n == 1 or text_width(word[:n], size) <= width)
             lines[-1], word = word[:fits], word[fits:]
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
     return lines
 
 
-def _width(text: str, size: float) -> int:
+def text_width(text: str, size: float) -> int:
+    """Return the width of a text, px."""
+    text = ascii_text(text)
     return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
 
 
