@@ -279,3 +279,43 @@ def test_nothing_half_written_is_left(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         write_urdf(SIX_R, tmp_path / "none" / "arm.urdf")
     assert list(tmp_path.iterdir()) == []
+
+
+#: UR5 as its makers' ROS description has it: where each joint stands (xyz, rpy) and its axis; angles of twelve digits.
+UR5_ROS = (
+    ("shoulder_pan", "0 0 0.089159", "0 0 0", "0 0 1"),
+    ("shoulder_lift", "0 0.13585 0", "0 1.57079632679 0", "0 1 0"),
+    ("elbow", "0 -0.1197 0.425", "0 0 0", "0 1 0"),
+    ("wrist_1", "0 0 0.39225", "0 1.57079632679 0", "0 1 0"),
+    ("wrist_2", "0 0.093 0", "0 0 0", "0 0 1"),
+    ("wrist_3", "0 0 0.09465", "0 0 0", "0 1 0"),
+)
+
+
+def test_an_arm_as_ros_describes_it_is_the_one_of_the_makers_table(tmp_path):
+    rows = ['<link name="world"/><link name="base_link"/><link name="base"/><link name="tool0"/><link name="ee_link"/>']
+    links = '<parent link="{0}"/><child link="{1}"/>'
+    fixed = '<joint name="{0}-{1}" type="fixed">' + links + '<origin xyz="{2}" rpy="{3}"/></joint>'
+    rows += [fixed.format("world", "base_link", "0 0 0", "0 0 0")]
+    rows += [fixed.format("base_link", "base", "0 0 0", "0 0 -3.14159265359")]
+    rows += [fixed.format("wrist_3", "ee_link", "0 0.0823 0", "0 0 1.57079632679")]
+    rows += [fixed.format("wrist_3", "tool0", "0 0.0823 0", "-1.57079632679 0 0")]
+    parent = "base_link"
+    for name, xyz, rpy, axis in UR5_ROS:
+        rows.append(
+            f'<link name="{name}"/><joint name="{name}_joint" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{name}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+            '<limit lower="-6.28318530718" upper="6.28318530718" velocity="3.15" effort="150"/></joint>'
+        )
+        parent = name
+    rows.append('<transmission name="t"><joint name="elbow_joint"/></transmission>')
+    path = tmp_path / "ur5.urdf"
+    path.write_text(f'<robot name="ur5" xmlns:xacro="http://wiki.ros.org/xacro">{"".join(rows)}</robot>')
+    with pytest.raises(InputError, match=r"several links end the chain \(ee_link, tool0\)|\(tool0, ee_link\)"):
+        read_urdf(path)
+    arm = read_urdf(path, tool_link="tool0")
+    base = pose(Rotation.from_euler("z", -np.pi).as_matrix(), np.zeros(3))
+    # Each of seven angles is 5e-12 rad off, a metre or less from the tool.
+    off = np.linalg.inv(base) @ arm.forward(probes()) - MODELS["ur5"].forward(probes())
+    assert np.abs(off).max() < 7 * 5e-12
+    assert len(arm.inverse(arm.forward(np.array([0.3, -1.2, 1.4, -0.5, 1.0, 0.2])))) == 8
