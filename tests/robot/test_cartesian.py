@@ -1,6 +1,7 @@
 """Motions of the tool in space: on the path by forward kinematics, refused at the place plain geometry says."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from arm_motions import shifted, start, within
 from armsight.errors import InputError
 from armsight.robot.models import MODELS
 from armsight.robot.trajectories import MotionRefused, arc, circle, line, waypoints
-from armsight.robot.trajectories.trajectory import check_times
+from armsight.robot.trajectories.trajectory import check_times, pieces
 
 SIX_R = MODELS["six_r"]
 #: Joint angles, deg, and 300 mm that each arm has room for. The tool of six_r goes across in front of it.
@@ -164,6 +165,22 @@ def test_waypoints_are_taken_up_from_a_moving_state():
         waypoints(arm, now.q, near, blend_m=0.001, qd_start=now.qd, qdd_start=now.qdd)
 
 
+def test_a_long_motion_is_looked_through_in_pieces():
+    t = check_times(50.0005)
+    parts = pieces(t)
+    assert len(parts) > 1
+    np.testing.assert_array_equal(np.concatenate([parts[0], *(part[1:] for part in parts[1:])]), t)
+    assert all(a[-1] == b[0] for a, b in pairwise(parts))
+    assert [list(part) for part in pieces(np.array([0.0, 0.1]))] == [[0.0, 0.1]]
+    arm, q = MODELS["ur5"], start("ur5")
+    motion = line(arm, q, shifted(arm.forward(q), [0.0, 0.1, 0.0]), duration_s=45.0)
+    assert motion.duration_s == pytest.approx(45.0, abs=1e-8)
+    tight = replace(arm, q_min=np.where(np.arange(6) == 0, motion.at(40.0).q[0], arm.q_min))
+    with pytest.raises(MotionRefused, match="joint 1 at") as found:
+        line(tight, q, shifted(arm.forward(q), [0.0, 0.1, 0.0]), duration_s=45.0)
+    assert found.value.t_s == pytest.approx(40.0, abs=0.01)
+
+
 # Refusals: where and when.
 
 
@@ -286,6 +303,7 @@ def test_a_start_that_moves_elsewhere_is_refused():
         (lambda a, q, T: line(a, q, T), "nothing to travel"),
         (lambda a, q, T: line(a, q, np.full((4, 4), np.nan)), "NaN"),
         (lambda a, q, T: line(a, q, shifted(T, [0.1, 0, 0]), duration_s=-1), "positive number of seconds"),
+        (lambda a, q, T: line(a, q, shifted(T, [0.1, 0, 0]), duration_s=1e9), "more than 3600 s is not planned"),
         (lambda a, q, T: circle(a, q, T[:3, 3], [0, 0, 1]), "on the circle's axis"),
         (lambda a, q, T: circle(a, q, T[:3, 3] + 0.1, [0, 0, 0]), "axis_base is zero"),
         (lambda a, q, T: circle(a, q, T[:3, 3] + 0.1, [0, 0, 1], 0.0), "angle_rad is 0.0"),

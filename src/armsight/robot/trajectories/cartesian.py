@@ -14,7 +14,7 @@ from armsight.robot.trajectories.chain import fit_chain
 from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, time_of
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped, pieces
 from armsight.robot.trajectories.walk import Obstacle, Walk, derivatives, refined, walk
 
 if TYPE_CHECKING:
@@ -122,8 +122,7 @@ def _from_moving(
         motion = PathMotion(arm, path, law, guide)
         if (most := _check_whole(motion)).ratio <= 1 + ROUNDING:
             return motion
-    at_s = float(check_times(motion.duration_s)[most.row])
-    raise _refused(path, Obstacle(float(motion.law.at(at_s).q[0]), most.what), at_s)
+    raise _refused(path, Obstacle(float(motion.law.at(most.t_s).q[0]), most.what), most.t_s)
 
 
 def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
@@ -171,16 +170,19 @@ def _check_whole(motion: PathMotion) -> Worst:
     Raises:
         MotionRefused: its joints leave their limits or jump from one configuration to another.
     """
-    arm, t_s = motion.arm, check_times(motion.duration_s)
-    joints = motion.at(t_s)
+    return max((_check_piece(motion, t_s) for t_s in pieces(check_times(motion.duration_s))), key=lambda w: w.stretch)
+
+
+def _check_piece(motion: PathMotion, t_s: Array) -> Worst:
+    """Do for times (N,) what :func:`_check_whole` does for the whole."""
+    arm, joints = motion.arm, motion.at(t_s)
     steps = np.diff(t_s)[:, None]
     moved = np.diff(joints.q, axis=0) - steps * (joints.qd[1:] + joints.qd[:-1]) / 2
     jumps = np.append((np.abs(moved) > steps**2 * arm.qdd_max + ROUNDING).any(axis=1), False)
     beyond = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
-    most = worst(arm, t_s, joints)
     if (bad := beyond | jumps).any():
         row = int(np.argmax(bad))
         reason = outside(arm, joints.q[row]) or "the arm would have to change its configuration"
         at_s = float(t_s[row])
         raise _refused(motion.path, Obstacle(float(motion.law.at(at_s).q[0]), reason), at_s)
-    return most
+    return worst(arm, t_s, joints)

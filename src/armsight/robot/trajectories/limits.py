@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times
+from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times, pieces
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -26,13 +26,13 @@ class Worst(NamedTuple):
         ratio: the value over its limit; at most 1 within it.
         stretch: how many times longer the motion would have to take to be at that limit.
         what: the limited quantity in words, with its values.
-        row: which of the samples.
+        t_s: when, s.
     """
 
     ratio: float
     stretch: float
     what: str
-    row: int
+    t_s: float
 
 
 def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | None) -> Joints:
@@ -93,7 +93,7 @@ def worst(arm: Arm, t_s: Array, joints: Joints) -> Worst:
         row, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
         ratio, most = float(ratios[row, i]), float(np.degrees(limit[i]))
         what = f"joint {i + 1} would need a {name} of {ratio * most:.4g} {unit}, its limit is {most:.4g}"
-        found.append(Worst(ratio, ratio ** (1 / order), what, int(row)))
+        found.append(Worst(ratio, ratio ** (1 / order), what, float(t_s[row])))
     return max(found, key=lambda w: w.stretch)
 
 
@@ -120,21 +120,20 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
     """Hold a motion in joints against every limit of the arm at 1 kHz.
 
     Raises:
-        MotionRefused: at the first instant outside the joint limits, or where another limit is passed furthest.
+        MotionRefused: at the first instant outside the joint limits, or where another limit is passed.
     """
-    t_s = check_times(trajectory.duration_s)
-    joints = trajectory.at(t_s)
-    over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
-    if over.any():
-        row = int(np.argmax(over))
-        reason = outside(arm, joints.q[row])
-        raise _refused(arm, str(reason), t_s, joints.q, row)
-    most = worst(arm, t_s, joints)
-    if most.ratio > 1 + ROUNDING:
-        raise _refused(arm, most.what, t_s, joints.q, most.row)
+    for t_s in pieces(check_times(trajectory.duration_s)):
+        joints = trajectory.at(t_s)
+        over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
+        if over.any():
+            row = int(np.argmax(over))
+            raise _refused(arm, trajectory, str(outside(arm, joints.q[row])), float(t_s[row]))
+        most = worst(arm, t_s, joints)
+        if most.ratio > 1 + ROUNDING:
+            raise _refused(arm, trajectory, most.what, most.t_s)
 
 
-def _refused(arm: Arm, reason: str, t_s: Array, q: Array, row: int) -> MotionRefused:
-    """Return the refusal of a motion in joints at one of its samples."""
-    share = float(t_s[row] / t_s[-1]) if t_s[-1] > 0 else 0.0
-    return MotionRefused(reason, share=share, t_s=float(t_s[row]), p_base=arm.forward(q[row])[:3, 3])
+def _refused(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRefused:
+    """Return the refusal of a motion in joints at a time."""
+    share = t_s / trajectory.duration_s if trajectory.duration_s > 0 else 0.0
+    return MotionRefused(reason, share=share, t_s=t_s, p_base=arm.forward(trajectory.at(t_s).q)[:3, 3])

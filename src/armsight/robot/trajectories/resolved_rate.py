@@ -40,6 +40,8 @@ GAIN = 30.0
 SOFT, DAMPING = 0.04, 0.03
 #: After the reference stands, the tool settles until the joints are slower than this share of their limits, or this long.
 SETTLED, SETTLE_S = 1e-4, 2.0
+#: The longest motion that may be asked for, s: each second of it is a thousand steps.
+LONGEST_S = 300.0
 #: Rounds of slowing down until the limits hold.
 ROUNDS = 12
 #: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
@@ -98,7 +100,7 @@ def resolved_rate(
         MotionRefused: a joint limit is passed, or the tool leaves the path further than allowed.
         InputError: bad numbers, or a duration within which the limits cannot be kept.
     """
-    check_duration(duration_s)
+    check_duration(duration_s, LONGEST_S)
     if not tolerance_m > 0:
         raise InputError(f"tolerance_m is {tolerance_m}; it must be a positive length in m")
     start = start_state(arm, q_start, None, None)
@@ -117,7 +119,7 @@ def resolved_rate(
             _check(arm, path, law, run, tolerance_m)
             return motion
         if duration_s is not None or len(tried) == ROUNDS:
-            raise _refused(path, law, most.what, float(t_s[most.row]))
+            raise _refused(path, law, most.what, most.t_s)
         tried.append((wanted_s, most.ratio))
         wanted_s *= _slower(tried, most)
 

@@ -8,6 +8,7 @@ can be run as it is. To write a new one: return a frozen object with ``duration_
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,6 +18,10 @@ from armsight.errors import InputError
 
 #: Every trajectory is checked at this rate when it is made, Hz.
 CHECK_RATE_HZ = 1000.0
+#: The longest motion that may be asked for, s: it is looked through at that rate.
+LONGEST_S = 3600.0
+#: How many instants are looked at together.
+PIECE = 20_000
 
 
 class Joints(NamedTuple):
@@ -78,19 +83,27 @@ def clamped(t_s: float | Array, duration_s: float) -> Array:
     return np.clip(times, 0.0, duration_s)
 
 
-def check_duration(duration_s: float | None) -> float | None:
+def check_duration(duration_s: float | None, longest_s: float = LONGEST_S) -> float | None:
     """Return a duration that was asked for; None stands for none.
 
     Raises:
-        InputError: no positive number.
+        InputError: no positive number, or too long to be looked through.
     """
     if duration_s is not None and not (np.isfinite(duration_s) and duration_s > 0):
         raise InputError(
             f"duration_s is {duration_s}; it must be a positive number of seconds, or None for the shortest"
         )
+    if duration_s is not None and duration_s > longest_s:
+        raise InputError(f"duration_s is {duration_s:g}; a motion of more than {longest_s:g} s is not planned in one")
     return duration_s
 
 
 def check_times(duration_s: float) -> Array:
     """Return (N,) the times at which a motion is checked, s: 1 kHz, its first and its last instant."""
     return np.append(np.arange(0.0, duration_s, 1 / CHECK_RATE_HZ), duration_s)
+
+
+def pieces(t_s: Array) -> list[Array]:
+    """Split times (N,) into pieces of about :data:`PIECE`, each beginning with the last instant of the one before."""
+    edges = np.linspace(0, len(t_s) - 1, max(1, len(t_s) // PIECE) + 1).astype(int)
+    return [t_s[begin : end + 1] for begin, end in pairwise(edges.tolist())]
