@@ -143,11 +143,11 @@ def figure_2(rng, poses):
     print(f"\nfigure 2: {poses} poses, half of them near singularities; wanted: below 1e-9 m and rad, 0 of the others")
     print(
         f"{'':9}{'poses':>8}{'solutions':>11}{'worst m':>10}{'worst rad':>10}{'NaN':>5}{'twice':>6}"
-        f"{'none':>6}{'EAIK finds':>12}{'of a family':>13}{'missed':>8}"
+        f"{'none':>6}{'EAIK finds':>12}{'of a family':>13}{'undetermined':>14}{'missed':>8}"
     )
     each = poses // len(MODELS) // 2
     for arm in MODELS.values():
-        total = np.zeros(8, dtype=np.int64)  # poses, solutions, NaN, twice, none, EAIK's, of a family, missed
+        total = np.zeros(9, dtype=np.int64)  # as the columns, without the errors
         worst = np.zeros(2)
         for start in range(0, each, CHUNK // 2):
             n = min(CHUNK // 2, each - start)
@@ -157,7 +157,7 @@ def figure_2(rng, poses):
             worst = np.maximum(worst, errors)
         print(
             f"{arm.name:9}{total[0]:8}{total[1]:11}{worst[0]:10.1e}{worst[1]:10.1e}{total[2]:5}{total[3]:6}{total[4]:6}"
-            + (f"{total[5]:12}{total[6]:13}{total[7]:8}" if have("eaik") else "  EAIK is not installed")
+            + (f"{total[5]:12}{total[6]:13}{total[7]:14}{total[8]:8}" if have("eaik") else "  EAIK is not installed")
         )
 
 
@@ -171,37 +171,43 @@ def one_chunk(arm, Ts):
         for i in range(width)
         for j in range(i)
     )
-    counts = [len(Ts), many.count.sum(), np.isnan(many.q).sum(), twice, (many.count == 0).sum(), 0, 0, 0]
+    counts = [len(Ts), many.count.sum(), np.isnan(many.q).sum(), twice, (many.count == 0).sum(), 0, 0, 0, 0]
     if have("eaik"):
         counts[5:] = beside_eaik(arm, Ts, many, there)
     return np.array(counts), (far.max(), turned.max())
 
 
 def beside_eaik(arm, Ts, many, there):
-    """How many exact solutions EAIK finds; how many are other members of a singular pose's family; how many are missed.
+    """How many exact solutions EAIK finds, and what of them is not among ours: see the columns.
 
-    On a singularity joint angles are a family of which each of us returns a few: a member counts as found if ours, asked
-    for the one near it, is the same.
+    On a singularity joint angles are a family of which each of us returns a few. A member counts as one of a family if
+    ours, asked for the one near it, is the same; as undetermined if its own error in the pose can move it by a radian
+    (that error over the smallest singular value of the Jacobian).
     """
     theirs = peers.Eaik(arm).inverse_batch(Ts)
     pose = np.repeat(np.arange(len(Ts)), [len(found) for found in theirs])
     q = (np.concatenate(theirs) + np.pi) % (2 * np.pi) - np.pi
-    exact = np.max(arms.off(arm.forward(q), Ts[pose]), axis=0) < 1e-9
-    pose, q = pose[exact], q[exact]
+    error = np.max(arms.off(arm.forward(q), Ts[pose]), axis=0) + 1e-15
+    exact = error < 1e-9
+    pose, q, error = pose[exact], q[exact], error[exact]
     ours = np.where(there[..., None], many.q, np.inf)
     with np.errstate(invalid="ignore"):
         apart = np.nan_to_num(arms.apart(ours[pose], q[:, None]), nan=np.inf).min(axis=1)
     doubtful = np.flatnonzero(apart > 1e-7)
     smallest = np.linalg.svd(arm.jacobian(q[doubtful]), compute_uv=False)[:, -1] if len(doubtful) else np.zeros(0)
     # Near a singularity joint angles are known as well as the pose, divided by the Jacobian's smallest singular value.
-    allowed = 1e-7 + 1e-12 / np.maximum(smallest, 1e-12)
-    family = missed = 0
+    allowed = 1e-7 + 4 * error[doubtful] / np.maximum(smallest, 1e-300)
+    family = undetermined = missed = 0
     for k, limit in zip(doubtful, allowed, strict=True):
-        if apart[k] > limit:
+        if apart[k] > min(limit, 1.0):
             near = arm.inverse(Ts[pose[k]], near=q[k])
-            same = len(near) and arms.apart(near.q, q[k]).min() < limit
-            family, missed = family + bool(same), missed + (not same)
-    return len(q), family, missed
+            if len(near) and arms.apart(near.q, q[k]).min() < min(limit, 1.0):
+                family += 1
+            elif limit > 1.0:
+                undetermined += 1
+            else:
+                missed += 1
+    return len(q), family, undetermined, missed
 
 
 def main() -> None:

@@ -84,19 +84,17 @@ class Toolbox:
         return self.robot.ikine_LM(T)
 
 
-def unmatched(arm, theirs, ours):
-    """Rows of ``theirs`` (N, 6) that are no solution of ``ours``, a Solutions: closer than both are determined.
+def unmatched(arm, T, theirs, ours):
+    """Rows of ``theirs`` (N, 6) that are no solution of ``ours``, a Solutions of the pose T.
 
-    Where the arm is singular a joint angle is known only as well as the pose's rounding, divided by the smallest singular
-    value of the Jacobian.
+    The error that a solution has in the pose moves its joints by that over the smallest singular value of the Jacobian.
     """
     out = []
     for q in theirs:
-        q = np.clip((q + np.pi) % (2 * np.pi) - np.pi, -np.pi, np.pi)
-        # The error their solution has in the pose moves joints by as much, divided by the Jacobian's smallest value.
-        smallest = np.linalg.svd(arm.jacobian(q))[1][-1]
-        allowed = 1e-7 + 1e-12 / max(smallest, 1e-12)
+        q = (q + np.pi) % (2 * np.pi) - np.pi
+        error = np.abs(arm.forward(q) - T).max() + 1e-15
+        allowed = 1e-7 + 4 * error / max(np.linalg.svd(arm.jacobian(q))[1][-1], 1e-300)
         apart = np.abs((ours.q - q + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
-        if not (apart < allowed).any():
+        if not (apart < min(allowed, 1.0)).any():
             out.append(q)
     return np.array(out).reshape(-1, 6)

@@ -279,7 +279,7 @@ def test_an_arm_without_structure_is_solved_from_many_starts():
         assert arms.apart(answer.q, q).min() < 1e-9
     T[:3, 3] = 9.0
     answer = arm.inverse(T)
-    assert answer.reason.startswith("unreachable: no joint angles found from")
+    assert answer.reason.startswith("unreachable: damped least squares found")
     assert answer.nearest.off_m > 7
 
 

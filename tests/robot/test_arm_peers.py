@@ -46,7 +46,7 @@ def test_no_solution_is_missed_that_eaik_finds(arm):
     for q in draw(4, 1500):
         T = arm.forward(q)
         theirs, answer = peer.inverse(T), arm.inverse(T)
-        missed += len(peers.unmatched(arm, theirs, answer))
+        missed += len(peers.unmatched(arm, T, theirs, answer))
         found, ours = found + len(theirs), ours + len(answer)
     assert missed == 0
     assert ours >= found > 6000
@@ -61,8 +61,8 @@ def test_near_singularities_what_eaik_finds_is_found_too(arm):
         theirs = peer.inverse(T)
         theirs = theirs[np.max(arms.off(arm.forward(theirs), T), axis=0) < 1e-9] if len(theirs) else theirs
         found += len(theirs)
-        for other in peers.unmatched(arm, theirs, arm.inverse(T)):
+        for other in peers.unmatched(arm, T, theirs, arm.inverse(T)):
             # On a singularity joint angles are a family of which each returns a few; asked for, theirs is ours too.
             assert np.linalg.svd(arm.jacobian(other))[1][-1] < 1e-5
-            missed += len(peers.unmatched(arm, [other], arm.inverse(T, near=other)))
+            missed += len(peers.unmatched(arm, T, [other], arm.inverse(T, near=other)))
     assert missed <= 1e-3 * found  # wrist, elbow and shoulder singular at once: what rounding leaves of it is a lottery

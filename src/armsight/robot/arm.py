@@ -328,7 +328,7 @@ _SINGULAR = {
 def _out_of_reach(missed: int) -> str:
     """Say why there is no solution."""
     parts = [text for bit, text in _OUT_OF_REACH.items() if missed & bit]
-    return "unreachable: " + (" and ".join(parts) or f"no joint angles found from {inverse.STARTS} starts")
+    return "unreachable: " + (" and ".join(parts) or "damped least squares found no joint angles")
 
 
 def _in_tool_axes(frame: str) -> bool:

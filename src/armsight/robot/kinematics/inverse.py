@@ -41,7 +41,7 @@ _LANES = SCRATCH - 6 * WORK
 _POLISHED, _WRONG = 1e-12, 3e-10
 #: How many places damped least squares starts from for an arm without structure; steps from there, in a polish, and towards
 #: the nearest pose; starts for that beside the closed form's.
-STARTS, _STEPS, _POLISH_STEPS, _NEAREST_STEPS, _NEAREST_STARTS = 64, 60, 20, 200, 8
+_STARTS, _STEPS, _POLISH_STEPS, _NEAREST_STEPS, _NEAREST_STARTS = 64, 60, 20, 200, 8
 #: Bounds of a joint that has none, rad.
 _FAR = 1e9
 
@@ -76,7 +76,7 @@ def _start(n: int, near: Array, q: Array) -> None:
 def _from_everywhere(table: Array, F: Frame, near: Array, most: int, steps: int, rows: Array, work: Array) -> int:
     """Write what damped least squares finds from many starts, at most so many; returns how many rows."""
     count = 0
-    for n in range(STARTS):
+    for n in range(_STARTS):
         if count == most:
             break
         rows[count] = 0.0
