@@ -122,6 +122,27 @@ def test_bad_options_are_refused(options, said):
         resolved_rate(SIX_R, q, path, **options)
 
 
+def test_the_tracker_takes_up_a_line_that_is_under_way():
+    arm, q = MODELS["ur5"], start("ur5")
+    T = arm.forward(q)
+    first = line(arm, q, shifted(T, [0.0, 0.3, 0.0]), duration_s=1.5)
+    now = first.at(0.3)
+    path = LinePath.between(arm.forward(now.q), shifted(T, [0.0, 0.4, 0.0]))
+    motion = resolved_rate(arm, now.q, path, qd_start=now.qd, qdd_start=now.qdd)
+    within(arm, motion)
+    begun = motion.at(0.0)
+    np.testing.assert_allclose(begun.q, now.q, atol=1e-12)
+    np.testing.assert_allclose(begun.qd, now.qd, atol=1e-12)
+    np.testing.assert_allclose(begun.qdd, now.qdd, atol=2e-3 * arm.qddd_max.max())  # within what two steps may change
+    assert motion.deviation_m < 1e-6
+    for qd, qdd in ((now.qd + 0.01, now.qdd), (now.qd, now.qdd + 0.01), (-now.qd, now.qdd)):
+        with pytest.raises(InputError, match="do not carry the tool along the path"):
+            resolved_rate(arm, now.q, path, qd_start=qd, qdd_start=qdd)
+    near = LinePath.between(arm.forward(now.q), arm.forward(first.at(0.31).q))
+    with pytest.raises(InputError, match="cannot stop at the end of the path"):
+        resolved_rate(arm, now.q, near, qd_start=now.qd, qdd_start=now.qdd)
+
+
 def test_a_start_off_the_path_is_refused():
     q, path = through_the_wrist(2.0)
     with pytest.raises(

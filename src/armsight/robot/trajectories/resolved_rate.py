@@ -42,6 +42,8 @@ SOFT, DAMPING = 0.04, 0.03
 SETTLED, SETTLE_S = 1e-4, 2.0
 #: The longest motion that may be asked for, s: each second of it is a thousand steps.
 LONGEST_S = 300.0
+#: How far from the path a start's speeds may point, of their limits, and its accelerations, rad/s^2 at the arm's size.
+ALONG = 1e-5
 #: Rounds of slowing down until the limits hold.
 ROUNDS = 12
 #: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
@@ -85,14 +87,23 @@ class _Run(NamedTuple):
 
 
 def resolved_rate(
-    arm: Arm, q_start: ArrayLike, path: Path, *, duration_s: float | None = None, tolerance_m: float = 1e-3
+    arm: Arm,
+    q_start: ArrayLike,
+    path: Path,
+    *,
+    qd_start: ArrayLike | None = None,
+    qdd_start: ArrayLike | None = None,
+    duration_s: float | None = None,
+    tolerance_m: float = 1e-3,
 ) -> TrackedMotion:
-    """Track a path of the tool from rest through the Jacobian, past singularities too.
+    """Track a path of the tool through the Jacobian, past singularities too.
 
     Args:
         arm: the arm.
         q_start: (6,) angles to start from, rad; they put the tool at the path's start.
         path: the path: a LinePath, an ArcPath, a BlendedPath, or anything with their ``at``.
+        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
+        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long the reference is to take, s; None for about as short as the limits allow.
         tolerance_m: how far the tool may leave the path where damping sets in, m.
 
@@ -103,16 +114,17 @@ def resolved_rate(
     check_duration(duration_s, LONGEST_S)
     if not tolerance_m > 0:
         raise InputError(f"tolerance_m is {tolerance_m}; it must be a positive length in m")
-    start = start_state(arm, q_start, None, None)
+    start = start_state(arm, q_start, qd_start, qdd_start)
     gap = np.linalg.norm(path.at(np.zeros(1)).T_base_tool[0] - arm.forward(start.q))
     if gap > tolerance_m:
         raise InputError(f"q_start does not put the tool at the start of the path: it is {1e3 * gap:.3f} mm away")
+    share = _share_state(arm, start, path)
     wanted_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
     tried: list[tuple[float, float]] = []
     while True:
-        law = _law(wanted_s)
+        law = _law(share, wanted_s, duration_s)
         run = _track(arm, start.q, path, law)
-        motion = _motion(run)
+        motion = _motion(run, start.qd)
         t_s = check_times(motion.duration_s)
         most = worst(arm, t_s, motion.at(t_s))
         if most.ratio <= 1 + ROUNDING or run.off_m[-1] > tolerance_m:  # no slower motion mends a goal that is missed
@@ -138,11 +150,37 @@ def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
     return float(min(factor, 4.0)) * 1.01
 
 
-def _law(duration_s: float) -> Profile:
-    """Return the share of the way over time."""
-    speed, acceleration, jerk = (np.array([limit / duration_s**order]) for order, limit in enumerate(SHAPE, start=1))
-    rest = Joints(np.zeros(1), np.zeros(1), np.zeros(1))
-    return plan_profile(rest, np.ones(1), speed, acceleration, jerk, duration_s)
+def _law(start: Joints, wanted_s: float, duration_s: float | None) -> Profile:
+    """Return the share of the way over time: in ``wanted_s``, or from a moving start in about that.
+
+    Raises:
+        InputError: a moving start cannot stop at the end of the path so gently.
+    """
+    speed, acceleration, jerk = (np.array([limit / wanted_s**order]) for order, limit in enumerate(SHAPE, start=1))
+    exact_s = duration_s if start.qd.any() else wanted_s
+    law = plan_profile(start, np.ones(1), speed, acceleration, jerk, exact_s)
+    low, high = law.extrema(0)
+    if low < -ROUNDING or high > 1 + ROUNDING:
+        raise InputError("from this moving start the tool cannot stop at the end of the path within the arm's limits")
+    return law
+
+
+def _share_state(arm: Arm, start: Joints, path: Path) -> Joints:
+    """Return the start as share of the way, its speed and its acceleration (1,).
+
+    Raises:
+        InputError: it does not move along the path.
+    """
+    _, twist, bend = (part[0] for part in path.at(np.zeros(1)))
+    scale = _scale(arm)
+    J, along = arm.jacobian(start.q), twist / scale
+    speed = float(along @ (J @ start.qd / scale) / (along @ along))
+    gained = J @ start.qdd + arm.jacobian_rate(start.q, start.qd) @ start.qd - bend * speed**2
+    acceleration = float(along @ (gained / scale) / (along @ along))
+    off = np.abs(start.qd - _speeds(J, twist * speed, scale)[0]) / arm.qd_max
+    if max(off.max(), np.abs(gained / scale - along * acceleration).max()) > ALONG or speed < 0:
+        raise InputError("qd_start and qdd_start do not carry the tool along the path: give ones that do, or none")
+    return Joints(np.zeros(1), np.array([speed]), np.array([acceleration]))
 
 
 def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
@@ -194,11 +232,10 @@ def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int, scale: Arr
     return qd, off, least
 
 
-def _motion(run: _Run) -> TrackedMotion:
+def _motion(run: _Run, qd_start: Array) -> TrackedMotion:
     """Return a run as a trajectory."""
     row = int(np.argmin(run.least))
-    still = np.zeros(run.q.shape[1])
-    spline = CubicSpline(run.t_s, run.q, bc_type=((1, still), (1, still)))
+    spline = CubicSpline(run.t_s, run.q, bc_type=((1, qd_start), (1, np.zeros(6))))
     return TrackedMotion(
         float(run.t_s[-1]),
         float(run.off_m.max()),
