@@ -60,31 +60,30 @@ class DiscTarget(Record):
 
     def find(self, image: NDArray[np.uint8]) -> Discs:
         """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has."""
-        found = [_find(image, kind) for kind in np.unique(self.bright)]
-        if len(found) == 1:
-            return found[0]
-        uv, cov, shape, bright = (
-            np.concatenate([getattr(part, name) for part in found]) for name in ("uv", "cov_uv", "shape", "bright")
+        image = np.ascontiguousarray(image)
+        if image.shape[1] % 8:
+            image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
+        theta = np.empty((_MOST_PLACES, disc_model.UNKNOWNS))
+        codes, signs = np.empty(_MOST_PLACES, np.int64), np.empty(_MOST_PLACES, np.int64)
+        cov, shape = np.empty((_MOST_PLACES, 2, 2)), np.empty((_MOST_PLACES, 3))
+        good, n = disc_search.find(
+            image,
+            image.view(np.uint64),
+            bool(self.bright.any()),
+            not bool(self.bright.all()),
+            theta,
+            codes,
+            signs,
+            cov,
+            shape,
+            disc_search.workspace(),
+            disc_model.workspace(),
         )
-        return Discs(uv, cov, shape, bright, found[0].rejected + found[1].rejected)
+        rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
+        return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
 
 
-def _find(image: NDArray[np.uint8], bright: np.bool_) -> Discs:
-    """Find the bright or the dark discs of an image."""
-    image = np.ascontiguousarray(image)
-    if image.shape[1] % 8:
-        image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
-    starts, codes = np.empty((_MOST_PLACES, disc_model.UNKNOWNS)), np.empty(_MOST_PLACES, np.int64)
-    noise = disc_search.noise_of(image)
-    sign = 1 if bright else -1
-    n = disc_search.search(image, image.view(np.uint64), noise, sign, starts, codes, disc_search.workspace())
-    theta, codes, cov = starts[:n], codes[:n], np.empty((n, 2, 2))
-    disc_fit.fit_all(image, noise, theta, cov, codes, disc_model.workspace())
-    good = codes == 0
-    shape = disc_fit.shapes_of(theta[good])
-    # Those that came furthest are told first: they look most like discs.
-    others = np.flatnonzero(~good)[np.argsort(~np.isin(codes[~good], disc_fit.LOOK_ALIKES), kind="stable")[:_MOST_TOLD]]
-    rejected = tuple(
-        Rejected((float(theta[i, 0]), float(theta[i, 1])), disc_fit.REASONS[int(codes[i])]) for i in others.tolist()
-    )
-    return Discs(theta[good, :2], cov[good], shape, np.full(int(good.sum()), bool(bright)), rejected)
+def _rejected(theta: Array, codes: NDArray[np.int64]) -> tuple[Rejected, ...]:
+    """Say what is no disc and why; what came furthest, and so looks most like one, first."""
+    told = np.argsort(~np.isin(codes, disc_fit.LOOK_ALIKES), kind="stable")[:_MOST_TOLD]
+    return tuple(Rejected((float(theta[i, 0]), float(theta[i, 1])), disc_fit.REASONS[int(codes[i])]) for i in told)

@@ -50,13 +50,17 @@ REASONS = {
     7: "smaller than 4 px across",
     8: "its inside is not even: smeared by motion, or no disc",
     9: "open on one side",
+    10: "what surrounds it is not even: text, a ring, a square of a board",
 }
 #: Reasons that only the fit gives: such a place has a closed rim.
-LOOK_ALIKES = (3, 4, 5, 6, 8)
+LOOK_ALIKES = (3, 4, 5, 6, 8, 10)
 _MOST_BLUR = 0.8  # of the smaller half axis
 _LEAST_RATIO = 0.22
-#: How far a sixteenth of the rim may lie off the ellipse beyond what noise does: px, and share of the size.
-_RIM_PX, _RIM_SHARE, _RIM_SIGMAS = 0.15, 0.02, 4.5
+#: How far the sixteenths of the rim may lie off the ellipse beyond what noise does, RMS: px, share of the size, and share
+#: of the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
+_RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.01, 1.5
+#: What the residuals may be beyond the image's noise, as a share of the contrast.
+_MOST_RESIDUAL = 0.14
 #: How uneven the inside may be beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
@@ -308,11 +312,18 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         return 4
     if not abs(theta[6]) > _LEAST_SNR * np.sqrt(variance):
         return 6
+    excess = np.sqrt(max(variance - noise_sigma * noise_sigma, 0.0)) / abs(theta[6])
+    if excess > _MOST_RESIDUAL:
+        return 10
     _rim(n, theta, x0, y0, work, sectors)
-    allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor)
+    square, count = 0.0, 0
     for k in range(_SECTORS):
-        if sectors[1, k] > 0.0 and abs(sectors[0, k]) > allowed + _RIM_SIGMAS * np.sqrt(variance / sectors[1, k]):
-            return 5
+        if sectors[1, k] > 0.0:
+            square += sectors[0, k] ** 2 - variance / sectors[1, k]
+            count += 1
+    allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
+    if square > count * allowed * allowed:
+        return 5
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
@@ -331,17 +342,6 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fit_all(
-    image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, codes: NDArray[np.int64],
-    work: Work,
-) -> None:  # fmt: skip
-    """Fit the discs whose code is 0, one by one: theta (N, 10), cov (N, 2, 2), codes (N,) as :func:`fit` has them."""
-    for i in range(len(codes)):
-        if codes[i] == 0:
-            codes[i] = fit(image, noise_sigma, theta[i], cov[i], work)
-
-
-@numba.njit(cache=True, error_model="numpy")
 def shape_of(theta: Array, shape: Array) -> None:
     """Fill S11, S12, S22 of a fitted ellipse, px^2.
 
@@ -350,12 +350,3 @@ def shape_of(theta: Array, shape: Array) -> None:
     det = theta[2] * theta[4] - theta[3] * theta[3]
     wider = (1.0 + 0.5 * theta[5] * theta[5] * np.sqrt(det)) ** 2 / det
     shape[0], shape[1], shape[2] = wider * theta[4], -wider * theta[3], wider * theta[2]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def shapes_of(theta: Array) -> Array:
-    """Return S11, S12, S22 (N, 3) of fitted ellipses, px^2, theta (N, 10)."""
-    shapes = np.empty((len(theta), 3))
-    for i in range(len(theta)):
-        shape_of(theta[i], shapes[i])
-    return shapes

@@ -9,8 +9,8 @@ distribution that lens and pixel blur the edge with, B the surround's level, C t
 c, M, s, C, B, g. A surround that is uneven itself leaves the disc flat (k = 1 - Phi), uneven light slopes disc and
 surround in proportion to their levels, stray light both alike (k = 1).
 
-Pixels near the rim tell c; of the rows that show flat ones, which tell B, C and g only, one in three to six is taken whole.
-Loops run over one array of float32 for each quantity, so that the compiler makes vectors of them.
+Pixels near the rim tell c; of the rows that show flat ones, which tell B, C and g only, one in three to eighteen is taken
+whole. Loops run over one array of float32 for each quantity, so that the compiler makes vectors of them.
 """
 
 from __future__ import annotations
@@ -122,13 +122,14 @@ def _grown(shape: Array, by: float, out: Array) -> None:
 @numba.njit(cache=True, error_model="numpy")
 def _take(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: int, n: int, work: Work) -> int:
     """Append the pixels first <= x < end of a row; return the new count."""
-    end = min(end, first + MOST_PIXELS - n)
-    row = F(y - y0)
-    for i in range(end - first):
-        work.px[n + i] = F(first + i - x0)
-        work.py[n + i] = row
-        work.level[n + i] = F(image[y, first + i])
-    return n + max(end - first, 0)
+    count = max(min(end - first, MOST_PIXELS - n), 0)
+    px, py, level, line = work.px[n : n + count], work.py[n : n + count], work.level[n : n + count], image[y, first:end]
+    row, column = F(y - y0), np.int32(first - x0)
+    for i in range(count):
+        px[i] = F(column + np.int32(i))
+        py[i] = row
+        level[i] = F(line[i])
+    return n + count
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -158,9 +159,8 @@ def gather(image: NDArray[np.uint8], theta: Array, work: Work) -> tuple[int, int
     _grown(s, near + _RING_PX, ring)
     _grown(s, -near, hole)
     size = np.sqrt(np.sqrt(s[0] * s[2] - s[1] * s[1]))
-    flat = (
-        1 if size < 7.0 else (2 if size < 12.0 else 3 if size < 18.0 else 6)
-    )  # of the rows one in so many is taken with its flat pixels
+    # Of every third row, one in so many is taken with its flat pixels.
+    flat = 1 if size < 7.0 else (2 if size < 12.0 else 3 if size < 18.0 else 6)
     stride = 1 + int(6.3 * (2 * size * near + 0.25 * size * size / flat) / MOST_PIXELS)
     reach = int(np.sqrt(ring[2]))
     top, bottom = max(0, y0 - reach), min(height - 1, y0 + reach)

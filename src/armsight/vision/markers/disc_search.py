@@ -1,6 +1,6 @@
 """Where in an image discs may be: every third row in steps of eight pixels, then a look around each find.
 
-A disc is brighter (or darker) than what lies eight pixels to its left and right. Eight pixels are compared at a time, in
+A disc is brighter (or darker) than what lies eight pixels to its left. Eight pixels are compared at a time, in
 one 64-bit word; the least contrast that counts follows from the image's own noise. From a find, the chord through it, the
 chord across that and sixteen rays outwards give an ellipse to start the fit from, or the reason why there is none.
 """
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.disc_model import factor, solve
+from armsight.vision.markers.disc_fit import fit, shape_of
+from armsight.vision.markers.disc_model import Work, factor, solve
 
 #: Rows between those looked at; the smallest disc, 5 px across, shows on one at least.
 _ROW_STEP = 3
@@ -29,7 +30,7 @@ _RIM_PX = 3.0
 _HIGH = np.uint64(0x8080808080808080)
 _SIX = np.uint64(0x3F3F3F3F3F3F3F3F)
 _LANES = np.uint64(0x0101010101010101)
-_TWO = np.uint64(2)
+_TWO, _MARK = np.uint64(2), np.uint64(0x80)
 _EMPTY = np.uint64(0)
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
@@ -72,31 +73,17 @@ def noise_of(image: Grey) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scan_row(row: Words, least: int, sign: int, marks: Words) -> bool:
-    """Mark the pixels whose neighbour eight to the right is brighter (sign 1) or darker (-1) by ``least`` x 4 levels.
+def _marks(a: np.uint64, b: np.uint64, t: np.uint64) -> np.uint64:
+    """Mark, with the high bit of its byte, each pixel of b that is brighter than its fellow of a by t times four levels."""
+    return ((((b >> _TWO) & _SIX) | _HIGH) - ((a >> _TWO) & _SIX) - t) & _HIGH
 
-    Args:
-        row: (W / 8,) a row of pixels.
-        least: contrast, in units of four grey levels.
-        sign: 1 or -1.
-        marks: (W / 8,) filled: the high bit of each pixel's byte.
 
-    Returns:
-        Whether any is marked.
-    """
-    t = np.uint64(least) * _LANES
+@numba.njit(cache=True, error_model="numpy")
+def differs(row: Words, t: np.uint64) -> bool:
+    """Tell whether any two pixels of a row (W / 8,), eight apart, differ by t units of four levels."""
     every = _EMPTY
-    if sign > 0:
-        for i in range(len(row) - 1):
-            a, b = (row[i] >> _TWO) & _SIX, (row[i + 1] >> _TWO) & _SIX
-            marks[i] = ((b | _HIGH) - a - t) & _HIGH
-            every |= marks[i]
-    else:
-        for i in range(len(row) - 1):
-            a, b = (row[i] >> _TWO) & _SIX, (row[i + 1] >> _TWO) & _SIX
-            marks[i] = ((a | _HIGH) - b - t) & _HIGH
-            every |= marks[i]
-    marks[len(row) - 1] = _EMPTY
+    for i in range(len(row) - 1):
+        every |= _marks(row[i], row[i + 1], t) | _marks(row[i + 1], row[i], t)
     return bool(every != _EMPTY)
 
 
@@ -207,18 +194,47 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
+    """Whether a place was looked at already, or lies on a disc that was found."""
+    n = cells[y >> 3, x >> 3]
+    if n < 0:
+        return False
+    if codes[n] != 0:
+        return True
+    u, v = x - starts[n, 0], y - starts[n, 1]
+    q = starts[n, 2] * u * u + 2 * starts[n, 3] * u * v + starts[n, 4] * v * v
+    return bool(np.sqrt(q) < 1.0 + _RIM_PX * np.sqrt(starts[n, 2] + starts[n, 4]))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
+    """Let the cells that a disc covers, and a little more, know it."""
+    height, width = cells.shape
+    det = starts[n, 2] * starts[n, 4] - starts[n, 3] ** 2
+    half_w, half_h = np.sqrt(starts[n, 4] / det) + _RIM_PX, np.sqrt(starts[n, 2] / det) + _RIM_PX
+    left, right = max(int(starts[n, 0] - half_w), 0) >> 3, min(int(starts[n, 0] + half_w) >> 3, width - 1)
+    top, bottom = max(int(starts[n, 1] - half_h), 0) >> 3, min(int(starts[n, 1] + half_h) >> 3, height - 1)
+    for y in range(top, bottom + 1):
+        for x in range(left, right + 1):
+            cells[y, x] = n
+
+
+@numba.njit(cache=True, error_model="numpy")
 def search(
-    image: Grey, words: Words, noise: float, sign: int, starts: Array, codes: NDArray[np.int64], room: Room
-) -> int:
+    image: Grey, words: Words, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    signs: NDArray[np.int64], room: Room,
+) -> int:  # fmt: skip
     """Look for discs in a whole image.
 
     Args:
         image: (H, W) grey, W a multiple of eight.
         words: (H, W / 8) the same memory.
         noise: standard deviation of the image's noise, grey levels.
-        sign: 1 for bright discs, -1 for dark ones.
+        bright: whether bright discs are looked for.
+        dark: whether dark ones are.
         starts: (N, 10) filled with starts for the fit; where there is no disc, with the place that was looked at.
         codes: (N,) filled with 0 or why there is no disc.
+        signs: (N,) filled with 1 for bright discs, -1 for dark ones.
         room: what :func:`workspace` returns.
 
     Returns:
@@ -227,63 +243,84 @@ def search(
     height, width = image.shape
     contrast = max(LEAST_CONTRAST, _CONTRAST_SIGMAS * 1.4142 * noise)
     least = min(int(np.ceil(contrast / 4.0)), 60)
-    found = np.empty(width // 8, np.uint64)
-    cells = np.full((height // 8 + 1, width // 8 + 1), -1, np.int16)
+    t = np.uint64(least) * _LANES
+    cells = np.full((2, height // 8 + 1, width // 8 + 1), -1, np.int16)
     n = 0
     for y in range(1, height - 1, _ROW_STEP):
-        if not scan_row(words[y], least, sign, found):
+        row = words[y]
+        if not differs(row, t):
             continue
-        previous = _EMPTY
-        for i in range(len(found)):
-            marks = found[i]
-            if marks == _EMPTY:
-                previous = _EMPTY
-                continue
-            # Only where a run of marked pixels begins: its byte is marked and the one before is not.
-            begins = marks & ~((marks << np.uint64(8)) | (previous >> np.uint64(56)))
-            previous = marks
-            while begins != _EMPTY:
-                lane = 0
-                while (begins >> np.uint64(8 * lane)) & np.uint64(0x80) == _EMPTY:
-                    lane += 1
-                begins &= begins - np.uint64(1)
-                x = 8 * i + lane
-                low = int(image[y, x])
-                x += 8
-                for k in range(x + 1, min(x + 5, width)):
-                    if sign * (np.int64(image[y, k]) - np.int64(image[y, x])) > 0:
-                        x = k
-                known = cells[y >> 3, x >> 3]
-                if known >= 0:
-                    if codes[known] != 0:
+        for i in range(len(row) - 1):
+            for sign in (1, -1):
+                if not (bright if sign > 0 else dark):
+                    continue
+                left = _marks(row[i], row[i + 1], t) if sign > 0 else _marks(row[i + 1], row[i], t)
+                mine = cells[(1 - sign) // 2]
+                while left != _EMPTY:
+                    # A run of marked pixels is one find: where the two differ most.
+                    lane, best, x = 0, -1, 0
+                    while (left >> np.uint64(8 * lane)) & _MARK == _EMPTY:
+                        lane += 1
+                    while lane < 8 and (left >> np.uint64(8 * lane)) & _MARK != _EMPTY:
+                        left &= ~(_MARK << np.uint64(8 * lane))
+                        gap = sign * (int(image[y, 8 * i + lane + 8]) - int(image[y, 8 * i + lane]))
+                        if gap > best:
+                            best, x = gap, 8 * i + lane + 8
+                        lane += 1
+                    if _known(x, y, starts, codes, mine):
                         continue
-                    u, v = x - starts[known, 0], y - starts[known, 1]
-                    q = starts[known, 2] * u * u + 2 * starts[known, 3] * u * v + starts[known, 4] * v * v
-                    if np.sqrt(q) < 1.0 + _RIM_PX * np.sqrt(starts[known, 2] + starts[known, 4]):
-                        continue
-                if n == len(starts):
-                    return n
-                code = outline(image, x, y, low, sign, starts[n], room)
-                codes[n] = code
-                if code != 0:
-                    starts[n, 0], starts[n, 1] = x, y
-                    cells[y >> 3, x >> 3] = n
-                else:
-                    det = starts[n, 2] * starts[n, 4] - starts[n, 3] ** 2
-                    half_w, half_h = np.sqrt(starts[n, 4] / det), np.sqrt(starts[n, 2] / det)
-                    half_w, half_h = half_w + _RIM_PX, half_h + _RIM_PX
-                    first, last = (
-                        max(int(starts[n, 0] - half_w), 0) >> 3,
-                        min(int(starts[n, 0] + half_w), width - 1) >> 3,
-                    )
-                    top, end = max(int(starts[n, 1] - half_h), 0) >> 3, min(int(starts[n, 1] + half_h), height - 1) >> 3
-                    for cy in range(top, end + 1):
-                        for cx in range(first, last + 1):
-                            cells[cy, cx] = n
-                n += 1
+                    if n == len(starts):
+                        return n
+                    codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room), sign
+                    if codes[n] == 0:
+                        _note(n, starts, mine)
+                    else:
+                        starts[n, 0], starts[n, 1] = x, y
+                        mine[y >> 3, x >> 3] = n
+                    n += 1
     return n
 
 
 def workspace() -> Room:
     """Return the arrays that :func:`outline` works in."""
     return np.empty((5, 5)), np.empty(5), np.empty(5), np.empty((5, 5)), np.empty(5), np.empty(5)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def find(
+    image: Grey, words: Words, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64], signs: NDArray[np.int64],
+    cov: Array, shape: Array, room: Room, work: Work,
+) -> tuple[int, int]:  # fmt: skip
+    """Search an image and fit what was found.
+
+    Args:
+        image: as in :func:`search`, and words, bright, dark, starts, codes, signs and room.
+        words: see there.
+        bright: see there.
+        dark: see there.
+        starts: see there; in the end the discs come first, fitted, then what is none.
+        codes: see there; in the same order.
+        signs: see there; in the same order.
+        cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
+        shape: (N, 3) filled with the discs' ellipses, px^2.
+        room: see there.
+        work: room for fits.
+
+    Returns:
+        How many discs, and how many places in all.
+    """
+    noise = noise_of(image)
+    n = search(image, words, noise, bright, dark, starts, codes, signs, room)
+    good = 0
+    for i in range(n):
+        if codes[i] == 0:
+            codes[i] = fit(image, noise, starts[i], cov[good], work)
+        if codes[i] == 0:
+            shape_of(starts[i], shape[good])
+            if i != good:
+                for a in range(starts.shape[1]):
+                    starts[good, a], starts[i, a] = starts[i, a], starts[good, a]
+                codes[good], codes[i] = codes[i], codes[good]
+                signs[good], signs[i] = signs[i], signs[good]
+            good += 1
+    return good, n
