@@ -15,7 +15,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.law import CLOSE, INSTANTS, SCALES, SHAPES, Law, along, bounds, slower
+from armsight.robot.trajectories.law import CLOSE, SCALES, SHAPES, Law, along, bounds, keeps, slower
 from armsight.robot.trajectories.limits import ROUNDING, stretches
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, check_times, clamped
@@ -124,8 +124,7 @@ def _taken_up(arm: Arm, guide: Walk, start: Joints, plan: _Plan, most: Array) ->
         part = _straight(start, plan.edges[:2], slower(most * shape, 1 / scale), plan.speeds[:1])
         if part is None or (best is not None and part.duration_s >= best.duration_s):
             continue
-        t_s = np.linspace(0, part.duration_s, INSTANTS)
-        if stretches(arm, t_s, along(guide, Chain((part,)), t_s)).max() <= 1 + ROUNDING:
+        if keeps(arm, guide, part):
             best = part
     if best is None:
         raise InputError(

@@ -15,9 +15,9 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.limits import ROUNDING, worst
+from armsight.robot.trajectories.limits import ROUNDING, stretches, worst
 from armsight.robot.trajectories.profile import Profile, plan_profile
-from armsight.robot.trajectories.trajectory import Joints, check_times
+from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_times
 from armsight.robot.trajectories.walk import Walk, columns
 
 if TYPE_CHECKING:
@@ -29,6 +29,9 @@ ROUNDS = 12
 CLOSE = 1e-3
 #: From a moving start these scales are tried too, and at most so many of what is found are looked at closely.
 SCALES, TRIED = (1.03, 1.0, 0.97, 0.93, 0.87, 0.8, 0.7, 0.6, 0.5, 0.4), 20
+#: How exactly the walk's derivatives are known between its places, how long a start's own state may last, s, and at every
+#: how many-th instant of the later check a moving start's laws are judged.
+HAIR, FIRST_S, EVERY = 2e-4, 5e-3, 2
 #: Halvings of a duration that find an instant.
 HALVINGS = 40
 #: Proportions of speed, acceleration and jerk that are tried, and at how many instants each is judged.
@@ -113,13 +116,23 @@ def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) 
                 law = single_law(start, slower(limits, 1 / scale), duration_s)
             except InputError:
                 continue
-            t_s = np.linspace(0, law.duration_s, INSTANTS)
-            if worst(arm, t_s, along(guide, law, t_s)).ratio <= 1 + ROUNDING:
+            if keeps(arm, guide, law):
                 found.append(law)
     if not found:
         asked = "" if duration_s is None else f" in {duration_s:g} s"
         raise InputError(f"from this moving start no motion to the end of the path{asked} keeps the arm's limits")
     return sorted(found, key=lambda law: law.duration_s)[:TRIED]
+
+
+def keeps(arm: Arm, guide: Walk, law: Law | Profile) -> bool:
+    """Say whether a law from a moving start keeps the limits by the walk's derivatives.
+
+    They are known to :data:`HAIR` there, so the joints must stay that far within the limits, but for the first instants:
+    the start may be at a limit, and is looked at exactly afterwards.
+    """
+    t_s = np.linspace(0, law.duration_s, max(2, int(np.ceil(law.duration_s * CHECK_RATE_HZ / EVERY))))
+    needed = stretches(arm, t_s, along(guide, law, t_s))
+    return bool((needed <= np.where(t_s < FIRST_S, 1 + HAIR, 1 - HAIR)).all())
 
 
 def slower(limits: Array, k: float) -> Array:
@@ -158,7 +171,7 @@ def bounds(arm: Arm, guide: Walk) -> Array:
     return np.array([speed, acceleration, jerk])
 
 
-def along(guide: Walk, law: Law, t_s: Array) -> Joints:
+def along(guide: Walk, law: Law | Profile, t_s: Array) -> Joints:
     """Return the joints (N, 6) at times (N,), between the places of the walk by interpolation; angles are left at 0."""
     share, speed, acceleration = (part[:, :1] for part in law.at(t_s))
     q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
