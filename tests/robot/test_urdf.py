@@ -163,6 +163,12 @@ def changed(old, new, count=1):
 
 
 RPY = 'rpy="-1.5707963267948966 0.0 0.0"'
+#: Entities that grow to 20 MB.
+BOMB = (
+    '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'
+    + "".join(f'<!ENTITY {b} "{8 * f"&{a};"}">' for a, b in itertools.pairwise("abcdefgh"))
+    + ']><robot name="&h;"/>'
+)
 PRISMATIC = (
     '<link name="finger"/><joint name="grip" type="{}"><parent link="tool"/><child link="finger"/>'
     '<limit lower="0" upper="1" velocity="1"/></joint></robot>'
@@ -208,6 +214,13 @@ PRISMATIC = (
             changed('velocity="1.5707963267948966"', 'velocity="0"'),
             "joint 'joint1': <limit> velocity=0 must be more than 0",
         ),
+        (changed('<link name="link2" />', '<link name="link1" />'), "two links are called 'link1'"),
+        (changed('name="joint2"', 'name="joint1"'), "two joints are called 'joint1'"),
+        (
+            changed('upper="2.9670597283903604"', 'upper="170"'),
+            "q_max has an angle of more than 20 rad; are these degrees",
+        ),
+        (BOMB, "not XML|0 revolute joints"),
         (changed("home_rad", "home_deg"), '<armsight>: home_rad="" must be six numbers'),
     ],
 )

@@ -126,6 +126,10 @@ def _number(where: str, element: ET.Element, key: str) -> float | None:
 def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link: str | None) -> list[_Joint]:
     """Return the joints from the base to the tool."""
     links = [element.get("name") for element in robot.findall("link")]
+    called: dict[str, list[str | None]] = {"links": links, "joints": [joint.name for joint in joints]}
+    for kind, names in called.items():
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"{path}: two {kind} are called {twice[0]!r}")
     above: dict[str, _Joint] = {}
     for joint in joints:
         for link in (joint.parent, joint.child):
@@ -187,24 +191,28 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], turning: list
     extra = robot.find("armsight")
     limits = [_limits(f"{path}: joint {joint.name!r}", joint.element) for joint in turning]
     q_min, q_max, qd, qdd, qddd = (np.array(column) for column in zip(*limits, strict=True))
-    arm = Arm(
-        name=robot.get("name", "") or Path(path).stem,
-        a=rows.a,
-        d=rows.d,
-        alpha=rows.alpha,
-        offset=rows.offset,
-        direction=rows.direction,
-        q_min=q_min,
-        q_max=q_max,
-        qd_max=qd,
-        qdd_max=qdd,
-        qddd_max=qddd,
-        home=np.zeros(6) if extra is None else _home(f"{path}: <armsight>", extra),
-        T_base_0=rows.T_base_0,
-        T_flange_tool=rows.T_flange_tool,
-        joint_names=tuple(joint.name for joint in turning),
-        source=(extra.get("source", "") if extra is not None else "") or f"URDF {Path(path).name}",
-    )
+    home = np.zeros(6) if extra is None else _home(f"{path}: <armsight>", extra)
+    try:
+        arm = Arm(
+            name=robot.get("name", "") or Path(path).stem,
+            a=rows.a,
+            d=rows.d,
+            alpha=rows.alpha,
+            offset=rows.offset,
+            direction=rows.direction,
+            q_min=q_min,
+            q_max=q_max,
+            qd_max=qd,
+            qdd_max=qdd,
+            qddd_max=qddd,
+            home=home,
+            T_base_0=rows.T_base_0,
+            T_flange_tool=rows.T_flange_tool,
+            joint_names=tuple(joint.name for joint in turning),
+            source=(extra.get("source", "") if extra is not None else "") or f"URDF {Path(path).name}",
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     check_same(f"{path}", arm, links)
     return arm
 
