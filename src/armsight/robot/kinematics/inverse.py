@@ -39,9 +39,9 @@ SCRATCH = 4 * 48 + 96 + 32 + 16 + 6 * WORK
 _LANES = SCRATCH - 6 * WORK
 #: A solution is polished where its pose is off by more than this, m or rad, and dropped where the polish leaves more.
 _POLISHED, _WRONG = 1e-12, 3e-10
-#: How many places damped least squares starts from for an arm without structure; steps from there, in a polish, and towards
-#: the nearest pose; starts for that beside the closed form's.
-_STARTS, _STEPS, _POLISH_STEPS, _NEAREST_STEPS, _NEAREST_STARTS = 64, 60, 20, 200, 8
+#: How many places damped least squares starts from for an arm without structure, and for the nearest pose beside the
+#: closed form's; how many steps it takes at most, in a polish and from afar.
+_STARTS, _NEAREST_STARTS, _STEPS, _LONG_STEPS = 64, 8, 20, 200
 #: Bounds of a joint that has none, rad.
 _FAR = 1e9
 
@@ -73,7 +73,7 @@ def _start(n: int, near: Array, q: Array) -> None:
 
 
 @_kernel
-def _from_everywhere(table: Array, F: Frame, near: Array, most: int, steps: int, rows: Array, work: Array) -> int:
+def _from_everywhere(table: Array, F: Frame, near: Array, most: int, rows: Array, work: Array) -> int:
     """Write what damped least squares finds from many starts, at most so many; returns how many rows."""
     count = 0
     for n in range(_STARTS):
@@ -81,7 +81,7 @@ def _from_everywhere(table: Array, F: Frame, near: Array, most: int, steps: int,
             break
         rows[count] = 0.0
         _start(n, near, rows[count])
-        if _polish(table, F, rows[count], steps, work) and not known(rows, count):
+        if _polish(table, F, rows[count], _LONG_STEPS, work) and not known(rows, count):
             count += 1
     return count
 
@@ -110,62 +110,42 @@ def _lane_angles(closed: Array, limits: Array, near: Array, lanes: Array, n: int
 
 
 @_kernel
-def _in_doubt(
+def _from_closed_form(
     table: Array,
     closed: Array,
     limits: Array,
     F: Frame,
     near: Array,
+    clamp: bool,
     rows: Array,
     already: int,
     lanes: Array,
     work: Array,
     n: int,
-) -> int:
-    """Add what descent finds from where the steps of the closed form come closest; returns how many rows there are."""
-    y, x = lanes[:48], lanes[48:96]
-    M = after(closed, UNTOOL, before(closed, UNBASE, F))
-    found, _ = closed_form(closed, M, near, True, y, x, lanes[288:320])
-    _lane_angles(closed, limits, near, lanes, n)
-    _to_rows(lanes, found, rows[n:])
-    count = already
-    for k in range(found):
-        rows[count] = rows[n + k]
-        if count < n and _polish(table, F, rows[count], _NEAREST_STEPS, work) and not known(rows, count):
-            count += 1
-    if count == 0:
-        count = _from_everywhere(table, F, near, 1, _NEAREST_STEPS, rows, work)
-        rows[0, STATE] = SHOULDER | WRIST
-    return count
-
-
-@_kernel
-def _from_closed_form(
-    table: Array, closed: Array, limits: Array, F: Frame, near: Array, rows: Array, lanes: Array, work: Array, n: int
 ) -> tuple[int, int]:
-    """Write what the closed form finds, measured and polished; returns how many rows, and what missed."""
-    exact = table[KIND] != 0.0
+    """Add what the closed form finds, measured and polished; returns how many rows there are, and what missed.
+
+    Clamped, it is where the steps of the closed form come closest, which a longer descent makes solutions of or not.
+    """
     y, x, q, theta = lanes[:48], lanes[48:96], lanes[96:144], lanes[144:192]
     M = after(closed, UNTOOL, before(closed, UNBASE, F))
-    found, missed = closed_form(closed, M, near, not exact, y, x, lanes[288:320])
+    found, missed = closed_form(closed, M, near, clamp, y, x, lanes[288:320])
     _lane_angles(closed, limits, near, lanes, n)
     thetas(table, q, theta, n)
     sincos_each(theta, y, x, 6 * n)
     frames(table, y, x, lanes[192:288], n)
     errors(lanes[192:288], F, lanes[320:328], lanes[328:336], n)
-    _to_rows(lanes, found, rows)
-    count, moved = 0, False
-    for k in range(found):
+    _to_rows(lanes, found, rows[already:])
+    count, moved = already, already > 0
+    for k in range(already, min(already + found, MOST)):
         if k != count:
             rows[count] = rows[k]
         good = max(rows[count, POSITION], rows[count, ANGLE]) <= _POLISHED
         if not good:
-            good, moved = _polish(table, F, rows[count], _POLISH_STEPS, work), True
+            good, moved = _polish(table, F, rows[count], _LONG_STEPS if clamp else _STEPS, work), True
         # Only solutions that were moved can come upon each other.
-        if good and not (moved and known(rows, count)):
+        if good and count < n and not (moved and known(rows, count)):
             count += 1
-    if missed & DOUBT:
-        count = _in_doubt(table, closed, limits, F, near, rows, count, lanes, work, n)
     return count, missed
 
 
@@ -201,11 +181,18 @@ def inverse(
     verdict, F = rigid(T)
     if verdict != 0:
         return verdict, 0, 0
-    missed, lanes, work = 0, scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
-    if closed[KIND] == 0.0:
-        count = _from_everywhere(table, F, near, MOST, _STEPS, rows, work)
-    else:
-        count, missed = _from_closed_form(table, closed, limits, F, near, rows, lanes, work, n)
+    lanes, work = scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
+    count = missed = 0
+    irregular = closed[KIND] == 0.0
+    # Where rounding may be to blame for what was missed, a second time from as close as the closed form comes.
+    for again in range(0 if irregular else 2):
+        clamp = again == 1 or table[KIND] == 0.0
+        if again == 0 or missed & DOUBT:
+            count, out = _from_closed_form(table, closed, limits, F, near, clamp, rows, count, lanes, work, n)
+            missed |= out
+    if irregular or (count == 0 and missed & DOUBT):
+        count = _from_everywhere(table, F, near, MOST if irregular else 1, rows, work)
+        rows[:count, STATE] = 0.0 if irregular else 1.0 * (SHOULDER | WRIST)
     bits = 0
     for k in range(count):
         bits |= int(rows[k, STATE])
@@ -262,7 +249,7 @@ def nearest(
         for i in range(6):
             turned, _ = placed(trial[i], limits[0, i], limits[1, i], near[i])
             trial[i] = min(limits[1, i], max(limits[0, i], turned))
-        cost = descend(table, F, trial, limits[0], limits[1], _NEAREST_STEPS, work)
+        cost = descend(table, F, trial, limits[0], limits[1], _LONG_STEPS, work)
         if cost < best:
             best = cost
             q[:] = trial
