@@ -7,7 +7,6 @@ Arrays in a record are read-only. Frames, units and the meaning of a covariance:
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -27,12 +26,11 @@ class Record:
 
     def __post_init__(self) -> None:
         """Make every array field a read-only view."""
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        fields = self.__dict__  # not dataclasses.fields: records are made for every shot of a live loop
+        for name, value in fields.items():
             if isinstance(value, np.ndarray):
-                view = value.view()
+                fields[name] = view = value.view()
                 view.flags.writeable = False
-                object.__setattr__(self, field.name, view)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,15 @@ last predictions were, and everything from pixels to covariance is one compiled 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
-from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
+from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.expected import bias_normals
 from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, SEEN, TURNED_AWAY, Found, Scene, follow_pair
 from armsight.vision.image import grey
@@ -26,6 +27,7 @@ from armsight.vision.markers.disc_model import workspace
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
+from armsight.vision.posefit import moved
 from armsight.vision.rig import StereoRig
 
 Way = Literal["followed", "searched", "lost"]
@@ -35,8 +37,6 @@ Way = Literal["followed", "searched", "lost"]
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
 #: A prediction older than so many shots is none.
 _OLDEST_SHOTS = 3
-#: A detection so many standard deviations off the pose sends the pair the slow way.
-_OFF_SIGMAS = 6.0
 #: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
 _JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
 _WORDS = {
@@ -70,7 +70,9 @@ class Track(Record):
 
     def predicted(self, t_s: float) -> Array:
         """Return the pose (4, 4) at a time."""
-        return self.T_left_body @ exp_se3(self.twist * (t_s - self.t_s))
+        T = np.empty((4, 4))
+        moved(self.T_left_body, self.twist * (t_s - self.t_s), T)
+        return T
 
 
 class Follower:
@@ -118,11 +120,12 @@ class Follower:
             np.where(discs.bright, 1, -1),
         )
         self._found = _room(len(discs.radii_m), rig.parameter_count)
-        self._cov_noise = np.empty((6, 6))
+        self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
+        self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
         self._work, self._outline = workspace(), disc_search.workspace()
         self._noise = 1.0
         blank = [np.zeros(camera.image_size_px[::-1], np.uint8) for camera in rig.cameras]
-        self._pair(blank[0], blank[1], 1.0)
+        self._pair(blank[0], blank[1], np.eye(4), np.zeros(6), 1.0, 1.0)
         measure(rig, target, Shot("", blank[0], blank[1]))
 
     def measure(self, shot: Shot) -> PoseEstimate | Missed:
@@ -177,59 +180,50 @@ class Follower:
         for camera, image in zip(self.rig.cameras, (left, right), strict=True):
             if (image.shape[1], image.shape[0]) != camera.image_size_px:
                 return None
-        found = self._found
-        found.T[:, :] = track.predicted(t_s)
-        both, cost, chi_square = self._pair(left, right, track.margin_px)
-        if both < 3 or not np.isfinite(cost) or np.abs(found.whitened).max() > _OFF_SIGMAS * self._scale():
+        twist = track.twist.copy()
+        seen, chi_square, wrong = self._pair(left, right, track.T_left_body, twist, t_s - track.t_s, track.margin_px)
+        if not seen:
             return None
-        codes = found.codes
-        good = codes == SEEN
-        off = found.uv - found.predicted
-        wrong = float(np.sqrt((off[good] ** 2).sum(axis=1).max()))
         margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
-        T = found.T.copy()
-        twist = log_se3(inverse(track.T_left_body) @ T) / (t_s - track.t_s)
+        T = self._found.T.copy()
         self._track = Track(T, twist, t_s, 0, margin, True)
-        return self._estimate(T, good, chi_square)
+        return self._estimate(T, seen, chi_square)
 
-    def _pair(self, left: NDArray[np.uint8], right: NDArray[np.uint8], margin: float) -> tuple[int, float, float]:
+    def _pair(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, margin: float
+    ) -> tuple[int, float, float]:
         """Run the compiled call."""
         least = max(disc_search.LEAST_CONTRAST, 5.0 * self._noise)
-        arguments = (self._scene, margin, self._noise, least, self._found, self._cov_noise, self._work, self._outline)
-        both, cost, chi_square = follow_pair(left, right, *arguments)
-        return both, cost, chi_square
-
-    def _scale(self) -> float:
-        """How many times larger than noise makes them whitened residuals may be, the calibration being wrong: the most."""
-        J_rig = self._found.J_rig
-        return float(np.sqrt(1.0 + np.einsum("ip,pq,iq->i", J_rig, self.rig.cov, J_rig).max()))
-
-    def _estimate(self, T: Array, good: NDArray[np.bool_], chi_square: float) -> PoseEstimate:
-        """Make the record of what the compiled call found."""
-        found, discs = self._found, self.target.discs
-        assert discs is not None
-        freedom = 2 * int(good.sum()) - 6
-        misfit = max(chi_square / freedom, 1.0) if chi_square > misfit_limit(freedom) else 1.0
-        seen = np.flatnonzero(good.any(axis=1))
-        both = np.flatnonzero(good.all(axis=1))
-        names = discs.body.point_names
-        dropped = tuple(
-            Dropped(names[m], f"{side}: {_WORDS[int(found.codes[m, c])]}")
-            for c, side in enumerate(("left", "right"))
-            for m in np.flatnonzero(~good[:, c])
+        arguments = (self._limits, self._found, self._cov_noise, self._work, self._outline)
+        seen, chi_square, wrong = follow_pair(
+            left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments
         )
-        uv = np.where(good[..., None], found.uv - found.bias, np.nan)[seen]
-        cov_uv = np.where(good[..., None, None], found.cov_uv, 0.0)[seen]
+        return seen, chi_square, wrong
+
+    def _estimate(self, T: Array, count: int, chi_square: float) -> PoseEstimate:
+        """Make the record of what the compiled call found: ``count`` ellipses."""
+        found = self._found
+        freedom = 2 * count - 6
+        misfit = max(chi_square / freedom, 1.0) if chi_square > self._limits[count] else 1.0
+        uv, cov_uv = found.uv - found.bias, found.cov_uv.copy()
+        dropped: tuple[Dropped, ...] = ()
+        seen = both = self._rows
+        residual = found.residual
+        if count < 2 * len(seen):
+            good = found.codes == SEEN
+            seen, both = np.flatnonzero(good.any(axis=1)), np.flatnonzero(good.all(axis=1))
+            uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(good)
+            uv, cov_uv, residual = uv[seen], cov_uv[seen], residual[good]
         p_left = found.p_left[both]
-        gap = p_left - (discs.body.points[both] @ T[:3, :3].T + T[:3, 3])
+        gap = p_left - (self._scene.points[both] @ T[:3, :3].T + T[:3, 3])
         noise = self._cov_noise * misfit
         return PoseEstimate(
             T,
             found.cov + noise,
             noise,
-            float(np.sqrt((gap**2).sum(axis=1).mean())),
-            float(np.sqrt((found.residual[good] ** 2).sum(axis=1).mean())),
-            float(np.sqrt(misfit)),
+            math.sqrt(float((gap * gap).sum()) / len(both)),
+            math.sqrt(float((residual * residual).sum()) / count),
+            math.sqrt(misfit),
             Points(
                 both,
                 p_left,
@@ -239,6 +233,15 @@ class Follower:
                 dropped,
             ),
             dropped,
+        )
+
+    def _dropped(self, good: NDArray[np.bool_]) -> tuple[Dropped, ...]:
+        """Say which discs which camera did not see, and why."""
+        names = self.target.body.point_names
+        return tuple(
+            Dropped(names[m], f"{side}: {_WORDS[int(self._found.codes[m, c])]}")
+            for c, side in enumerate(SIDES)
+            for m in np.flatnonzero(~good[:, c])
         )
 
 

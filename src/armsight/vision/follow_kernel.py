@@ -28,6 +28,8 @@ _FACING = 0.2
 #: How much larger or smaller than predicted a disc may look.
 _SIZE = 1.35
 _STEPS = 8
+#: A detection so many standard deviations off the pose sends the pair the slow way.
+_OFF_SIGMAS = 6.0
 #: A step that changes the cost by less than this share is the last.
 _REACHED = 1e-5
 
@@ -304,8 +306,8 @@ def settle(scene: Scene, found: Found) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def uncertainty(scene: Scene, found: Found, cov_noise: Array) -> float:
-    """Fill covariances; return the residuals' chi-square with what a wrong calibration explains taken off.
+def uncertainty(scene: Scene, found: Found, cov_noise: Array, chi_square: float, limit: float) -> float:
+    """Fill covariances; return the residuals' chi-square, above ``limit`` less what a wrong calibration explains.
 
     The rig's share goes through the same fit: gain = H^-1 J^T J_rig. Chi-square: residuals weighted by the inverse of
     I + B cov_rig B^T with B the part of J_rig that no pose explains (Woodbury's identity), as in ``locate``.
@@ -318,11 +320,49 @@ def uncertainty(scene: Scene, found: Found, cov_noise: Array) -> float:
     cov_noise[:, :] = np.linalg.inv(found.H)
     gain = cov_noise @ (J.T @ J_rig)
     found.cov[:, :] = gain @ scene.cov_rig @ gain.T
+    if chi_square <= limit:
+        return chi_square
     B = J_rig - J @ gain
     v = B.T @ found.whitened
     M = np.eye(len(scene.cov_rig)) + scene.cov_rig @ (B.T @ B)
     explained = v @ np.linalg.solve(M, scene.cov_rig @ v)
-    return float(found.whitened @ found.whitened - explained)
+    return float(chi_square - explained)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _inverse_normal(A: Array, out: Array) -> None:
+    """Fill the inverse of A^T A, A (4, 3), by its adjugate."""
+    a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(4):
+        a += A[i, 0] * A[i, 0]
+        b += A[i, 0] * A[i, 1]
+        c += A[i, 0] * A[i, 2]
+        d += A[i, 1] * A[i, 1]
+        e += A[i, 1] * A[i, 2]
+        f += A[i, 2] * A[i, 2]
+    out[0, 0], out[0, 1], out[0, 2] = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
+    out[1, 1], out[1, 2], out[2, 2] = a * f - c * c, b * c - a * e, a * d - b * b
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] /= det
+
+
+@numba.njit(cache=True, error_model="numpy")
+def velocity(T_from: Array, T_to: Array, seconds: float, twist: Array) -> None:
+    """Fill the twist (6,) that :func:`~armsight.vision.posefit.moved` carries one pose into the other with."""
+    R = np.empty((3, 3))
+    for i in range(3):
+        twist[i] = 0.0
+        for j in range(3):
+            twist[i] += T_from[j, i] * (T_to[j, 3] - T_from[j, 3]) / seconds
+            R[i, j] = T_from[0, i] * T_to[0, j] + T_from[1, i] * T_to[1, j] + T_from[2, i] * T_to[2, j]
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    sine = 0.5 * np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    k = (0.5 * angle / sine if sine > 1e-9 else 0.5) / seconds
+    twist[3], twist[4], twist[5] = k * x, k * y, k * z
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -339,7 +379,7 @@ def triangulated(scene: Scene, found: Found) -> None:
             p[i] = found.T[i, 3]
             for j in range(3):
                 p[i] += found.T[i, j] * scene.points[m, j]
-        H = np.empty((3, 3))
+        H = found.cov_p[m]
         for step in range(3):
             for side in range(2):
                 for i in range(3):
@@ -363,47 +403,76 @@ def triangulated(scene: Scene, found: Found) -> None:
                 for j in range(3):
                     A[a, j] /= l00
                     A[a + 1, j] = (A[a + 1, j] - l10 * A[a, j]) / l11
-            H[:, :] = A.T @ A
+            _inverse_normal(A, H)
             if step < 2:
-                p += np.linalg.solve(H, A.T @ r)
-        found.cov_p[m] = np.linalg.inv(H)
-        found.by_rig[m] = -found.cov_p[m] @ (A.T @ found.J_rig[4 * m : 4 * m + 4])
+                for i in range(3):
+                    for j in range(4):
+                        p[i] += (H[i, 0] * A[j, 0] + H[i, 1] * A[j, 1] + H[i, 2] * A[j, 2]) * r[j]
+        for i in range(3):
+            G = found.by_rig[m, i]
+            G[:] = 0.0
+            for j in range(4):
+                gain = H[i, 0] * A[j, 0] + H[i, 1] * A[j, 1] + H[i, 2] * A[j, 2]
+                for q in range(len(G)):
+                    G[q] -= gain * found.J_rig[4 * m + j, q]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _believable(scene: Scene, found: Found) -> bool:
+    """Tell whether no residual is larger than noise and calibration together make it."""
+    C, J_rig = scene.cov_rig, found.J_rig
+    for row in range(len(found.whitened)):
+        r = found.whitened[row] * found.whitened[row]
+        if r > _OFF_SIGMAS * _OFF_SIGMAS and r > _OFF_SIGMAS * _OFF_SIGMAS * (1.0 + J_rig[row] @ (C @ J_rig[row])):
+            return False
+    return True
 
 
 @numba.njit(cache=True, error_model="numpy")
 def follow_pair(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], scene: Scene, margin: float, noise: float, least: float,
-    found: Found, cov_noise: Array, work: Work, room: Room,
+    left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, scene: Scene,
+    margin: float, noise: float, least: float, limits: Array, found: Found, cov_noise: Array, work: Work, room: Room,
 ) -> tuple[int, float, float]:  # fmt: skip
     """Measure one pair around a predicted pose.
 
     Args:
         left: (H, W) grey.
         right: (H, W) grey.
+        T: (4, 4) last pose.
+        twist: (6,) of the body since; in the end its velocity between that pose and this.
+        seconds: since the last pose.
         scene: what does not change.
         margin: how far a disc may be from where it is predicted, px.
         noise: standard deviation of the images' noise, grey levels.
         least: least contrast of a disc, grey levels.
-        found: room for the result; ``found.T`` is the predicted pose (4, 4).
+        limits: (2 M + 1,) by how many ellipses were seen, chi-square above which the residuals are a misfit.
+        found: room for the result.
         cov_noise: (6, 6) filled with the covariance from the pixel noise alone.
         work: room for fits.
         room: room for outlines.
 
     Returns:
-        How many discs both cameras saw; the sum of the squared whitened residuals, infinite where no pose was found; the
-        same with what a wrong calibration explains taken off.
+        How many ellipses were seen, 0 where they give no pose to be believed; chi-square of the residuals as
+        :func:`uncertainty` has it; how far off the prediction was at the most, px.
     """
+    xi = twist * seconds
+    moved(T, xi, found.T)
     look(left, 0, scene, margin, noise, least, found, work, room)
     look(right, 1, scene, margin, noise, least, found, work, room)
-    both, single = 0, 0
+    both, seen, wrong = 0, 0, 0.0
     for m in range(len(scene.radii)):
         both += found.codes[m, 0] == SEEN and found.codes[m, 1] == SEEN
-        single += found.codes[m, 0] == SEEN or found.codes[m, 1] == SEEN
+        for side in range(2):
+            if found.codes[m, side] == SEEN:
+                seen += 1
+                gap = found.uv[m, side] - found.predicted[m, side]
+                wrong = max(wrong, np.sqrt(gap[0] * gap[0] + gap[1] * gap[1]))
     if both < 3:
-        return both, np.inf, np.inf
+        return 0, np.inf, wrong
     cost = settle(scene, found)
-    if not np.isfinite(cost):
-        return both, np.inf, np.inf
-    chi_square = uncertainty(scene, found, cov_noise)
+    if not np.isfinite(cost) or not _believable(scene, found):
+        return 0, np.inf, wrong
+    chi_square = uncertainty(scene, found, cov_noise, cost, limits[seen])
     triangulated(scene, found)
-    return both, cost, chi_square
+    velocity(T, found.T, seconds, twist)
+    return seen, chi_square, wrong

@@ -6,8 +6,10 @@ the body's geometry say together (:mod:`~armsight.vision.identify`).
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from armsight.vision.markers.body_file import Marker
 
 #: Most places looked at in an image, and most rejected ones that are told.
 _MOST_PLACES, _MOST_TOLD = 16384, 100
+_KEPT = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,24 +66,29 @@ class DiscTarget(Record):
         image = np.ascontiguousarray(image)
         if image.shape[1] % 8:
             image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
-        theta = np.empty((_MOST_PLACES, disc_model.UNKNOWNS))
-        codes, signs = np.empty(_MOST_PLACES, np.int64), np.empty(_MOST_PLACES, np.int64)
-        cov, shape = np.empty((_MOST_PLACES, 2, 2)), np.empty((_MOST_PLACES, 3))
+        room = _room()
         good, n = disc_search.find(
-            image,
-            image.view(np.uint64),
-            bool(self.bright.any()),
-            not bool(self.bright.all()),
-            theta,
-            codes,
-            signs,
-            cov,
-            shape,
+            image, image.view(np.uint64), bool(self.bright.any()), not bool(self.bright.all()), *room
+        )
+        theta, codes, signs, cov, shape = room[:5]
+        rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
+        return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
+
+
+def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, disc_search.Room, disc_model.Work]:
+    """Return the arrays that this thread finds discs in; kept, for new memory each time costs as much as the search."""
+    if not hasattr(_KEPT, "room"):
+        _KEPT.room = (
+            np.empty((_MOST_PLACES, disc_model.UNKNOWNS)),
+            np.empty(_MOST_PLACES, np.int64),
+            np.empty(_MOST_PLACES, np.int64),
+            np.empty((_MOST_PLACES, 2, 2)),
+            np.empty((_MOST_PLACES, 3)),
             disc_search.workspace(),
             disc_model.workspace(),
         )
-        rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
-        return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
+    room: tuple[Any, ...] = _KEPT.room
+    return room
 
 
 def _rejected(theta: Array, codes: NDArray[np.int64]) -> tuple[Rejected, ...]:
