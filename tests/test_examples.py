@@ -46,3 +46,15 @@ def test_calibrate_in_python(tmp_path, capsys):
     assert [float(text) for text in printed.groups()] == pytest.approx(
         [1e3 * rig.baseline_m, 1e3 * truth.baseline_m], abs=5.1e-4
     )
+
+
+def test_follow_a_plate(capsys):
+    run("03", EXAMPLES[0].parent)
+    lines = capsys.readouterr().out.splitlines()
+    ways = [line.split(": ")[1] for line in lines]
+    assert ways[0] == "searched"
+    assert set(ways[5:8]) == {"lost"}
+    assert set(ways[1:5] + ways[9:]) == {"followed"}
+    found = np.array(re.findall(r"sigma ([\d.]+) mm, error ([\d.]+) mm$", "\n".join(lines), re.MULTILINE), float)
+    assert len(found) == 9
+    assert (found[:, 1] <= 5.54 * (found[:, 0] + 5e-4) + 5e-4).all()  # see test_measure_a_board

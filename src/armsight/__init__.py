@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.camera import Camera
+    from armsight.vision.follow import Follower
     from armsight.vision.markers.board import open_board
     from armsight.vision.markers.targets import open_body, open_target
     from armsight.vision.measure import measure
@@ -27,6 +28,7 @@ __all__ = [
     "ArmsightError",
     "Body",
     "Camera",
+    "Follower",
     "Missed",
     "Pair",
     "PoseEstimate",
@@ -47,6 +49,7 @@ _HOME = {
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
+    "Follower": "armsight.vision.follow",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
     "measure": "armsight.vision.measure",

@@ -219,7 +219,7 @@ def test_misses_count_what_was_found():
     left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
     two = Discs(left.uv[:2], left.cov_uv[:2], left.shape[:2], left.bright[:2], (Rejected((3.0, 4.0), "glint"),))
     assert identify(rig, PLATE, two, right).reason == (
-        "left: 2 discs found, 1 looked like one and is none (glint); right: 3 discs found; plate has 3"
+        "left: 2 discs found (1 other place looked at; the most likely: glint); right: 3 discs found; plate has 3"
     )
     nothing = Discs(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 3)), np.zeros(0, bool))
     assert identify(rig, PLATE, nothing, nothing).reason == "left: 0 discs found; right: 0 discs found; plate has 3"

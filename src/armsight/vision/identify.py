@@ -194,6 +194,6 @@ def _too_few(target: DiscTarget, discs: tuple[Discs, Discs]) -> str:
         text = f"{side}: {len(seen.uv)} disc{'' if len(seen.uv) == 1 else 's'} found"
         if seen.rejected:
             many, first = len(seen.rejected), seen.rejected[0].reason  # the one that looks most like a disc
-            text += f", {many} looked like one and {'is' if many == 1 else 'are'} none ({first})"
+            text += f" ({many} other place{'' if many == 1 else 's'} looked at; the most likely: {first})"
         parts.append(text)
     return f"{'; '.join(parts)}; {target.body.name} has {len(target.radii_m)}"
