@@ -9,7 +9,7 @@ axes at right angles:
 
 Each step solves what the steps before have left exactly, so that an angle which is badly determined near a singularity
 does not spoil the pose. Where an angle is not determined at all, it is given the value wanted (``near``, or 0). Pieper,
-"The kinematics of manipulators under computer control", 1968; for the chapter's arm: docs/chapter.md, "The 6R arm".
+"The kinematics of manipulators under computer control", 1968; the chapter's arm (table 18.1) is a PARALLEL one.
 
 Angles are carried as points (cosine, sine): the eight lanes' angles are taken all at once afterwards. Letters: c and s are
 a cosine and a sine, n o a the columns of the wanted rotation, w the wrist point.
@@ -34,8 +34,6 @@ Point = tuple[float, float]
 SHOULDER, ELBOW, WRIST = 1, 2, 4
 #: Beside them: what the arm missed may be what rounding did to badly determined angles.
 DOUBT = 16
-#: Lane arrays beside the angles: shoulder, elbow, wrist (+-1), state.
-TAGS = 4
 
 #: Below this distance, m, or sine, a joint is not determined: what it moves stays below 1e-12 m or rad.
 _FREE = 1e-12
