@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,15 +62,19 @@ class DiscTarget(Record):
         body = Body(name, tuple(m.name for m in markers), np.array([m.position for m in markers]))
         return DiscTarget(body, np.array(radii), np.array(bright), np.array(normals))
 
+    @cached_property
+    def _kinds(self) -> tuple[bool, bool]:
+        """Whether there are bright discs, and dark ones."""
+        return bool(self.bright.any()), not bool(self.bright.all())
+
     def find(self, image: NDArray[np.uint8]) -> Discs:
         """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has."""
         image = np.ascontiguousarray(image)
         if image.shape[1] % 8:
             image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
         room = _room()
-        good, n = disc_search.find(
-            image, image.view(np.uint64), bool(self.bright.any()), not bool(self.bright.all()), *room
-        )
+        bright, dark = self._kinds
+        good, n = disc_search.find(image, image.view(np.uint64), bright, dark, *room)
         theta, codes, signs, cov, shape = room[:5]
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
         return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)

@@ -123,7 +123,7 @@ def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array)
     sectors[:, :] = 0.0
     cx, cy = F(theta[0] - x0), F(theta[1] - y0)
     for i in range(n):
-        if F(0.01) < inside[i] < F(0.99):
+        if F(0.03) < inside[i] < F(0.97):
             square = J[0, i] * J[0, i] + J[1, i] * J[1, i]
             u, v = px[i] - cx, py[i] - cy
             a, b = abs(u), abs(v)
@@ -233,17 +233,20 @@ def _significance(theta: Array, first: int, work: Work) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _average(n: int, theta: Array, x0: float, y0: float, noise_sigma: float, cov: Array, work: Work) -> None:
+def _average(
+    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: Work
+) -> None:
     """Replace centre and covariance by the mean over the kinds of gradient, each by how likely it is (model averaging).
 
-    A kind that cannot be told from another pulls the centre by up to its own standard deviation: the spread between the
-    kinds is part of the covariance.
+    What SURROUND gives, sum of squares and all, is what comes in. A kind that cannot be told from another pulls the centre
+    by up to its own standard deviation: the spread between the kinds is part of the covariance.
     """
     trial, start = work.trial, work.start
     start[:] = theta
-    results, block = np.zeros((3, 7)), np.empty((2, 2))
-    least = np.inf
-    for kind in (LIGHT, SURROUND, STRAY):
+    results, block, least = np.zeros((3, 7)), np.empty((2, 2)), square
+    results[SURROUND, 0], results[SURROUND, 1], results[SURROUND, 2] = square, theta[0], theta[1]
+    results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
+    for kind in (LIGHT, STRAY):
         trial[:] = start
         square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
         results[kind, 0] = np.inf
@@ -254,8 +257,6 @@ def _average(n: int, theta: Array, x0: float, y0: float, noise_sigma: float, cov
             results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
             results[kind, 3:6] *= variance
             least = min(least, square)
-    if not least < np.inf:
-        return
     total = 0.0
     for kind in range(3):
         results[kind, 6] = _KINDS[kind] * np.exp(-0.5 * (results[kind, 0] - least) * (n - UNKNOWNS) / least)
@@ -316,13 +317,13 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     _rim(n, theta, x0, y0, work, sectors)
-    square, count = 0.0, 0
+    off, count = 0.0, 0
     for k in range(_SECTORS):
         if sectors[1, k] > 0.0:
-            square += sectors[0, k] ** 2 - variance / sectors[1, k]
+            off += sectors[0, k] ** 2 - variance / sectors[1, k]
             count += 1
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
-    if square > count * allowed * allowed:
+    if off > count * allowed * allowed:
         return 5
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
@@ -337,7 +338,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         for b in range(2):
             cov[a, b] *= variance
     if uneven and texture == 0.0:
-        _average(n, theta, x0, y0, noise_sigma, cov, work)
+        _average(n, theta, x0, y0, noise_sigma, square, cov, work)
     return 0
 
 

@@ -56,7 +56,7 @@ class Work(NamedTuple):
         H: (10, 10) normal matrix.
         g: (10,) right side.
         L: (10, 10) factor of H.
-        scale: (10,) square roots of its diagonal.
+        scale: (10,) inverse square roots of its diagonal.
         x: (10,) solution.
         at: (10,) parameters, the centre relative to the pixels' origin.
         shapes: (4, 3) ellipses.
@@ -264,23 +264,27 @@ def normal_equations(n: int, J: Floats, residual: Floats, H: Array, g: Array) ->
 
 @numba.njit(cache=True, error_model="numpy")
 def factor(H: Array, L: Array, scale: Array) -> bool:
-    """Factor H as D L L^T D with D = diag(scale); False where it is not positive definite."""
+    """Factor H as D L L^T D; False where it is not positive definite.
+
+    Divisions are dear: ``scale`` (n,) is filled with the inverse of D's diagonal, and L's diagonal with its own inverse.
+    """
     n = len(H)
     for a in range(n):
         if not H[a, a] > 0.0:
             return False
-        scale[a] = np.sqrt(H[a, a])
+        scale[a] = 1.0 / np.sqrt(H[a, a])
     for a in range(n):
-        for b in range(a + 1):
-            total = H[a, b] / (scale[a] * scale[b])
+        for b in range(a):
+            total = H[a, b] * scale[a] * scale[b]
             for k in range(b):
                 total -= L[a, k] * L[b, k]
-            if a == b:
-                if not total > 1e-9:
-                    return False
-                L[a, a] = np.sqrt(total)
-            else:
-                L[a, b] = total / L[b, b]
+            L[a, b] = total * L[b, b]
+        total = 1.0
+        for k in range(a):
+            total -= L[a, k] * L[a, k]
+        if not total > 1e-9:
+            return False
+        L[a, a] = 1.0 / np.sqrt(total)
     return True
 
 
@@ -289,17 +293,17 @@ def solve(L: Array, scale: Array, g: Array, x: Array) -> None:
     """Solve H x = g with the factors of :func:`factor`."""
     n = len(g)
     for a in range(n):
-        total = g[a] / scale[a]
+        total = g[a] * scale[a]
         for k in range(a):
             total -= L[a, k] * x[k]
-        x[a] = total / L[a, a]
+        x[a] = total * L[a, a]
     for a in range(n - 1, -1, -1):
         total = x[a]
         for k in range(a + 1, n):
             total -= L[k, a] * x[k]
-        x[a] = total / L[a, a]
+        x[a] = total * L[a, a]
     for a in range(n):
-        x[a] /= scale[a]
+        x[a] *= scale[a]
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)

@@ -50,10 +50,10 @@ def noise_of(image: Grey) -> float:
     counts = np.zeros(256, np.int64)
     total = 0
     length = min(32, width - 1)
-    for k in range(24):
+    for k in range(16):
         # Short runs of pixels, spread over the image as a lattice of coprime steps spreads them.
-        y = ((2 * k + 1) * height) // 48
-        first = ((k * 7) % 24) * (width - 1 - length) // 23
+        y = ((2 * k + 1) * height) // 32
+        first = ((k * 7) % 16) * (width - 1 - length) // 15
         for x in range(first, first + length):
             a, b = np.int64(image[y, x]), np.int64(image[y, x + 1])
             if 0 < a < 255 and 0 < b < 255:
