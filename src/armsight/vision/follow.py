@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3
+from armsight.vision.disc_pose import SEEN, Found, Scene
 from armsight.vision.expected import bias_normals
-from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, SEEN, TURNED_AWAY, Found, Scene, follow_pair
+from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
 from armsight.vision.locate import misfit_limit
 from armsight.vision.markers import disc_search
@@ -208,30 +209,22 @@ class Follower:
         uv, cov_uv = found.uv - found.bias, found.cov_uv.copy()
         dropped: tuple[Dropped, ...] = ()
         seen = both = self._rows
-        residual = found.residual
+        p_left, cov_p, by_rig = found.p_left.copy(), found.cov_p.copy(), found.by_rig.copy()
         if count < 2 * len(seen):
             good = found.codes == SEEN
             seen, both = np.flatnonzero(good.any(axis=1)), np.flatnonzero(good.all(axis=1))
             uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(good)
-            uv, cov_uv, residual = uv[seen], cov_uv[seen], residual[good]
-        p_left = found.p_left[both]
-        gap = p_left - (self._scene.points[both] @ T[:3, :3].T + T[:3, 3])
+            uv, cov_uv = uv[seen], cov_uv[seen]
+            p_left, cov_p, by_rig = p_left[both], cov_p[both], by_rig[both]
         noise = self._cov_noise * misfit
         return PoseEstimate(
             T,
             found.cov + noise,
             noise,
-            math.sqrt(float((gap * gap).sum()) / len(both)),
-            math.sqrt(float((residual * residual).sum()) / count),
+            math.sqrt(found.squares[0] / len(both)),
+            math.sqrt(found.squares[1] / count),
             math.sqrt(misfit),
-            Points(
-                both,
-                p_left,
-                found.cov_p[both],
-                found.by_rig[both],
-                Correspondences(seen, uv, cov_uv, dropped),
-                dropped,
-            ),
+            Points(both, p_left, cov_p, by_rig, Correspondences(seen, uv, cov_uv, dropped), dropped),
             dropped,
         )
 
@@ -272,4 +265,5 @@ def _room(count: int, parameters: int) -> Found:
         np.zeros((4 * count, 6)),
         np.zeros((4 * count, parameters)),
         np.zeros((count, 2, 2)),
+        np.zeros(2),
     )
