@@ -16,8 +16,9 @@ lint: $(VENV)/.armsight-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(VENV)/.armsight-test  ## ours beside OpenCV; real recordings are looked for at ARMSIGHT_DATA
-	cd benchmarks && ../$(BIN)/python calibration.py
+bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA; about an hour
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
+	cd benchmarks && for each in calibration markers kinematics motions; do ../$(BIN)/python $$each.py || exit 1; done
 
 $(VENV)/.armsight: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

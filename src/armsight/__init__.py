@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
+    from armsight.robot.arm import Arm
+    from armsight.robot.models import open_arm
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.camera import Camera
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from armsight.vision.sources import open_source
 
 __all__ = [
+    "Arm",
     "ArmsightError",
     "Body",
     "Camera",
@@ -37,6 +40,7 @@ __all__ = [
     "calibrate_boards",
     "calibrate_bodies",
     "measure",
+    "open_arm",
     "open_board",
     "open_body",
     "open_source",
@@ -45,11 +49,13 @@ __all__ = [
 
 _HOME = {
     **dict.fromkeys(("Body", "Missed", "PoseEstimate", "Shot"), "armsight.data"),
+    "Arm": "armsight.robot.arm",
     "ArmsightError": "armsight.errors",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
     "Follower": "armsight.vision.follow",
+    "open_arm": "armsight.robot.models",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
     "measure": "armsight.vision.measure",
