@@ -1,0 +1,189 @@
+#include "command.h"
+
+#include "number.h"
+#include "pid.h"
+#include "pot.h"
+#include "safety.h"
+#include "setpoint.h"
+
+/* Begin to drive a joint from where it is, at rest, with limits that let it move in but never further out. */
+static void start_joint(joint_state *joint, const joint_config *config)
+{
+    const float angle_rad = joint->pot.angle_rad;
+    const float speed_rad_s = joint->pid.speed_rad_s;
+    pid_reset(&joint->pid, angle_rad);
+    joint->pid.speed_rad_s = speed_rad_s; /* the filter runs on: a coasting joint is braked from the first tick */
+    setpoint_hold(&joint->setpoint, angle_rad);
+    pot_watch(&joint->pot, angle_rad);
+    joint->low_rad = angle_rad < config->soft_min_rad ? angle_rad : config->soft_min_rad;
+    joint->high_rad = angle_rad > config->soft_max_rad ? angle_rad : config->soft_max_rad;
+    joint->gravity_duty = 0.0f;
+    joint->duty_cap = config->duty_limit;
+    joint->following_ticks = 0u;
+    joint->stall_ticks = 0u;
+    joint->stall_mark_rad = angle_rad;
+    joint->held_back = 0u;
+}
+
+static uint32_t enable(core_state *core, bool inward)
+{
+    if (core->state != STATE_DISABLED) {
+        return REFUSAL_WRONG_STATE;
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        const joint_config *config = &core->config.joint[i];
+        if (!pot_is_read(&core->joint[i].pot)) {
+            return REFUSAL_POT_UNREAD;
+        }
+        if (!inward && !number_within(core->joint[i].pot.angle_rad, config->soft_min_rad, config->soft_max_rad)) {
+            return REFUSAL_OUTSIDE_LIMITS;
+        }
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        start_joint(&core->joint[i], &core->config.joint[i]);
+    }
+    core->state = STATE_ENABLED;
+    core->silent_ticks = 0u;
+    return REFUSAL_NONE;
+}
+
+static uint32_t disable(core_state *core)
+{
+    if (core->state == STATE_STOPPED) {
+        return REFUSAL_WRONG_STATE;
+    }
+    core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
+    return REFUSAL_NONE;
+}
+
+static uint32_t clear_faults(core_state *core)
+{
+    if (core->state == STATE_STOPPED || core->state == STATE_STOPPING) {
+        return REFUSAL_WRONG_STATE;
+    }
+    if (core->standing != 0u) {
+        return REFUSAL_FAULT_STANDS;
+    }
+    safety_forget(core);
+    if (core->state == STATE_FAULTED) {
+        core->state = STATE_DISABLED;
+    } else if (core->state == STATE_HOLDING) {
+        core->state = STATE_ENABLED; /* the arm is held already; letting go of it would drop it */
+        core->silent_ticks = 0u;
+    }
+    return REFUSAL_NONE;
+}
+
+static uint32_t clear_stop(core_state *core, bool pressed)
+{
+    if (core->state != STATE_STOPPED) {
+        return REFUSAL_WRONG_STATE;
+    }
+    if (pressed) {
+        return REFUSAL_STOP_PRESSED;
+    }
+    core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
+    return REFUSAL_NONE;
+}
+
+static uint32_t check_move(const move_command *move)
+{
+    const bool lasts = move->duration_ticks >= 1u && move->duration_ticks <= 10000u;
+    uint32_t refusal = lasts ? REFUSAL_NONE : REFUSAL_OUT_OF_RANGE;
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i]) ||
+            !number_finite(move->gravity_duty[i])) {
+            return REFUSAL_NOT_FINITE;
+        }
+        if (!number_within(move->gravity_duty[i], -1.0f, 1.0f)) {
+            refusal = REFUSAL_OUT_OF_RANGE;
+        }
+    }
+    return refusal;
+}
+
+static void move_joint(joint_state *joint, const joint_config *config, const move_command *move, uint32_t i)
+{
+    const float limit_rad_s = config->speed_limit_rad_s;
+    const float to_rad = number_clamp(move->position_rad[i], joint->low_rad, joint->high_rad);
+    float to_rad_s = number_clamp(move->speed_rad_s[i], -limit_rad_s, limit_rad_s);
+    uint32_t held_back = to_rad_s != move->speed_rad_s[i] ? LIMITED_SPEED : 0u;
+    if (to_rad != move->position_rad[i]) {
+        held_back |= LIMITED_SOFT;
+        to_rad_s = 0.0f; /* it ends at the limit, so it ends at rest */
+    }
+    if (setpoint_aim(&joint->setpoint, to_rad, to_rad_s, move->duration_ticks, limit_rad_s)) {
+        held_back |= LIMITED_SPEED;
+    }
+    joint->held_back = held_back;
+    joint->gravity_duty = move->gravity_duty[i];
+}
+
+static uint32_t take_move(core_state *core, const move_command *move)
+{
+    const uint32_t refusal = core->state == STATE_ENABLED ? check_move(move) : REFUSAL_WRONG_STATE;
+    if (refusal != REFUSAL_NONE) {
+        return refusal;
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        move_joint(&core->joint[i], &core->config.joint[i], move, i);
+    }
+    core->silent_ticks = 0u;
+    return REFUSAL_NONE;
+}
+
+static uint32_t take_gains(core_state *core, const gain_set *gains)
+{
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        if (!pid_gains_finite(&gains->joint[i])) {
+            return REFUSAL_NOT_FINITE;
+        }
+        if (!pid_gains_in_range(&gains->joint[i])) {
+            return REFUSAL_OUT_OF_RANGE;
+        }
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        pid_change_gains(&core->joint[i].pid, &core->config.joint[i].gains, &gains->joint[i]);
+        core->config.joint[i].gains = gains->joint[i];
+    }
+    return REFUSAL_NONE;
+}
+
+static uint32_t obey(core_state *core, const core_inputs *inputs)
+{
+    const core_command *command = &inputs->command;
+    switch (command->kind) {
+    case COMMAND_MOVE:
+        return take_move(core, &command->move);
+    case COMMAND_ENABLE:
+        return enable(core, false);
+    case COMMAND_ENABLE_INWARD:
+        return enable(core, true);
+    case COMMAND_DISABLE:
+        return disable(core);
+    case COMMAND_CLEAR_FAULTS:
+        return clear_faults(core);
+    case COMMAND_CLEAR_STOP:
+        return clear_stop(core, inputs->stop_pressed != 0u);
+    case COMMAND_GAINS:
+        return take_gains(core, &command->gains);
+    default:
+        return REFUSAL_UNKNOWN_COMMAND;
+    }
+}
+
+void command_take(core_state *core, const core_inputs *inputs)
+{
+    if (inputs->command.kind == COMMAND_NONE) {
+        return;
+    }
+    const uint32_t refusal = obey(core, inputs);
+    if (refusal == REFUSAL_NONE) {
+        core->obeyed_sequence = inputs->command.sequence;
+        core->obeyed_count++;
+    } else {
+        core->refused_sequence = inputs->command.sequence;
+        core->refused_count++;
+        core->refusal = refusal;
+    }
+}

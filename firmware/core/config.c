@@ -1,0 +1,162 @@
+#include "config.h"
+
+#include <stddef.h>
+
+#include "number.h"
+#include "pid.h"
+
+_Static_assert(sizeof(pot_config) == 2u * (POT_NODES + 3u) + 4u * (POT_NODES + 4u), "pot_config has a hole");
+_Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32_t), "config_copy has a hole");
+
+uint32_t config_crc(const void *bytes, uint32_t length)
+{
+    const uint8_t *byte = bytes;
+    uint32_t crc = 0xFFFFFFFFu;
+    for (uint32_t i = 0u; i < length; i++) {
+        crc ^= byte[i];
+        for (uint32_t bit = 0u; bit < 8u; bit++) {
+            crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
+        }
+    }
+    return ~crc;
+}
+
+static const joint_config factory_joint = {
+    .gains = {.kp_per_rad = 1.0f, .derivative_filter_s = 0.005f, .anti_windup_per_s = 10.0f},
+    .pot = {.node_count = 2u,
+            .counts = {3277u, 62258u},
+            .short_counts = 1000u,
+            .open_counts = 64500u,
+            .angle_rad = {-2.6f, 2.6f},
+            .direction = 1,
+            .jump_rad = 0.02f,
+            .frozen_rad = 0.1f,
+            .inverted_rad = 0.1f},
+    .soft_min_rad = -2.4f,
+    .soft_max_rad = 2.4f,
+    .speed_limit_rad_s = 0.5f,
+    .deceleration_rad_s2 = 5.0f,
+    .duty_limit = 0.2f,
+    .duty_slew_per_s = 5.0f,
+    .current_cut_per_a_s = 5.0f,
+    .following_rad = 0.3f,
+    .stall_duty = 0.19f,
+    .stall_rad = 0.01f,
+    .current_limit_ma = 1000u,
+    .motor_direction = 1,
+};
+
+void config_factory(core_config *config)
+{
+    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+        config->joint[joint] = factory_joint;
+    }
+    config->supply_min_mv = 10000u;
+    config->supply_max_mv = 14000u;
+    config->supply_ticks = 5u;
+    config->pot_ticks = 5u;
+    config->following_ticks = 50u;
+    config->stall_ticks = 500u;
+    config->silence_ticks = 100u;
+    config->silence_reaction = REACTION_HOLD;
+}
+
+static bool pot_is_valid(const pot_config *pot)
+{
+    if (pot->node_count < 2u || pot->node_count > POT_NODES || pot->short_counts >= pot->open_counts) {
+        return false;
+    }
+    const bool rising = pot->angle_rad[1] > pot->angle_rad[0];
+    for (uint32_t node = 0u; node < pot->node_count; node++) {
+        if (!number_within(pot->angle_rad[node], -13.0f, 13.0f)) {
+            return false;
+        }
+        if (node == 0u) {
+            continue;
+        }
+        const float before = pot->angle_rad[node - 1u];
+        const bool onwards = rising ? pot->angle_rad[node] > before : pot->angle_rad[node] < before;
+        if (!onwards || pot->counts[node] <= pot->counts[node - 1u]) {
+            return false;
+        }
+    }
+    return (pot->direction == 1 || pot->direction == -1) && number_within(pot->jump_rad, 1e-4f, 1.0f) &&
+           number_within(pot->frozen_rad, 1e-3f, 1.0f) && number_within(pot->inverted_rad, 1e-3f, 1.0f);
+}
+
+static bool joint_is_valid(const joint_config *joint)
+{
+    return pid_gains_in_range(&joint->gains) && pot_is_valid(&joint->pot) &&
+           number_within(joint->soft_min_rad, -13.0f, 13.0f) && number_within(joint->soft_max_rad, -13.0f, 13.0f) &&
+           joint->soft_min_rad < joint->soft_max_rad && number_within(joint->speed_limit_rad_s, 0.01f, 20.0f) &&
+           number_within(joint->deceleration_rad_s2, 0.1f, 1000.0f) && number_within(joint->duty_limit, 0.0f, 1.0f) &&
+           number_within(joint->duty_slew_per_s, 0.1f, 1000.0f) &&
+           number_within(joint->current_cut_per_a_s, 0.0f, 1000.0f) &&
+           number_within(joint->following_rad, 1e-3f, 13.0f) && number_within(joint->stall_duty, 0.01f, 1.0f) &&
+           number_within(joint->stall_rad, 1e-4f, 1.0f) &&
+           (joint->motor_direction == 1 || joint->motor_direction == -1);
+}
+
+static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return ticks >= least && ticks <= most; }
+
+bool config_is_valid(const core_config *config)
+{
+    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+        if (!joint_is_valid(&config->joint[joint])) {
+            return false;
+        }
+    }
+    return config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_ticks, 1u, 1000u) &&
+           ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&
+           ticks_within(config->stall_ticks, 1u, 10000u) && ticks_within(config->silence_ticks, 2u, 60000u) &&
+           (config->silence_reaction == REACTION_HOLD || config->silence_reaction == REACTION_RELEASE);
+}
+
+void config_seal(config_copy *copy, const core_config *config, uint32_t serial)
+{
+    copy->magic = CONFIG_MAGIC;
+    copy->version = CONFIG_VERSION;
+    copy->serial = serial;
+    copy->config = *config;
+    copy->crc = config_crc(copy, (uint32_t)offsetof(config_copy, crc));
+}
+
+static bool copy_is_good(const config_copy *copy)
+{
+    return copy->magic == CONFIG_MAGIC && copy->version == CONFIG_VERSION &&
+           copy->crc == config_crc(copy, (uint32_t)offsetof(config_copy, crc)) && config_is_valid(&copy->config);
+}
+
+/* Return the newer of two copies; serial numbers may wrap. */
+static const config_copy *newer(const config_copy *first, const config_copy *second)
+{
+    return second->serial - first->serial - 1u < 0x7FFFFFFFu ? second : first;
+}
+
+uint32_t config_load(core_config *config, const config_copy *first, const config_copy *second)
+{
+    const bool first_good = copy_is_good(first);
+    const bool second_good = copy_is_good(second);
+    if (first_good && second_good) {
+        *config = newer(first, second)->config;
+        return CONFIG_NEWEST;
+    }
+    if (first_good || second_good) {
+        *config = first_good ? first->config : second->config;
+        return CONFIG_OLDER;
+    }
+    config_factory(config);
+    return CONFIG_FACTORY;
+}
+
+uint32_t config_next(const config_copy *first, const config_copy *second, uint32_t *serial)
+{
+    const bool first_good = copy_is_good(first);
+    const bool second_good = copy_is_good(second);
+    const config_copy *keep = first_good ? first : second;
+    if (first_good && second_good) {
+        keep = newer(first, second);
+    }
+    *serial = first_good || second_good ? keep->serial + 1u : 1u;
+    return keep == first ? 1u : 0u;
+}

@@ -1,0 +1,27 @@
+/* The few operations on numbers the core needs and the C library would otherwise give. Any context. */
+#ifndef ARMSIGHT_NUMBER_H
+#define ARMSIGHT_NUMBER_H
+
+#include <float.h>
+#include <stdbool.h>
+#include <stdint.h>
+
+/* The same bits everywhere need float arithmetic that is float arithmetic. */
+_Static_assert(FLT_EVAL_METHOD == 0, "float expressions must be computed in float");
+
+/* Tell whether x is neither NaN nor infinite. */
+static inline bool number_finite(float x) { return x >= -FLT_MAX && x <= FLT_MAX; }
+
+/* Tell whether x lies in [low, high]; NaN does not. */
+static inline bool number_within(float x, float low, float high) { return x >= low && x <= high; }
+
+/* Return x held within [low, high]; low <= high. */
+static inline float number_clamp(float x, float low, float high) { return x < low ? low : (x > high ? high : x); }
+
+/* Return the size of x. */
+static inline float number_size(float x) { return x < 0.0f ? -x : x; }
+
+/* Return count + 1, or count where it would wrap. */
+static inline uint32_t number_count(uint32_t count) { return count == UINT32_MAX ? count : count + 1u; }
+
+#endif

@@ -1,0 +1,78 @@
+#include "pid.h"
+
+#include "number.h"
+
+void pid_reset(pid_state *pid, float measured_rad)
+{
+    *pid = (pid_state){.measured_rad = measured_rad};
+}
+
+void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
+{
+    const float raw_rad_s = (measured_rad - pid->measured_rad) / TICK_S;
+    const float weight = TICK_S / (gains->derivative_filter_s + TICK_S);
+    pid->speed_rad_s += weight * (raw_rad_s - pid->speed_rad_s);
+    pid->measured_rad = measured_rad;
+}
+
+/* Return the duty asked for held to the limits, and say which of them held it. */
+static float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
+{
+    const float within = number_clamp(asked, -demand->duty_cap, demand->duty_cap);
+    if (within != asked) {
+        *limited |= demand->duty_cap < demand->duty_limit ? LIMITED_CURRENT : LIMITED_DUTY;
+    }
+    const float step = demand->duty_slew_per_s * TICK_S;
+    const float reached = number_clamp(within, pid->duty - step, pid->duty + step);
+    if (reached != within) {
+        *limited |= LIMITED_SLEW;
+    }
+    return reached;
+}
+
+float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
+{
+    const float error_rad = demand->reference_rad - pid->measured_rad;
+    const float asked = gains->kp_per_rad * error_rad + pid->integral_duty - gains->kd_s_per_rad * pid->speed_rad_s +
+                        gains->kv_s_per_rad * demand->reference_rad_s + demand->gravity_duty;
+    const float duty = limited_duty(pid, demand, asked, limited);
+    float integral = pid->integral_duty;
+    if (gains->ki_per_rad_s > 0.0f) {
+        /* Back-calculation: what a limit took away is taken from the integral as well. */
+        const float pull = gains->anti_windup_per_s * (duty - asked);
+        integral += TICK_S * (gains->ki_per_rad_s * error_rad + pull);
+    } else {
+        /* Nothing feeds the integral: what a change of gains left in it fades. */
+        integral -= TICK_S * gains->anti_windup_per_s * integral;
+    }
+    pid->integral_duty = number_clamp(integral, -demand->duty_limit, demand->duty_limit);
+    if (pid->integral_duty != integral) {
+        *limited |= LIMITED_DUTY;
+    }
+    pid->duty = duty;
+    pid->error_rad = error_rad;
+    pid->reference_rad_s = demand->reference_rad_s;
+    return duty;
+}
+
+void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gains *after)
+{
+    pid->integral_duty += (before->kp_per_rad - after->kp_per_rad) * pid->error_rad -
+                          (before->kd_s_per_rad - after->kd_s_per_rad) * pid->speed_rad_s +
+                          (before->kv_s_per_rad - after->kv_s_per_rad) * pid->reference_rad_s;
+}
+
+bool pid_gains_finite(const joint_gains *gains)
+{
+    return number_finite(gains->kp_per_rad) && number_finite(gains->ki_per_rad_s) &&
+           number_finite(gains->kd_s_per_rad) && number_finite(gains->kv_s_per_rad) &&
+           number_finite(gains->derivative_filter_s) && number_finite(gains->anti_windup_per_s);
+}
+
+bool pid_gains_in_range(const joint_gains *gains)
+{
+    return number_within(gains->kp_per_rad, 0.0f, 100.0f) && number_within(gains->ki_per_rad_s, 0.0f, 1000.0f) &&
+           number_within(gains->kd_s_per_rad, 0.0f, 100.0f) && number_within(gains->kv_s_per_rad, 0.0f, 100.0f) &&
+           number_within(gains->derivative_filter_s, 0.0f, 1.0f) &&
+           number_within(gains->anti_windup_per_s, 0.0f, 1000.0f);
+}

@@ -1,0 +1,28 @@
+/* The control law of one joint (docs/firmware.md, "Control law"). Float32, 1 kHz, no state but pid_state.
+ * All functions: tick context, one caller per state. */
+#ifndef ARMSIGHT_PID_H
+#define ARMSIGHT_PID_H
+
+#include <stdbool.h>
+
+#include "types.h"
+
+/* Forget everything: duty and integral 0, speed 0 at measured_rad. */
+void pid_reset(pid_state *pid, float measured_rad);
+
+/* Take this tick's measurement (rad) into the speed filter; every tick, driven or not. */
+void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad);
+
+/* Compute this tick's duty (-duty_limit to duty_limit) from the last measurement; sets LIMITED_... bits in *limited. */
+float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited);
+
+/* Move what a change of gains would add to the output into the integral, so that the output does not jump. */
+void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gains *after);
+
+/* Tell whether every gain is finite. */
+bool pid_gains_finite(const joint_gains *gains);
+
+/* Tell whether every gain is in the range types.h names. */
+bool pid_gains_in_range(const joint_gains *gains);
+
+#endif

@@ -1,0 +1,38 @@
+/* Faults: how they latch, what they do to the arm, and what watches for them. All functions: tick context, except the
+ * texts, which any context may ask for. */
+#ifndef ARMSIGHT_SAFETY_H
+#define ARMSIGHT_SAFETY_H
+
+#include <stdbool.h>
+
+#include "types.h"
+
+/* Return the short name of a fault, a state or a refusal ("POT_OPEN"), or "?" for a code that is none. */
+const char *fault_name(uint32_t code);
+const char *state_name(uint32_t code);
+const char *refusal_name(uint32_t code);
+
+/* Return its text for people, or "?" for a code that is none. */
+const char *fault_text(uint32_t code);
+const char *state_text(uint32_t code);
+const char *refusal_text(uint32_t code);
+
+/* Tell whether the drives are on in the present state. */
+bool safety_drives_on(const core_state *core);
+
+/* Latch a fault of a joint (0 to 5, or NO_JOINT), whose cause stands in this tick, and react to it. */
+void safety_raise(core_state *core, uint32_t fault, uint32_t joint);
+
+/* Take the emergency stop: drives off in every state. */
+void safety_stop(core_state *core);
+
+/* Forget all latched faults; the caller has made sure that none of their causes stands. */
+void safety_forget(core_state *core);
+
+/* Watch the tick timer, the supply and, while the arm follows the host, the host's silence. */
+void safety_watch_arm(core_state *core, const core_inputs *inputs);
+
+/* Watch a driven joint (0 to 5) that read counts in this tick, after its duty is known. */
+void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts);
+
+#endif

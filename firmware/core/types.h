@@ -1,0 +1,294 @@
+/* Every record of the core: what a tick takes, what it gives, what it remembers and how it is set up.
+ *
+ * Angles are radians at the joint, duties are fractions of full drive (-1 to 1), counts are 16-bit fractions of the
+ * potentiometer's supply (a 12-bit converter's reading is shifted left by four). Every record is built of fields of
+ * two or four bytes without a hole, so that it reads the same on every machine and can be stored and checked as bytes.
+ * Integers where a board measures, floats where the law computes: what comes from a board can never be NaN.
+ */
+#ifndef ARMSIGHT_TYPES_H
+#define ARMSIGHT_TYPES_H
+
+#include <stdint.h>
+
+#define JOINTS 6u
+#define POT_NODES 9u
+#define TICKS_PER_S 1000u
+#define TICK_S 0.001f
+#define NO_JOINT 255u
+
+/* X(name, code, reaction, text): the faults. A fault latches; docs/firmware.md says when each comes. */
+#define FAULT_LIST(X)                                                                                 \
+    X(POT_OPEN, 1, RELEASE, "potentiometer open: the reading is above its band")                      \
+    X(POT_SHORT, 2, RELEASE, "potentiometer short: the reading is below its band")                    \
+    X(POT_FROZEN, 3, RELEASE, "potentiometer frozen: the reading stands still while the arm is told to move") \
+    X(POT_JUMP, 4, RELEASE, "potentiometer jump: the reading moved faster than the joint can")        \
+    X(POT_INVERTED, 5, RELEASE, "inverted: the joint moves away from its command")                    \
+    X(FOLLOWING, 6, RELEASE, "following error: the joint is too far from its reference")              \
+    X(STALL, 7, RELEASE, "stall: the motor is driven hard and the joint does not turn")               \
+    X(HOST_SILENT, 8, CHOSEN, "host silent: no motion command within the time set")                   \
+    X(SUPPLY_LOW, 9, RELEASE, "supply too low")                                                       \
+    X(SUPPLY_HIGH, 10, RELEASE, "supply too high")                                                    \
+    X(TICK_MISSED, 11, HOLD, "tick missed: the control loop lost time")                               \
+    X(TICK_OVERRUN, 12, HOLD, "tick overrun: the control loop took longer than its period")           \
+    X(WATCHDOG, 13, RELEASE, "restarted by the watchdog")                                             \
+    X(CONFIG, 14, RELEASE, "no valid configuration: factory values are in use")
+
+/* X(name, code, text): the states. */
+#define STATE_LIST(X)                                                     \
+    X(DISABLED, 0, "disabled: drives off")                                \
+    X(ENABLED, 1, "enabled: follows the host")                            \
+    X(STOPPING, 2, "stopping: a fault slows the arm down to rest")        \
+    X(HOLDING, 3, "holding: a fault stands, the arm is held at rest")     \
+    X(FAULTED, 4, "faulted: a fault stands, drives off")                  \
+    X(STOPPED, 5, "emergency stop: drives off until it is cleared")
+
+/* X(name, code, text): why a command was not obeyed. A refused command changes nothing. */
+#define REFUSAL_LIST(X)                                                                \
+    X(NOT_FINITE, 1, "a number is NaN or infinite")                                    \
+    X(OUT_OF_RANGE, 2, "a number is outside its range")                                \
+    X(WRONG_STATE, 3, "not in this state")                                             \
+    X(OUTSIDE_LIMITS, 4, "a joint is outside its soft limits: enable to move back in") \
+    X(POT_UNREAD, 5, "a potentiometer is not read")                                    \
+    X(FAULT_STANDS, 6, "the cause of a fault still stands")                            \
+    X(STOP_PRESSED, 7, "the emergency stop is still pressed")                          \
+    X(UNKNOWN_COMMAND, 8, "unknown command")
+
+#define FAULT_CODE(name, code, reaction, text) FAULT_##name = (code),
+#define STATE_CODE(name, code, text) STATE_##name = (code),
+#define REFUSAL_CODE(name, code, text) REFUSAL_##name = (code),
+enum { FAULT_NONE = 0, FAULT_LIST(FAULT_CODE) FAULT_COUNT };
+enum { STATE_LIST(STATE_CODE) STATE_COUNT };
+enum { REFUSAL_NONE = 0, REFUSAL_LIST(REFUSAL_CODE) REFUSAL_COUNT };
+#undef FAULT_CODE
+#undef STATE_CODE
+#undef REFUSAL_CODE
+
+/* What a fault does to a moving arm. CHOSEN is the configuration's silence_reaction. */
+enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3 };
+
+/* What a command asks for. */
+enum {
+    COMMAND_NONE = 0,
+    COMMAND_MOVE = 1,
+    COMMAND_ENABLE = 2,
+    COMMAND_ENABLE_INWARD = 3,
+    COMMAND_DISABLE = 4,
+    COMMAND_CLEAR_FAULTS = 5,
+    COMMAND_CLEAR_STOP = 6,
+    COMMAND_GAINS = 7,
+};
+
+/* What holds a joint back without being a fault, one bit each. */
+enum {
+    LIMITED_DUTY = 1,
+    LIMITED_SLEW = 2,
+    LIMITED_CURRENT = 4,
+    LIMITED_SOFT = 8,
+    LIMITED_SPEED = 16,
+};
+
+/* Where a configuration came from. */
+enum { CONFIG_NEWEST = 0, CONFIG_OLDER = 1, CONFIG_FACTORY = 2 };
+
+/* The gains of one joint. */
+typedef struct joint_gains {
+    float kp_per_rad;          /* duty per rad of error, 0 to 100 */
+    float ki_per_rad_s;        /* duty per second and rad of error, 0 to 1000 */
+    float kd_s_per_rad;        /* duty per rad/s of measured speed, 0 to 100: damps */
+    float kv_s_per_rad;        /* duty per rad/s of reference speed, 0 to 100: feed-forward */
+    float derivative_filter_s; /* time constant of the speed filter, 0 to 1: longer is smoother and later */
+    float anti_windup_per_s;   /* how fast the integral gives way to a limit, 0 to 1000: 1/time constant */
+} joint_gains;
+
+/* A gain set: all joints at once, so that no tick ever sees half of it. */
+typedef struct gain_set {
+    joint_gains joint[JOINTS];
+} gain_set;
+
+/* How one potentiometer is read. */
+typedef struct pot_config {
+    uint16_t node_count;         /* 2 to POT_NODES: used nodes of the table */
+    uint16_t counts[POT_NODES];  /* rising strictly over the used nodes */
+    uint16_t short_counts;       /* below it the wiper is shorted to ground */
+    uint16_t open_counts;        /* above it the wiper is open: a pull-up must lift it */
+    float angle_rad[POT_NODES];  /* joint angle at each node before direction, strictly monotone, -13 to 13 */
+    int32_t direction;           /* 1 or -1, multiplies the table's angle */
+    float jump_rad;              /* largest change the joint can make in one tick, 1e-4 to 1 */
+    float frozen_rad;            /* reference travel over which the counts must change, 1e-3 to 1 */
+    float inverted_rad;          /* travel away from the command that proves an inversion, 1e-3 to 1 */
+} pot_config;
+
+/* The configuration of one joint. */
+typedef struct joint_config {
+    joint_gains gains;
+    pot_config pot;
+    float soft_min_rad;        /* -13 to 13, below soft_max_rad */
+    float soft_max_rad;        /* -13 to 13 */
+    float speed_limit_rad_s;   /* 0.01 to 20: bounds the reference's speed */
+    float deceleration_rad_s2; /* 0.1 to 1000: how a stop slows the reference down */
+    float duty_limit;          /* 0 to 1 */
+    float duty_slew_per_s;     /* 0.1 to 1000: largest change of duty */
+    float current_cut_per_a_s; /* 0 to 1000: duty taken away per second and ampere beyond the limit */
+    float following_rad;       /* 1e-3 to 13: largest distance from the reference */
+    float stall_duty;          /* 0.01 to 1: from here on the motor must turn the joint */
+    float stall_rad;           /* 1e-4 to 1: turning less than this within stall_ticks is standing still */
+    uint32_t current_limit_ma; /* motor current from which the duty is cut */
+    int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
+} joint_config;
+
+/* The configuration of the arm. Times are in ticks of 1 ms. */
+typedef struct core_config {
+    joint_config joint[JOINTS];
+    uint32_t supply_min_mv;
+    uint32_t supply_max_mv;
+    uint32_t supply_ticks;     /* 1 to 1000: a supply fault must last as long */
+    uint32_t pot_ticks;        /* 1 to 100: so must an open, short or jumping potentiometer */
+    uint32_t following_ticks;  /* 1 to 10000: and a following error */
+    uint32_t stall_ticks;      /* 1 to 10000: and a stall */
+    uint32_t silence_ticks;    /* 2 to 60000: longest time without a motion command */
+    uint32_t silence_reaction; /* REACTION_HOLD or REACTION_RELEASE */
+} core_config;
+
+/* One stored copy of the configuration. */
+typedef struct config_copy {
+    uint32_t magic;
+    uint32_t version;
+    uint32_t serial; /* rises by one with each copy written */
+    core_config config;
+    uint32_t crc; /* CRC-32 of everything before it */
+} config_copy;
+
+/* What a motion command asks of the joints. */
+typedef struct move_command {
+    float position_rad[JOINTS]; /* where to be when duration_ticks have passed; clamped to the soft limits */
+    float speed_rad_s[JOINTS];  /* how fast to be there; clamped to the speed limits */
+    float gravity_duty[JOINTS]; /* -1 to 1: duty that carries the arm's weight, added from the next tick on */
+    uint32_t duration_ticks;    /* 1 to 10000: usually the host's own period */
+} move_command;
+
+/* One command of the host. */
+typedef struct core_command {
+    uint32_t kind;     /* COMMAND_... */
+    uint32_t sequence; /* the host's number for it, given back when it is obeyed or refused */
+    move_command move; /* read for COMMAND_MOVE only */
+    gain_set gains;    /* read for COMMAND_GAINS only */
+} core_command;
+
+/* What a tick takes. */
+typedef struct core_inputs {
+    uint32_t tick;               /* the board's tick timer: one more each time, it may wrap */
+    uint32_t overrun;            /* not 0: the last tick had not ended when this one was due */
+    uint32_t stop_pressed;       /* not 0: an emergency stop is asked for, by button or by message */
+    uint32_t supply_mv;          /* motor supply */
+    uint32_t counts[JOINTS];     /* potentiometers, 0 to 65535 */
+    uint32_t current_ma[JOINTS]; /* size of the motor currents; 0 where a board does not measure them */
+    core_command command;        /* COMMAND_NONE where none came since the last tick */
+} core_inputs;
+
+/* What a tick gives. */
+typedef struct core_outputs {
+    uint32_t tick;                /* the input's */
+    uint32_t drives_on;           /* 0: switch the motor drivers off */
+    uint32_t feed_watchdog;       /* not 0: the tick ran to its end, the watchdog may be fed */
+    uint32_t state;               /* STATE_... */
+    uint32_t faults;              /* latched faults, bit number = code */
+    uint32_t joint_faults[JOINTS]; /* the same, those of each joint */
+    uint32_t first_fault;         /* the fault that came first since the last clear, FAULT_NONE without */
+    uint32_t first_joint;         /* its joint, NO_JOINT where it belongs to none */
+    uint32_t obeyed_sequence;     /* the last command obeyed */
+    uint32_t obeyed_count;        /* how many were, it wraps */
+    uint32_t refused_sequence;    /* the last command refused */
+    uint32_t refused_count;       /* how many were, it wraps */
+    uint32_t refusal;             /* why that one was, REFUSAL_... */
+    uint32_t limited[JOINTS];     /* LIMITED_... bits of this tick */
+    float duty[JOINTS];           /* to the motors, -1 to 1 */
+    float angle_rad[JOINTS];      /* measured */
+    float speed_rad_s[JOINTS];    /* measured, filtered as the derivative is */
+    float reference_rad[JOINTS];  /* where the joint is to be */
+    float reference_rad_s[JOINTS]; /* how fast it is to move */
+} core_outputs;
+
+/* What the controller of one joint remembers. */
+typedef struct pid_state {
+    float integral_duty;
+    float measured_rad;    /* last tick's, for the derivative */
+    float speed_rad_s;     /* filtered derivative of the measurement */
+    float duty;            /* last tick's, for the slew limit */
+    float error_rad;       /* last tick's, for a bumpless change of gains */
+    float reference_rad_s; /* likewise */
+} pid_state;
+
+/* What the controller of one joint is to reach and within which limits. */
+typedef struct pid_demand {
+    float reference_rad;
+    float reference_rad_s;
+    float gravity_duty;
+    float duty_limit;      /* 0 to 1 */
+    float duty_cap;        /* 0 to duty_limit: what the current limit leaves */
+    float duty_slew_per_s;
+} pid_demand;
+
+/* The reference of one joint: a cubic from one point to the next, then straight on. */
+typedef struct setpoint_state {
+    float position_rad;
+    float speed_rad_s;
+    float from_rad;
+    float from_rad_s;
+    float to_rad;
+    float to_rad_s;
+    uint32_t ticks;    /* length of the cubic */
+    uint32_t elapsed;  /* ticks since its beginning */
+} setpoint_state;
+
+/* What is remembered of one potentiometer. */
+typedef struct pot_state {
+    uint32_t valid;        /* not 0 once a reading was within its band */
+    uint32_t bad_ticks;    /* readings not believed in a row */
+    uint32_t last_counts;
+    float angle_rad;       /* the last one believed */
+    float mark_rad;        /* where the reference was when the counts last changed */
+    int32_t towards;       /* which way the joint is driven to its command, 0 while it is braked */
+    float farthest_rad;    /* how far that way it has been meanwhile */
+} pot_state;
+
+/* What is remembered of one joint. */
+typedef struct joint_state {
+    pid_state pid;
+    setpoint_state setpoint;
+    pot_state pot;
+    float gravity_duty;
+    float duty_cap;          /* what the current limit leaves of the duty limit */
+    float low_rad;           /* soft limits, widened to the joint's place while it is brought back in */
+    float high_rad;
+    uint32_t following_ticks;
+    uint32_t stall_ticks;
+    float stall_mark_rad;    /* where the joint was when stall_ticks began */
+    uint32_t held_back;      /* LIMITED_SOFT and LIMITED_SPEED of the last motion command */
+    uint32_t limited;        /* LIMITED_... of this tick */
+} joint_state;
+
+/* The whole controller. */
+typedef struct core_state {
+    uint32_t guard_head; /* a known word on either side: a stray write that passes through shows */
+    core_config config;
+    joint_state joint[JOINTS];
+    uint32_t state;
+    uint32_t started;        /* not 0 after the first tick */
+    uint32_t tick;
+    uint32_t silent_ticks;
+    uint32_t supply_bad_ticks;
+    uint32_t standing;       /* faults whose cause stands in this tick */
+    uint32_t faults;
+    uint32_t joint_faults[JOINTS];
+    uint32_t first_fault;
+    uint32_t first_joint;
+    uint32_t permanent;      /* faults only a restart takes away */
+    uint32_t obeyed_sequence;
+    uint32_t obeyed_count;
+    uint32_t refused_sequence;
+    uint32_t refused_count;
+    uint32_t refusal;
+    uint32_t guard_tail;
+} core_state;
+
+#endif

@@ -1,0 +1,31 @@
+"""The firmware's core as a shared library, built once for the whole run."""
+
+import ctypes
+
+import pytest
+from firmware_arm import LabArm, declare
+from firmware_build import build_host, compilers
+
+
+@pytest.fixture(scope="session")
+def libraries(tmp_path_factory):
+    """The host build of every compiler found, by the compiler's name."""
+    found = compilers()
+    if not found:
+        pytest.skip("no C compiler: install gcc, or ziglang from PyPI")
+    return {
+        name: declare(ctypes.CDLL(str(build_host(compiler, tmp_path_factory.mktemp(name)))))
+        for name, compiler in found.items()
+    }
+
+
+@pytest.fixture(scope="session")
+def library(libraries):
+    """The host build of the first compiler found."""
+    return next(iter(libraries.values()))
+
+
+@pytest.fixture
+def arm(library):
+    """An arm fresh from power-up."""
+    return LabArm(library)

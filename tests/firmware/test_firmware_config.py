@@ -1,0 +1,173 @@
+"""The configuration: two stored copies, and what each value may be."""
+
+import ctypes
+import random
+import zlib
+
+import pytest
+from firmware_arm import LabArm, lab_config
+from firmware_layout import RECORDS, c
+
+COPY_BYTES = ctypes.sizeof(c.config_copy)
+
+
+def config_of(library, silence_ticks):
+    """A configuration that can be told from others."""
+    config = lab_config(library)
+    config.silence_ticks = silence_ticks
+    return config
+
+
+def sealed(library, silence_ticks, serial):
+    copy = c.config_copy()
+    library.config_seal(ctypes.byref(copy), ctypes.byref(config_of(library, silence_ticks)), serial)
+    return copy
+
+
+def load(library, first, second):
+    """(where it came from, its silence_ticks)."""
+    config = c.core_config()
+    source = library.config_load(ctypes.byref(config), ctypes.byref(first), ctypes.byref(second))
+    return source, config.silence_ticks
+
+
+def following(library, first, second):
+    """(which copy to write, with which serial number)."""
+    serial = ctypes.c_uint32()
+    return library.config_next(ctypes.byref(first), ctypes.byref(second), ctypes.byref(serial)), serial.value
+
+
+def test_records_are_laid_out_as_the_header_is_read(library):
+    for name, record in RECORDS.items():
+        assert library.host_size(name.encode()) == ctypes.sizeof(record), name
+    assert library.host_size(b"core") == 0
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 936])
+def test_the_crc_is_the_usual_one(library, length):
+    data = random.Random(length).randbytes(length)
+    assert library.config_crc(data, length) == zlib.crc32(data)
+
+
+def test_the_newer_of_two_good_copies_is_used(library):
+    old, new = sealed(library, 111, 4), sealed(library, 222, 5)
+    assert load(library, old, new) == (c.CONFIG_NEWEST, 222)
+    assert load(library, new, old) == (c.CONFIG_NEWEST, 222)
+
+
+def test_serial_numbers_may_wrap(library):
+    old, new = sealed(library, 111, 2**32 - 1), sealed(library, 222, 0)
+    assert load(library, old, new) == (c.CONFIG_NEWEST, 222)
+    assert load(library, new, old) == (c.CONFIG_NEWEST, 222)
+
+
+@pytest.mark.parametrize("order", [1, -1], ids=["newer second", "newer first"])
+def test_the_older_copy_is_used_whichever_byte_of_the_newer_is_flipped(library, order):
+    draw = random.Random(order)
+    old = sealed(library, 111, 4)
+    whole = bytes(sealed(library, 222, 5))
+    for at in range(COPY_BYTES):
+        broken = bytearray(whole)
+        broken[at] ^= 1 << draw.randrange(8)
+        pair = (old, c.config_copy.from_buffer(broken))
+        assert load(library, *pair[::order]) == (c.CONFIG_OLDER, 111)
+
+
+@pytest.mark.parametrize("byte", [b"\x00", b"\xff"], ids=["zeros", "erased"])
+def test_without_a_good_copy_the_factory_values_are_used_and_the_arm_stays_off(library, byte):
+    empty = c.config_copy.from_buffer_copy(byte * COPY_BYTES)
+    factory = c.core_config()
+    library.config_factory(ctypes.byref(factory))
+    assert load(library, empty, empty) == (c.CONFIG_FACTORY, factory.silence_ticks)
+    assert library.config_is_valid(ctypes.byref(factory))
+    arm = LabArm(library, factory, source=c.CONFIG_FACTORY)
+    arm.enable()
+    assert not arm.obeyed()
+    assert arm.outputs.first_fault == c.FAULT_CONFIG
+
+
+def test_a_power_cut_while_writing_never_costs_the_only_good_copy(library):
+    """Write a hundred configurations, each write cut off somewhere: what is loaded is the last whole one."""
+    draw = random.Random(7)
+    store = [bytearray(b"\xff" * COPY_BYTES), bytearray(b"\xff" * COPY_BYTES)]
+    copies = [c.config_copy.from_buffer(slot) for slot in store]
+    last = None
+    for number in range(100, 200):
+        slot, serial = following(library, *copies)
+        assert serial == (1 if last is None else copies[1 - slot].serial + 1)
+        whole = bytes(sealed(library, number, serial))
+        cut = draw.choice([0, COPY_BYTES, draw.randrange(COPY_BYTES)])
+        store[slot][:] = whole[:cut] + b"\xff" * (COPY_BYTES - cut)
+        last = number if cut == COPY_BYTES else last
+        source, loaded = load(library, *copies)
+        assert last is None or (source != c.CONFIG_FACTORY and loaded == last)
+
+
+NAN, INF = float("nan"), float("inf")
+WRONG = {
+    "gains.kp_per_rad": [-0.1, 100.1, NAN, INF],
+    "gains.ki_per_rad_s": [-1, 1001, NAN],
+    "gains.kd_s_per_rad": [-1, 101, NAN],
+    "gains.kv_s_per_rad": [-1, 101, NAN],
+    "gains.derivative_filter_s": [-0.001, 1.1, NAN],
+    "gains.anti_windup_per_s": [-1, 1001, NAN],
+    "pot.node_count": [0, 1, 10],
+    "pot.counts.1": [3277, 0],
+    "pot.short_counts": [64500, 65000],
+    "pot.angle_rad.0": [2.6, 14, NAN],
+    "pot.angle_rad.1": [-13.5, NAN, INF],
+    "pot.direction": [0, 2, -2],
+    "pot.jump_rad": [0, 1.1, NAN],
+    "pot.frozen_rad": [0, 1.1, NAN],
+    "pot.inverted_rad": [0, 1.1, NAN],
+    "soft_min_rad": [2.4, -13.1, NAN],
+    "soft_max_rad": [-2.4, 13.1, NAN],
+    "speed_limit_rad_s": [0, 20.1, NAN],
+    "deceleration_rad_s2": [0, 1001, NAN],
+    "duty_limit": [-0.1, 1.01, NAN],
+    "duty_slew_per_s": [0, 1001, NAN],
+    "current_cut_per_a_s": [-1, 1001, NAN],
+    "following_rad": [0, 14, NAN],
+    "stall_duty": [0, 1.01, NAN],
+    "stall_rad": [0, 1.01, NAN],
+    "motor_direction": [0, 3],
+}
+WRONG_ARM = {
+    "supply_min_mv": [14000],
+    "supply_ticks": [0, 1001],
+    "pot_ticks": [0, 101],
+    "following_ticks": [0, 10001],
+    "stall_ticks": [0, 10001],
+    "silence_ticks": [1, 60001],
+    "silence_reaction": [0, 3],
+}
+
+
+def put(record, path, value):
+    *folders, last = path.split(".")
+    for name in folders:
+        record = getattr(record, name)
+    if last.isdigit():
+        record[int(last)] = value
+    else:
+        setattr(record, last, value)
+
+
+@pytest.mark.parametrize("path", [*WRONG, *WRONG_ARM])
+def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path):
+    for value in {**WRONG, **WRONG_ARM}[path]:
+        config = lab_config(library)
+        assert library.config_is_valid(ctypes.byref(config))
+        put(config.joint[4] if path in WRONG else config, path, value)
+        assert not library.config_is_valid(ctypes.byref(config)), value
+        arm = LabArm(library, config)  # even where it is handed over as good
+        assert arm.tick().first_fault == c.FAULT_CONFIG
+        assert arm.core.config.silence_ticks == 100
+
+
+def test_every_value_has_its_range_tried(library):
+    """A field added to the configuration must be added here."""
+    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "current_limit_ma")}
+    leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
+    assert leaves <= set(WRONG)
+    assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)
