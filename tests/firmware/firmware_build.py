@@ -11,7 +11,7 @@ FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 CORE = sorted((FIRMWARE / "core").glob("*.c"))
 HOST = [*CORE, FIRMWARE / "boards" / "host" / "host.c"]
 SHARED = ("-O2", "-shared", "-fPIC")
-CORTEX_M4F = ("-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4")
+CORTEX_M4F = ("-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp", "-fno-unwind-tables")
 
 
 def compilers() -> dict[str, list[str]]:

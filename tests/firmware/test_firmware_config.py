@@ -86,6 +86,13 @@ def test_without_a_good_copy_the_factory_values_are_used_and_the_arm_stays_off(l
     assert arm.outputs.first_fault == c.FAULT_CONFIG
 
 
+def test_a_sealed_copy_with_a_value_outside_its_range_is_broken(library):
+    config, copy = config_of(library, 222), c.config_copy()
+    config.joint[2].duty_limit = 1.5
+    library.config_seal(ctypes.byref(copy), ctypes.byref(config), 9)
+    assert load(library, sealed(library, 111, 4), copy) == (c.CONFIG_OLDER, 111)
+
+
 def test_a_power_cut_while_writing_never_costs_the_only_good_copy(library):
     """Write a hundred configurations, each write cut off somewhere: what is loaded is the last whole one."""
     draw = random.Random(7)

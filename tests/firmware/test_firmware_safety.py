@@ -461,10 +461,14 @@ def test_every_command_is_counted_as_obeyed_or_refused(moving):
     assert (moving.outputs.obeyed_count, moving.outputs.refused_count) == (before[0] + 3, before[1] + 3)
 
 
-@pytest.mark.parametrize(("joint", "field", "value", "refusal"), [
-    (0, "kp_per_rad", NAN, c.REFUSAL_NOT_FINITE), (5, "anti_windup_per_s", INF, c.REFUSAL_NOT_FINITE),
-    (5, "kp_per_rad", 101.0, c.REFUSAL_OUT_OF_RANGE), (3, "derivative_filter_s", -0.1, c.REFUSAL_OUT_OF_RANGE),
-])  # fmt: skip
+GAIN_FIELDS = [name for name, _ in c.joint_gains._fields_]
+
+
+@pytest.mark.parametrize(
+    ("joint", "field", "value", "refusal"),
+    [(k, field, [NAN, INF, -INF][k % 3], c.REFUSAL_NOT_FINITE) for k, field in enumerate(GAIN_FIELDS)]
+    + [(5 - k, field, [-0.1, 1001.0][k % 2], c.REFUSAL_OUT_OF_RANGE) for k, field in enumerate(GAIN_FIELDS)],
+)
 def test_a_gain_set_is_taken_whole_or_not_at_all(moving, joint, field, value, refusal):
     before = [bytes(entry.gains) for entry in moving.core.config.joint]
     gains = moving.inputs.command.gains
@@ -506,6 +510,18 @@ def test_a_target_beyond_the_soft_limit_ends_at_it(moving):
     assert moving.outputs.limited[0] & c.LIMITED_SOFT
     assert max(moving.angle_rad) < 2.4 + 0.01
     assert moving.outputs.faults == 0
+
+
+def test_a_reference_that_runs_on_stops_at_the_soft_limit(library):
+    config = lab_config(library)
+    config.silence_ticks = 1000
+    arm = LabArm(library, config, angle_rad=2.2)
+    arm.enable()
+    arm.move(2.39, speed_rad_s=1.0, ticks=300)
+    arm.tick(350)
+    assert arm.outputs.state == c.STATE_ENABLED
+    assert (arm.outputs.reference_rad[0], arm.outputs.reference_rad_s[0]) == (ctypes.c_float(2.4).value, 0.0)
+    assert arm.outputs.limited[0] & c.LIMITED_SOFT
 
 
 def test_a_jump_of_the_target_is_travelled_at_the_speed_limit(moving):
