@@ -114,8 +114,10 @@ static void rest(core_state *core)
     }
 }
 
+/* Write every field of the outputs. */
 static void report(const core_state *core, core_outputs *outputs)
 {
+    outputs->tick = core->tick;
     outputs->drives_on = safety_drives_on(core) ? 1u : 0u;
     outputs->feed_watchdog = 1u;
     outputs->state = core->state;
@@ -141,8 +143,8 @@ static void report(const core_state *core, core_outputs *outputs)
 
 void core_tick(core_state *core, const core_inputs *inputs, core_outputs *outputs)
 {
-    *outputs = (core_outputs){.tick = inputs->tick, .state = STATE_STOPPED, .first_joint = NO_JOINT};
     if (core->guard_head != GUARD || core->guard_tail != GUARD) {
+        *outputs = (core_outputs){.tick = inputs->tick, .state = STATE_STOPPED, .first_joint = NO_JOINT};
         return;
     }
     core->standing = 0u;

@@ -5,6 +5,7 @@ import ctypes
 import pytest
 from firmware_arm import LabArm, declare
 from firmware_build import build_host, compilers
+from firmware_layout import c
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +30,12 @@ def library(libraries):
 def arm(library):
     """An arm fresh from power-up."""
     return LabArm(library)
+
+
+@pytest.fixture
+def moving(arm):
+    """An arm that follows a sine without a fault."""
+    arm.enable()
+    arm.wander(500)
+    assert (arm.outputs.state, arm.outputs.faults) == (c.STATE_ENABLED, 0)
+    return arm

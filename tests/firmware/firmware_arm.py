@@ -132,3 +132,31 @@ class LabArm:
         obeyed = self.outputs.obeyed_sequence == self.sequence
         assert obeyed != (self.outputs.refused_sequence == self.sequence)
         return obeyed
+
+
+def twin_of(arm):
+    """A second arm in the very same condition."""
+    twin = LabArm(arm.library)
+    for name in ("core", "inputs", "outputs"):
+        record = getattr(arm, name)
+        setattr(twin, name, type(record).from_buffer_copy(record))
+    twin.angle_rad, twin.speed_rad_s = [*arm.angle_rad], [*arm.speed_rad_s]
+    return twin
+
+
+def read_as(joint, counts):
+    """A spoiler: this potentiometer reads so many counts."""
+
+    def spoil(arm):
+        arm.inputs.counts[joint] = counts
+
+    return spoil
+
+
+def supply(millivolts):
+    """A spoiler: the supply has so many millivolts."""
+
+    def spoil(arm):
+        arm.inputs.supply_mv = millivolts
+
+    return spoil
