@@ -98,6 +98,15 @@ def test_a_target_beyond_the_soft_limit_ends_at_it(moving):
     assert moving.outputs.faults == 0
 
 
+def test_a_target_beyond_the_soft_limit_is_reached_at_rest(library):
+    arm = LabArm(library, angle_rad=2.2)
+    arm.enable()
+    arm.move(3.0, speed_rad_s=1.0, ticks=90)
+    speeds = [arm.tick().reference_rad_s[0] for _ in range(400) if arm.outputs.reference_rad[0] < 2.3999]
+    # The cubic to rest: its last tick moves less than a tenth of its fastest.
+    assert speeds[-1] < 0.1 * max(speeds)
+
+
 def test_a_reference_that_runs_on_stops_at_the_soft_limit(library):
     config = lab_config(library)
     config.silence_ticks = 1000

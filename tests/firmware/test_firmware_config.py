@@ -93,6 +93,13 @@ def test_a_sealed_copy_with_a_value_outside_its_range_is_broken(library):
     assert load(library, sealed(library, 111, 4), copy) == (c.CONFIG_OLDER, 111)
 
 
+def test_a_copy_of_another_version_is_broken(library):
+    copy = sealed(library, 222, 9)
+    copy.version += 1
+    copy.crc = zlib.crc32(bytes(copy)[:-4])
+    assert load(library, sealed(library, 111, 4), copy) == (c.CONFIG_OLDER, 111)
+
+
 def test_a_power_cut_while_writing_never_costs_the_only_good_copy(library):
     """Write a hundred configurations, each write cut off somewhere: what is loaded is the last whole one."""
     draw = random.Random(7)

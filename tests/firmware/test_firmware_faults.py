@@ -178,6 +178,43 @@ def test_an_arm_at_rest_with_still_readings_is_not_frozen(moving):
     assert moving.outputs.faults == 0
 
 
+@pytest.mark.parametrize(("spoil", "limit"), [(supply(0), "supply_ticks"), (read_as(0, 0), "pot_ticks")])
+def test_a_fault_takes_exactly_its_ticks(moving, spoil, limit):
+    moving.spoil = spoil
+    moving.tick(getattr(moving.config, limit) - 1)
+    assert moving.outputs.faults == 0
+    assert moving.tick().faults != 0
+
+
+def test_a_fault_with_the_drives_off_keeps_them_off(arm):
+    arm.tick(20)
+    overrun(arm)
+    assert arm.outputs.state == c.STATE_FAULTED
+    arm.command(c.COMMAND_ENABLE)
+    assert not arm.obeyed()
+
+
+def test_a_jump_of_the_reading_is_no_speed(moving):
+    moving.wander(1500, amplitude_rad=0.0)
+    moving.spoil = shift(3, 2000)
+    out = next(out for out in iter(moving.tick, None) if out.faults)
+    assert out.speed_rad_s[3] == 0.0
+
+
+def test_a_joint_driven_hard_that_turns_does_not_stall(library):
+    config = lab_config(library)
+    for joint in config.joint:
+        joint.stall_duty = 0.2
+    arm = LabArm(library, config, angle_rad=-2.0)
+    arm.enable()
+    for _ in range(80):
+        arm.move(2.0, ticks=4000)
+        arm.tick(19)
+    driven = [c.core_outputs.from_buffer_copy(raw).duty[0] > 0.2 for raw in arm.history]
+    assert sum(driven) > config.stall_ticks
+    assert arm.outputs.faults == 0
+
+
 def test_a_short_block_is_no_stall_and_no_following_error(moving):
     moving.blocked = True
     moving.wander(40)

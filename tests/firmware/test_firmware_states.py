@@ -29,6 +29,28 @@ def test_the_first_reference_is_the_measured_position(library, angle_rad):
     assert max(abs(arm.angle_rad[i] - angle_rad) for i in JOINTS) < 1e-3
 
 
+def test_a_coasting_arm_is_braked_from_the_first_tick(arm):
+    def coast(arm):
+        arm.speed_rad_s = [0.5] * 6
+
+    arm.spoil = coast
+    out = arm.enable()
+    for i in JOINTS:
+        assert out.speed_rad_s[i] > 0.3
+        assert out.duty[i] == pytest.approx(max(-0.1 * out.speed_rad_s[i], -0.05), abs=1e-6)  # or the slew limit
+
+
+def test_enabling_again_remembers_nothing_of_the_last_motion(moving):
+    moving.move(0.4, gravity=0.3)
+    moving.tick(50)
+    out = moving.command(c.COMMAND_DISABLE)
+    assert (list(out.reference_rad), list(out.reference_rad_s)) == (list(out.angle_rad), [0.0] * 6)
+    moving.tick(500)
+    out = moving.command(c.COMMAND_ENABLE)
+    assert max(map(abs, out.duty)) < 0.01
+    assert max(map(abs, moving.tick(50).duty)) < 0.01
+
+
 def test_before_a_potentiometer_is_read_the_arm_cannot_be_enabled(arm):
     arm.spoil = read_as(3, 65535)
     arm.tick(2)
@@ -98,9 +120,12 @@ def test_a_refused_motion_command_does_not_feed_it_either(moving):
 
 
 def test_a_held_arm_is_not_dropped_by_clearing(moving):
+    moving.move(2.0, ticks=1)
+    assert moving.outputs.limited[0] & c.LIMITED_SPEED
     moving.tick(500)
     assert moving.outputs.state == c.STATE_HOLDING
     moving.command(c.COMMAND_CLEAR_FAULTS)
+    assert not moving.outputs.limited[0] & c.LIMITED_SPEED
     assert (moving.outputs.state, moving.outputs.drives_on) == (c.STATE_ENABLED, 1)
     moving.move(0.1)
     assert moving.obeyed()
