@@ -1,9 +1,12 @@
 """Following: the same answers as searching, regained after a loss, jumps told, and honest covariances."""
 
+import sys
+
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 
-from armsight.data import Missed, PoseEstimate, Shot
+from armsight.data import Missed, PoseEstimate, Record, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.vision.follow import Follower, follows
 from armsight.vision.markers.targets import Composite
@@ -97,6 +100,93 @@ def test_shots_without_time_and_shots_without_images():
             assert isinstance(follower.measure(Shot("bad", None, None, problem="unplugged")), Missed)
             assert follower.way == "lost"
     assert ways == ["searched", "followed", "followed", "followed"]
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [0, 1, 2, np.nan, 4, 5, 6],
+        [0, 1, 2, np.inf, 4, 5, 6],
+        [0, 1, 2, -300, -299, -298, -297],
+        [0, 1, 2, 600, 601, 602, 603],
+        [0, 1, 1 + 1e-12, 3, 4, 5, 6],
+        [0, 5e-324, 1e-323, 3, 4, 5, 6],
+        [0, 0, 0, 0, 4, 5, 6],
+    ],
+)
+def test_times_that_are_odd_make_no_jumps(times):
+    """Times in shots: missing, standing still, going back, a pause of ten seconds."""
+    follower = Follower(RIG, BODY)
+    for (truth, shot), t in zip(shots(PLATE, 7, 7), times, strict=True):
+        result = follower.measure(Shot(shot.name, shot.left, shot.right, t / 60))
+        assert isinstance(result, PoseEstimate)
+        assert follower.jump is None
+        assert np.linalg.norm(result.T_left_body[:3, 3] - truth[:3, 3]) < 2e-3
+    assert follower.way == "followed"
+
+
+def arrays_of(record):
+    """Copy all arrays of a record and of the records in it."""
+    if isinstance(record, np.ndarray):
+        return [record.copy()]
+    if isinstance(record, tuple):
+        return [array for part in record for array in arrays_of(part)]
+    return [a for part in vars(record).values() for a in arrays_of(part)] if isinstance(record, Record) else []
+
+
+def test_what_was_given_stays_as_it_was():
+    """The follower works in the same arrays again and again; its records must not."""
+    follower, given = Follower(RIG, BODY), []
+    for _, shot in shots(PLATE, 6, 9, {4: ((2, 1),)}):
+        result = follower.measure(shot)
+        given.append((result, arrays_of(result)))
+    assert sum(len(arrays) >= 10 for _, arrays in given) == 5
+    for result, arrays in given:
+        for before, after in zip(arrays, arrays_of(result), strict=True):
+            np.testing.assert_array_equal(before, after)
+
+
+def compiled():
+    """How many kinds of arguments each of the project's compiled functions has been compiled for."""
+    return {
+        (name, key): len(value.signatures)
+        for name, module in sys.modules.items()
+        if name.startswith("armsight.")
+        for key, value in vars(module).items()
+        if isinstance(value, Dispatcher)
+    }
+
+
+def test_nothing_is_compiled_once_it_is_ready():
+    follower = Follower(RIG, BODY)
+    before, ways = compiled(), []
+    for k, (_, shot) in enumerate(shots(PLATE, 9, 8, {6: ((0, 0),)})):
+        left, right = shot.left, shot.right
+        if k in (3, 7):
+            left, right = np.dstack([left] * 3), np.dstack([right] * 3)
+        if k == 4:
+            left = left.astype(np.uint16) * 257
+        follower.measure(Shot(shot.name, left, right, shot.t_s))
+        ways.append(follower.way)
+    assert set(ways) >= {"searched", "followed", "lost"}
+    assert compiled() == before
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        discs_of([[0, 0, 0], [0.1, 0, 0], [0.05, 0.05 * np.sqrt(3), 0]]),
+        discs_of([[0, 0, 0], [0.1, 0, 0], [0.02, 0.09, 0]], normal=None),
+        discs_of(np.eye(3) * 0.05, normal=np.eye(3)),
+        discs_of([[0, 0, 0.05], [0, 0, -0.05], [0.05, 0, 0], [-0.05, 0, 0]],
+                 normal=[[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]),
+        discs_of([[0, 0, 0], [9, 0, 0], [2, 8, 0]], radius=0.4),
+        discs_of([[0, 0, 0], [1e-3, 0, 0], [2e-4, 1e-3, 0]], radius=2e-4),
+    ],
+    ids=["all alike", "no normals", "a corner", "four sides", "9 m", "1 mm"],
+)  # fmt: skip
+def test_getting_ready_for_any_body(target):
+    Follower(RIG, Composite("any", (), target))
 
 
 def test_covariance_is_honest():
