@@ -179,3 +179,15 @@ def test_noise_alone_shows_no_disc():
     rng = np.random.default_rng(9)
     for noise in (0.5, 3.0, 12.0):
         assert len(BRIGHT.find(grey(np.full((480, 640), 100.0), noise, rng)).uv) == 0
+
+
+def test_an_image_with_too_many_places_is_said_to_be():
+    image = (255 * np.random.default_rng(12).integers(0, 2, (2160, 3840))).astype(np.uint8)
+
+    def full(part):
+        return "no more are looked at" in BRIGHT.find(part).rejected[0].reason
+
+    row = round(BRIGHT.find(image).rejected[0].uv[1])
+    assert full(image)
+    assert full(image[: row + 12])
+    assert not full(image[: row - 12])

@@ -114,7 +114,7 @@ def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator
     if not follows(target):
         yield from ((shot, measure(rig, target, shot), {}) for shot in shots)
         return
-    click.echo("getting ready to follow (compiles for about a minute the first time on a machine)", err=True)
+    click.echo("getting ready to follow (compiles for a minute or two the first time on a machine)", err=True)
     follower = Follower(rig, target)
     for shot in shots:
         begun = time.perf_counter()

@@ -77,6 +77,10 @@ class DiscTarget(Record):
         good, n = disc_search.find(image, image.view(np.uint64), bright, dark, *room)
         theta, codes, signs, cov, shape = room[:5]
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
+        if n == _MOST_PLACES:  # rows are looked at from above
+            row = float(min(np.nanmax(theta[:n, 1]), len(image) - 1))
+            reason = f"{n} places stand out, and no more are looked at: below about row {row:.0f} discs were not found"
+            rejected = (Rejected((0.0, row), reason), *rejected)
         return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
 
 
