@@ -214,3 +214,16 @@ def test_what_can_be_followed():
     assert not follows(Composite("bent", (), bent))
     with pytest.raises(ValueError, match="cannot be followed"):
         Follower(RIG, Composite("bent", (), bent))
+
+
+def test_fast_motion_is_followed_once_two_searches_have_told_its_velocity():
+    fast = np.array(
+        [1.6, -0.8, 0.3, 0.5, -0.4, 0.8]
+    )  # 25 px and more a shot, past the plate's edge and its other discs
+    rng = np.random.default_rng(11)
+    start, follower, ways = someplace(rng, z=(0.9, 0.9), tilt=0.3), Follower(RIG, BODY), []
+    for k in range(6):
+        left, right = pair_of(RIG, PLATE, start @ exp_se3(fast * k / 60), rng)
+        assert isinstance(follower.measure(Shot(str(k), left, right, k / 60)), PoseEstimate)
+        ways.append(follower.way)
+    assert ways[2:] == ["followed"] * 4

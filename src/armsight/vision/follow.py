@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.disc_pose import SEEN, Found, Scene
+from armsight.vision.disc_pose import SEEN, Found, Scene, velocity
 from armsight.vision.expected import bias_normals
 from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
@@ -62,6 +62,7 @@ class Track(Record):
         shots: how many shots ago it was seen.
         margin_px: how far off predictions may be.
         step_s: from the pose before to the last; infinite where the twist is not known.
+        proven: whether the motion has foretold a pose before; what is far from it then is a jump.
     """
 
     T_left_body: Array
@@ -70,6 +71,7 @@ class Track(Record):
     shots: int
     margin_px: float
     step_s: float
+    proven: bool
 
     def foretells(self, t_s: float) -> bool:
         """Whether it is known where to look at a time: not before the last pose, nor too long after."""
@@ -94,22 +96,23 @@ class Follower:
     way: Way
     jump: str | None
 
-    def __init__(self, rig: StereoRig, target: Composite) -> None:
+    def __init__(self, rig: StereoRig, target: Target) -> None:
         """Make ready to follow; compiles where that was not done on this machine yet (a minute or two, once).
 
         Args:
             rig: the calibrated pair.
             target: a body whose markers are discs and nothing else, with the normals of all known.
         """
-        self.rig, self.target = rig, target
         self.way, self.jump = "lost", None
         self._track: Track | None = None
         self._count = 0
-        discs = target.discs
-        if not follows(target) or discs is None:
+        if not follows(target):
             raise ValueError(
-                f"{target.name} cannot be followed: it needs three discs or more with known normals, and no codes"
+                f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no codes"
             )
+        discs = target.discs
+        assert discs is not None
+        self.rig, self.target = rig, target
         kernel = [camera.kernel_arguments() for camera in rig.cameras]
         sizes = [camera.parameters.size for camera in rig.cameras]
         self._scene = Scene(
@@ -134,7 +137,7 @@ class Follower:
         # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
         rehearse(rig, target, discs)
         black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
-        track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf)
+        track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
         track.predicted(1.0)
         self._noise = disc_search.noise_of(black[0])
         self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
@@ -157,7 +160,13 @@ class Follower:
             self.way = "lost"
             if track is not None:
                 self._track = Track(
-                    track.T_left_body, track.twist, track.t_s, track.shots + 1, _MARGIN_MOST_PX, track.step_s
+                    track.T_left_body,
+                    track.twist,
+                    track.t_s,
+                    track.shots + 1,
+                    _MARGIN_MOST_PX,
+                    track.step_s,
+                    track.proven,
                 )
             return result
         self.way = "searched"
@@ -169,7 +178,7 @@ class Follower:
         assert shot.left is not None
         self._noise = disc_search.noise_of(grey(shot.left))
         self._found.contrast[:] = 0.0
-        if track is not None and track.step_s < math.inf and track.foretells(t_s):
+        if track is not None and track.proven and track.foretells(t_s):
             before = track.predicted(t_s)
             xi = log_se3(inverse(before) @ result.T_left_body)
             px = (
@@ -181,7 +190,11 @@ class Follower:
                     f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(turned):.0f} degrees from where it was "
                     "expected"
                 )
-        self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf)
+        twist, step_s = np.zeros(6), math.inf
+        if track is not None and track.shots == 0 and _LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
+            step_s = t_s - track.t_s  # two poses found by searching tell the velocity as well
+            velocity(track.T_left_body, result.T_left_body, step_s, twist)
+        self._track = Track(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
 
     def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
         """Measure where the body should be; None where that gives nothing to be believed."""
@@ -197,7 +210,7 @@ class Follower:
             return None
         margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
         T = self._found.T.copy()
-        self._track = Track(T, twist, t_s, 0, margin, t_s - track.t_s)
+        self._track = Track(T, twist, t_s, 0, margin, t_s - track.t_s, True)
         return self._estimate(T, seen, chi_square)
 
     def _pair(
