@@ -168,6 +168,12 @@ def test_nothing_is_compiled_once_it_is_ready():
             left = left.astype(np.uint16) * 257
         follower.measure(Shot(shot.name, left, right, shot.t_s))
         ways.append(follower.way)
+    start = someplace(np.random.default_rng(8), z=(0.8, 0.8), tilt=0.2)
+    for k, across in enumerate((0.0, 0.12, 0.0)):  # too far for following: search after search
+        there = start @ exp_se3(np.array([across, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        follower.measure(Shot("far", *pair_of(RIG, PLATE, there, np.random.default_rng(k)), 10 + k / 60))
+        ways.append(follower.way)
+    assert ways[-3:] == ["searched"] * 3
     assert set(ways) >= {"searched", "followed", "lost"}
     assert compiled() == before
 

@@ -139,6 +139,7 @@ class Follower:
         black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
         track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
         track.predicted(1.0)
+        velocity(track.T_left_body, track.T_left_body, 1.0, np.zeros(6))
         self._noise = disc_search.noise_of(black[0])
         self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
 
