@@ -166,10 +166,9 @@ def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Mar
     if "position_mm" not in entry:
         raise InputError(f"{where}: has no position_mm = [x, y, z]")
     for key in _PLACE:
-        if any(
-            isinstance(number, str | bool) for number in (entry.get(key) if isinstance(entry.get(key), list) else ())
-        ):
-            raise InputError(f"{where}: {key} must be numbers without quotes, got {entry[key]!r}")
+        given = entry.get(key, [])
+        if isinstance(given, list) and any(isinstance(number, str | bool) for number in given):
+            raise InputError(f"{where}: {key} must be numbers without quotes, got {given!r}")
     numbers = {
         key: checked(entry[key], (4 if key == "quaternion_wxyz" else 3,), f"{where}: {key}")
         for key in _PLACE

@@ -52,8 +52,8 @@ REASONS = {
     9: "open on one side",
     10: "what surrounds it is not even: text, a ring, a square of a board",
 }
-#: Reasons that only the fit gives: such a place has a closed rim.
-LOOK_ALIKES = (3, 4, 5, 6, 8, 10)
+#: Reasons of places that have a closed rim, those that look most like a disc first.
+LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
 _LEAST_RATIO = 0.22
 #: How far the sixteenths of the rim may lie off the ellipse beyond what noise does, RMS: px, share of the size, and share
