@@ -245,6 +245,15 @@ def test_the_nearest_pose_is_no_worse_than_any_tried(arm):
         assert arm.within_limits(nearest.q)
 
 
+@pytest.mark.parametrize("far_m", [1e9, 1e200])
+def test_a_pose_beyond_all_bounds_is_answered_too(far_m):
+    T = SIX.forward(SIX.home)
+    T[0, 3] = far_m
+    nearest = SIX.inverse(T).nearest
+    assert nearest.off_m == pytest.approx(far_m)  # in squares the second is beyond what a number holds
+    assert SIX.within_limits(nearest.q)
+
+
 def test_a_pose_that_only_limits_forbid_has_its_solutions_and_the_nearest_within():
     tight = dataclasses.replace(IRB, q_min=IRB.home - 0.1, q_max=IRB.home + 0.1)
     T = IRB.forward(IRB.home + 0.3)

@@ -122,6 +122,17 @@ def test_bad_options_are_refused(options, said):
         resolved_rate(SIX_R, q, path, **options)
 
 
+@pytest.mark.parametrize(("name", "step"), [("ur5", [-0.18, 0.03, -0.05]), ("irb120", [0.01, -0.04, 0.03])])
+def test_the_limits_hold_between_the_instants_of_the_check(name, step):
+    arm, q = MODELS[name], start(name)
+    T = arm.forward(q)
+    motion = resolved_rate(arm, q, LinePath.between(T, shifted(T, step)))
+    knots, qdd = motion.spline.x, motion.spline(motion.spline.x, 2)
+    # Between the spline's instants the jerk is constant and the acceleration even: this is all there is.
+    assert (np.abs(np.diff(qdd, axis=0)) <= np.diff(knots)[:, None] * arm.qddd_max * (1 + 1e-6)).all()
+    assert (np.abs(qdd) <= arm.qdd_max * (1 + 1e-8)).all()
+
+
 def test_the_tracker_takes_up_a_line_that_is_under_way():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)

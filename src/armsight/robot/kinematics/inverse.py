@@ -250,6 +250,6 @@ def nearest(
             turned, _ = placed(trial[i], limits[0, i], limits[1, i], near[i])
             trial[i] = min(limits[1, i], max(limits[0, i], turned))
         cost = descend(table, F, trial, limits[0], limits[1], _LONG_STEPS, work)
-        if cost < best:
+        if k == 0 or cost < best:  # the first anyway: a pose may be so far off that every cost is infinite
             best = cost
             q[:] = trial

@@ -26,7 +26,6 @@ from armsight.robot.trajectories.trajectory import (
     Joints,
     MotionRefused,
     check_duration,
-    check_times,
     clamped,
 )
 from armsight.robot.trajectories.walk import behind
@@ -125,8 +124,8 @@ def resolved_rate(
         law = _law(share, wanted_s, duration_s)
         run = _track(arm, start.q, path, law)
         motion = _motion(run, start.qd)
-        t_s = check_times(motion.duration_s)
-        most = worst(arm, t_s, motion.at(t_s))
+        # At the spline's own instants, 1 kHz or a little more: between them the jerk is constant.
+        most = worst(arm, run.t_s, motion.at(run.t_s))
         if most.ratio <= 1 + ROUNDING or run.off_m[-1] > tolerance_m:  # no slower motion mends a goal that is missed
             _check(arm, path, law, run, tolerance_m)
             return motion
