@@ -51,14 +51,18 @@ REASONS = {
     8: "its inside is not even: smeared by motion, or no disc",
     9: "open on one side",
     10: "what surrounds it is not even: text, a ring, a square of a board",
+    11: "found already",
 }
+FOUND_TWICE = 11
 #: Reasons of places that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
 _LEAST_RATIO = 0.22
 #: How far the sixteenths of the rim may lie off the ellipse beyond what noise does, RMS: px, share of the size, and share
 #: of the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
-_RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.01, 1.5
+_RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
+#: Standard deviations of that beyond which it is no chance.
+_RIM_CHANCE = 4.0
 #: What the residuals may be beyond the image's noise, as a share of the contrast.
 _MOST_RESIDUAL = 0.14
 #: How uneven the inside may be beyond the image's noise, as a share of the contrast.
@@ -114,6 +118,15 @@ def _spread(n: int, work: Work, flat: Array) -> None:
         count_out += surround
     flat[0], flat[1] = square_in / max(count_in, F(1.0)), square_out / max(count_out, F(1.0))
     flat[2], flat[3] = count_in, count_out
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _clipped(n: int, work: Work) -> int:
+    """Count the pixels without light or with more than eight bits hold."""
+    level, count = work.level, np.int32(0)
+    for i in range(n):
+        count += np.int32(1) if level[i] <= F(0.0) or level[i] >= F(255.0) else np.int32(0)
+    return int(count)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -302,7 +315,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2
-    variance = square / (n - UNKNOWNS)
+    # Clipped pixels have no noise and say nothing of it.
+    variance = square / max(n - _clipped(n, work) - UNKNOWNS, UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
     half = (theta[2] + theta[4]) / 2
     root = np.sqrt(max(half * half - det, 0.0))
@@ -317,10 +331,11 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     _rim(n, theta, x0, y0, work, sectors)
-    off, count = 0.0, 0
+    off, chance, count = 0.0, 0.0, 0
     for k in range(_SECTORS):
         if sectors[1, k] > 0.0:
             off += sectors[0, k] ** 2 - variance / sectors[1, k]
+            chance += 2.0 * (variance / sectors[1, k]) ** 2
             count += 1
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed:
@@ -339,6 +354,10 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
             cov[a, b] *= variance
     if uneven and texture == 0.0:
         _average(n, theta, x0, y0, noise_sigma, square, cov, work)
+    if off > _RIM_CHANCE * np.sqrt(chance):
+        # A rim that is off beyond chance, a little of it covered perhaps, may have taken the centre along as far.
+        cov[0, 0] += off / count
+        cov[1, 1] += off / count
     return 0
 
 
