@@ -156,7 +156,10 @@ def test_the_tracker_takes_up_a_line_that_is_under_way():
 
 def test_a_start_off_the_path_is_refused():
     q, path = through_the_wrist(2.0)
-    with pytest.raises(
-        InputError, match=r"q_start does not put the tool at the start of the path: it is \d+\.\d+ mm away"
+    for T, said in (
+        (shifted(path.T_base_start, [0.0, 0.03, 0.04]), "it is 50.000 mm and 0.000 deg away"),
+        (shifted(path.T_base_start, [0.0, 0.0, 0.0], [0.0, 0.0, 0.1]), "it is 0.000 mm and 5.730 deg away"),
     ):
-        resolved_rate(SIX_R, q + 0.1, path)
+        off = LinePath.between(T, shifted(T, [0.0, 0.0, 0.01]))
+        with pytest.raises(InputError, match=f"q_start does not put the tool at the start of the path: {said}"):
+            resolved_rate(SIX_R, q, off)

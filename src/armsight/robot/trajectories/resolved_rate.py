@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.geometry.rotation import log_so3
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.path import Path, Places
 from armsight.robot.trajectories.profile import Profile, plan_profile
@@ -114,9 +115,14 @@ def resolved_rate(
     if not tolerance_m > 0:
         raise InputError(f"tolerance_m is {tolerance_m}; it must be a positive length in m")
     start = start_state(arm, q_start, qd_start, qdd_start)
-    gap = np.linalg.norm(path.at(np.zeros(1)).T_base_tool[0] - arm.forward(start.q))
-    if gap > tolerance_m:
-        raise InputError(f"q_start does not put the tool at the start of the path: it is {1e3 * gap:.3f} mm away")
+    T_begin, T_now = path.at(np.zeros(1)).T_base_tool[0], arm.forward(start.q)
+    gap_m = np.linalg.norm(T_begin[:3, 3] - T_now[:3, 3])
+    gap_rad = np.linalg.norm(log_so3(np.ascontiguousarray(T_begin[:3, :3].T @ T_now[:3, :3])))
+    if max(gap_m, gap_rad) > tolerance_m:
+        raise InputError(
+            f"q_start does not put the tool at the start of the path: it is {1e3 * gap_m:.3f} mm and "
+            f"{np.degrees(gap_rad):.3f} deg away"
+        )
     share = _share_state(arm, start, path)
     wanted_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
     tried: list[tuple[float, float]] = []
