@@ -74,6 +74,18 @@ def test_without_a_duration_it_is_slowed_down_until_the_limits_hold(passed):
     assert motion.duration_s < 5.0
 
 
+def test_its_end_does_not_slow_the_whole_down():
+    arm, q = (
+        MODELS["irb120"],
+        np.radians([0, 0, 0, 0, 60, 0]),
+    )  # passes near the wrist's singularity, where it settles slowly
+    T = arm.forward(q)
+    goal = shifted(T, [0.0, 0.0, -0.3])
+    motion = resolved_rate(arm, q, LinePath.between(T, goal))
+    within(arm, motion)
+    assert motion.duration_s < 2 * line(arm, q, goal).duration_s
+
+
 def _share(p, path):
     return (p - path.T_base_start[:3, 3]) @ path.step / (path.step @ path.step)
 

@@ -39,7 +39,8 @@ GAIN = 30.0
 #: Damping sets in below this singular value (linear rows over the arm's size) and reaches its square's share of DAMPING.
 SOFT, DAMPING = 0.04, 0.03
 #: After the reference stands, the tool settles until the joints are slower than this share of their limits, or this long.
-SETTLED, SETTLE_S = 1e-4, 2.0
+#: A speed that is left is taken off within the last step of 1 ms: by a jerk some 1e7 times as large.
+SETTLED, SETTLE_S = 2e-6, 2.0
 #: The longest motion that may be asked for, s: each second of it is a thousand steps.
 LONGEST_S = 300.0
 #: How far from the path a start's speeds may point, of their limits, and its accelerations, rad/s^2 at the arm's size.
