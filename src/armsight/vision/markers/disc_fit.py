@@ -64,7 +64,9 @@ _RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
 #: Standard deviations of that beyond which it is no chance.
 _RIM_CHANCE = 4.0
 #: What the residuals may be beyond the image's noise, as a share of the contrast.
-_MOST_RESIDUAL = 0.14
+_MOST_RESIDUAL = 0.1
+#: A centre that its uneven surround leaves less certain than this is not given, px.
+_MOST_SIGMA_PX = 0.08
 #: How uneven the inside may be beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
@@ -338,7 +340,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
             chance += 2.0 * (variance / sectors[1, k]) ** 2
             count += 1
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
-    if off > count * allowed * allowed:
+    if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
         return 5
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
@@ -349,6 +351,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     _pair(0, work, cov)
     if texture > 0.0:
         variance *= _texture_factor(n, theta[5], texture, work)
+        if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
+            return 10
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
