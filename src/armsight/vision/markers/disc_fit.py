@@ -136,6 +136,7 @@ def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array)
     """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
     px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
     sectors[:, :] = 0.0
+    x = work.x.astype(np.float32)  # the last step: the residuals are those before it
     cx, cy = F(theta[0] - x0), F(theta[1] - y0)
     for i in range(n):
         if F(0.03) < inside[i] < F(0.97):
@@ -143,7 +144,10 @@ def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array)
             u, v = px[i] - cx, py[i] - cy
             a, b = abs(u), abs(v)
             k = 8 * (u > F(0.0)) + 4 * (v > F(0.0)) + 2 * (a > b) + (min(a, b) > F(0.41421356) * max(a, b))
-            sectors[0, k] += np.sqrt(square) * residual[i]
+            left = residual[i]
+            for m in range(UNKNOWNS):
+                left -= J[m, i] * x[m]
+            sectors[0, k] += np.sqrt(square) * left
             sectors[1, k] += square
     for k in range(_SECTORS):
         sectors[0, k] /= max(sectors[1, k], 1e-12)
