@@ -1,5 +1,7 @@
 """Where the tool is and how it moves: against products of matrices and against differences."""
 
+import dataclasses
+
 import arms
 import numpy as np
 import pytest
@@ -26,6 +28,13 @@ def test_forward_and_links_are_the_products_of_the_table(arm):
         wanted = arms.frames(arm, q)
         np.testing.assert_allclose(arm.forward(q), wanted[-1], rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(arm.links(q), wanted, rtol=0, atol=ROUNDING)
+
+
+def test_frame_0_of_a_modified_table_is_before_its_first_twist_and_length():
+    base = arms.odd(arms.CRAIG, "odd_craig", 3)
+    arm = dataclasses.replace(base, a=base.a + 0.04, alpha=base.alpha + 0.3)
+    for q in draw(7, 5):
+        np.testing.assert_allclose(arm.links(q), arms.frames(arm, q), rtol=0, atol=ROUNDING)
 
 
 @given(st.sampled_from(arms.ALL), vectors(-20, 20, 6))

@@ -49,6 +49,12 @@ def test_near_is_looked_at_too(bad):
         ARM.inverse_batch(T[None], near=bad)
 
 
+def test_what_is_wrong_with_near_is_said_of_near():
+    for bad, said in ((np.zeros(5), r"near has shape \(5,\)"), ("a", "near must be numbers")):
+        with pytest.raises(InputError, match=said):
+            ARM.inverse(T, near=bad)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -81,6 +87,7 @@ def test_a_pose_that_is_none_is_refused(change, said):
         ({"direction": np.full(6, 0.5)}, "each must be 1 or -1"),
         ({"convention": "craig"}, "convention 'craig' is unknown; known are standard, modified"),
         ({"joint_names": ("one",)}, "1 joint names"),
+        ({"joint_names": ("one", "two", "one", "four", "five", "six")}, "no two joints may share one"),
         ({"T_base_0": 2 * np.eye(4)}, "T_base_0 is no rigid motion: its 3x3"),
         ({"T_flange_tool": np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0.1}, "T_flange_tool is no rigid motion"),
     ],

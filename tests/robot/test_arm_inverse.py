@@ -112,6 +112,16 @@ def test_poses_near_singularities_are_answered_as_well(arm):
             assert (arms.apart(many.q[both, i], many.q[both, j]) > 1e-7).all()
 
 
+@pytest.mark.parametrize("arm", arms.IDENTIFIED, ids=arms.names(arms.IDENTIFIED))
+def test_an_identified_arm_is_hardly_ever_told_that_a_pose_it_is_in_is_out_of_reach(arm):
+    Ts = arm.forward(arms.near_singular(arm, 300, np.random.default_rng(11)))
+    many = arm.inverse_batch(Ts)
+    assert (many.count > 0).mean() > 0.99  # beside a singularity descent may end in a place nearby
+    there = np.arange(many.q.shape[1]) < many.count[:, None]
+    far, turned = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
+    assert max(far.max(), turned.max()) < 1e-9
+
+
 @exact
 def test_a_batch_is_its_single_calls(arm):
     Ts = arm.forward(np.random.default_rng(10).uniform(-np.pi, np.pi, (20, 6)))
@@ -243,6 +253,15 @@ def test_the_nearest_pose_is_no_worse_than_any_tried(arm):
         far, turned = arms.off(tried, T)
         assert np.hypot(nearest.off_m, nearest.off_rad) <= np.hypot(far, turned).min()
         assert arm.within_limits(nearest.q)
+
+
+@pytest.mark.parametrize("far_m", [1e9, 1e200])
+def test_a_pose_beyond_all_bounds_is_answered_too(far_m):
+    T = SIX.forward(SIX.home)
+    T[0, 3] = far_m
+    nearest = SIX.inverse(T).nearest
+    assert nearest.off_m == pytest.approx(far_m)  # in squares the second is beyond what a number holds
+    assert SIX.within_limits(nearest.q)
 
 
 def test_a_pose_that_only_limits_forbid_has_its_solutions_and_the_nearest_within():

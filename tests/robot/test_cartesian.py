@@ -148,6 +148,29 @@ def test_bends_are_passed_at_a_steady_pace_and_lines_faster():
         waypoints(arm, q, corners, blend_m=0.02, duration_s=0.9 * motion.duration_s)
 
 
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        ("six_r", [0.03, 0.04, -0.03]),
+        ("puma560", [0.03, 0.04, -0.03]),
+        ("ur5", [0.0, 0.1, 0.0]),
+        ("ur10", [0.0, 0.0, -0.1]),
+        ("irb120", [0.03, 0.04, -0.03]),
+    ],
+)
+def test_a_line_planned_anew_from_its_own_middle_goes_on_as_fast(name, step):
+    # Half way a joint is braked as hard as it may be: little but the motion itself leads to the end from there.
+    arm, q = MODELS[name], start(name)
+    goal = shifted(arm.forward(q), step)
+    first = line(arm, q, goal)
+    now = first.at(0.5 * first.duration_s)
+    motion = line(arm, now.q, goal, qd_start=now.qd, qdd_start=now.qdd)
+    within(arm, motion)
+    for before, after in zip(now, motion.at(0.0), strict=True):
+        np.testing.assert_allclose(before, after, atol=1e-7)
+    assert motion.duration_s < 1.03 * 0.5 * first.duration_s  # a step of the scales that are tried
+
+
 def test_waypoints_are_taken_up_from_a_moving_state():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)

@@ -74,6 +74,18 @@ def test_without_a_duration_it_is_slowed_down_until_the_limits_hold(passed):
     assert motion.duration_s < 5.0
 
 
+def test_its_end_does_not_slow_the_whole_down():
+    arm, q = (
+        MODELS["irb120"],
+        np.radians([0, 0, 0, 0, 60, 0]),
+    )  # passes near the wrist's singularity, where it settles slowly
+    T = arm.forward(q)
+    goal = shifted(T, [0.0, 0.0, -0.3])
+    motion = resolved_rate(arm, q, LinePath.between(T, goal))
+    within(arm, motion)
+    assert motion.duration_s < 2 * line(arm, q, goal).duration_s
+
+
 def _share(p, path):
     return (p - path.T_base_start[:3, 3]) @ path.step / (path.step @ path.step)
 
@@ -122,6 +134,17 @@ def test_bad_options_are_refused(options, said):
         resolved_rate(SIX_R, q, path, **options)
 
 
+@pytest.mark.parametrize(("name", "step"), [("ur5", [-0.18, 0.03, -0.05]), ("irb120", [0.01, -0.04, 0.03])])
+def test_the_limits_hold_between_the_instants_of_the_check(name, step):
+    arm, q = MODELS[name], start(name)
+    T = arm.forward(q)
+    motion = resolved_rate(arm, q, LinePath.between(T, shifted(T, step)))
+    knots, qdd = motion.spline.x, motion.spline(motion.spline.x, 2)
+    # Between the spline's instants the jerk is constant and the acceleration even: this is all there is.
+    assert (np.abs(np.diff(qdd, axis=0)) <= np.diff(knots)[:, None] * arm.qddd_max * (1 + 1e-6)).all()
+    assert (np.abs(qdd) <= arm.qdd_max * (1 + 1e-8)).all()
+
+
 def test_the_tracker_takes_up_a_line_that_is_under_way():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)
@@ -145,7 +168,10 @@ def test_the_tracker_takes_up_a_line_that_is_under_way():
 
 def test_a_start_off_the_path_is_refused():
     q, path = through_the_wrist(2.0)
-    with pytest.raises(
-        InputError, match=r"q_start does not put the tool at the start of the path: it is \d+\.\d+ mm away"
+    for T, said in (
+        (shifted(path.T_base_start, [0.0, 0.03, 0.04]), "it is 50.000 mm and 0.000 deg away"),
+        (shifted(path.T_base_start, [0.0, 0.0, 0.0], [0.0, 0.0, 0.1]), "it is 0.000 mm and 5.730 deg away"),
     ):
-        resolved_rate(SIX_R, q + 0.1, path)
+        off = LinePath.between(T, shifted(T, [0.0, 0.0, 0.01]))
+        with pytest.raises(InputError, match=f"q_start does not put the tool at the start of the path: {said}"):
+            resolved_rate(SIX_R, q, off)

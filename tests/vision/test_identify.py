@@ -244,3 +244,17 @@ def test_a_body_that_fixes_no_pose_is_told(points):
     rig, rng = hd_rig(), np.random.default_rng(0)
     left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
     assert "fix no pose" in identify(rig, discs_of(points), left, right).reason
+
+
+def test_a_wrong_radius_and_a_wrong_size_are_told():
+    rig, rng = hd_rig(known=True), np.random.default_rng(21)
+    T = someplace(rng, z=(0.7, 0.8), tilt=0.3)
+    left, right, _ = views(rig, PLATE, [T], rng)
+    points = PLATE.body.points
+    result = identify(rig, discs_of(points, radius=0.0105), left, right)
+    assert isinstance(result, Missed)
+    assert "radius of about 8.1 mm" in result.reason  # sizes are seen to 2%
+    assert "10.5 mm" in result.reason
+    result = identify(rig, discs_of(1.036 * points), left, right)
+    assert isinstance(result, Missed)
+    assert "0.965 times as far apart" in result.reason

@@ -111,6 +111,9 @@ def test_grey_of_every_kind_of_image():
     np.testing.assert_array_equal(grey(np.dstack([COLOUR, GREY])), expected)
     assert np.abs(grey(COLOUR.astype(np.uint16) * 257).astype(int) - expected).max() <= 1
     assert grey(COLOUR[::2, ::2]).flags.c_contiguous
+    for image in (GREY, GREY.astype(np.uint16), COLOUR):
+        assert not grey(image).flags.writeable
+    assert GREY.flags.writeable
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ the functions in ``kinematics``; here stands what is checked once at the public 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Literal
@@ -116,6 +117,8 @@ class Arm(Record):
             raise InputError(f"{self.name}: convention {self.convention!r} is unknown; known are standard, modified")
         if len(self.joint_names) != 6:
             raise InputError(f"{self.name}: {len(self.joint_names)} joint names; an arm here has six joints")
+        if len(set(self.joint_names)) != 6:
+            raise InputError(f"{self.name}: joint names are {', '.join(self.joint_names)}; no two joints may share one")
         if not np.isin(self.direction, (-1.0, 1.0)).all():
             raise InputError(f"{self.name}: direction is {self.direction.tolist()}; each must be 1 or -1")
         for name in ("alpha", "offset", "q_min", "q_max", "home"):
@@ -168,6 +171,7 @@ class Arm(Record):
         Ts = np.empty((8, 4, 4))
         if chain.links(self.table, angles, Ts):
             raise angle_refusal(angles)
+        Ts[0] = self.T_base_0  # the packed table of a modified convention begins behind its first alpha and a
         return Ts
 
     def jacobian(self, q: ArrayLike, frame: Axes = "base") -> Array:
@@ -292,9 +296,7 @@ class Arm(Record):
         inverse.nearest(self.table, self._closed, self._limits, T, near, q, rows, scratch, lanes.LANES)
         T_base_tool = self.forward(q)
         turned = log_so3(T_base_tool[:3, :3].T @ T[:3, :3])
-        return Nearest(
-            q, T_base_tool, float(np.linalg.norm(T_base_tool[:3, 3] - T[:3, 3])), float(np.linalg.norm(turned))
-        )
+        return Nearest(q, T_base_tool, math.dist(T_base_tool[:3, 3], T[:3, 3]), float(np.linalg.norm(turned)))
 
     def within_limits(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Say whether joint angles (6,) or (N, 6), rad, are within the limits; () or (N,)."""

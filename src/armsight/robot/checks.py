@@ -15,20 +15,20 @@ from armsight.robot.kinematics import chain
 DEGREES = "are these degrees? give radians: numpy.deg2rad(...)"
 
 
-def angles_of(q: ArrayLike, *, batch: bool = True) -> Array:
+def angles_of(q: ArrayLike, *, batch: bool = True, name: str = "q") -> Array:
     """Return joint angles as a new array, so that kernels see one type only."""
     try:
         angles = np.array(q, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
-        raise InputError(f"q must be numbers: {error}") from None
+        raise InputError(f"{name} must be numbers: {error}") from None
     if angles.shape != (6,) and not (batch and angles.ndim == 2 and angles.shape[1] == 6):
-        raise InputError(f"q has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
+        raise InputError(f"{name} has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
     return angles
 
 
 def near_angles(near: ArrayLike) -> Array:
     """Return the angles to be near to."""
-    angles = angles_of(near, batch=False)
+    angles = angles_of(near, batch=False, name="near")
     if chain.verdict(angles):
         raise InputError(str(angle_refusal(angles)).replace("q", "near", 1))
     return angles

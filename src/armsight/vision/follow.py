@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.disc_pose import SEEN, Found, Scene
+from armsight.vision.disc_pose import SEEN, Found, Scene, velocity
 from armsight.vision.expected import bias_normals
 from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
@@ -29,6 +29,7 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from armsight.vision.posefit import moved
+from armsight.vision.rehearse import rehearse
 from armsight.vision.rig import StereoRig
 
 Way = Literal["followed", "searched", "lost"]
@@ -36,8 +37,9 @@ Way = Literal["followed", "searched", "lost"]
 #: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
 #: least and at the most; and in sizes of the last errors of prediction.
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
-#: A prediction older than so many shots is none.
-_OLDEST_SHOTS = 3
+#: A prediction older than so many shots, or so many times the time between the last two poses, is none; poses nearer to
+#: each other than so many seconds tell no velocity.
+_OLDEST_SHOTS, _OLDEST_STEPS, _LEAST_S = 3, 4.0, 1e-6
 #: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
 _JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
 _WORDS = {
@@ -59,7 +61,8 @@ class Track(Record):
         t_s: time of the last pose, or the number of its shot.
         shots: how many shots ago it was seen.
         margin_px: how far off predictions may be.
-        moving: whether the twist is known.
+        step_s: from the pose before to the last; infinite where the twist is not known.
+        proven: whether the motion has foretold a pose before; what is far from it then is a jump.
     """
 
     T_left_body: Array
@@ -67,7 +70,13 @@ class Track(Record):
     t_s: float
     shots: int
     margin_px: float
-    moving: bool
+    step_s: float
+    proven: bool
+
+    def foretells(self, t_s: float) -> bool:
+        """Whether it is known where to look at a time: not before the last pose, nor too long after."""
+        since = t_s - self.t_s
+        return self.shots < _OLDEST_SHOTS and _LEAST_S <= since < math.inf and since <= _OLDEST_STEPS * self.step_s
 
     def predicted(self, t_s: float) -> Array:
         """Return the pose (4, 4) at a time."""
@@ -87,22 +96,23 @@ class Follower:
     way: Way
     jump: str | None
 
-    def __init__(self, rig: StereoRig, target: Composite) -> None:
-        """Make ready to follow; compiles where that was not done on this machine yet (about 30 s, once).
+    def __init__(self, rig: StereoRig, target: Target) -> None:
+        """Make ready to follow; compiles where that was not done on this machine yet (a minute or two, once).
 
         Args:
             rig: the calibrated pair.
             target: a body whose markers are discs and nothing else, with the normals of all known.
         """
-        self.rig, self.target = rig, target
         self.way, self.jump = "lost", None
         self._track: Track | None = None
         self._count = 0
-        discs = target.discs
-        if not follows(target) or discs is None:
+        if not follows(target):
             raise ValueError(
-                f"{target.name} cannot be followed: it needs three discs or more with known normals, and no codes"
+                f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no codes"
             )
+        discs = target.discs
+        assert discs is not None
+        self.rig, self.target = rig, target
         kernel = [camera.kernel_arguments() for camera in rig.cameras]
         sizes = [camera.parameters.size for camera in rig.cameras]
         self._scene = Scene(
@@ -124,10 +134,14 @@ class Follower:
         self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
         self._work, self._outline = workspace(), disc_search.workspace()
-        self._noise = 1.0
-        blank = [np.zeros(camera.image_size_px[::-1], np.uint8) for camera in rig.cameras]
-        self._pair(blank[0], blank[1], np.eye(4), np.zeros(6), 1.0, 1.0)
-        measure(rig, target, Shot("", blank[0], blank[1]))
+        # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
+        rehearse(rig, target, discs)
+        black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
+        track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
+        track.predicted(1.0)
+        velocity(track.T_left_body, track.T_left_body, 1.0, np.zeros(6))
+        self._noise = disc_search.noise_of(black[0])
+        self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
 
     def measure(self, shot: Shot) -> PoseEstimate | Missed:
         """Measure one shot; shots come in the order of their time."""
@@ -137,7 +151,7 @@ class Follower:
         result: PoseEstimate | Missed | None = None
         track = self._track
         usable = shot.left is not None and shot.right is not None and shot.problem is None
-        if usable and track is not None and track.shots < _OLDEST_SHOTS and t_s > track.t_s:
+        if usable and track is not None and track.foretells(t_s):
             result = self._followed(shot, track, t_s)
         if isinstance(result, PoseEstimate):
             self.way = "followed"
@@ -147,7 +161,13 @@ class Follower:
             self.way = "lost"
             if track is not None:
                 self._track = Track(
-                    track.T_left_body, track.twist, track.t_s, track.shots + 1, _MARGIN_MOST_PX, track.moving
+                    track.T_left_body,
+                    track.twist,
+                    track.t_s,
+                    track.shots + 1,
+                    _MARGIN_MOST_PX,
+                    track.step_s,
+                    track.proven,
                 )
             return result
         self.way = "searched"
@@ -157,9 +177,9 @@ class Follower:
     def _begin(self, shot: Shot, result: PoseEstimate, track: Track | None, t_s: float) -> None:
         """Take up the track at a pose that was found by searching."""
         assert shot.left is not None
-        self._noise = disc_search.noise_of(np.ascontiguousarray(grey(shot.left)))
+        self._noise = disc_search.noise_of(grey(shot.left))
         self._found.contrast[:] = 0.0
-        if track is not None and track.moving and track.shots < _OLDEST_SHOTS:
+        if track is not None and track.proven and track.foretells(t_s):
             before = track.predicted(t_s)
             xi = log_se3(inverse(before) @ result.T_left_body)
             px = (
@@ -171,7 +191,11 @@ class Follower:
                     f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(turned):.0f} degrees from where it was "
                     "expected"
                 )
-        self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, False)
+        twist, step_s = np.zeros(6), math.inf
+        if track is not None and track.shots == 0 and _LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
+            step_s = t_s - track.t_s  # two poses found by searching tell the velocity as well
+            velocity(track.T_left_body, result.T_left_body, step_s, twist)
+        self._track = Track(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
 
     def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
         """Measure where the body should be; None where that gives nothing to be believed."""
@@ -187,7 +211,7 @@ class Follower:
             return None
         margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
         T = self._found.T.copy()
-        self._track = Track(T, twist, t_s, 0, margin, True)
+        self._track = Track(T, twist, t_s, 0, margin, t_s - track.t_s, True)
         return self._estimate(T, seen, chi_square)
 
     def _pair(

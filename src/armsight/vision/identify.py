@@ -18,6 +18,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
 from armsight.vision.assign_discs import assign
+from armsight.vision.disc_size import wrong_size
 from armsight.vision.disc_view import DiscView
 from armsight.vision.expected import centred
 from armsight.vision.hypothesis import Hypothesis, hypothesis
@@ -123,7 +124,8 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
         return Missed(f"{what}, and three have its distances, but {reasons.most_common(1)[0][0]}")
     if len(found.ids):
         return Missed(f"{what}, but three with its distances would be seen from behind")
-    return Missed(f"{what}, but no three have its distances; {_too_few(target, discs)}")
+    hint = wrong_size(view.rig, target, *discs)
+    return Missed(hint or f"{what}, but no three have its distances; {_too_few(target, discs)}")
 
 
 def _settled(grown: list[Hypothesis], most: int) -> bool:

@@ -111,7 +111,8 @@ def grey(image: Image) -> NDArray[np.uint8]:
         image: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, uint8 or uint16; 16 bits are scaled by 1/257.
 
     Returns:
-        (H, W) uint8.
+        (H, W) uint8, read-only whatever the image is: to compiled functions arrays that are read-only and arrays that are
+        not are two types, and they would be compiled again for the other.
 
     Raises:
         InputError: another shape or type.
@@ -124,4 +125,6 @@ def grey(image: Image) -> NDArray[np.uint8]:
         image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image[:, :, :3].copy(), cv2.COLOR_BGR2GRAY)
     if image.dtype == np.uint16:
         image = np.rint(image / 257.0).astype(np.uint8)
-    return np.ascontiguousarray(image)
+    out = np.ascontiguousarray(image).view()
+    out.flags.writeable = False
+    return out

@@ -179,3 +179,48 @@ def test_noise_alone_shows_no_disc():
     rng = np.random.default_rng(9)
     for noise in (0.5, 3.0, 12.0):
         assert len(BRIGHT.find(grey(np.full((480, 640), 100.0), noise, rng)).uv) == 0
+
+
+def test_an_image_with_too_many_places_is_said_to_be():
+    image = (255 * np.random.default_rng(12).integers(0, 2, (2160, 3840))).astype(np.uint8)
+
+    def full(part):
+        return "no more are looked at" in BRIGHT.find(part).rejected[0].reason
+
+    row = round(BRIGHT.find(image).rejected[0].uv[1])
+    assert full(image)
+    assert full(image[: row + 12])
+    assert not full(image[: row - 12])
+
+
+def test_discs_side_by_side_are_each_found_once():
+    rng = np.random.default_rng(10)
+    tile = share([outline((6.3, 6.1), 3.6, 3.6, 0)], 0.6, np.zeros(2), 13)
+    found = BRIGHT.find(grey(40 + 150 * np.tile(tile, (30, 40)), 1.5, rng))
+    assert 1190 <= len(found.uv) <= 1200  # neighbours stand in each other's surround; a few at the border are not taken
+    assert min(np.sort(np.linalg.norm(found.uv - uv, axis=1))[1] for uv in found.uv) > 10
+
+
+def test_a_disc_that_is_a_little_covered_is_rejected_or_knows_it():
+    rng = np.random.default_rng(11)
+    for radius, cut in ((8.0, 1.0), (15.0, 1.5), (25.0, 2.5), (12.0, 0.5)):
+        size = 2 * int(radius + 9)
+        c = np.array([size / 2 + 0.2, size / 2 - 0.3])
+        rim = outline(c, radius, radius, 0)
+        rim[:, 0] = np.minimum(rim[:, 0], c[0] + radius - cut)
+        window = share([rim], 0.8, np.zeros(2), size)
+        for _ in range(8):
+            found = BRIGHT.find(grey(50 + 120 * window, 2.0, rng))
+            for uv, cov in zip(found.uv, found.cov_uv, strict=True):
+                assert np.linalg.norm(uv - c) < 4 * np.sqrt(np.trace(cov) / 2)
+
+
+def test_a_saturated_disc_does_not_claim_too_much():
+    rng = np.random.default_rng(12)
+    window = share([outline((31.3, 30.8), 9, 9, 0)], 0.9, np.zeros(2), 64)
+    squares = []
+    for _ in range(80):
+        found = BRIGHT.find(grey(60 + 320 * window, 2.5, rng))
+        e = found.uv[0] - (31.3, 30.8)
+        squares.append(e @ np.linalg.solve(found.cov_uv[0], e) / 2)
+    assert np.mean(squares) < 1.3  # a clipped edge is not that of the model, and the covariance holds it

@@ -93,7 +93,12 @@ def command(
             stack.callback(view.finish, records)
         if out is not None:
             stack.callback(_write, out, records)
-        _run(results, total, body, records, as_json, view)
+        try:
+            _run(results, total, body, records, as_json, view)
+        except KeyboardInterrupt:
+            kept = f", kept in {out}" if out is not None and records else ""
+            click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
+            raise
     _close(records, time.perf_counter() - started, out, view)
 
 
@@ -114,7 +119,7 @@ def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator
     if not follows(target):
         yield from ((shot, measure(rig, target, shot), {}) for shot in shots)
         return
-    click.echo("getting ready to follow (compiles for about a minute the first time on a machine)", err=True)
+    click.echo("getting ready to follow (compiles for a minute or two the first time on a machine)", err=True)
     follower = Follower(rig, target)
     for shot in shots:
         begun = time.perf_counter()
@@ -160,7 +165,8 @@ def _line(record: dict[str, Any]) -> str:
         f"{n} {value:.3f}" for n, value in zip(("roll", "pitch", "yaw"), record["roll_pitch_yaw_deg"], strict=True)
     )
     turned = np.degrees(np.linalg.norm(sigma[3:]))
-    note = f", {len(record['dropped'])} points dropped" if record["dropped"] else ""
+    dropped = len(record["dropped"])
+    note = f", {dropped} point{'' if dropped == 1 else 's'} dropped" if dropped else ""
     note += f", misfit {record['misfit']:.1f}" if record["misfit"] > 1 else ""
     note += f", {record['jump']}" if record.get("jump") else ""
     singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""

@@ -184,15 +184,17 @@ def inverse(
     lanes, work = scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
     count = missed = 0
     irregular = closed[KIND] == 0.0
+    exact = table[KIND] != 0.0
     # Where rounding may be to blame for what was missed, a second time from as close as the closed form comes.
     for again in range(0 if irregular else 2):
-        clamp = again == 1 or table[KIND] == 0.0
+        clamp = again == 1 or not exact
         if again == 0 or missed & DOUBT:
             count, out = _from_closed_form(table, closed, limits, F, near, clamp, rows, count, lanes, work, n)
             missed |= out
-    if irregular or (count == 0 and missed & DOUBT):
-        count = _from_everywhere(table, F, near, MOST if irregular else 1, rows, work)
-        rows[:count, STATE] = 0.0 if irregular else 1.0 * (SHOULDER | WRIST)
+    if count == 0 and (not exact or missed & DOUBT):
+        most = 1 if exact else MOST if irregular else n
+        count = _from_everywhere(table, F, near, most, rows, work)
+        rows[:count, STATE] = 1.0 * (SHOULDER | WRIST) if exact else 0.0
     bits = 0
     for k in range(count):
         bits |= int(rows[k, STATE])
@@ -250,6 +252,6 @@ def nearest(
             turned, _ = placed(trial[i], limits[0, i], limits[1, i], near[i])
             trial[i] = min(limits[1, i], max(limits[0, i], turned))
         cost = descend(table, F, trial, limits[0], limits[1], _LONG_STEPS, work)
-        if cost < best:
+        if k == 0 or cost < best:  # the first anyway: a pose may be so far off that every cost is infinite
             best = cost
             q[:] = trial

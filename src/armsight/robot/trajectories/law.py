@@ -7,8 +7,10 @@ rest that is exact, because the whole motion then is the same one, k times slowe
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from operator import attrgetter
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -29,6 +31,11 @@ ROUNDS = 12
 CLOSE = 1e-3
 #: From a moving start these scales are tried too, and at most so many of what is found are looked at closely.
 SCALES, TRIED = (1.03, 1.0, 0.97, 0.93, 0.87, 0.8, 0.7, 0.6, 0.5, 0.4), 20
+#: Where none of these will do: speeds and accelerations as shares of what the joints could do at most, beside the start's
+#: own, which are a little widened; what is made harder, the jerk alone or all limits as time is scaled; up to what, and in
+#: how many halvings.
+SPEEDS, ACCELERATIONS, ALIKE = np.array([4.0, 1.0, 0.7, 0.5, 0.3]), np.array([4.0, 1.0, 0.6, 0.3]), 1e-7
+JERK_ONLY, ALL_LIMITS, HARDEST, HARDER = np.array([0.0, 0.0, 1.0]), np.array([1.0, 2.0, 3.0]), 2.0, 14
 #: How exactly the walk's derivatives are known between its places, how long a start's own state may last, s, and at every
 #: how many-th instant of the later check a moving start's laws are judged.
 HAIR, FIRST_S, EVERY = 2e-4, 5e-3, 2
@@ -95,8 +102,8 @@ def fit_law(arm: Arm, guide: Walk) -> SingleLaw:
     return law
 
 
-def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> list[SingleLaw]:
-    """Return shares over time from a moving start that keep the limits by the walk's derivatives, the shortest first.
+def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> Iterator[SingleLaw]:
+    """Yield shares over time from a moving start that keep the limits by the walk's derivatives, the shortest first.
 
     Args:
         arm: the arm, for its limits.
@@ -118,10 +125,41 @@ def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) 
                 continue
             if keeps(arm, guide, law):
                 found.append(law)
-    if not found:
+    by_length = attrgetter("duration_s")
+    yield from sorted(found, key=by_length)[:TRIED]
+    hard_pressed = _hard_pressed(arm, guide, start, duration_s)
+    yield from sorted(hard_pressed, key=by_length)[:TRIED]
+    if not (found or hard_pressed):
         asked = "" if duration_s is None else f" in {duration_s:g} s"
         raise InputError(f"from this moving start no motion to the end of the path{asked} keeps the arm's limits")
-    return sorted(found, key=lambda law: law.duration_s)[:TRIED]
+
+
+def _hard_pressed(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> list[SingleLaw]:
+    """Return what :func:`moving_laws` does, for a start that leaves hardly any choice: each as hard as can be.
+
+    A motion taken up where it speeds up or brakes at a limit can go on in little else than the way it began: what is
+    gentler runs past the end, what is less gentle passes the limit.
+    """
+    most, found = bounds(arm, guide), []
+    now = np.abs([start.qd[0], start.qdd[0]]) * (1 + ALIKE)
+    speeds, accelerations = (*(most[0] * SPEEDS), now[0]), (*(most[1] * ACCELERATIONS), now[1])
+    rays = [(np.array([*pair, most[2]]), JERK_ONLY) for pair in product(speeds, accelerations)]
+    for base, powers in rays + [(most * shape, ALL_LIMITS) for shape in SHAPES]:
+        gentle, hard, best = 0.0, HARDEST, None
+        for _ in range(HARDER):
+            middle = (gentle + hard) / 2
+            try:
+                law = single_law(start, base * middle**powers, duration_s)
+            except InputError:
+                gentle = middle
+                continue
+            if keeps(arm, guide, law):
+                gentle, best = middle, law
+            else:
+                hard = middle
+        if best is not None:
+            found.append(best)
+    return found
 
 
 def keeps(arm: Arm, guide: Walk, law: Law | Profile) -> bool:

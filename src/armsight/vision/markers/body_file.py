@@ -52,12 +52,12 @@ class Marker(Record):
 
     def check_keys(self, kind: str, required: Collection[str], optional: Collection[str] = ()) -> None:
         """Raise InputError where a key of the kind's table is missing or unknown."""
-        for key in required:
-            if key not in self.fields:
-                raise self.error(f"{kind} has no {key}; it needs {', '.join(required)}")
         for key in self.fields:
             if key not in required and key not in optional:
                 raise self.error(f"{kind} has an unknown key {key!r}; known are {', '.join((*required, *optional))}")
+        for key in required:
+            if key not in self.fields:
+                raise self.error(f"{kind} has no {key}; it needs {', '.join(required)}")
 
     def converted(self, key: str, convert: Callable[[str], str]) -> str:
         """Return a text field through ``convert``, whose InputError then names the entry."""
@@ -152,7 +152,12 @@ def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Mar
     where = f"{where} ({name})"
     own = [key for key in entry if key not in ("name", *_PLACE)]
     known = ", ".join(sorted(kinds))
-    if len(own) != 1 or own[0] not in kinds:
+    for key in own:
+        if key not in kinds:
+            raise InputError(
+                f"{where}: unknown key {key!r}; a marker has name, {', '.join(_PLACE)}, and one table of: {known}"
+            )
+    if len(own) != 1:
         raise InputError(
             f"{where}: needs exactly one table that says its kind, of: {known}; got {', '.join(own) or 'none'}"
         )
@@ -160,6 +165,10 @@ def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Mar
         raise InputError(f"{where}: {own[0]} must be a table, such as {own[0]} = {{ ... }}")
     if "position_mm" not in entry:
         raise InputError(f"{where}: has no position_mm = [x, y, z]")
+    for key in _PLACE:
+        given = entry.get(key, [])
+        if isinstance(given, list) and any(isinstance(number, str | bool) for number in given):
+            raise InputError(f"{where}: {key} must be numbers without quotes, got {given!r}")
     numbers = {
         key: checked(entry[key], (4 if key == "quaternion_wxyz" else 3,), f"{where}: {key}")
         for key in _PLACE

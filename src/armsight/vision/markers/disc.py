@@ -21,7 +21,7 @@ from armsight.vision.markers.body_check import check_discs
 from armsight.vision.markers.body_file import Marker
 
 #: Most places looked at in an image, and most rejected ones that are told.
-_MOST_PLACES, _MOST_TOLD = 16384, 100
+_MOST_PLACES, _MOST_TOLD, _NEVER = 16384, 100, 99
 _KEPT = threading.local()
 
 
@@ -77,6 +77,10 @@ class DiscTarget(Record):
         good, n = disc_search.find(image, image.view(np.uint64), bright, dark, *room)
         theta, codes, signs, cov, shape = room[:5]
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
+        if n == _MOST_PLACES:  # rows are looked at from above
+            row = float(min(np.nanmax(theta[:n, 1]), len(image) - 1))
+            reason = f"{n} places stand out, and no more are looked at: below about row {row:.0f} discs were not found"
+            rejected = (Rejected((0.0, row), reason), *rejected)
         return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
 
 
@@ -97,6 +101,7 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, 
 
 
 def _rejected(theta: Array, codes: NDArray[np.int64]) -> tuple[Rejected, ...]:
-    """Say what is no disc and why; what came furthest, and so looks most like one, first."""
-    told = np.argsort(~np.isin(codes, disc_fit.LOOK_ALIKES), kind="stable")[:_MOST_TOLD]
+    """Say what is no disc and why: places with a closed rim, most like a disc first, or the others where there is none."""
+    order = np.array([disc_fit.LOOK_ALIKES.index(c) if c in disc_fit.LOOK_ALIKES else _NEVER for c in codes.tolist()])
+    told = np.argsort(order, kind="stable")[: min(_MOST_TOLD, max(int((order < _NEVER).sum()), 1))]
     return tuple(Rejected((float(theta[i, 0]), float(theta[i, 1])), disc_fit.REASONS[int(codes[i])]) for i in told)

@@ -51,16 +51,22 @@ REASONS = {
     8: "its inside is not even: smeared by motion, or no disc",
     9: "open on one side",
     10: "what surrounds it is not even: text, a ring, a square of a board",
+    11: "found already",
 }
-#: Reasons that only the fit gives: such a place has a closed rim.
-LOOK_ALIKES = (3, 4, 5, 6, 8, 10)
+FOUND_TWICE = 11
+#: Reasons of places that have a closed rim, those that look most like a disc first.
+LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
 _LEAST_RATIO = 0.22
 #: How far the sixteenths of the rim may lie off the ellipse beyond what noise does, RMS: px, share of the size, and share
 #: of the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
-_RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.01, 1.5
+_RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
+#: Standard deviations of that beyond which it is no chance.
+_RIM_CHANCE = 4.0
 #: What the residuals may be beyond the image's noise, as a share of the contrast.
-_MOST_RESIDUAL = 0.14
+_MOST_RESIDUAL = 0.1
+#: A centre that its uneven surround leaves less certain than this is not given, px.
+_MOST_SIGMA_PX = 0.08
 #: How uneven the inside may be beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
@@ -116,11 +122,21 @@ def _spread(n: int, work: Work, flat: Array) -> None:
     flat[2], flat[3] = count_in, count_out
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _clipped(n: int, work: Work) -> int:
+    """Count the pixels without light or with more than eight bits hold."""
+    level, count = work.level, np.int32(0)
+    for i in range(n):
+        count += np.int32(1) if level[i] <= F(0.0) or level[i] >= F(255.0) else np.int32(0)
+    return int(count)
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) -> None:
     """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
     px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
     sectors[:, :] = 0.0
+    x = work.x.astype(np.float32)  # the last step: the residuals are those before it
     cx, cy = F(theta[0] - x0), F(theta[1] - y0)
     for i in range(n):
         if F(0.03) < inside[i] < F(0.97):
@@ -128,7 +144,10 @@ def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array)
             u, v = px[i] - cx, py[i] - cy
             a, b = abs(u), abs(v)
             k = 8 * (u > F(0.0)) + 4 * (v > F(0.0)) + 2 * (a > b) + (min(a, b) > F(0.41421356) * max(a, b))
-            sectors[0, k] += np.sqrt(square) * residual[i]
+            left = residual[i]
+            for m in range(UNKNOWNS):
+                left -= J[m, i] * x[m]
+            sectors[0, k] += np.sqrt(square) * left
             sectors[1, k] += square
     for k in range(_SECTORS):
         sectors[0, k] /= max(sectors[1, k], 1e-12)
@@ -302,7 +321,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2
-    variance = square / (n - UNKNOWNS)
+    # Clipped pixels have no noise and say nothing of it.
+    variance = square / max(n - _clipped(n, work) - UNKNOWNS, UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
     half = (theta[2] + theta[4]) / 2
     root = np.sqrt(max(half * half - det, 0.0))
@@ -317,13 +337,14 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     _rim(n, theta, x0, y0, work, sectors)
-    off, count = 0.0, 0
+    off, chance, count = 0.0, 0.0, 0
     for k in range(_SECTORS):
         if sectors[1, k] > 0.0:
             off += sectors[0, k] ** 2 - variance / sectors[1, k]
+            chance += 2.0 * (variance / sectors[1, k]) ** 2
             count += 1
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
-    if off > count * allowed * allowed:
+    if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
         return 5
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
@@ -334,11 +355,17 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     _pair(0, work, cov)
     if texture > 0.0:
         variance *= _texture_factor(n, theta[5], texture, work)
+        if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
+            return 10
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
     if uneven and texture == 0.0:
         _average(n, theta, x0, y0, noise_sigma, square, cov, work)
+    if off > _RIM_CHANCE * np.sqrt(chance):
+        # A rim that is off beyond chance, a little of it covered perhaps, may have taken the centre along as far.
+        cov[0, 0] += off / count
+        cov[1, 1] += off / count
     return 0
 
 

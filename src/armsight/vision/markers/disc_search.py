@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.disc_fit import fit, shape_of
+from armsight.vision.markers.disc_fit import FOUND_TWICE, fit, shape_of
 from armsight.vision.markers.disc_model import Work, factor, solve
 
 #: Rows between those looked at; the smallest disc, 5 px across, shows on one at least.
@@ -287,6 +287,24 @@ def workspace() -> Room:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
+    """Whether disc n is one of those before it; if not, let its cell of 8 px know it.
+
+    Two discs in one cell do not look for each other's copies: they are smaller than 5 px then.
+    """
+    x, y = int(starts[n, 0]) >> 3, int(starts[n, 1]) >> 3
+    for j in range(max(y - 1, 0), min(y + 2, cells.shape[0])):
+        for i in range(max(x - 1, 0), min(x + 2, cells.shape[1])):
+            m = cells[j, i]
+            if m < 0 or signs[m] != signs[n]:
+                continue
+            if (starts[m, 0] - starts[n, 0]) ** 2 + (starts[m, 1] - starts[n, 1]) ** 2 < 4.0:
+                return True
+    cells[y, x] = n
+    return False
+
+
+@numba.njit(cache=True, error_model="numpy")
 def find(
     image: Grey, words: Words, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64], signs: NDArray[np.int64],
     cov: Array, shape: Array, room: Room, work: Work,
@@ -312,15 +330,19 @@ def find(
     noise = noise_of(image)
     n = search(image, words, noise, bright, dark, starts, codes, signs, room)
     good = 0
+    cells = np.full((image.shape[0] // 8 + 1, image.shape[1] // 8 + 1), -1, np.int16)
     for i in range(n):
         if codes[i] == 0:
             codes[i] = fit(image, noise, starts[i], cov[good], work)
-        if codes[i] == 0:
-            shape_of(starts[i], shape[good])
-            if i != good:
-                for a in range(starts.shape[1]):
-                    starts[good, a], starts[i, a] = starts[i, a], starts[good, a]
-                codes[good], codes[i] = codes[i], codes[good]
-                signs[good], signs[i] = signs[i], signs[good]
+        if codes[i] != 0:
+            continue
+        for a in range(starts.shape[1]):
+            starts[good, a], starts[i, a] = starts[i, a], starts[good, a]
+        codes[good], codes[i] = codes[i], codes[good]
+        signs[good], signs[i] = signs[i], signs[good]
+        if _again(good, starts, signs, cells):
+            codes[good] = FOUND_TWICE
+        else:
+            shape_of(starts[good], shape[good])
             good += 1
     return good, n
