@@ -2,7 +2,7 @@
 
     python examples/03_follow_a_plate.py
 
-The first run on a machine compiles for about a minute. The plate is examples/plate.toml; ``armsight body draw`` prints it.
+The first run on a machine compiles for a minute or two. The plate is examples/plate.toml; ``armsight body draw`` prints it.
 """
 
 from pathlib import Path
