@@ -32,19 +32,19 @@ class Following:
 
     def __init__(self, rig: StereoRig, target: DiscTarget) -> None:
         self.way = "searched"
-        self._rig, self._target, self._count, self._follower = rig, opened(target), 0, None
+        self._rig, self._target, self._count, self.follower = rig, opened(target), 0, None
         if lacking("follow") is None:
             from armsight.vision.follow import Follower
 
-            self._follower = Follower(rig, self._target)
+            self.follower = Follower(rig, self._target)
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
         self._count += 1
         shot = Shot(str(self._count), left, right, self._count / RATE_HZ)
-        if self._follower is None:
+        if self.follower is None:
             return measure(self._rig, self._target, shot)
-        result = self._follower.measure(shot)
-        self.way = self._follower.way
+        result = self.follower.measure(shot)
+        self.way = self.follower.way
         return result
 
 

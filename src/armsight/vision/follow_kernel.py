@@ -94,12 +94,11 @@ def _seek(
 def look(
     image: NDArray[np.uint8], side: int, scene: Scene, margin: float, noise: float, least: float, found: Found, work: Work,
     room: Room,
-) -> int:  # fmt: skip
-    """Find the discs of one image around where the pose ``found.T`` has them; return how many were found."""
+) -> None:  # fmt: skip
+    """Find the discs of one image around where the pose ``found.T`` has them; ``found.codes`` says what came of each."""
     T = scene.T_right_left @ found.T if side == 1 else found.T
     P, n = np.empty(3), np.empty(3)
     theta, expected, J_P, J_n = np.empty(10), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
-    seen = 0
     for m in range(len(scene.radii)):
         for i in range(3):
             P[i] = T[i, 3]
@@ -132,8 +131,6 @@ def look(
         if code == 0:
             found.uv[m, side, 0], found.uv[m, side, 1] = theta[0], theta[1]
             found.contrast[m, side] = abs(theta[6])
-            seen += 1
-    return seen
 
 
 @numba.njit(cache=True, error_model="numpy")

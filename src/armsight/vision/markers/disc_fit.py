@@ -124,7 +124,7 @@ def _spread(n: int, work: Work, flat: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _clipped(n: int, work: Work) -> int:
-    """Count the pixels without light or with more than eight bits hold."""
+    """Count the pixels that are black or white to the last level."""
     level, count = work.level, np.int32(0)
     for i in range(n):
         count += np.int32(1) if level[i] <= F(0.0) or level[i] >= F(255.0) else np.int32(0)
@@ -242,11 +242,11 @@ def _slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> flo
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _significance(theta: Array, first: int, work: Work) -> float:
-    """Return the squared distance from zero of two neighbouring unknowns, in units of the noise's variance."""
+def _slope_outside(theta: Array, work: Work) -> float:
+    """Return what chi-square would lose without the surround's gradient, in units of the noise's variance."""
     cov = work.shapes
-    _pair(first, work, cov)
-    a, b = theta[first], theta[first + 1]
+    _pair(8, work, cov)
+    a, b = theta[8], theta[9]
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
     return float((cov[1, 1] * a * a - 2 * cov[0, 1] * a * b + cov[0, 0] * b * b) / det)
 
@@ -349,8 +349,9 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     _spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
-    uneven = _slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance or _significance(theta, 8, work) > (
-        _SLOPE_OUTSIDE * variance
+    uneven = texture == 0.0 and (
+        _slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
+        or _slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
     )
     _pair(0, work, cov)
     if texture > 0.0:
@@ -360,7 +361,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
-    if uneven and texture == 0.0:
+    if uneven:
         _average(n, theta, x0, y0, noise_sigma, square, cov, work)
     if off > _RIM_CHANCE * np.sqrt(chance):
         # A rim that is off beyond chance, a little of it covered perhaps, may have taken the centre along as far.
