@@ -220,3 +220,33 @@ class PoseEstimate(Record):
     misfit: float
     points: Points
     dropped: tuple[Dropped, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class JointCommand(Record):
+    """Where the joints are to be, as a board takes it.
+
+    Attributes:
+        q_ref: (6,) joint angles to be at when ``duration_s`` has passed, rad.
+        qd_ref: (6,) speeds to have there, rad/s.
+        gravity_duty: (6,) duty that carries the arm's weight, -1 to 1.
+        duration_s: usually the time until the next command; a whole number of the board's ticks.
+    """
+
+    q_ref: Array
+    qd_ref: Array
+    gravity_duty: Array
+    duration_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointStates(Record):
+    """What the potentiometers said since the last time, oldest first.
+
+    Attributes:
+        t_s: (N,) times on the board's clock, s.
+        q: (N, 6) measured joint angles, rad.
+    """
+
+    t_s: Array
+    q: Array

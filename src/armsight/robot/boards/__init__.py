@@ -1,0 +1,1 @@
+"""Boards: joint commands go out, what the joints do comes back."""
