@@ -8,14 +8,18 @@ beside it where the installed OpenCV has them (5.0 has not).
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
 
 from armsight.data import Array
-from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.pose import inverse, log_se3, mean_pose, pose
 
+#: OpenCV as it is at run time: its type stubs are those of one version.
+_CV: Any = cv2
 #: Parts of this many poses are tried too, so that some of them are free of gross errors.
 PART = 6
 #: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
@@ -47,7 +51,7 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
         for _ in range(PARTS):
             rows = rng.choice(len(A), PART, replace=False)
             found.append(kronecker(A[rows], B[rows]))
-    found = [(X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all()]
+    found = [(X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _turns(X) and _turns(Z)]
     return sorted(found, key=lambda XZ: _score(A, B, *XZ))
 
 
@@ -78,23 +82,26 @@ def _rotation(M: Array) -> Array:
 
 
 def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield what OpenCV's solvers find, where it has them."""
-    RA, tA, RB, tB = list(A[:, :3, :3]), list(A[:, :3, 3]), list(B[:, :3, :3]), list(B[:, :3, 3])
-    back = inverse(A)
-    if hasattr(cv2, "calibrateRobotWorldHandEye"):
-        # Its world is what is seen by the camera, its base and gripper ours, all the other way round: Z^-1 A X = B.
-        for name in _OPENCV:
-            with_base = cv2.calibrateRobotWorldHandEye(RB, tB, list(back[:, :3, :3]), list(back[:, :3, 3]),
-                                                       method=getattr(cv2, name))  # fmt: skip
-            del with_base
-    if hasattr(cv2, "calibrateHandEye"):
-        for name in _OPENCV_MOTIONS:
-            try:
-                R, t = cv2.calibrateHandEye(RA, tA, list(inverse(B)[:, :3, :3]), list(inverse(B)[:, :3, 3]),
-                                            method=getattr(cv2, name))  # fmt: skip
-            except cv2.error:
-                continue
-            yield pose(R, t.ravel()), np.eye(4)
+    """Yield what OpenCV's solvers find, where it has them and they take what they are given."""
+    back = inverse(B)
+    for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
+            X = pose(R, t.ravel())
+            yield X, mean_pose(A @ X @ back)
+    for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
+            yield pose(RX, tX.ravel()), pose(RZ, tZ.ravel())
+
+
+def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
+    return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
+
+
+def _turns(T: Array) -> bool:
+    """Say whether a solver's answer is a rigid motion at all."""
+    return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
 
 
 def _score(A: Array, B: Array, X: Array, Z: Array) -> float:

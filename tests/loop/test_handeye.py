@@ -1,0 +1,110 @@
+import cv2
+import numpy as np
+import pytest
+from handeye_motions import SIGMA_FLANGE_M, SIGMA_FLANGE_RAD, error, recording
+from scipy.stats import chi2
+
+from armsight.errors import CalibrationError, InputError
+from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop import handeye_start
+from armsight.loop.handeye import calibrate_handeye
+from armsight.loop.handeye_fit import Poses, adjoint, residuals
+from asserts import assert_jacobian
+
+
+@pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
+def test_the_covariance_holds_the_error_and_the_arms_share_is_found(eye):
+    squares, place, turn = [], [], []
+    for seed in range(16):
+        A, B, cov, Z, X = recording(seed, eye, gross=seed % 4)
+        h = calibrate_handeye(A, B, cov, eye=eye, folds=2)
+        assert (h.used == (np.arange(len(A)) >= seed % 4)).all()
+        e = error(h, Z, X)
+        squares.append(e @ np.linalg.solve(h.cov, e))
+        place.append(h.sigma_flange_m)
+        turn.append(h.sigma_flange_rad)
+    # Chance 1e-3 at either end; the sigmas themselves are estimated from 180 numbers, which widens the upper end by 10 %.
+    assert chi2.ppf(1e-3, 12 * 16) < sum(squares) < 1.1 * chi2.isf(1e-3, 12 * 16)
+    assert np.mean(place) == pytest.approx(SIGMA_FLANGE_M, rel=0.1)
+    assert np.mean(turn) == pytest.approx(SIGMA_FLANGE_RAD, rel=0.1)
+
+
+@pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
+def test_without_noise_the_answer_is_exact(eye):
+    A, _, _, Z, X = recording(3, eye)
+    B = inverse(Z) @ A @ X if eye == "to_hand" else inverse(A @ X) @ Z
+    h = calibrate_handeye(A, B, eye=eye)
+    assert np.abs(error(h, Z, X)).max() < 1e-9
+    assert h.held_out.most()[0] < 1e-9
+    assert np.abs(h.predict(A) - B).max() < 1e-9
+
+
+@pytest.mark.parametrize("in_hand", [False, True])
+def test_the_derivative_is_the_derivative(in_hand):
+    A, B, cov, Z, X = recording(5, "in_hand" if in_hand else "to_hand", n=4)
+    poses = Poses(A, B, cov, in_hand)
+
+    def f(x):
+        return residuals(poses, Z @ exp_se3(x[:6]), X @ exp_se3(x[6:]))[0]
+
+    e, J, _ = residuals(poses, Z, X)
+    assert_jacobian(J, f, np.zeros(12), 1e-4, rtol=float(np.abs(e).max()) ** 2)  # exact to the square of the residual
+
+
+def test_the_adjoint_carries_a_tangent():
+    rng = np.random.default_rng(1)
+    T, xi = exp_se3(rng.normal(size=6)), rng.normal(size=6) * 0.1
+    np.testing.assert_allclose(T @ exp_se3(xi) @ inverse(T), exp_se3(adjoint(T) @ xi), atol=1e-14)
+
+
+def test_the_held_out_error_is_what_new_poses_show():
+    A, B, cov, _, _ = recording(11, n=60)
+    h = calibrate_handeye(A[:30], B[:30], cov[:30])
+    new = np.linalg.norm((h.predict(A[30:]) - B[30:])[:, :3, 3], axis=1)
+    assert h.held_out.rms()[0] == pytest.approx(np.sqrt(np.mean(new**2)), rel=0.25)  # 90 numbers each: 7 % sigma a side
+
+
+@pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV has no calibrateHandEye")
+def test_the_own_start_is_as_good_as_opencvs():
+    A, B, _, _, _ = recording(2)
+    own = handeye_start.kronecker(A, B)
+    for X_cv, Z_cv in handeye_start._opencv(A, B):
+        assert np.abs(own[0] - X_cv).max() < 0.02
+        assert np.abs(own[1] - Z_cv).max() < 0.02
+
+
+def test_turns_about_one_axis_are_refused():
+    A, _, _, Z, X = recording(3)
+    turn = exp_se3(np.array([0, 0, 0, 0, 0, 1.0])[None] * np.linspace(-1, 1, 20)[:, None])
+    A = turn @ A[0]
+    with pytest.raises(CalibrationError, match="two axes that are not parallel"):
+        calibrate_handeye(A, inverse(Z) @ A @ X)
+
+
+def test_poses_all_alike_are_refused():
+    A, B, cov, _, _ = recording(3, still=True)
+    with pytest.raises(CalibrationError, match="turn the wrist"):
+        calibrate_handeye(A, B, cov)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda A, B: (A[:3], B[:3]), "needs 4 or more poses, got 3"),
+        (lambda A, B: (A, B[:-1]), "Ts_rig_body has shape"),
+        (lambda A, B: (A * np.nan, B), "NaN"),
+        (lambda A, B: (A, B * 2), "pose 0 is no rigid motion"),
+    ],
+)
+def test_what_is_no_recording_is_refused(change, said):
+    A, B, _, _, _ = recording(3)
+    with pytest.raises(InputError, match=said):
+        calibrate_handeye(*change(A, B))
+
+
+def test_an_unknown_mounting_and_a_transform_of_the_other_one_are_refused():
+    A, B, cov, _, _ = recording(3)
+    with pytest.raises(InputError, match="to_hand, in_hand"):
+        calibrate_handeye(A, B, cov, eye="on_foot")
+    with pytest.raises(InputError, match="belongs to 'in_hand'"):
+        _ = calibrate_handeye(A, B, cov).T_flange_rig
