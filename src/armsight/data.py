@@ -28,9 +28,9 @@ class Record:
         """Make every array field a read-only view."""
         fields = self.__dict__  # not dataclasses.fields: records are made for every shot of a live loop
         for name, value in fields.items():
-            if isinstance(value, np.ndarray):
+            if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = view = value.view()
-                view.flags.writeable = False
+                view.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,10 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     w = w / w.sum()
     mean_b, mean_a = w @ p_b, w @ p_a
     U, _, Vt = np.linalg.svd((w[:, None] * (p_a - mean_a)).T @ (p_b - mean_b))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    R = U @ Vt
+    if np.linalg.det(R) < 0:  # a mirror image lies better: the least spread is given up
+        U[:, 2] = -U[:, 2]
+        R = U @ Vt
     return pose(R, mean_a - R @ mean_b)
 
 

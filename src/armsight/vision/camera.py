@@ -8,9 +8,11 @@ as in OpenCV's ``fisheye``). The kernels are compiled by numba; all derivatives 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -192,11 +194,18 @@ class Camera(Record):
         """Return the same camera with other intrinsics and distortion (4 + n,)."""
         return Camera(self.image_size_px, self.model, parameters[:4].copy(), parameters[4:].copy())
 
+    @cached_property
+    def _kernel(self) -> tuple[bool, Array, Array]:
+        """What :meth:`kernel_arguments` returns; a live loop asks for it many times a shot."""
+        k, d = np.array(self.intrinsics), np.zeros(8)
+        d[: self.distortion.size] = self.distortion
+        for shared in (k, d):
+            shared.setflags(write=False)
+        return self.model == "fisheye", k, d
+
     def kernel_arguments(self) -> tuple[bool, Array, Array]:
         """Return what the compiled kernels take: fisheye or not, (4,) intrinsics, (8,) coefficients padded with zeros."""
-        d = np.zeros(8)
-        d[: self.distortion.size] = self.distortion
-        return self.model == "fisheye", np.array(self.intrinsics), d
+        return self._kernel
 
     def project_jacobians(self, p: Array) -> tuple[Array, Array, Array]:
         """Project points and differentiate.
@@ -222,3 +231,9 @@ class Camera(Record):
         rays = np.empty((len(uv), 3))
         _unproject(*self.kernel_arguments(), np.ascontiguousarray(uv, dtype=np.float64), rays)
         return rays
+
+
+def pair_arguments(cameras: tuple[Camera, Camera]) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Return what compiled kernels of two cameras take: (2,) fisheye or not, (2, 4) intrinsics, (2, 8) coefficients."""
+    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
+    return np.array([fish_l, fish_r]), np.array([k_l, k_r]), np.array([d_l, d_r])

@@ -21,7 +21,7 @@ from armsight.vision.disc_pose import SEEN, Found, Scene, velocity
 from armsight.vision.expected import bias_normals
 from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
-from armsight.vision.locate import misfit_limit
+from armsight.vision.likeness import misfit_limit
 from armsight.vision.markers import disc_search
 from armsight.vision.markers.disc_fit import REASONS
 from armsight.vision.markers.disc_model import workspace

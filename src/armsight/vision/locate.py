@@ -9,7 +9,7 @@ the noise is what the residuals show (Birge's ratio), and the estimate says by h
 
 from __future__ import annotations
 
-from functools import lru_cache
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from scipy.stats import chi2
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.geometry.pose import transform
-from armsight.geometry.rigid import fit_rigid, fit_scale
+from armsight.geometry.rigid import fit_rigid
+from armsight.vision.likeness import misfit_limit, on_one_line, unbelievable
 from armsight.vision.pnp import consensus_poses
 from armsight.vision.posefit import PoseFit, Sightings, fit_pose, whitened
 from armsight.vision.rig import StereoRig
@@ -31,17 +32,9 @@ _AGREEING = 0.5
 #: With this many matched points the rigid fit alone is a safe start; with fewer, every pose that one camera allows is
 #: tried too, mirror solutions among them.
 _SAFE_POINTS = 8
-_COLLINEAR = 1e-3
 #: A robust fit whose median squared distance is this many times the expected one may be in a wrong minimum: then rigid
 #: fits of so many triples are judged, and the best few tried.
 _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
-#: Residuals beyond chance and beyond this share of the body's apparent size are of something else than the body: a square
-#: of a wrong size, wrong names. A bent or badly printed body is a few hundredths off.
-_ALIKE = 0.2
-#: A body whose points are this much too far apart or too close together, and by so many standard deviations, is another.
-_SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
-#: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
-_MISFIT_QUANTILE = 0.999
 
 
 def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
@@ -59,9 +52,9 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     reason = _unlocatable(body, points)
     if reason is not None:
         return Missed(reason)
-    sightings = Sightings.of(points.seen, rig.sigma_px)
-    best = _best(rig, body, sightings, _starts(rig, body, points))
-    if best is None or np.median(best.distance2) > _SUSPECT * _MEDIAN:
+    sightings, rigid = Sightings.of(points.seen, rig.sigma_px), fit_rigid(body.points[points.ids], points.p_left)
+    best = _best(rig, body, sightings, _starts(rig, body, points, rigid))
+    if best is None or _median(best.distance2) > _SUSPECT * _MEDIAN:
         others = _best(rig, body, sightings, _agreed_starts(body, points))
         best = min((fit for fit in (best, others) if fit is not None), key=lambda fit: fit.cost, default=None)
     if best is None:
@@ -69,7 +62,7 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     good, fit = _without_outliers(rig, body, best, sightings)
     if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    reason = _unbelievable(rig, body, points, fit, _chosen(sightings, good))
+    reason = unbelievable(rig, body, points, fit, _chosen(sightings, good), rigid)
     return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
 
 
@@ -78,54 +71,7 @@ def _unlocatable(body: Body, points: Points) -> str | None:
     if len(points.ids) < 3:
         lost = f"; dropped: {_listed(points.dropped)}" if points.dropped else ""
         return f"{len(points.ids)} matched points, 3 are needed{lost}"
-    return "the matched points lie on one line" if _on_one_line(body.points[points.ids]) else None
-
-
-def _on_one_line(points: Array) -> bool:
-    """Whether points (N, 3), N >= 3, lie on one line, which can turn about itself unseen."""
-    centred = points - points.mean(axis=0)
-    spread = np.linalg.eigvalsh(centred.T @ centred)
-    return bool(spread[1] <= _COLLINEAR**2 * spread[2])
-
-
-def _wrong_size(rig: StereoRig, body: Body, points: Points) -> str | None:
-    """Say that the points are closer together or further apart than the body's, beyond what the rig can be wrong, or None.
-
-    The scale is that of a similarity fit; its sigma holds pixel noise and the rig's calibration.
-    """
-    p_body = body.points[points.ids]
-    p = (p_body - p_body.mean(axis=0)) @ fit_rigid(p_body, points.p_left)[:3, :3].T
-    spread = float((p**2).sum())
-    by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
-    variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
-    scale = float((p * points.p_left).sum()) / spread
-    if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * np.sqrt(variance)):
-        return None
-    return (
-        f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
-        "square, a tag, the body file's unit), and is it the target the rig sees?"
-    )
-
-
-def _unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
-    """Say why a fit is no measurement of the body, or None."""
-    count = np.bincount(used.point, minlength=len(body.points))
-    if _on_one_line(body.points[count > 0]):
-        return "the points that agree with one pose of the body lie on one line"
-    sides = [used.uv[used.camera == c] for c in (0, 1)]
-    size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
-    off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
-    if fit.cost <= misfit_limit(2 * len(used.point) - 6) or off <= _ALIKE * size:
-        both = count[points.ids] == 2
-        if both.sum() < 3 or _on_one_line(body.points[points.ids[both]]):
-            return None
-        arrays = (points.ids[both], points.p_left[both], points.cov[both], points.calibration[both])
-        return _wrong_size(rig, body, Points(*arrays, points.seen))
-    scale = fit_scale(body.points[points.ids], points.p_left)
-    return (
-        f"the detections are not those of the body: {off:.1f} px off at an apparent size of {size:.0f} px, and "
-        f"{scale:.2f} times as far apart as its points"
-    )
+    return "the matched points lie on one line" if on_one_line(body.points[points.ids]) else None
 
 
 def _listed(dropped: tuple[Dropped, ...]) -> str:
@@ -134,9 +80,9 @@ def _listed(dropped: tuple[Dropped, ...]) -> str:
     return shown + (f" and {len(dropped) - 3} more" if len(dropped) > 3 else "")
 
 
-def _starts(rig: StereoRig, body: Body, points: Points) -> list[Array]:
+def _starts(rig: StereoRig, body: Body, points: Points, rigid: Array) -> list[Array]:
     """Return poses to start from: the rigid fit, and where points are few what each camera alone allows."""
-    starts = [fit_rigid(body.points[points.ids], points.p_left)]
+    starts = [rigid]
     if len(points.ids) < _SAFE_POINTS:
         seen = points.seen
         for side, camera in enumerate(rig.cameras):
@@ -177,7 +123,7 @@ def _without_outliers(
     d2, T = robust.distance2, robust.T_left_body
     good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
-        now = d2 <= _LIMIT * max(1.0, float(np.median(d2)) / _MEDIAN)
+        now = d2 <= _LIMIT * max(1.0, _median(d2) / _MEDIAN)
         if now.sum() < max(3, _AGREEING * len(now)) or np.count_nonzero(np.bincount(sightings.point[now])) < 3:
             return now, None
         if fit is not None and (now == good).all():
@@ -207,15 +153,17 @@ def _estimate(
     W, A, B = whitened(rig.cameras, rig.T_left_right, body.points, used, T)
     noise = np.linalg.inv(fit.information).astype(np.float64)
     gain = noise @ (A.T @ B)
-    misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
+    misfit = 1.0
+    if fit.cost > misfit_limit(2 * len(used.point) - 6):
+        misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
     points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, sightings, good)
-    gap = points.p_left - transform(T, body.points[points.ids])
+    gap = points.p_left - (body.points[points.ids] @ T[:3, :3].T + T[:3, 3])
     return PoseEstimate(
         T,
         noise * misfit + gain @ rig.cov @ gain.T,
         noise * misfit,
-        float(np.sqrt((gap**2).sum(axis=1).mean())) if len(gap) else float("nan"),
-        float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean())),
+        _rms(gap),
+        _rms(fit.residuals_px),
         float(np.sqrt(misfit)),
         points,
         points.dropped + dropped,
@@ -262,7 +210,12 @@ def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
     return chi_square / freedom if chi_square > misfit_limit(freedom) else 1.0
 
 
-@lru_cache(maxsize=256)
-def misfit_limit(freedom: int) -> float:
-    """Sum of squares beyond which residuals are a misfit, not chance."""
-    return float(chi2.ppf(_MISFIT_QUANTILE, freedom)) if freedom > 0 else np.inf
+def _rms(gaps: Array) -> float:
+    """Return the root mean square length of gaps (N, K); NaN of none."""
+    return math.sqrt(float(np.vdot(gaps, gaps)) / len(gaps)) if len(gaps) else math.nan
+
+
+def _median(values: Array) -> float:
+    """Return the median of (N,) values, N > 0; numpy's own takes as long as fitting a pose."""
+    ordered, half = np.sort(values), len(values) // 2
+    return float(ordered[half] + ordered[-1 - half]) / 2

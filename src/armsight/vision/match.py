@@ -6,10 +6,10 @@ rig, by name. Distances are measured in undistorted pixels of each camera.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
-from armsight.geometry.rotation import skew
 from armsight.vision.rig import StereoRig
 
 #: The gate in standard deviations of the epipolar distance, and the least it may be, px. A wrong identity is many
@@ -41,15 +41,32 @@ def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array
     Returns:
         (N, 2) distance in the left and in the right image, undistorted px; NaN where a pixel has no ray.
     """
-    x_left, x_right = rig.left.unproject(uv_left), rig.right.unproject(uv_right)
-    E = skew(rig.T_left_right[:3, 3]) @ rig.T_left_right[:3, :3]  # x_left^T E x_right = 0
     out = np.empty((len(uv_left), 2))
-    pairs = ((x_left, x_right @ E.T, rig.left), (x_right, x_left @ E, rig.right))
-    for side, (x, line, camera) in enumerate(pairs):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            gap = np.abs(np.einsum("ni,ni->n", x, line)) / np.abs(x[:, 2])
-            out[:, side] = gap / np.hypot(line[:, 0] / camera.intrinsics[0], line[:, 1] / camera.intrinsics[1])
+    focal = np.array([camera.intrinsics[:2] for camera in rig.cameras])
+    _gaps(rig.left.unproject(uv_left), rig.right.unproject(uv_right), np.array(rig.T_left_right), focal, out)
     return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gaps(rays_left: Array, rays_right: Array, T_left_right: Array, focal: Array, out: Array) -> None:
+    """Fill what :func:`epipolar_distances` returns from rays (N, 3) and focal lengths (2, 2), px."""
+    t, E, line = T_left_right[:3, 3], np.empty((3, 3)), np.empty((2, 2))  # x_left^T E x_right = 0
+    for j in range(3):
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            E[i, j] = t[a] * T_left_right[b, j] - t[b] * T_left_right[a, j]
+    for n in range(len(out)):
+        a, b, gap = rays_left[n], rays_right[n], 0.0
+        line[:] = 0.0
+        for i in range(3):
+            for j in range(3):
+                gap += a[i] * E[i, j] * b[j]
+                if i < 2:
+                    line[0, i] += E[i, j] * b[j] / focal[0, i]
+                if j < 2:
+                    line[1, j] += a[i] * E[i, j] / focal[1, j]
+        out[n, 0] = abs(gap / a[2]) / np.hypot(line[0, 0], line[0, 1])
+        out[n, 1] = abs(gap / b[2]) / np.hypot(line[1, 0], line[1, 1])
 
 
 def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
@@ -64,12 +81,13 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
         What is left; every dropped point is named with its distance.
     """
     rows = np.flatnonzero(seen.paired)
-    if not len(rows):
-        return seen
-    distance = epipolar_distances(rig, seen.uv[rows, 0], seen.uv[rows, 1]).max(axis=1)
-    variance = np.trace(seen.cov_uv[rows], axis1=2, axis2=3).max(axis=1) / 2 + rig.sigma_px**2
+    uv, cov = seen.uv[rows], seen.cov_uv[rows]
+    distance = epipolar_distances(rig, uv[:, 0], uv[:, 1]).max(axis=1)
+    variance = (cov[:, :, 0, 0] + cov[:, :, 1, 1]).max(axis=1) / 2 + rig.sigma_px**2
     limit = np.maximum(GATE_PX, GATE_SIGMAS * np.sqrt(2 * variance))
     bad = ~(distance <= limit)
+    if not bad.any():
+        return seen
     keep = np.ones(len(seen.ids), bool)
     keep[rows[bad]] = False
     dropped = tuple(

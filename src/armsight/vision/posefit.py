@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.pose import inverse
 from armsight.vision.bundle import CAUCHY_SCALE
-from armsight.vision.camera import Camera, distort
+from armsight.vision.camera import Camera, distort, pair_arguments
 
 _STEPS = 40
 _DONE = 1e-8  # relative decrease of the cost
@@ -94,15 +94,14 @@ def fit_pose(
         The minimum next to the start, or None where the start puts a point behind its camera or the
         sightings do not determine a pose.
     """
-    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
     T, p = np.array(start), np.ascontiguousarray(points[sightings.point])
     n = len(p)
     weight = np.empty((n, 2, 2))
     _invert(np.array(sightings.cov_uv), weight)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
     arguments: tuple[Any, ...] = (
-        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), inverse(T_left_right), p,
-        np.array(sightings.camera), np.array(sightings.uv), weight, T, robust, steps, residuals, d2, H,
+        *pair_arguments(cameras), inverse(T_left_right), p, np.array(sightings.camera), np.array(sightings.uv), weight, T,
+        robust, steps, residuals, d2, H,
     )  # fmt: skip
     try:
         cost = _fit(*arguments)
@@ -127,13 +126,11 @@ def whitened(
         (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the
         pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
     """
-    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
     n, counts = len(sightings.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))
     _differentiate(
-        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), counts, inverse(T_left_right),
-        np.ascontiguousarray(points[sightings.point]), np.array(sightings.camera), np.array(sightings.cov_uv),
-        np.array(T_left_body), W, by_pose, by_rig,
+        *pair_arguments(cameras), counts, inverse(T_left_right), np.ascontiguousarray(points[sightings.point]),
+        np.array(sightings.camera), np.array(sightings.cov_uv), np.array(T_left_body), W, by_pose, by_rig,
     )  # fmt: skip
     return W, by_pose, by_rig
 
@@ -149,15 +146,15 @@ def _invert(cov: Array, weight: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def _differentiate(
-    fisheye: Array, k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array, T: Array,
-    W: Array, by_pose: Array, by_rig: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array,
+    T: Array, W: Array, by_pose: Array, by_rig: Array,
 ) -> None:  # fmt: skip
     """Fill what :func:`whitened` returns."""
-    xy, J_p, J_d, M, q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty((4, 4)), np.empty(3)
-    T_right, starts, rig = T_right_left @ T, (0, 4 + counts[0]), 8 + counts[0] + counts[1]
+    xy, J_p, J_d, q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3)
+    Ts, starts, rig = np.stack((T, T_right_left @ T)), (0, 4 + counts[0]), 8 + counts[0] + counts[1]
     for n in range(len(p)):
         c = camera[n]
-        M[:, :] = T_right if c == 1 else T
+        M = Ts[c]
         for i in range(3):
             q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
         distort(fisheye[c], d[c], q, xy, J_p, J_d)
@@ -191,19 +188,18 @@ def _differentiate(
 
 @numba.njit(cache=True, error_model="numpy")
 def _assemble(
-    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array, T: Array,
-    robust: bool, residuals: Array, d2: Array, H: Array, g: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
+    T: Array, robust: bool, residuals: Array, d2: Array, H: Array, g: Array,
 ) -> float:  # fmt: skip
     """Fill residuals, squared distances, normal equations; return the cost, infinite behind a camera."""
     H[:, :] = 0.0
     g[:] = 0.0
     cost, c2 = 0.0, CAUCHY_SCALE * CAUCHY_SCALE
-    xy, J_p, J_d, M = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty((4, 4))
-    q, J = np.empty(3), np.empty((2, 6))
-    T_right = T_right_left @ T
+    xy, J_p, J_d, q, J = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3), np.empty((2, 6))
+    Ts = np.stack((T, T_right_left @ T))
     for n in range(p.shape[0]):
         c = camera[n]
-        M[:, :] = T_right if c == 1 else T
+        M = Ts[c]
         for i in range(3):
             q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
         if q[2] <= 0.0:
@@ -256,8 +252,8 @@ def moved(T: Array, xi: Array, out: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def _fit(
-    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array, T: Array,
-    robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
+    T: Array, robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
 ) -> float:  # fmt: skip
     """Levenberg-Marquardt on T in place; residuals, distances and information are those of the result."""
     g, damped, trial = np.empty(6), np.empty((6, 6)), np.empty((4, 4))

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Correspondences, Dropped, Ids, Points
 from armsight.geometry.pose import inverse
-from armsight.vision.camera import distort
+from armsight.vision.camera import distort, pair_arguments
 from armsight.vision.rig import StereoRig
 
 _STEPS = 10
-_DONE = 1e-12  # relative to the depth
-#: A minimum is reached when one more step would gain less than this, in units of chi-square.
+#: A minimum is reached by a step that gains less than this, in units of chi-square: a thousandth of a standard deviation,
+#: and the step after it would be a hundred times smaller at least.
 _REACHED = 1e-6
 #: A pivot of the normal equations below this share of its diagonal leaves a direction open.
 _SINGULAR = 1e-15
@@ -73,44 +74,42 @@ def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Arr
         (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
         pixel noise, m^2; (N, 3, P) derivative by the rig's parameters.
     """
-    (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in rig.cameras)
     T, n = np.array(rig.T_left_right), len(uv)
     rays = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
     counts = np.array([camera.distortion.size for camera in rig.cameras])
     p, cov, by_rig = np.empty((n, 3)), np.full((n, 3, 3), np.nan), np.full((n, 3, rig.parameter_count), np.nan)
     _between(*rays, T, p)
     _minimise(
-        np.array([fish_l, fish_r]), np.stack([k_l, k_r]), np.stack([d_l, d_r]), counts, inverse(T),
-        np.ascontiguousarray(uv, dtype=np.float64), np.ascontiguousarray(cov_uv, dtype=np.float64), *rays, p, cov, by_rig,
+        *pair_arguments(rig.cameras), counts, inverse(T), np.ascontiguousarray(uv, dtype=np.float64),
+        np.ascontiguousarray(cov_uv, dtype=np.float64), *rays, p, cov, by_rig,
     )  # fmt: skip
     return p, cov, by_rig
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _to_right(T_right_left: Array, p: Array) -> Array:
-    """Return a point p (3,) of the left frame in the right one."""
-    q = np.empty(3)
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def _to_right(T_right_left: Array, p: Array, q: Array) -> None:
+    """Fill q (3,), a point p (3,) of the left frame in the right one."""
     for i in range(3):
         q[i] = T_right_left[i, 0] * p[0] + T_right_left[i, 1] * p[1] + T_right_left[i, 2] * p[2] + T_right_left[i, 3]
-    return q
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def _linearise(
-    fisheye: Array, k: Array, d: Array, T_right_left: Array, p: Array, uv: Array, r: Array, J: Array, xy: Array,
-    J_p: Array, J_d: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, uv: Array, r: Array, J: Array, q: Array,
+    xy: Array, J_p: Array, J_d: Array,
 ) -> None:  # fmt: skip
     """Fill the residuals r (2, 2) of a point p of the left frame and their Jacobian J (2, 2, 3) by it.
 
-    Of both cameras: xy (2, 2) where it is in focal lengths, J_p (2, 2, 3) pixel by the point in the camera's own frame,
+    Of both cameras: q (2, 3) the point in the camera's own frame, xy (2, 2) where it is in focal lengths, J_p (2, 2, 3) pixel by the point in the camera's own frame,
     J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
     """
+    q[0] = p
+    _to_right(T_right_left, p, q[1])
     for c in range(2):
-        q = _to_right(T_right_left, p) if c == 1 else p
-        if q[2] <= 0.0 and not fisheye[c]:
+        if q[c, 2] <= 0.0 and not fisheye[c]:
             r[c] = np.nan
             continue
-        distort(fisheye[c], d[c], q, xy[c], J_p[c], J_d[c])
+        distort(fisheye[c], d[c], q[c], xy[c], J_p[c], J_d[c])
         for i in range(2):
             r[c, i] = uv[c, i] - (k[c, i] * xy[c, i] + k[c, 2 + i])
             J_p[c, i] *= k[c, i]
@@ -123,7 +122,7 @@ def _linearise(
                         J[c, i, j] += J_p[c, i, m] * T_right_left[m, j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def _step(weight: Array, r: Array, J: Array, JW: Array, H: Array, L: Array, g: Array, step: Array) -> bool:
     """Fill the normal equations of one point and solve them; False where they do not determine it."""
     for j in range(3):
@@ -155,7 +154,7 @@ def _step(weight: Array, r: Array, J: Array, JW: Array, H: Array, L: Array, g: A
     return bool(np.isfinite(step.sum()))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def _back(L: Array, g: Array, x: Array) -> None:
     """Solve L L^T x = g of three unknowns."""
     x[0] = g[0] / L[0, 0]
@@ -167,13 +166,14 @@ def _back(L: Array, g: Array, x: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def _minimise(
-    fisheye: Array, k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array, rays_left: Array,
-    rays_right: Array, p: Array, cov: Array, by_rig: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array,
+    rays_left: Array, rays_right: Array, p: Array, cov: Array, by_rig: Array,
 ) -> None:  # fmt: skip
     """Take points p from their start to the minimum, NaN where there is none, and fill covariances and derivatives."""
-    r, J, xy, J_p, J_d = (
+    r, J, q, xy, J_p, J_d = (
         np.empty((2, 2)),
         np.empty((2, 2, 3)),
+        np.empty((2, 3)),
         np.empty((2, 2)),
         np.empty((2, 2, 3)),
         np.empty((2, 2, 8)),
@@ -188,28 +188,33 @@ def _minimise(
             weight[c, 0, 1], weight[c, 1, 0] = -C[0, 1] / det, -C[1, 0] / det
         good = False
         for _ in range(_STEPS + 1):
-            _linearise(fisheye, k, d, T_right_left, p[n], uv[n], r, J, xy, J_p, J_d)
+            _linearise(fisheye, k, d, T_right_left, p[n], uv[n], r, J, q, xy, J_p, J_d)
             if not (np.isfinite(r.sum()) and _step(weight, r, J, JW, H, L, g, step)):
                 good = False
                 break
             good = g[0] * step[0] + g[1] * step[1] + g[2] * step[2] <= _REACHED
             p[n] += step
-            if np.abs(step).max() <= _DONE * abs(p[n, 2]):
+            if good:
                 break
-        if not (good and _ahead(p[n], rays_left[n], T_right_left, rays_right[n])):
+        if not (good and _ahead(p[n], rays_left[n], q[1], rays_right[n])):
             p[n] = np.nan
             continue
         for j in range(3):
             g[:] = 0.0
             g[j] = 1.0
             _back(L, g, cov[n, j])
-        _rig_jacobian(counts, T_right_left, p[n], xy, J_p, J_d, J_rig)
-        by_rig[n] = -(cov[n] @ JW) @ J_rig
+        _rig_jacobian(counts, q[1], xy, J_p, J_d, J_rig)
+        for j in range(3):
+            by_rig[n, j] = 0.0
+            for i in range(4):
+                gain = cov[n, j, 0] * JW[0, i] + cov[n, j, 1] * JW[1, i] + cov[n, j, 2] * JW[2, i]
+                for m in range(J_rig.shape[1]):
+                    by_rig[n, j, m] -= gain * J_rig[i, m]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _rig_jacobian(counts: Ids, T_right_left: Array, p: Array, xy: Array, J_p: Array, J_d: Array, J_rig: Array) -> None:
-    """Fill J_rig (4, P), the pixels of a point by the rig's parameters."""
+def _rig_jacobian(counts: Ids, q: Array, xy: Array, J_p: Array, J_d: Array, J_rig: Array) -> None:
+    """Fill J_rig (4, P), the pixels of a point, q (3,) in the right frame, by the rig's parameters."""
     J_rig[:] = 0.0
     start = 0
     for c in range(2):
@@ -218,7 +223,6 @@ def _rig_jacobian(counts: Ids, T_right_left: Array, p: Array, xy: Array, J_p: Ar
             row[start + i], row[start + 2 + i] = xy[c, i], 1.0
             row[start + 4 : start + 4 + counts[c]] = J_d[c, i, : counts[c]]
         start += 4 + counts[c]
-    q = _to_right(T_right_left, p)
     for i in range(2):
         a, b, c_ = J_p[1, i]
         row = J_rig[2 + i]
@@ -227,12 +231,12 @@ def _rig_jacobian(counts: Ids, T_right_left: Array, p: Array, xy: Array, J_p: Ar
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _ahead(p: Array, ray_left: Array, T_right_left: Array, ray_right: Array) -> bool:
+def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
     """Whether a point lies where its pixels look, and not behind a camera or where the distortion folds back."""
-    q = _to_right(T_right_left, p)
-    along_left, along_right = np.dot(ray_left, p), np.dot(ray_right, q)
-    left = along_left > _LOOKING * np.sqrt(np.dot(p, p))
-    return bool(left and along_right > _LOOKING * np.sqrt(np.dot(q, q)))
+    left = ray_left[0] * p[0] + ray_left[1] * p[1] + ray_left[2] * p[2]
+    right = ray_right[0] * q[0] + ray_right[1] * q[1] + ray_right[2] * q[2]
+    far = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    return bool(left > _LOOKING * far[0] and right > _LOOKING * far[1])
 
 
 def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
@@ -250,7 +254,9 @@ def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
     rows = np.flatnonzero(seen.paired)
     cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)
     p, cov, by_rig = optimal_points(rig, seen.uv[rows], cov_uv)
-    good = np.isfinite(p).all(axis=1)
+    good = np.isfinite(p[:, 0])
+    if good.all():
+        return Points(seen.ids[rows], p, cov, by_rig, seen, seen.dropped)
     dropped = tuple(
         Dropped(body.point_names[i], "its rays do not meet before both cameras") for i in seen.ids[rows[~good]]
     )
