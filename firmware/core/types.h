@@ -51,7 +51,10 @@
     X(POT_UNREAD, 5, "a potentiometer is not read")                                    \
     X(FAULT_STANDS, 6, "the cause of a fault still stands")                            \
     X(STOP_PRESSED, 7, "the emergency stop is still pressed")                          \
-    X(UNKNOWN_COMMAND, 8, "unknown command")
+    X(UNKNOWN_COMMAND, 8, "unknown command")                                           \
+    X(NO_HELLO, 9, "no hello of the board's own version came: only STOP is obeyed")    \
+    X(TOO_MANY, 10, "too many commands at once")                                       \
+    X(CONFIG_BROKEN, 11, "the configuration came incomplete, or could not be stored")
 
 #define FAULT_CODE(name, code, reaction, text) FAULT_##name = (code),
 #define STATE_CODE(name, code, text) STATE_##name = (code),

@@ -7,13 +7,18 @@
 
 #define FRAME_REQUEST 0x51525341u /* "ASRQ" as bytes in memory */
 #define FRAME_ANSWER 0x4E415341u  /* "ASAN" */
+#define FRAME_REFUSED 0x4F4E5341u /* "ASNO": the request's magic or version is another, or it is too long; no tick was run */
 #define FRAME_VERSION 1u          /* goes up whenever a frame changes */
 #define FRAME_BYTES 512u          /* most bytes of the wire either way in one tick */
+
+/* What a request may do before its tick. */
+enum { RESTART_NONE = 0, RESTART_POWER = 1, RESTART_WATCHDOG = 2 };
 
 typedef struct pil_request {
     uint32_t magic;
     uint32_t version;
     uint32_t tick;
+    uint32_t restart;            /* RESTART_...: the board starts anew; the stored configuration stays */
     uint32_t overrun;            /* injected: not 0 says that the last tick took too long */
     uint32_t stop_pressed;       /* the button */
     uint32_t supply_mv;

@@ -1,0 +1,40 @@
+/* The contract of a board: one struct literal. To add a board: fill one in, call loop_start, loop_tick from its 1 kHz timer and
+ * loop_poll from its main loop (docs/add_a_board.md). */
+#ifndef ARMSIGHT_BOARD_H
+#define ARMSIGHT_BOARD_H
+
+#include <stdbool.h>
+
+#include "types.h"
+
+typedef struct board_description {
+    const char *name; /* at most 16 characters, told in WELCOME */
+    uint32_t baud;    /* bits a second on the wire, 8N1: the telemetry's rate follows from it */
+
+    /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts, current_ma. */
+    void (*sense)(core_inputs *inputs);
+
+    /* Tick. Put the duties to the motors; with drives_on 0 switch their drivers off. */
+    void (*drive)(const core_outputs *outputs);
+
+    /* Tick, once each time it ran to its end. */
+    void (*feed_watchdog)(void);
+
+    /* Before the first tick. Tell whether the watchdog restarted the board. */
+    bool (*watchdog_reset)(void);
+
+    /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which there
+     * was no room since the last call. */
+    uint32_t (*receive)(uint8_t *bytes, uint32_t room, uint32_t *overrun);
+
+    /* Main loop. Take bytes for the host and return how many were taken; the others are offered again. */
+    uint32_t (*send)(const uint8_t *bytes, uint32_t length);
+
+    /* Main loop, and before the first tick. Read the stored copy 0 or 1 as it is, good or not. */
+    void (*read_copy)(uint32_t which, config_copy *copy);
+
+    /* Main loop, drives off. Store a copy (may take long); returns whether it reads back as written. */
+    bool (*write_copy)(uint32_t which, const config_copy *copy);
+} board_description;
+
+#endif

@@ -1,0 +1,1 @@
+/* MAVLink's headers ask for stdio.h and use nothing of it. */

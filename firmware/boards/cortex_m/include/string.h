@@ -1,0 +1,10 @@
+/* As much of string.h as the firmware has (memory.c), for MAVLink's headers. */
+#ifndef ARMSIGHT_STRING_H
+#define ARMSIGHT_STRING_H
+
+#include <stddef.h>
+
+void *memcpy(void *to, const void *from, size_t length);
+void *memset(void *to, int value, size_t length);
+
+#endif

@@ -1,0 +1,76 @@
+/* Memory: filled at reset, and what compilers ask for where there is no C library: memcpy, memset, and the run-time ABI's names for them. Any context. */
+#include <stddef.h>
+#include <stdint.h>
+
+#include "memory.h"
+
+#define KEEP __asm__ volatile("" ::: "memory") /* else a compiler makes of the loop a call of the function it stands in */
+
+void *memcpy(void *to, const void *from, size_t length);
+void *memset(void *to, int value, size_t length);
+void __aeabi_memcpy(void *to, const void *from, size_t length);
+void __aeabi_memcpy4(void *to, const void *from, size_t length);
+void __aeabi_memcpy8(void *to, const void *from, size_t length);
+void __aeabi_memclr(void *to, size_t length);
+void __aeabi_memclr4(void *to, size_t length);
+void __aeabi_memclr8(void *to, size_t length);
+void __aeabi_memset(void *to, size_t length, int value);
+void __aeabi_memset4(void *to, size_t length, int value);
+void __aeabi_memset8(void *to, size_t length, int value);
+
+typedef uint32_t __attribute__((may_alias)) word;
+
+extern char data_begin[], data_end[], data_stored[], bss_begin[], bss_end[]; /* of sections.ld */
+
+void memory_start(void)
+{
+    memcpy(data_begin, data_stored, (size_t)(data_end - data_begin));
+    memset(bss_begin, 0, (size_t)(bss_end - bss_begin));
+}
+
+void *memcpy(void *to, const void *from, size_t length)
+{
+    uint8_t *target = to;
+    const uint8_t *source = from;
+    if ((((uintptr_t)target | (uintptr_t)source) & 3u) == 0u) {
+        for (; length >= 16u; length -= 16u, target += 16, source += 16) {
+            const word *four = (const word *)(const void *)source;
+            const word a = four[0], b = four[1], c = four[2], d = four[3];
+            word *place = (word *)(void *)target;
+            place[0] = a, place[1] = b, place[2] = c, place[3] = d;
+            KEEP;
+        }
+    }
+    for (; length != 0u; length--) {
+        *target++ = *source++;
+        KEEP;
+    }
+    return to;
+}
+
+void *memset(void *to, int value, size_t length)
+{
+    uint8_t *target = to;
+    const word fill = (uint8_t)value * 0x01010101u;
+    if (((uintptr_t)target & 3u) == 0u) {
+        for (; length >= 4u; length -= 4u, target += 4) {
+            *(word *)(void *)target = fill;
+            KEEP;
+        }
+    }
+    for (; length != 0u; length--) {
+        *target++ = (uint8_t)value;
+        KEEP;
+    }
+    return to;
+}
+
+void __aeabi_memcpy(void *to, const void *from, size_t length) { memcpy(to, from, length); }
+void __aeabi_memcpy4(void *to, const void *from, size_t length) { memcpy(to, from, length); }
+void __aeabi_memcpy8(void *to, const void *from, size_t length) { memcpy(to, from, length); }
+void __aeabi_memclr(void *to, size_t length) { memset(to, 0, length); }
+void __aeabi_memclr4(void *to, size_t length) { memset(to, 0, length); }
+void __aeabi_memclr8(void *to, size_t length) { memset(to, 0, length); }
+void __aeabi_memset(void *to, size_t length, int value) { memset(to, value, length); }
+void __aeabi_memset4(void *to, size_t length, int value) { memset(to, value, length); }
+void __aeabi_memset8(void *to, size_t length, int value) { memset(to, value, length); }

@@ -1,0 +1,66 @@
+#include "loop.h"
+
+#include <stddef.h>
+
+#include "config.h"
+#include "core.h"
+
+#define CHUNK 128u
+
+void loop_start(board_loop *loop, const board_description *board)
+{
+    core_config config;
+    *loop = (board_loop){.board = board};
+    board->read_copy(0u, &loop->copies[0]);
+    board->read_copy(1u, &loop->copies[1]);
+    const uint32_t source = config_load(&config, &loop->copies[0], &loop->copies[1]);
+    core_init(&loop->core, &config, source, board->watchdog_reset());
+    wire_init(&loop->wire, &(wire_setup){board->name, board->baud, source, &loop->core.config});
+}
+
+void loop_tick(board_loop *loop)
+{
+    loop->board->sense(&loop->inputs);
+    wire_before_tick(&loop->wire, &loop->inputs);
+    core_tick(&loop->core, &loop->inputs, &loop->outputs);
+    loop->board->drive(&loop->outputs);
+    if (loop->outputs.feed_watchdog != 0u) {
+        loop->board->feed_watchdog();
+    }
+    wire_after_tick(&loop->wire, &loop->inputs, &loop->outputs);
+}
+
+/* Write a configuration beside the newest good copy; returns whether it is stored. */
+static bool store(board_loop *loop, const core_config *config)
+{
+    uint32_t serial = 0u;
+    loop->board->read_copy(0u, &loop->copies[0]);
+    loop->board->read_copy(1u, &loop->copies[1]);
+    const uint32_t which = config_next(&loop->copies[0], &loop->copies[1], &serial);
+    config_seal(&loop->copies[which], config, serial);
+    return loop->board->write_copy(which, &loop->copies[which]);
+}
+
+void loop_poll(board_loop *loop)
+{
+    uint8_t bytes[CHUNK];
+    uint32_t length;
+    do {
+        uint32_t overrun = 0u;
+        length = loop->board->receive(bytes, CHUNK, &overrun);
+        wire_receive(&loop->wire, bytes, length, overrun);
+    } while (length == CHUNK);
+    wire_poll(&loop->wire);
+    const core_config *config = wire_to_store(&loop->wire);
+    if (config != NULL) {
+        wire_stored(&loop->wire, store(loop, config));
+    }
+    const uint8_t *waiting;
+    while ((length = wire_output(&loop->wire, &waiting)) != 0u) {
+        const uint32_t taken = loop->board->send(waiting, length);
+        wire_sent(&loop->wire, taken);
+        if (taken != length) {
+            break;
+        }
+    }
+}

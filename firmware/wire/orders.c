@@ -1,0 +1,204 @@
+#include <stddef.h>
+#include <string.h>
+
+#include "config.h"
+#include "inside.h"
+
+_Static_assert(sizeof(gain_set) == sizeof(((mavlink_gains_t *)NULL)->gains), "GAINS carries a whole gain set");
+
+void order_refuse(wire_state *wire, uint32_t sequence, uint32_t refusal)
+{
+    wire->fate.refused_sequence = sequence;
+    wire->fate.refused_count++;
+    wire->fate.refusal = refusal;
+    wire->status_due = 1u;
+}
+
+void order_obeyed(wire_state *wire, uint32_t sequence)
+{
+    wire->fate.obeyed_sequence = sequence;
+    wire->fate.obeyed_count++;
+    wire->status_due = 1u;
+}
+
+/* Tell whether this number comes after all that came; numbers go round. */
+static bool is_newer(const wire_state *wire, uint32_t sequence)
+{
+    const uint32_t ahead = sequence - wire->newest_sequence;
+    return wire->sequence_known == 0u || (ahead != 0u && ahead < 0x80000000u);
+}
+
+bool order_admit(wire_state *wire, uint32_t sequence)
+{
+    if (wire->greeted == 0u) {
+        order_refuse(wire, sequence, REFUSAL_NO_HELLO);
+        return false;
+    }
+    if (!is_newer(wire, sequence)) {
+        wire->counters.stale_commands++;
+        return false;
+    }
+    wire->sequence_known = 1u;
+    wire->newest_sequence = sequence;
+    return true;
+}
+
+/* Drop the waiting commands of a kind; of all kinds for COMMAND_NONE. */
+static void drop(wire_state *wire, uint32_t kind)
+{
+    wire_queue *queue = &wire->queue;
+    uint32_t kept = 0u;
+    for (uint32_t i = 0u; i < queue->count; i++) {
+        if (kind != COMMAND_NONE && queue->command[i].kind != kind) {
+            if (kept != i) {
+                queue->command[kept] = queue->command[i];
+            }
+            kept++;
+        }
+    }
+    wire->counters.stale_commands += queue->count - kept;
+    queue->count = kept;
+}
+
+core_command *order_append(wire_state *wire, uint32_t kind, uint32_t sequence)
+{
+    wire_queue *queue = &wire->queue;
+    if (kind == COMMAND_MOVE) {
+        drop(wire, COMMAND_MOVE);
+    }
+    if (queue->count == WIRE_QUEUE) {
+        order_refuse(wire, sequence, REFUSAL_TOO_MANY);
+        return NULL;
+    }
+    core_command *command = &queue->command[queue->count];
+    queue->count++;
+    command->kind = kind;
+    command->sequence = sequence;
+    return command;
+}
+
+void order_mail(wire_state *wire)
+{
+    wire_queue *queue = &wire->queue;
+    const bool busy = atomic_load(&wire->shared.mail_full) != 0u || wire->staged.storing != 0u;
+    const bool known = wire->reports_read == atomic_load(&wire->shared.report_count);
+    if (busy || !known || queue->count == 0u) {
+        return;
+    }
+    const core_command *oldest = &queue->command[0];
+    if (oldest->kind != COMMAND_STORE) {
+        wire->shared.mail = *oldest;
+        wire->mailed_kind = oldest->kind;
+        atomic_store(&wire->shared.mail_full, 1u);
+    } else {
+        settings_store(wire, oldest->sequence);
+    }
+    queue->count--;
+    for (uint32_t i = 0u; i < queue->count; i++) {
+        queue->command[i] = queue->command[i + 1u];
+    }
+}
+
+static void take_hello(wire_state *wire, const mavlink_message_t *message)
+{
+    mavlink_hello_t hello;
+    mavlink_msg_hello_decode(message, &hello);
+    wire->greeted = hello.dialect_version == ARMSIGHT_DIALECT_VERSION && hello.config_version == CONFIG_VERSION;
+    wire->sequence_known = 0u;
+    drop(wire, COMMAND_NONE);
+    mavlink_welcome_t welcome = {
+        .dialect_version = ARMSIGHT_DIALECT_VERSION,
+        .config_version = CONFIG_VERSION,
+        .nonce = hello.nonce,
+        .tick = wire_tick(wire),
+        .ticks_per_s = TICKS_PER_S,
+        .baud = wire->setup.baud,
+        .config_source = wire->setup.config_source,
+        .joints = JOINTS,
+        .firmware = FIRMWARE_VERSION,
+    };
+    for (uint32_t i = 0u; i < sizeof welcome.board && wire->setup.board[i] != '\0'; i++) {
+        welcome.board[i] = wire->setup.board[i];
+    }
+    mavlink_message_t answer;
+    mavlink_msg_welcome_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &answer, &welcome);
+    telemetry_put(wire, &answer);
+    wire->status_urgent = 1u;
+}
+
+static void take_move(wire_state *wire, const mavlink_message_t *message)
+{
+    mavlink_move_t move;
+    mavlink_msg_move_decode(message, &move);
+    core_command *command = order_admit(wire, move.sequence) ? order_append(wire, COMMAND_MOVE, move.sequence) : NULL;
+    if (command == NULL) {
+        return;
+    }
+    memcpy(command->move.position_rad, move.position_rad, sizeof command->move.position_rad);
+    memcpy(command->move.speed_rad_s, move.speed_rad_s, sizeof command->move.speed_rad_s);
+    memcpy(command->move.gravity_duty, move.gravity_duty, sizeof command->move.gravity_duty);
+    command->move.duration_ticks = move.duration_ticks;
+}
+
+static void take_order(wire_state *wire, const mavlink_message_t *message)
+{
+    mavlink_order_t order;
+    mavlink_msg_order_decode(message, &order);
+    if (!order_admit(wire, order.sequence)) {
+        return;
+    }
+    if (order.kind < COMMAND_ENABLE || order.kind > COMMAND_CLEAR_STOP) {
+        order_refuse(wire, order.sequence, REFUSAL_UNKNOWN_COMMAND);
+        return;
+    }
+    order_append(wire, order.kind, order.sequence);
+}
+
+static void take_gains(wire_state *wire, const mavlink_message_t *message)
+{
+    mavlink_gains_t gains;
+    mavlink_msg_gains_decode(message, &gains);
+    core_command *command = order_admit(wire, gains.sequence) ? order_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
+    if (command != NULL) {
+        memcpy(&command->gains, gains.gains, sizeof command->gains);
+    }
+}
+
+/* A stop is taken whatever its number and whoever sent it; what waited before it is no longer wanted. */
+static void take_stop(wire_state *wire, const mavlink_message_t *message)
+{
+    const uint32_t sequence = mavlink_msg_stop_get_sequence(message);
+    drop(wire, COMMAND_NONE);
+    atomic_fetch_add(&wire->shared.stops, 1u);
+    if (is_newer(wire, sequence)) {
+        wire->sequence_known = wire->greeted;
+        wire->newest_sequence = sequence;
+    }
+    wire->stop_sequence = sequence;
+    wire->stop_report = atomic_load(&wire->shared.report_count);
+    wire->stop_waits = 1u;
+}
+
+void message_take(wire_state *wire, const mavlink_message_t *message)
+{
+    switch (message->msgid) {
+    case MAVLINK_MSG_ID_HELLO:
+        take_hello(wire, message);
+        break;
+    case MAVLINK_MSG_ID_MOVE:
+        take_move(wire, message);
+        break;
+    case MAVLINK_MSG_ID_ORDER:
+        take_order(wire, message);
+        break;
+    case MAVLINK_MSG_ID_STOP:
+        take_stop(wire, message);
+        break;
+    case MAVLINK_MSG_ID_GAINS:
+        take_gains(wire, message);
+        break;
+    default:
+        settings_take(wire, message);
+        break;
+    }
+}

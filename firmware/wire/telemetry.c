@@ -1,0 +1,190 @@
+#include <stddef.h>
+#include <string.h>
+
+#include "inside.h"
+
+#define FRAME(name) (MAVLINK_MSG_ID_##name##_LEN + MAVLINK_NUM_NON_PAYLOAD_BYTES)
+#define JOINTS_EVERY 10u       /* JOINTS are as many times rarer than ANGLES */
+#define STATUS_TICKS 20u       /* 50 Hz where the wire carries it */
+#define STATUS_EVERY 4u        /* and not more often than every so many ANGLES */
+#define STATUS_GAP_DIVISOR 4u  /* STATUS of orders comes at most as many times more often than by itself */
+#define USED_PER_BAUD 80u      /* bytes a second to use of 1000 baud: 80 % of what it carries */
+#define BACKLOG_PER_BAUD 1000u /* telemetry waits while more than 10 ms of it wait to go out, */
+#define BACKLOG_BYTES 512u     /* or more than this */
+
+static wire_periods periods_of(uint32_t angles)
+{
+    const uint32_t status = STATUS_EVERY * angles;
+    return (wire_periods){angles, JOINTS_EVERY * angles, status < STATUS_TICKS ? STATUS_TICKS : status};
+}
+
+wire_periods wire_periods_at(uint32_t baud)
+{
+    wire_periods periods = periods_of(1u);
+    for (uint32_t angles = 2u; angles <= TICKS_PER_S; angles++) {
+        const uint32_t bytes_per_s = FRAME(ANGLES) * TICKS_PER_S / periods.angles +
+                                     FRAME(JOINTS) * TICKS_PER_S / periods.joints +
+                                     FRAME(BOARD_STATUS) * TICKS_PER_S / periods.status;
+        if (bytes_per_s <= baud / 1000u * USED_PER_BAUD) {
+            break;
+        }
+        periods = periods_of(angles);
+    }
+    return periods;
+}
+
+void telemetry_put(wire_state *wire, const mavlink_message_t *message)
+{
+    wire_ring *ring = &wire->output;
+    uint8_t bytes[MAVLINK_MAX_PACKET_LEN];
+    const uint32_t length = mavlink_msg_to_send_buffer(bytes, message);
+    if (length > WIRE_OUT_BYTES - (ring->written - ring->taken)) {
+        return;
+    }
+    for (uint32_t i = 0u; i < length; i++) {
+        ring->bytes[(ring->written + i) % WIRE_OUT_BYTES] = bytes[i];
+    }
+    ring->written += length;
+}
+
+uint32_t wire_output(const wire_state *wire, const uint8_t **bytes)
+{
+    const wire_ring *ring = &wire->output;
+    const uint32_t from = ring->taken % WIRE_OUT_BYTES;
+    const uint32_t waiting = ring->written - ring->taken;
+    *bytes = &ring->bytes[from];
+    return waiting < WIRE_OUT_BYTES - from ? waiting : WIRE_OUT_BYTES - from;
+}
+
+void wire_sent(wire_state *wire, uint32_t length) { wire->output.taken += length; }
+
+/* Return the newest report of the tick. It writes the other one next: this one is whole unless two ticks passed meanwhile. */
+static uint32_t copy_report(wire_state *wire, uint32_t number)
+{
+    for (;;) {
+        wire->report = wire->shared.report[number % 2u];
+        const uint32_t now = atomic_load(&wire->shared.report_count);
+        if (now == number) {
+            return number;
+        }
+        number = now;
+    }
+}
+
+bool telemetry_fetch(wire_state *wire)
+{
+    const core_outputs *outputs = &wire->report.outputs;
+    const uint32_t obeyed = outputs->obeyed_count;
+    const uint32_t refused = outputs->refused_count;
+    const uint32_t state = outputs->state;
+    const uint32_t faults = outputs->faults;
+    const uint32_t number = atomic_load(&wire->shared.report_count);
+    if (number == wire->reports_read) {
+        return false;
+    }
+    wire->reports_read = copy_report(wire, number);
+    if (wire->stop_waits != 0u && wire->reports_read != wire->stop_report) {
+        wire->stop_waits = 0u;
+        order_obeyed(wire, wire->stop_sequence);
+    }
+    if (outputs->obeyed_count != obeyed) {
+        wire->fate.obeyed_count += outputs->obeyed_count - obeyed;
+        wire->fate.obeyed_sequence = outputs->obeyed_sequence;
+        wire->status_due |= wire->mailed_kind != COMMAND_MOVE;
+    }
+    if (outputs->refused_count != refused) {
+        wire->fate.refused_count += outputs->refused_count - refused;
+        wire->fate.refused_sequence = outputs->refused_sequence;
+        wire->fate.refusal = outputs->refusal;
+        wire->status_due = 1u;
+    }
+    wire->status_urgent |= outputs->state != state || outputs->faults != faults;
+    return true;
+}
+
+static void write_status(wire_state *wire)
+{
+    const core_outputs *outputs = &wire->report.outputs;
+    mavlink_board_status_t status = {
+        .tick = outputs->tick,
+        .state = outputs->state,
+        .faults = outputs->faults,
+        .first_fault = outputs->first_fault,
+        .first_joint = outputs->first_joint,
+        .obeyed_sequence = wire->fate.obeyed_sequence,
+        .obeyed_count = wire->fate.obeyed_count,
+        .refused_sequence = wire->fate.refused_sequence,
+        .refused_count = wire->fate.refused_count,
+        .refusal = wire->fate.refusal,
+        .supply_mv = wire->report.supply_mv,
+        .crc_errors = wire->counters.crc_errors,
+        .lost_bytes = wire->counters.lost_bytes,
+        .overrun_bytes = wire->counters.overrun_bytes,
+        .stale_commands = wire->counters.stale_commands,
+        .lost_messages = wire->counters.lost_messages,
+        .config_stored = wire->counters.config_stored,
+    };
+    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+        status.joint_faults[joint] = (uint16_t)outputs->joint_faults[joint];
+    }
+    mavlink_message_t message;
+    mavlink_msg_board_status_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &message, &status);
+    telemetry_put(wire, &message);
+    wire->status_tick = outputs->tick;
+    wire->status_urgent = 0u;
+    wire->status_due = 0u;
+}
+
+static void write_joints(wire_state *wire)
+{
+    const core_outputs *outputs = &wire->report.outputs;
+    mavlink_joints_t joints = {.tick = outputs->tick};
+    memcpy(joints.speed_rad_s, outputs->speed_rad_s, sizeof joints.speed_rad_s);
+    memcpy(joints.reference_rad, outputs->reference_rad, sizeof joints.reference_rad);
+    memcpy(joints.reference_rad_s, outputs->reference_rad_s, sizeof joints.reference_rad_s);
+    memcpy(joints.duty, outputs->duty, sizeof joints.duty);
+    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+        joints.limited[joint] = (uint8_t)outputs->limited[joint];
+    }
+    mavlink_message_t message;
+    mavlink_msg_joints_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &message, &joints);
+    telemetry_put(wire, &message);
+    wire->joints_tick = outputs->tick;
+}
+
+static void write_angles(wire_state *wire)
+{
+    const core_outputs *outputs = &wire->report.outputs;
+    mavlink_message_t message;
+    mavlink_msg_angles_pack_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &message, outputs->tick,
+                                   outputs->angle_rad);
+    telemetry_put(wire, &message);
+    wire->angles_tick = outputs->tick;
+}
+
+/* Tell whether what waits to go out leaves telemetry worth writing. */
+static bool has_room(const wire_state *wire)
+{
+    const uint32_t waiting = wire->output.written - wire->output.taken;
+    return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
+}
+
+void telemetry_write(wire_state *wire)
+{
+    const uint32_t tick = wire_tick(wire);
+    const uint32_t since = tick - wire->status_tick;
+    const bool due = since >= wire->periods.status ||
+                     (wire->status_due != 0u && since >= wire->periods.status / STATUS_GAP_DIVISOR);
+    if (wire->greeted == 0u) {
+        return;
+    }
+    if ((due || wire->status_urgent != 0u) && has_room(wire)) {
+        write_status(wire);
+    }
+    if (tick - wire->joints_tick >= wire->periods.joints && has_room(wire)) {
+        write_joints(wire);
+    }
+    if (tick - wire->angles_tick >= wire->periods.angles && has_room(wire)) {
+        write_angles(wire);
+    }
+}
