@@ -100,8 +100,8 @@ def _linearise(
 ) -> None:  # fmt: skip
     """Fill the residuals r (2, 2) of a point p of the left frame and their Jacobian J (2, 2, 3) by it.
 
-    Of both cameras: q (2, 3) the point in the camera's own frame, xy (2, 2) where it is in focal lengths, J_p (2, 2, 3) pixel by the point in the camera's own frame,
-    J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
+    Of both cameras: q (2, 3) the point in the camera's own frame, xy (2, 2) where it is in focal lengths, J_p (2, 2, 3)
+    pixel by q, J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
     """
     q[0] = p
     _to_right(T_right_left, p, q[1])

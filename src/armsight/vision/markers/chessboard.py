@@ -85,15 +85,17 @@ class Chessboard(Record):
         if rough is None:
             return Detections.none(f"no chessboard of {self.columns}x{self.rows} inner corners found")
         fits = fit_grid(image, rough)
-        kept = fits.kept & ~misfits(fits) & self._colours_agree(fits)
+        colours = np.sign(fits.contrast * self._parity)
+        first = np.sign(colours[fits.kept].sum())  # -1 where the first square is dark
+        kept = fits.kept & ~misfits(fits) & (colours == first)
         if kept.sum() < max(4, KEPT_SHARE * kept.size):
             return Detections.none(_why_not(fits, int(kept.sum())))
-        if goes_on(image, fits, kept, self._parity, (self.rows, self.columns)):
+        if goes_on(image, fits, kept, first * self._parity, (self.rows, self.columns)):
             return Detections.none(
                 f"the chessboard goes on beyond {self.columns}x{self.rows} inner corners: count those where two dark "
                 "squares touch, columns x rows"
             )
-        order = self._canonical_order(fits)
+        order = self._canonical_order(fits, first < 0)
         kept = kept[order]
         return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
 
@@ -103,19 +105,15 @@ class Chessboard(Record):
         y, x = np.mgrid[: self.rows, : self.columns]
         return np.where((x + y) % 2 == 0, 1.0, -1.0).ravel()
 
-    def _colours_agree(self, fits: CornerFits) -> NDArray[np.bool_]:
-        """(M,) whether a corner's colours are those the other corners tell."""
-        colours = np.sign(fits.contrast * self._parity)
-        return np.asarray(colours == np.sign(np.sum(colours[fits.kept])))
-
-    def _canonical_order(self, fits: CornerFits) -> Ids:
+    def _canonical_order(self, fits: CornerFits, first_is_dark: bool) -> Ids:
         """Return (M,) the permutation that brings fits into the board's order."""
         here = np.arange(self.columns * self.rows)
-        first_is_dark = float(np.sum((np.sign(fits.contrast) * self._parity)[fits.kept])) < 0
         orders = [here, *(perm for _, perm in self._turns)]
         dark = [first_is_dark, *(first_is_dark != self._colours_tell(n) for n, _ in self._turns)]
         if any(dark):
             orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
+        if len(orders) == 1:
+            return orders[0]
         uv = np.where(fits.kept[:, None], fits.uv, np.nan).reshape(self.rows, self.columns, 2)
         rightwards = []
         for order in orders:
@@ -143,9 +141,8 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     if not found:
         return None
     uv = (corners.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
-    across, down = uv[:, -1] - uv[:, 0], uv[-1] - uv[0]
-    handed = np.sum(across[:, 0]) * np.sum(down[:, 1]) - np.sum(across[:, 1]) * np.sum(down[:, 0])
-    return uv if handed > 0 else np.ascontiguousarray(uv[:, ::-1])
+    across, down = (uv[:, -1] - uv[:, 0]).sum(axis=0), (uv[-1] - uv[0]).sum(axis=0)
+    return uv if across[0] * down[1] - across[1] * down[0] > 0 else np.ascontiguousarray(uv[:, ::-1])
 
 
 def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> CornerFits:
@@ -167,7 +164,7 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
 
 
 def goes_on(
-    image: NDArray[np.uint8], fits: CornerFits, kept: NDArray[np.bool_], parity: Array, shape: tuple[int, int]
+    image: NDArray[np.uint8], fits: CornerFits, kept: NDArray[np.bool_], colours: Array, shape: tuple[int, int]
 ) -> bool:
     """Tell whether another row or column of corners stands where a board should end: it is larger than it was said to be.
 
@@ -175,14 +172,14 @@ def goes_on(
         image: (H, W) grey image.
         fits: of the board's corners, row by row.
         kept: (M,) which of them are good.
-        parity: (M,) +1 and -1 by turns, as the colours go.
+        colours: (M,) +1 and -1 by turns: the signs of the corners' contrast.
         shape: (rows, columns).
     """
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
     squares = local_squares(uv)[0]
-    sign = np.sign((fits.contrast * parity)[kept].sum()) * parity.reshape(shape)
+    signs = colours.reshape(shape)
     for end, inner in _ENDS:
-        beyond, sides, colour = 2 * uv[end] - uv[inner], squares[end], -sign[end]
+        beyond, sides, colour = 2 * uv[end] - uv[inner], squares[end], -signs[end]
         least = max(3.0, MORE_SHARE * np.count_nonzero(np.isfinite(beyond[:, 0])))
         if np.count_nonzero(crossed(image, beyond, sides) == colour) < least:
             continue
@@ -195,7 +192,8 @@ def goes_on(
 def misfits(fits: CornerFits) -> NDArray[np.bool_]:
     """(N,) whether a corner's residual, relative to its contrast, is far off the others'."""
     relative = fits.residual / np.maximum(np.abs(fits.contrast), 1e-9)
-    usual = float(np.median(relative[fits.kept])) if fits.kept.any() else 0.0
+    good = np.sort(relative[fits.kept])
+    usual = float(good[len(good) // 2]) if len(good) else 0.0
     return np.asarray(relative > max(MISFIT_RATIO * usual, MISFIT_FLOOR))
 
 

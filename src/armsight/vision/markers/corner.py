@@ -33,6 +33,7 @@ from armsight.vision.markers.crossing import (
     edge_noise,
     first_guess,
     fit_crossing,
+    rough_noise,
 )
 from armsight.vision.markers.window import WINDOW_MAX_PX, WINDOW_SHARE, fill_up, gather, reach_px, thin
 
@@ -181,7 +182,7 @@ def _refine(
         if n < 0:
             verdict[i] = -n
             continue
-        residual[i] = np.sqrt(edge_noise(n, w, L, cov[i]))
+        residual[i] = np.sqrt(rough_noise(n, w) if rough else edge_noise(n, w, L, cov[i]))
         reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
@@ -258,7 +259,7 @@ def refine_corners(
             straight by default.
         arm: how far from the edges the squares are plain, as a share of a side; what lies further from both edges is
             not looked at. The squares of a charuco board are plain only along their sides.
-        rough: fit a share of the pixels only, in half the time; good to some hundredths of a pixel.
+        rough: fit a share of the pixels only, in half the time; good to some hundredths of a pixel, without covariance.
         like: earlier fits of the same corners at uv; those it kept are where the fits start, in half the time.
 
     Returns:

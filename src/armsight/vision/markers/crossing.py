@@ -34,6 +34,10 @@ _BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost
 #: only what the pixels leave open: the blur of an edge that falls between two pixels.
 _BLUR2_PRIOR = (0.25, 0.25)
 
+#: A step that moves the edges by less than this share of their blur, at the corner and so far from it, needs no other:
+#: the next would be this share of it.
+_SLIGHT, _ARM_PX = 0.1, 10.0
+
 _f = np.float32
 _ZERO, _HALF, _ONE, _TWO = _f(0.0), _f(0.5), _f(1.0), _f(2.0)
 _TWO_OVER_PI, _THIRD = _f(2.0 / np.pi), _f(1.0 / 3.0)
@@ -194,6 +198,25 @@ def first_guess(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _slight(x: Array, q: Array) -> bool:
+    """Whether a step x from q moves and blurs the edges by so little that residuals follow it linearly."""
+    blur2 = min(q[4], q[5]) + 1.0 / 12.0
+    moved = abs(x[0]) + abs(x[1]) + _ARM_PX * max(abs(x[2]), abs(x[3]))
+    return bool(moved < _SLIGHT * np.sqrt(blur2) and max(abs(x[4]), abs(x[5])) < _SLIGHT * blur2)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _carry(n: int, w: Work, x: Array) -> None:
+    """Take the residuals along a step x, linearly."""
+    left = w[_R : _R + n]
+    for i in range(PARAMETERS):
+        share, o = _f(x[i]), JACOBIAN + i * ROOM
+        row = w[o : o + n]
+        for m in range(n):
+            left[m] -= share * row[m]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def fit_crossing(
     n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, L: Array, stop: float
 ) -> bool:
@@ -223,9 +246,11 @@ def fit_crossing(
         trial[:] = q + x
         trial[4], trial[5] = max(trial[4], _BLUR2_MIN), max(trial[5], _BLUR2_MIN)
         gain = np.dot(x, g)  # how much lower the cost should get, or a little more
-        done = damping <= 1.0 and gain < stop * cost / pixels
-        if done and current:  # a step as small as this changes neither derivatives nor residuals
+        x[:] = trial - q
+        done = damping <= 1.0 and (gain < stop * cost / pixels or _slight(x, q))
+        if done and current:  # derivatives stay what they are
             q[:] = trial
+            _carry(n, w, x)
             return factor(H, 0.0, L)
         new = _assemble(n, w, flat, x0, y0, trial, sides, bow, T)
         done |= max(gain, abs(new - cost)) < stop * cost / pixels
@@ -242,6 +267,15 @@ def fit_crossing(
         if done:
             return factor(H, 0.0, L)
     return False
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def rough_noise(n: int, w: Work) -> float:
+    """Return the variance of what a fit leaves of the n pixels near the edges."""
+    r, power = w[_R : _R + n], _ZERO
+    for m in range(n):
+        power += r[m] * r[m]
+    return float(power / (n - PARAMETERS))
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
