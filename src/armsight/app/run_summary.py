@@ -12,9 +12,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from armsight.app.run_data import RunData
 from armsight.app.run_tracks import ToolTrack, errors
 from armsight.data import Array
 
+#: Kinds of motion whose path in space is what counts.
+PATHS = ("line", "circle")
+_SETTLED_S = 0.2  # at the end of a rest
 #: A path's points are taken so close that the distance to the nearest is the distance to the path.
 _PATH_STEP_M = 2e-5
 
@@ -48,6 +52,36 @@ def track_figures(track: ToolTrack, truth: ToolTrack, floor: Array | None = None
             "inside_95_share": float((nees <= chi2.ppf(0.95, 6)).mean()),
         }
     return found
+
+
+def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
+    """Return how far from its goal the tool stood in the last fifth of a second of each rest, RMS, m."""
+    found = {}
+    for segment in run.segments:
+        rows = (run.wanted.t_s > segment.end_s - _SETTLED_S) & (run.wanted.t_s <= segment.end_s)
+        if segment.phase == "rest" and segment.motion and rows.any():
+            off = truth.at(run.wanted.t_s[rows])[:, :3, 3] - run.wanted.Ts_base_tool[rows, :3, 3]
+            found[segment.motion] = float(np.sqrt((off**2).sum(axis=1).mean()))
+    return found
+
+
+def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]]:
+    """Return for each motion along a path (line, circle) times since its start and distances from the path, m."""
+    found = {}
+    for segment in run.segments:
+        if segment.phase == "rest" or segment.kind not in PATHS:
+            continue
+        rows = (run.wanted.t_s > segment.begin_s) & (run.wanted.t_s <= segment.end_s)
+        if rows.any():
+            was = truth.at(run.wanted.t_s[rows])[:, :3, 3]
+            away = path_distances(was, run.wanted.Ts_base_tool[rows, :3, 3])
+            found[segment.motion] = (run.wanted.t_s[rows] - segment.begin_s, away)
+    return found
+
+
+def judge(run: RunData) -> ToolTrack:
+    """Return what the run is judged by: the truth, or on a real arm the fused estimate."""
+    return run.fused if run.truth is None else run.truth
 
 
 def path_distances(was: Array, wanted: Array) -> Array:

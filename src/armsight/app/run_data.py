@@ -1,0 +1,136 @@
+"""A run as tables: its log brought onto one axis of time, beside what was wanted and, in the workcell, the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.app.run_loop import Log, Segment
+from armsight.app.run_tracks import ToolTrack
+from armsight.data import Array, Record
+from armsight.loop.estimators import Verdict
+from armsight.robot.arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class RunData(Record):
+    """A run.
+
+    Attributes:
+        t_s: (N,) times of the potentiometers' readings, board's clock.
+        q: (N, 6) what they said, rad.
+        q_wanted: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
+        potentiometers: where the table of the arm has the tool with them.
+        vision: where each used shot saw it.
+        fused: where the estimator had it, when it was asked.
+        wanted: where it was to be, at the times something was planned.
+        truth: where it was; None for a real arm.
+        segments: what happened when.
+        latency_s: from each image to the command that knows it, our time, s.
+        modes: (M,) what each command was based on.
+        missed: shots that gave no pose.
+        outliers: sightings that the estimator did not believe.
+    """
+
+    t_s: Array
+    q: Array
+    q_wanted: Array
+    potentiometers: ToolTrack
+    vision: ToolTrack
+    fused: ToolTrack
+    wanted: ToolTrack
+    truth: ToolTrack | None
+    segments: tuple[Segment, ...]
+    latency_s: Array
+    modes: NDArray[np.str_]
+    missed: int
+    outliers: int
+
+
+def assembled(log: Log, arm: Arm, delay_s: float, truth: tuple[Array, Array] | None = None) -> RunData:
+    """Bring a log onto one axis of time.
+
+    Args:
+        log: of the run.
+        arm: the nominal arm.
+        delay_s: how late the camera's stamps are.
+        truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
+    """
+    t_s = np.concatenate([s.t_s for s in log.joints])
+    q = np.concatenate([s.q for s in log.joints])
+    q_wanted = np.full_like(q, np.nan)
+    for segment in log.segments:
+        if segment.trajectory is not None:
+            rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
+            since = t_s[rows] - segment.begin_s
+            q_wanted[rows] = segment.trajectory.at(
+                since + (segment.trajectory.duration_s if _rests(segment) else 0.0)
+            ).q
+    planned = np.isfinite(q_wanted).all(axis=1)
+    named = _Named(log.segments)
+    seen = [(s.t_s - delay_s, s) for _, s in log.sightings]
+    fused = [part for part in log.fused if part.covs is not None]
+    return RunData(
+        t_s,
+        q,
+        q_wanted,
+        named.track(t_s, arm.forward(q)),
+        named.track(
+            np.array([t for t, _ in seen]),
+            np.array([s.T_base_tool for _, s in seen]).reshape(-1, 4, 4),
+            np.array([s.cov_noise + s.cov_common for _, s in seen]).reshape(-1, 6, 6),
+        ),
+        named.track(
+            np.concatenate([part.t_s for part in fused]),
+            np.concatenate([part.Ts_base_tool for part in fused]),
+            np.concatenate([part.covs for part in fused if part.covs is not None]),
+        ),
+        named.track(t_s[planned], arm.forward(q_wanted[planned])),
+        None if truth is None else named.track(*truth),
+        tuple(log.segments),
+        np.array(log.latency_s),
+        np.array(log.modes),
+        len(log.poses) - len(log.sightings),
+        sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
+    )
+
+
+def _rests(segment: Segment) -> bool:
+    """Whether the arm stands at the end of its trajectory."""
+    return segment.phase == "rest"
+
+
+class _Named:
+    """Tells for any time which phase and motion it belongs to."""
+
+    def __init__(self, segments: list[Segment]) -> None:
+        self._begins = np.array([s.begin_s for s in segments])
+        self._phase = np.array([s.phase for s in segments] + ["calibration"])
+        self._motion = np.array([s.motion for s in segments] + [""])
+
+    def track(self, t_s: Array, Ts_base_tool: Array, covs: Array | None = None) -> ToolTrack:
+        """Return a track with its phases and motions; what lies before the first segment belongs to the calibration."""
+        at = np.searchsorted(self._begins, t_s, side="left") - 1
+        return ToolTrack(t_s, Ts_base_tool, self._phase[at], self._motion[at], covs)
+
+
+def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
+    """Return what lies between two times of all tracks."""
+
+    def within(track: ToolTrack) -> ToolTrack:
+        return track[(track.t_s > begin_s) & (track.t_s <= end_s)]
+
+    rows = (run.t_s > begin_s) & (run.t_s <= end_s)
+    return replace(
+        run,
+        t_s=run.t_s[rows],
+        q=run.q[rows],
+        q_wanted=run.q_wanted[rows],
+        potentiometers=within(run.potentiometers),
+        vision=within(run.vision),
+        fused=within(run.fused),
+        wanted=within(run.wanted),
+        segments=tuple(s for s in run.segments if s.begin_s >= begin_s - 1e-9 and s.end_s <= end_s + 1e-9),
+    )

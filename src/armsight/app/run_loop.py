@@ -1,0 +1,196 @@
+"""The loop of a run: let a period pass, hear the joints, look, estimate, command; and keep all of it.
+
+Sim and hardware look alike from here: a :class:`~armsight.robot.boards.board.Board`, in whose ``receive`` time passes, and
+a function that hands out the newest shot there is. Time is the board's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from armsight.app.run_tracks import ToolTrack
+from armsight.data import JointCommand, JointStates, PoseEstimate, Shot
+from armsight.errors import DeviceError
+from armsight.loop.estimators import Estimator, Mounting, Sighting, Verdict
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import State
+from armsight.robot.trajectories import Trajectory
+from armsight.vision.follow import Follower
+
+#: Period of the loop and so of the commands, s.
+PERIOD_S = 0.004
+#: Without a shot for so long the cameras have stalled, s.
+STALLED_S = 0.5
+_STOP_S = 0.3  # in which an interrupted motion comes to rest
+
+
+class Controller(Protocol):
+    """Says what the joints are to do next."""
+
+    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return the command to send at a time of the board's clock, and in a word what it is based on."""
+        ...
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a run.
+
+    Attributes:
+        phase: calibration, open_loop, closed_loop or rest.
+        motion: name of the motion, or of the one whose end the arm stands at; "" before the first.
+        kind: joints, home, line or circle, of that motion.
+        closed: whether the loop was closed on vision.
+        begin_s: on the board's clock.
+        end_s: likewise.
+        trajectory: what the joints were to do from ``begin_s`` on; None where nothing was planned.
+    """
+
+    phase: str
+    motion: str
+    kind: str
+    closed: bool
+    begin_s: float = 0.0
+    end_s: float = 0.0
+    trajectory: Trajectory | None = None
+
+
+@dataclass
+class Log:
+    """All that a run measured, as it came.
+
+    Attributes:
+        joints: the potentiometers, batch by batch.
+        fused: where the estimator had the tool at each reading, batch by batch.
+        sightings: each used shot's, with the name of the shot.
+        verdicts: what the estimator made of each of them.
+        poses: each shot's name, stamp and pose, or why there is none.
+        commands: when each was sent, and what.
+        modes: what each was based on.
+        latency_s: our time from an image to the command that knows it, image by image, s.
+        segments: what happened when.
+    """
+
+    joints: list[JointStates] = field(default_factory=list)
+    fused: list[ToolTrack] = field(default_factory=list)
+    sightings: list[tuple[str, Sighting]] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+    poses: list[tuple[str, float, object]] = field(default_factory=list)
+    commands: list[tuple[float, JointCommand]] = field(default_factory=list)
+    modes: list[str] = field(default_factory=list)
+    latency_s: list[float] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
+
+
+class Loop:
+    """Runs controllers on a board with cameras beside it.
+
+    Args:
+        board: the joints.
+        poll: returns the newest shot not handed out yet, or None; raises DeviceError where a camera is gone.
+        follower: measures the body.
+        mounting: where cameras and body are.
+        estimator: says where the tool is.
+        log: where all is kept.
+        on_shot: called with each shot that was looked at, after its command is on its way.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        poll: Callable[[], Shot | None],
+        follower: Follower,
+        mounting: Mounting,
+        estimator: Estimator,
+        log: Log,
+        *,
+        on_shot: Callable[[Shot, object], None] = lambda shot, result: None,
+    ) -> None:
+        self.board, self.poll, self.follower, self.mounting = board, poll, follower, mounting
+        self.estimator, self.log, self.on_shot = estimator, log, on_shot
+        self.t_s = 0.0
+        self._shot_s: float | None = None
+        self.pass_time(PERIOD_S)
+
+    def pass_time(self, wait_s: float) -> None:
+        """Let time pass and hear the joints."""
+        states = self.board.receive(wait_s)
+        if not len(states.t_s):
+            return
+        self.t_s = float(states.t_s[-1])
+        self.log.joints.append(states)
+        self.estimator.joints(states)
+        track = self.estimator.track(states.t_s)
+        none = np.full(len(states.t_s), "")
+        self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
+
+    def look(self) -> tuple[Shot, float, object] | None:
+        """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
+        shot = self.poll()
+        if shot is None:
+            return None
+        began = time.perf_counter()
+        result = self.follower.measure(shot)
+        self._shot_s = self.t_s
+        if isinstance(result, PoseEstimate) and shot.t_s is not None:
+            sighting = self.mounting.sighting(result, shot.t_s)
+            self.log.sightings.append((shot.name, sighting))
+            self.log.verdicts.append(self.estimator.vision(sighting))
+        self.log.poses.append((shot.name, float("nan") if shot.t_s is None else shot.t_s, result))
+        return shot, began, result
+
+    def run(self, controller: Controller, duration_s: float, segment: Segment) -> None:
+        """Let a controller command the joints for a while.
+
+        Args:
+            controller: what commands.
+            duration_s: how long.
+            segment: what is done; its times are filled in.
+
+        Raises:
+            DeviceError: the board left the enabled state (its faults are told), or a device is gone.
+        """
+        begin_s = self.t_s
+        try:
+            while self.t_s - begin_s < duration_s - 1e-9:
+                self.pass_time(PERIOD_S)
+                self._check_board()
+                looked = self.look()
+                command, mode = controller.command(self.t_s, self.estimator)
+                self.board.send(command)
+                self.log.commands.append((self.t_s, command))
+                self.log.modes.append(mode)
+                if looked is not None:
+                    shot, began, result = looked
+                    self.log.latency_s.append(time.perf_counter() - began)
+                    self.on_shot(shot, result)
+        finally:
+            self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
+
+    def stop(self) -> None:
+        """Bring the arm to rest where it is, and leave it held there."""
+        self.pass_time(0.0)
+        if self.board.status.state is not State.ENABLED or not self.log.commands:
+            return
+        newest = self.log.commands[-1][1]
+        reference = self.board.joints.reference_rad if self.board.joints is not None else newest.q_ref
+        self.board.send(JointCommand(reference, np.zeros(6), newest.gravity_duty, _STOP_S))
+        self.pass_time(_STOP_S)
+
+    def _check_board(self) -> None:
+        """Raise where the board does not follow any more."""
+        status = self.board.status
+        if status.state is State.ENABLED:
+            return
+        causes = "; ".join(str(fault) for fault in status.faults) or "no fault is latched"
+        raise DeviceError(f"the board went over to {status.state.name} at {status.t_s:.3f} s: {causes}")
+
+    @property
+    def stalled(self) -> bool:
+        """Whether the cameras have been silent for too long."""
+        return self._shot_s is not None and self.t_s - self._shot_s > STALLED_S
