@@ -11,11 +11,12 @@ SRC = Path(__file__).resolve().parent.parent / "src" / "armsight"
 #: Layer -> the layers it may import besides itself. Everything may import the ground beneath.
 MAY_IMPORT = {
     "geometry": set(),
+    "firmware": set(),
     "vision": {"geometry"},
-    "robot": {"geometry"},
+    "robot": {"geometry", "firmware"},
     "sim": {"geometry", "vision", "robot"},
     "loop": {"geometry", "vision", "robot"},
-    "app": {"geometry", "vision", "robot", "sim", "loop"},
+    "app": {"geometry", "firmware", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
 GROUND = {"data": {"errors"}, "errors": set(), "files": {"errors"}}
