@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from armsight.data import Array, Record
 
 
@@ -19,8 +22,8 @@ class Sensed(Record):
         stop_pressed: whether the emergency stop button is pressed.
     """
 
-    counts: Array
-    current_ma: Array
+    counts: NDArray[np.uint32]
+    current_ma: NDArray[np.uint32]
     supply_mv: int = 24000
     stop_pressed: bool = False
 

@@ -1,0 +1,274 @@
+"""What every board must get right: a run each through motion, a bad wire, a silent host, bad sensors, the stop, new gains.
+
+A scenario is a function of a :class:`~armsight.app.board_bench.Bench` that notes on it what is not as it must be.
+Those in :data:`DRIVEN` switch the drives on; those in :data:`AT_REST` never do: for a real board, whose arm is not to move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from armsight.app.board_bench import PERIOD_S, Bench
+from armsight.data import Array, JointCommand
+from armsight.errors import DeviceError
+from armsight.robot.boards.codes import Fault, Order, Refusal, State
+from armsight.robot.boards.configuration import gains_array
+from armsight.sim.joints import PotFault
+
+Scenario = Callable[[Bench], None]
+
+#: How near the joints stay to where they are told to be, rad, while they swing.
+_NEAR_RAD = 0.1
+#: Longer than any board's time without a command in these runs.
+_SILENCE_S = 0.5
+
+
+def nominal(bench: Bench) -> None:
+    """Enable, swing, disable: the joints follow, nothing is refused."""
+    bench.enable()
+    errors = bench.swing(1.0)
+    bench.expect_state(State.ENABLED, "while swinging")
+    bench.expect(
+        float(np.abs(errors).max()) < _NEAR_RAD, f"joints are up to {np.abs(errors).max():.3f} rad off their way"
+    )
+    bench.expect(bench.board.status.refused_count == 0, "a command was refused")
+    bench.disable()
+    bench.expect_state(State.DISABLED, "after the order to disable")
+    bench.expect(not bench.board.joints.duty.any(), "a duty stays on with the drives off")
+
+
+def crc_faults(bench: Bench) -> None:
+    """Swing while every sixth message to the board is disturbed: those are dropped and counted, the others obeyed."""
+    bench.enable()
+    _disturb(bench, lambda: bench.swing(1.0))
+    bench.expect_state(State.ENABLED, "on a disturbed wire")
+    _whole_again(bench)
+    bench.disable()
+
+
+def host_loss(bench: Bench) -> None:
+    """Fall silent in motion: the board brings the arm to rest by itself and goes on when told to."""
+    bench.enable()
+    bench.swing(0.4)
+    bench.readings(_SILENCE_S)
+    status = bench.board.status
+    bench.expect([f.fault for f in status.faults] == [Fault.HOST_SILENT], f"silence is told as {status.faults}")
+    bench.expect(status.state in (State.HOLDING, State.FAULTED), f"without a host it is {status.state.name}")
+    moved = np.ptp(bench.readings(0.1), axis=0).max()
+    bench.expect(float(moved) < _NEAR_RAD / 4, f"the arm still moves by {moved:.3f} rad in 0.1 s")
+    bench.clear()
+    bench.enable()
+    bench.swing(0.2)
+    bench.expect_state(State.ENABLED, "after the silence was cleared")
+    bench.disable()
+
+
+def sensor_faults(bench: Bench) -> None:
+    """Break a potentiometer in motion in each way, then the supply: each is told by its name, and the drives go off."""
+    plant = bench.plant
+    if plant is None:
+        return
+    for joint, (broken, fault) in enumerate(_POT_FAULTS.items()):
+        bench.enable()
+        bench.swing(0.4)
+        plant.break_pot(joint, broken)
+        bench.swing(0.5)
+        _expect_fault(bench, fault, joint)
+        plant.break_pot(joint, PotFault.NONE)
+        bench.readings(0.3)
+        bench.clear()
+    for supply_mv, fault in ((8000, Fault.SUPPLY_LOW), (16000, Fault.SUPPLY_HIGH)):
+        bench.enable()
+        bench.swing(0.1)
+        plant.supply_mv, whole_mv = supply_mv, plant.supply_mv
+        bench.swing(0.1)
+        _expect_fault(bench, fault, None)
+        plant.supply_mv = whole_mv
+        bench.readings(0.05)
+        bench.clear()
+
+
+def e_stop(bench: Bench) -> None:
+    """Stop in motion, by message and by button: the drives go off and stay off until the stop is cleared."""
+    for press in _stops(bench):
+        bench.enable()
+        bench.swing(0.3)
+        press(True)
+        bench.readings(0.05)
+        bench.expect_state(State.STOPPED, "after the emergency stop")
+        _stopped(bench)
+        press(False)
+        bench.clear()
+    bench.enable()
+    bench.swing(0.1)
+    bench.expect_state(State.ENABLED, "after the stop was cleared")
+    bench.disable()
+
+
+def gain_change(bench: Bench) -> None:
+    """Change the gains in motion: taken whole without a jump of the duty, or refused whole."""
+    gains = gains_array(bench.board.configuration())
+    changed = gains * [1.5, 0.5, 1.2, 1.0, 1.0, 1.0]
+    bench.enable()
+    bench.swing(0.35)
+    before = bench.board.joints.duty
+    number = bench.board.set_gains(changed)
+    bench.swing(PERIOD_S)
+    jump = float(np.abs(bench.board.joints.duty - before).max())
+    bench.expect(jump < 0.25, f"new gains move the duty by {jump:.2f}")
+    bench.swing(0.4)
+    bench.expect(bench.board.status.refused_sequence != number, "good gains were refused")
+    _bad_gains(bench, changed)
+    bench.expect_state(State.ENABLED, "with other gains")
+    bench.disable()
+    bench.expect(_has_gains(bench, changed), "the gains are not those that were sent last and obeyed")
+    bench.board.confirm(bench.board.set_gains(gains))
+
+
+def nominal_at_rest(bench: Bench) -> None:
+    """Drives off: telemetry comes, a motion command is refused."""
+    angles = bench.readings(0.5)
+    bench.expect(len(angles) > 5, f"{len(angles)} readings in 0.5 s")
+    bench.expect(not bench.board.status.drives_on, "the drives are on, though nobody switched them on")
+    bench.expect(_refused(bench) == Refusal.WRONG_STATE, "a motion command with the drives off was not refused")
+    bench.expect(not bench.board.joints.duty.any(), "a duty is on with the drives off")
+
+
+def crc_faults_at_rest(bench: Bench) -> None:
+    """Drives off: disturbed messages are dropped and counted, the next whole one is answered."""
+    _disturb(bench, lambda: [_refused(bench) for _ in range(30)])
+    _whole_again(bench)
+
+
+def e_stop_at_rest(bench: Bench) -> None:
+    """Drives off: the stop is taken by message, keeps the drives from being enabled, and is cleared."""
+    bench.board.stop()
+    bench.readings(0.1)
+    bench.expect_state(State.STOPPED, "after the emergency stop")
+    _stopped(bench)
+    bench.board.confirm(bench.board.order(Order.CLEAR_STOP))
+
+
+def gain_change_at_rest(bench: Bench) -> None:
+    """Drives off: the board's own gains are taken again, wrong ones refused."""
+    gains = gains_array(bench.board.configuration())
+    bench.board.confirm(bench.board.set_gains(gains))
+    _bad_gains(bench, gains)
+    bench.expect(_has_gains(bench, gains), "a refused gain set changed the gains")
+
+
+DRIVEN: Mapping[str, Scenario] = {
+    "nominal": nominal,
+    "crc_faults": crc_faults,
+    "host_loss": host_loss,
+    "sensor_faults": sensor_faults,
+    "e_stop": e_stop,
+    "gain_change": gain_change,
+}
+#: What needs an arm whose sensors can be broken.
+EMULATED_ONLY = ("sensor_faults",)
+AT_REST: Mapping[str, Scenario] = {
+    "nominal": nominal_at_rest,
+    "crc_faults": crc_faults_at_rest,
+    "e_stop": e_stop_at_rest,
+    "gain_change": gain_change_at_rest,
+}
+_POT_FAULTS = {
+    PotFault.OPEN: Fault.POT_OPEN,
+    PotFault.SHORT: Fault.POT_SHORT,
+    PotFault.FROZEN: Fault.POT_FROZEN,
+    PotFault.JUMP: Fault.POT_JUMP,
+    PotFault.INVERTED: Fault.POT_INVERTED,
+}
+
+
+def _disturb(bench: Bench, run: Callable[[], object]) -> None:
+    """Run something with every sixth message disturbed, each time at another byte and bit."""
+    sent = 0
+
+    def flip(data: bytes) -> bytes:
+        nonlocal sent
+        sent += 1
+        if sent % 6:
+            return data
+        spoiled = bytearray(data)
+        spoiled[sent * 7 % len(data)] ^= 1 << sent // 6 % 8
+        return bytes(spoiled)
+
+    before = bench.board.status
+    bench.wire.spoil = flip
+    run()
+    bench.wire.spoil = None
+    bench.readings(0.05)
+    after = bench.board.status
+    noticed = after.crc_errors + after.lost_bytes - before.crc_errors - before.lost_bytes
+    bench.expect(noticed > 0, "no disturbed message was counted")
+    bench.expect(not after.faults, f"a disturbed wire led to {after.faults}")
+
+
+def _whole_again(bench: Bench) -> None:
+    """Expect the next gains to be taken at the first try."""
+    try:
+        bench.board.confirm(bench.board.set_gains(gains_array(bench.board.configuration())))
+    except DeviceError as error:
+        bench.expect(False, f"the wire does not come back: {error}")
+
+
+def _refused(bench: Bench) -> Refusal:
+    """Send a command to stay where the joints are and return why it was refused."""
+    here = bench.readings(PERIOD_S)[-1]
+    number = bench.board.send(JointCommand(here, np.zeros(6), np.zeros(6), PERIOD_S))
+    bench.readings(0.05)
+    status = bench.board.status
+    return status.refusal if status.refused_sequence == number else Refusal.NONE
+
+
+def _expect_fault(bench: Bench, fault: Fault, joint: int | None) -> None:
+    status = bench.board.status
+    first = status.first_fault
+    told = "nothing" if first is None else str(first)
+    bench.expect(first is not None and (first.fault, first.joint) == (fault, joint), f"{fault.name} is told as: {told}")
+    bench.expect(not status.drives_on, f"{fault.name} leaves the drives on")
+
+
+def _stops(bench: Bench) -> list[Callable[[bool], None]]:
+    """Return the ways to stop: by message, and where there is one by button."""
+
+    def message(pressed: bool) -> None:
+        if pressed:
+            bench.board.stop()
+
+    def button(pressed: bool) -> None:
+        assert bench.plant is not None
+        bench.plant.stop_pressed = pressed
+        bench.readings(PERIOD_S)
+
+    return [message] if bench.plant is None else [message, button]
+
+
+def _stopped(bench: Bench) -> None:
+    """Expect a stopped board to refuse motion and enabling."""
+    bench.expect(_refused(bench) == Refusal.WRONG_STATE, "a stopped board took a motion command")
+    try:
+        bench.board.enable()
+    except DeviceError:
+        return
+    bench.expect(False, "a stopped board was enabled")
+
+
+def _bad_gains(bench: Bench, gains: Array) -> None:
+    """Send gains a board must refuse, past the host's own check."""
+    for value, refusal in ((101.0, Refusal.OUT_OF_RANGE), (np.nan, Refusal.NOT_FINITE)):
+        wrong = gains.copy()
+        wrong[3, 0] = value
+        number = bench.board.set_gains(wrong, checked=False)
+        bench.swing(0.05) if bench.board.status.drives_on else bench.readings(0.05)
+        status = bench.board.status
+        told = status.refusal if status.refused_sequence == number else Refusal.NONE
+        bench.expect(told == refusal, f"a gain of {value} is told as {told.name} in place of {refusal.name}")
+
+
+def _has_gains(bench: Bench, gains: Array) -> bool:
+    return bool(np.array_equal(gains_array(bench.board.configuration()), gains.astype(np.float32)))

@@ -1,0 +1,136 @@
+"""What a board's numbers mean: its states, faults, refusals and limits, as ``firmware/core/types.h`` lists them.
+
+The texts are the firmware's own; a test reads the header and holds both together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum, IntFlag
+
+
+class State(IntEnum):
+    """What the board does with its drives."""
+
+    DISABLED = 0
+    ENABLED = 1
+    STOPPING = 2
+    HOLDING = 3
+    FAULTED = 4
+    STOPPED = 5
+
+
+class Fault(IntEnum):
+    """What went wrong; bit ``1 << code`` in a set of faults."""
+
+    POT_OPEN = 1
+    POT_SHORT = 2
+    POT_FROZEN = 3
+    POT_JUMP = 4
+    POT_INVERTED = 5
+    FOLLOWING = 6
+    STALL = 7
+    HOST_SILENT = 8
+    SUPPLY_LOW = 9
+    SUPPLY_HIGH = 10
+    TICK_MISSED = 11
+    TICK_OVERRUN = 12
+    WATCHDOG = 13
+    CONFIG = 14
+
+
+class Refusal(IntEnum):
+    """Why a command was not obeyed."""
+
+    NONE = 0
+    NOT_FINITE = 1
+    OUT_OF_RANGE = 2
+    WRONG_STATE = 3
+    OUTSIDE_LIMITS = 4
+    POT_UNREAD = 5
+    FAULT_STANDS = 6
+    STOP_PRESSED = 7
+    UNKNOWN_COMMAND = 8
+    NO_HELLO = 9
+    TOO_MANY = 10
+    CONFIG_BROKEN = 11
+
+
+class Limited(IntFlag):
+    """What holds a joint back without being a fault."""
+
+    DUTY = 1
+    SLEW = 2
+    CURRENT = 4
+    SOFT = 8
+    SPEED = 16
+
+
+class Order(IntEnum):
+    """What a board can be told beside motion; the numbers are the wire's."""
+
+    ENABLE = 2
+    ENABLE_INWARD = 3
+    DISABLE = 4
+    CLEAR_FAULTS = 5
+    CLEAR_STOP = 6
+
+
+class Reaction(IntEnum):
+    """What an arm does that hears nothing of its host."""
+
+    HOLD = 1
+    RELEASE = 2
+
+
+class ConfigSource(IntEnum):
+    """Where a board took its configuration from."""
+
+    NEWEST = 0
+    OLDER = 1
+    FACTORY = 2
+
+
+STATE_TEXTS: Mapping[State, str] = {
+    State.DISABLED: "disabled: drives off",
+    State.ENABLED: "enabled: follows the host",
+    State.STOPPING: "stopping: a fault slows the arm down to rest",
+    State.HOLDING: "holding: a fault stands, the arm is held at rest",
+    State.FAULTED: "faulted: a fault stands, drives off",
+    State.STOPPED: "emergency stop: drives off until it is cleared",
+}
+FAULT_TEXTS: Mapping[Fault, str] = {
+    Fault.POT_OPEN: "potentiometer open: the reading is above its band",
+    Fault.POT_SHORT: "potentiometer short: the reading is below its band",
+    Fault.POT_FROZEN: "potentiometer frozen: the reading stands still while the arm is told to move",
+    Fault.POT_JUMP: "potentiometer jump: the reading moved faster than the joint can",
+    Fault.POT_INVERTED: "inverted: the joint moves away from its command",
+    Fault.FOLLOWING: "following error: the joint is too far from its reference",
+    Fault.STALL: "stall: the motor is driven hard and the joint does not turn",
+    Fault.HOST_SILENT: "host silent: no motion command within the time set",
+    Fault.SUPPLY_LOW: "supply too low",
+    Fault.SUPPLY_HIGH: "supply too high",
+    Fault.TICK_MISSED: "tick missed: the control loop lost time",
+    Fault.TICK_OVERRUN: "tick overrun: the control loop took longer than its period",
+    Fault.WATCHDOG: "restarted by the watchdog",
+    Fault.CONFIG: "no valid configuration: factory values are in use",
+}
+REFUSAL_TEXTS: Mapping[Refusal, str] = {
+    Refusal.NONE: "obeyed",
+    Refusal.NOT_FINITE: "a number is NaN or infinite",
+    Refusal.OUT_OF_RANGE: "a number is outside its range",
+    Refusal.WRONG_STATE: "not in this state",
+    Refusal.OUTSIDE_LIMITS: "a joint is outside its soft limits: enable to move back in",
+    Refusal.POT_UNREAD: "a potentiometer is not read",
+    Refusal.FAULT_STANDS: "the cause of a fault still stands",
+    Refusal.STOP_PRESSED: "the emergency stop is still pressed",
+    Refusal.UNKNOWN_COMMAND: "unknown command",
+    Refusal.NO_HELLO: "no hello of the board's own version came: only STOP is obeyed",
+    Refusal.TOO_MANY: "too many commands at once",
+    Refusal.CONFIG_BROKEN: "the configuration came incomplete, or could not be stored",
+}
+
+
+def faults_in(bits: int) -> tuple[Fault, ...]:
+    """Return the faults of a set of bits, by code; bits no fault belongs to are passed over."""
+    return tuple(fault for fault in Fault if bits >> fault & 1)

@@ -1,0 +1,236 @@
+"""A board's configuration as the host edits it: gains, limits and tables of all joints, with the ranges of each.
+
+A :data:`Configuration` is a structured numpy array of shape () laid out as ``core_config`` in ``firmware/core/types.h``
+(a test holds both together), so that its bytes are the board's bytes::
+
+    config = board.configuration()
+    config["joint"]["soft_max_rad"][2] = 1.2        # third joint
+    config["joint"]["gains"]["kp_per_rad"] = 5.0    # all joints
+    board.store(config)
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.robot.boards.codes import Reaction
+
+Configuration = NDArray[np.void]
+JOINTS, POT_NODES = 6, 9
+#: Layout of the configuration this armsight knows, and the first word of a stored copy: ``firmware/core/config.h``.
+CONFIG_VERSION, _COPY_MAGIC = 1, 0x31435341
+
+GAINS = np.dtype(
+    [
+        ("kp_per_rad", "<f4"),
+        ("ki_per_rad_s", "<f4"),
+        ("kd_s_per_rad", "<f4"),
+        ("kv_s_per_rad", "<f4"),
+        ("derivative_filter_s", "<f4"),
+        ("anti_windup_per_s", "<f4"),
+    ]
+)
+POT = np.dtype(
+    [
+        ("node_count", "<u2"),
+        ("counts", "<u2", POT_NODES),
+        ("short_counts", "<u2"),
+        ("open_counts", "<u2"),
+        ("angle_rad", "<f4", POT_NODES),
+        ("direction", "<i4"),
+        ("jump_rad", "<f4"),
+        ("frozen_rad", "<f4"),
+        ("inverted_rad", "<f4"),
+    ]
+)
+JOINT = np.dtype(
+    [
+        ("gains", GAINS),
+        ("pot", POT),
+        ("soft_min_rad", "<f4"),
+        ("soft_max_rad", "<f4"),
+        ("speed_limit_rad_s", "<f4"),
+        ("deceleration_rad_s2", "<f4"),
+        ("duty_limit", "<f4"),
+        ("duty_slew_per_s", "<f4"),
+        ("current_cut_per_a_s", "<f4"),
+        ("following_rad", "<f4"),
+        ("stall_duty", "<f4"),
+        ("stall_rad", "<f4"),
+        ("current_limit_ma", "<u4"),
+        ("motor_direction", "<i4"),
+    ]
+)
+CONFIG = np.dtype(
+    [
+        ("joint", JOINT, JOINTS),
+        ("supply_min_mv", "<u4"),
+        ("supply_max_mv", "<u4"),
+        ("supply_ticks", "<u4"),
+        ("pot_ticks", "<u4"),
+        ("following_ticks", "<u4"),
+        ("stall_ticks", "<u4"),
+        ("silence_ticks", "<u4"),
+        ("silence_reaction", "<u4"),
+    ]
+)
+
+#: Name -> smallest and largest value, as config.c holds them.
+GAIN_RANGES = {
+    "kp_per_rad": (0.0, 100.0),
+    "ki_per_rad_s": (0.0, 1000.0),
+    "kd_s_per_rad": (0.0, 100.0),
+    "kv_s_per_rad": (0.0, 100.0),
+    "derivative_filter_s": (0.0, 1.0),
+    "anti_windup_per_s": (0.0, 1000.0),
+}
+_POT_RANGES = {
+    "node_count": (2, POT_NODES),
+    "jump_rad": (1e-4, 1.0),
+    "frozen_rad": (1e-3, 1.0),
+    "inverted_rad": (1e-3, 1.0),
+}
+_JOINT_RANGES = {
+    "soft_min_rad": (-13.0, 13.0),
+    "soft_max_rad": (-13.0, 13.0),
+    "speed_limit_rad_s": (0.01, 20.0),
+    "deceleration_rad_s2": (0.1, 1000.0),
+    "duty_limit": (0.0, 1.0),
+    "duty_slew_per_s": (0.1, 1000.0),
+    "current_cut_per_a_s": (0.0, 1000.0),
+    "following_rad": (1e-3, 13.0),
+    "stall_duty": (0.01, 1.0),
+    "stall_rad": (1e-4, 1.0),
+}
+_ARM_RANGES = {
+    "supply_ticks": (1, 1000),
+    "pot_ticks": (1, 100),
+    "following_ticks": (1, 10000),
+    "stall_ticks": (1, 10000),
+    "silence_ticks": (2, 60000),
+}
+
+
+def lab_configuration() -> Configuration:
+    """Return a configuration for the simulated arm: firm gains, +-2.4 rad, 2 rad/s, 12 V, silent after 100 ms."""
+    config = np.zeros((), CONFIG)
+    joint = config["joint"]
+    joint["gains"] = np.array((4.0, 8.0, 0.1, 0.2, 0.005, 20.0), GAINS)
+    pot = joint["pot"]
+    pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
+    pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
+    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.08
+    values = {
+        "soft_min_rad": -2.4,
+        "soft_max_rad": 2.4,
+        "speed_limit_rad_s": 2.0,
+        "deceleration_rad_s2": 10.0,
+        "duty_limit": 0.8,
+        "duty_slew_per_s": 50.0,
+        "current_cut_per_a_s": 5.0,
+        "following_rad": 0.3,
+        "stall_duty": 0.5,
+        "stall_rad": 0.01,
+        "current_limit_ma": 1600,
+        "motor_direction": 1,
+    }
+    for name, value in values.items():
+        joint[name] = value
+    config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 10000, 14000, 5
+    config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
+    config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
+    return config
+
+
+def sealed(config: Configuration, serial: int = 1) -> bytes:
+    """Return a stored copy of a configuration (``config_copy``) as a board's memory holds it: for emulated boards.
+
+    Raises:
+        InputError: a value is outside its range.
+    """
+    check_configuration(config)
+    body = struct.pack("<III", _COPY_MAGIC, CONFIG_VERSION, serial) + config.tobytes()
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def gains_array(config: Configuration) -> Array:
+    """Return the gains of a configuration: (6, 6), a row per joint: kp, ki, kd, kv, derivative filter, anti-windup."""
+    gains = config["joint"]["gains"]
+    return np.stack([gains[name].astype(float) for name in GAIN_RANGES], axis=1)
+
+
+def check_gains(gains: Array) -> Array:
+    """Return a gain set as an array of shape (6, 6), or say which gain of which joint is wrong.
+
+    Raises:
+        InputError: the shape, a number that is not finite, or one outside its range.
+    """
+    values = np.asarray(gains, dtype=float)
+    if values.shape != (JOINTS, len(GAIN_RANGES)):
+        raise InputError(
+            f"gains are of shape {values.shape}; (6, 6) is needed: a row per joint of {', '.join(GAIN_RANGES)}"
+        )
+    for column, (name, (low, high)) in enumerate(GAIN_RANGES.items()):
+        for joint in range(JOINTS):
+            if not low <= values[joint, column] <= high:
+                raise InputError(
+                    f"joint {joint + 1}: {name} is {values[joint, column]:g}; {low:g} to {high:g} is allowed;"
+                    " nothing was changed"
+                )
+    return values
+
+
+def check_configuration(config: Configuration) -> None:
+    """Say what is wrong with a configuration, where the board would refuse it whole.
+
+    Raises:
+        InputError: it is of another layout, or a value is outside its range.
+    """
+    if config.dtype != CONFIG or config.shape != ():
+        raise InputError("this is no configuration: begin with board.configuration() and change what is to change")
+    for problem in _problems(config):
+        raise InputError(f"configuration: {problem}; nothing was changed")
+
+
+def _problems(config: Configuration) -> Iterator[str]:
+    joints = config["joint"]
+    check_gains(gains_array(config))
+    for j in range(JOINTS):
+        for values, ranges in ((joints[j], _JOINT_RANGES), (joints[j]["pot"], _POT_RANGES)):
+            yield from (f"joint {j + 1}: {text}" for text in _outside(values, ranges))
+        yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
+    yield from _outside(config, _ARM_RANGES)
+    if config["supply_min_mv"] >= config["supply_max_mv"]:
+        yield "supply_min_mv must be below supply_max_mv"
+    if config["silence_reaction"] not in tuple(Reaction):
+        yield f"silence_reaction is {config['silence_reaction']}; 1 (hold) or 2 (release) is allowed"
+
+
+def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -> Iterator[str]:
+    for name, (low, high) in ranges.items():
+        if not np.float32(low) <= values[name] <= np.float32(high):
+            yield f"{name} is {values[name]:g}; {low:g} to {high:g} is allowed"
+
+
+def _joint_problems(joint: Configuration) -> Iterator[str]:
+    pot = joint["pot"]
+    n = int(pot["node_count"])
+    counts, angles = np.diff(pot["counts"][:n].astype(int)), np.diff(pot["angle_rad"][:n].astype(float))
+    if (counts <= 0).any():
+        yield "the counts of the potentiometer's table must rise"
+    if not ((angles > 0).all() or (angles < 0).all()) or not (np.abs(pot["angle_rad"][:n]) <= 13.0).all():
+        yield "the angles of the potentiometer's table must rise or fall throughout, within -13 to 13 rad"
+    if pot["short_counts"] >= pot["open_counts"]:
+        yield "short_counts must be below open_counts"
+    if joint["soft_min_rad"] >= joint["soft_max_rad"]:
+        yield "soft_min_rad must be below soft_max_rad"
+    for name, value in (("direction", pot["direction"]), ("motor_direction", joint["motor_direction"])):
+        if value not in (1, -1):
+            yield f"{name} is {value}; 1 or -1 is allowed"

@@ -1,0 +1,183 @@
+"""The link to an emulated board: one frame a millisecond carries what the board senses, drives, hears and says.
+
+In: bytes of the host. Out: bytes of the board. Every tick the plant is sensed, the firmware runs once on a machine, and
+the plant moves on with the duties it gave. Bytes to the board ride in at the modelled baud rate (8N1: ten bits each),
+those from it leave at the rate the firmware keeps to by itself. Time passes by ``read`` and ``step`` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.frames import (
+    ANSWER,
+    ANSWER_MAGIC,
+    REQUEST,
+    REQUEST_MAGIC,
+    RESTART_POWER,
+    RESTART_WATCHDOG,
+    VERSION,
+    WIRE_BYTES,
+)
+from armsight.robot.boards.machine import Machine, Plant
+
+TICK_S = 0.001
+_BITS_PER_BYTE = 10
+_WRAP = 1 << 32
+
+
+class Faults(Protocol):
+    """What goes wrong on the wire of an emulated board; handed to :class:`EmulatedLink`."""
+
+    def to_board(self, tick: int, data: bytes) -> bytes:
+        """Return what arrives at the board of what the host sent in this tick."""
+        ...
+
+    def to_host(self, tick: int, data: bytes) -> bytes:
+        """Return what arrives at the host of what the board sent in this tick."""
+        ...
+
+
+class EmulatedLink:
+    """A board in lock-step, behind the contract of :class:`~armsight.robot.boards.link.Link`.
+
+    Args:
+        machine: runs the firmware; closed with the link.
+        plant: the arm at the board's motors.
+        baud: bits a second towards the board.
+        faults: what goes wrong on the wire.
+        advance: lets a number of seconds pass in place of this link, whose ``step`` it must call once a millisecond:
+            for a world that owns the time.
+        watch: called with every answer frame (``pil_answer`` as bytes), for traces.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        plant: Plant,
+        baud: int = 921600,
+        faults: Faults | None = None,
+        *,
+        advance: Callable[[float], None] | None = None,
+        watch: Callable[[bytes], None] | None = None,
+    ) -> None:
+        if baud <= 0:
+            raise InputError(f"the baud rate is {baud}; it must be positive")
+        self._machine, self._plant, self._faults = machine, plant, faults
+        self._advance, self._watch = advance, watch
+        self._bytes_per_tick = baud / _BITS_PER_BYTE * TICK_S
+        self._credit = 0.0
+        self._ticks = 0
+        self._to_board, self._to_host = bytearray(), bytearray()
+        self._frame: Any = np.zeros((), REQUEST)
+        self._frame["magic"], self._frame["version"] = REQUEST_MAGIC, VERSION
+        self._overrun, self._restart = False, 0
+        self._duty, self._drives_on = np.zeros(6), False
+        self._closed = False
+        #: The newest answer of the firmware (``pil_answer``): all it knows, not only what the wire carries.
+        self.answer: Any = np.zeros((), ANSWER)
+
+    @property
+    def t_s(self) -> float:
+        """How much time has passed, s."""
+        return self._ticks * TICK_S
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; they ride in with the next ticks."""
+        self._check_open()
+        self._to_board += data
+
+    def read(self, wait_s: float = 0.0) -> bytes:
+        """Let ``wait_s`` pass, to the nearest tick, and return what came meanwhile and before."""
+        self._check_open()
+        if self._advance is None:
+            self.step(round(wait_s / TICK_S))
+        elif wait_s > 0:
+            self._advance(wait_s)
+        data = bytes(self._to_host)
+        self._to_host.clear()
+        return data
+
+    def step(self, ticks: int = 1) -> None:
+        """Run the board and the plant on by so many milliseconds."""
+        self._check_open()
+        for _ in range(ticks):
+            self._tick()
+
+    def overrun(self) -> None:
+        """Let the board's last tick have taken longer than its period."""
+        self._overrun = True
+
+    def restart(self, *, watchdog: bool = False) -> None:
+        """Let the board start anew with the next tick, as after a power cut or by its watchdog; what it stored stays."""
+        self._restart = RESTART_WATCHDOG if watchdog else RESTART_POWER
+        self._to_board.clear()
+
+    def miss(self, ticks: int) -> None:
+        """Let time pass in which the board does not run: the last duties stay on, and what is sent to it is lost."""
+        for _ in range(ticks):
+            self._ticks += 1
+            self._ride()
+            self._plant.sense()
+            self._plant.step(self._duty, self._drives_on)
+
+    def close(self) -> None:
+        """End the emulation."""
+        if not self._closed:
+            self._closed = True
+            self._machine.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeviceError("the emulated board is closed")
+
+    def _ride(self) -> bytes:
+        """Return what reaches the board in this tick."""
+        self._credit += self._bytes_per_tick
+        if not self._to_board:
+            self._credit = min(self._credit, self._bytes_per_tick)
+            return b""
+        count = min(int(self._credit), len(self._to_board), WIRE_BYTES)
+        self._credit -= count
+        data = bytes(self._to_board[:count])
+        del self._to_board[:count]
+        return data if self._faults is None else self._faults.to_board(self._ticks, data)[:WIRE_BYTES]
+
+    def _request(self) -> bytes:
+        frame, sensed, data = self._frame, self._plant.sense(), self._ride()
+        frame["tick"] = self._ticks % _WRAP
+        frame["overrun"], frame["stop_pressed"], frame["supply_mv"] = (
+            self._overrun,
+            sensed.stop_pressed,
+            sensed.supply_mv,
+        )
+        frame["counts"], frame["current_ma"], frame["length"] = sensed.counts, sensed.current_ma, len(data)
+        if data:
+            frame["bytes"][: len(data)] = np.frombuffer(data, np.uint8)
+        frame["restart"] = self._restart
+        self._overrun, self._restart = False, 0
+        request: bytes = frame.tobytes()
+        return request
+
+    def _tick(self) -> None:
+        self._ticks += 1
+        reply = self._machine.tick(self._request())
+        self.answer = answer = np.frombuffer(reply, ANSWER)[0] if len(reply) == ANSWER.itemsize else self.answer
+        if answer["magic"] != ANSWER_MAGIC or answer["version"] != VERSION or answer["tick"] != self._ticks % _WRAP:
+            raise DeviceError(
+                f"the emulated board did not answer tick {self._ticks} with a frame of version {VERSION}: its image and"
+                " this armsight do not belong together; build it anew with `armsight board build`"
+            )
+        if self._watch is not None:
+            self._watch(reply)
+        outputs = answer["outputs"]
+        self._duty, self._drives_on = outputs["duty"], bool(outputs["drives_on"])
+        self._plant.step(self._duty, self._drives_on)
+        length = int(answer["length"])
+        if length:
+            said = answer["bytes"][:length].tobytes()
+            self._to_host += said if self._faults is None else self._faults.to_host(self._ticks, said)

@@ -1,0 +1,50 @@
+"""The firmware compiled for this computer: the same bits as on the board, and the fastest machine there is."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from armsight.errors import InputError
+from armsight.robot.boards.frames import ANSWER, REQUEST
+
+
+class HostMachine:
+    """The board's code in a shared library, behind :class:`~armsight.robot.boards.machine.Machine`.
+
+    Args:
+        library: of the board ``host``.
+
+    Raises:
+        InputError: it cannot be loaded.
+    """
+
+    def __init__(self, library: Path) -> None:
+        # A library's variables exist once however often it is loaded: a second board needs a second file.
+        handle, name = tempfile.mkstemp(suffix=library.suffix)
+        os.close(handle)
+        try:
+            shutil.copyfile(library, name)
+            loaded = ctypes.CDLL(name)
+            self._request = (ctypes.c_char * REQUEST.itemsize).in_dll(loaded, "pil_request_frame")
+            self._answer = (ctypes.c_char * ANSWER.itemsize).in_dll(loaded, "pil_answer_frame")
+            self._tick = loaded.pil_tick
+            loaded.pil_start()
+        except (OSError, AttributeError, ValueError) as error:
+            raise InputError(
+                f"{library}: no host build of the firmware ({error}); run `armsight board build`"
+            ) from None
+        finally:
+            os.unlink(name)
+
+    def tick(self, request: bytes) -> bytes:
+        """Run one tick on a request frame and return the answer frame."""
+        ctypes.memmove(self._request, request, REQUEST.itemsize)
+        self._tick()
+        return self._answer.raw
+
+    def close(self) -> None:
+        """Nothing to end: the library stays loaded as long as the process lives."""

@@ -1,0 +1,85 @@
+"""The firmware's ARM image under QEMU: a whole Cortex-M4F machine, mps2-an386, with its interrupts and SysTick.
+
+Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in instructions
+and jumps on while it waits for its timer, so that it runs as fast as it can and always the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+from pathlib import Path
+from typing import IO
+
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.frames import ANSWER
+
+PROGRAM = "qemu-system-arm"
+_MACHINE = (
+    *("-M", "mps2-an386", "-icount", "shift=5,align=off,sleep=off", "-display", "none"),
+    *("-monitor", "none", "-serial", "none", "-parallel", "none", "-semihosting-config", "enable=on,target=native"),
+)
+_END_S = 5.0
+
+
+class QemuMachine:
+    """The board's image in QEMU, behind :class:`~armsight.robot.boards.machine.Machine`.
+
+    Args:
+        image: ELF file of the board ``pil``.
+
+    Raises:
+        InputError: QEMU is not installed.
+    """
+
+    def __init__(self, image: Path) -> None:
+        program = shutil.which(PROGRAM)
+        if program is None:
+            raise InputError(f"{PROGRAM} is not installed: apt install qemu-system-arm, or use emulated:unicorn")
+        self._process = subprocess.Popen(
+            [program, *_MACHINE, "-kernel", str(image)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+        )
+        self._in, self._out, self._said = _pipes(self._process)
+
+    def tick(self, request: bytes) -> bytes:
+        """Run one tick on a request frame and return the answer frame."""
+        try:
+            self._in.write(request)
+            answer = self._out.read(ANSWER.itemsize)
+            while answer and len(answer) < ANSWER.itemsize:
+                more = self._out.read(ANSWER.itemsize - len(answer))
+                answer = answer + more if more else b""
+        except (BrokenPipeError, ValueError):
+            answer = b""
+        if not answer:
+            raise DeviceError(f"the emulated board broke down: {PROGRAM} ended{self._last_words()}")
+        return answer
+
+    def close(self) -> None:
+        """End the emulation."""
+        with contextlib.suppress(BrokenPipeError):
+            self._in.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._out.close()
+        self._said.close()
+
+    def _last_words(self) -> str:
+        self._process.wait(_END_S)
+        said = self._said.read().decode(errors="replace").strip()
+        return f": {said}" if said else ""
+
+
+def _pipes(process: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes], IO[bytes]]:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    assert process.stderr is not None
+    return process.stdin, process.stdout, process.stderr

@@ -1,0 +1,179 @@
+"""What a board says of itself, as frozen records made of the wire's messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.robot.boards.codes import FAULT_TEXTS, ConfigSource, Fault, Limited, Refusal, State, faults_in
+from armsight.robot.boards.wire import Message
+
+_NO_JOINT = 255
+
+
+@dataclass(frozen=True)
+class Welcome:
+    """Who a board is.
+
+    Attributes:
+        board: its name.
+        firmware: its firmware's version.
+        ticks_per_s: how many ticks its clock has a second.
+        baud: bits a second on its wire.
+        config_source: where its configuration came from.
+    """
+
+    board: str
+    firmware: str
+    ticks_per_s: int
+    baud: int
+    config_source: ConfigSource
+
+
+@dataclass(frozen=True)
+class JointFault:
+    """A latched fault.
+
+    Attributes:
+        fault: which.
+        joint: of which joint, 0 to 5; None where it belongs to none.
+    """
+
+    fault: Fault
+    joint: int | None = None
+
+    def __str__(self) -> str:
+        where = "" if self.joint is None else f"joint {self.joint + 1}: "
+        return where + FAULT_TEXTS[self.fault]
+
+
+@dataclass(frozen=True)
+class BoardStatus:
+    """How a board is.
+
+    Attributes:
+        t_s: when, s on the board's clock.
+        state: what it does with its drives.
+        faults: all that are latched.
+        first_fault: the one that came first since the last clear; None without.
+        obeyed_sequence: number of the last command obeyed.
+        obeyed_count: how many were.
+        refused_sequence: number of the last command refused.
+        refused_count: how many were.
+        refusal: why that one was.
+        supply_v: motor supply, V.
+        crc_errors: messages from the host that were broken.
+        lost_bytes: bytes from the host that belonged to no message.
+        overrun_bytes: bytes from the host for which there was no room.
+        stale_commands: commands dropped because a newer one had come already.
+        lost_messages: messages from the host that are missing in the count of the frames.
+        config_stored: configurations stored since the start.
+    """
+
+    t_s: float
+    state: State
+    faults: tuple[JointFault, ...]
+    first_fault: JointFault | None
+    obeyed_sequence: int
+    obeyed_count: int
+    refused_sequence: int
+    refused_count: int
+    refusal: Refusal
+    supply_v: float
+    crc_errors: int
+    lost_bytes: int
+    overrun_bytes: int
+    stale_commands: int
+    lost_messages: int
+    config_stored: int
+
+    @property
+    def drives_on(self) -> bool:
+        """Whether the motors are driven."""
+        return self.state in (State.ENABLED, State.STOPPING, State.HOLDING)
+
+
+@dataclass(frozen=True, eq=False)
+class JointReport(Record):
+    """How the joints are driven.
+
+    Attributes:
+        t_s: when, s on the board's clock.
+        speed_rad_s: (6,) measured speeds, filtered.
+        reference_rad: (6,) where the joints are to be.
+        reference_rad_s: (6,) how fast they are to move.
+        duty: (6,) to the motors, -1 to 1.
+        limited: what holds each joint back without being a fault.
+    """
+
+    t_s: float
+    speed_rad_s: Array
+    reference_rad: Array
+    reference_rad_s: Array
+    duty: Array
+    limited: tuple[Limited, ...]
+
+
+def welcome_of(message: Message) -> Welcome:
+    """Return what a WELCOME says."""
+    return Welcome(
+        board=_text(message.board),
+        firmware=_text(message.firmware),
+        ticks_per_s=message.ticks_per_s,
+        baud=message.baud,
+        config_source=ConfigSource(message.config_source),
+    )
+
+
+def status_of(message: Message, t_s: float) -> BoardStatus:
+    """Return what a BOARD_STATUS says."""
+    first = None
+    if message.first_fault:
+        first = JointFault(
+            Fault(message.first_fault), None if message.first_joint == _NO_JOINT else message.first_joint
+        )
+    return BoardStatus(
+        t_s=t_s,
+        state=State(message.state),
+        faults=_faults(message.faults, message.joint_faults),
+        first_fault=first,
+        obeyed_sequence=message.obeyed_sequence,
+        obeyed_count=message.obeyed_count,
+        refused_sequence=message.refused_sequence,
+        refused_count=message.refused_count,
+        refusal=Refusal(message.refusal),
+        supply_v=message.supply_mv * 1e-3,
+        crc_errors=message.crc_errors,
+        lost_bytes=message.lost_bytes,
+        overrun_bytes=message.overrun_bytes,
+        stale_commands=message.stale_commands,
+        lost_messages=message.lost_messages,
+        config_stored=message.config_stored,
+    )
+
+
+def joints_of(message: Message, t_s: float) -> JointReport:
+    """Return what a JOINTS says."""
+    return JointReport(
+        t_s=t_s,
+        speed_rad_s=np.array(message.speed_rad_s),
+        reference_rad=np.array(message.reference_rad),
+        reference_rad_s=np.array(message.reference_rad_s),
+        duty=np.array(message.duty),
+        limited=tuple(Limited(bits) for bits in message.limited),
+    )
+
+
+def _faults(bits: int, joint_bits: list[int]) -> tuple[JointFault, ...]:
+    """Return the latched faults, those of the joints first."""
+    of_joints = [JointFault(fault, j) for j, own in enumerate(joint_bits) for fault in faults_in(own)]
+    told = {each.fault for each in of_joints}
+    return tuple(of_joints + [JointFault(fault) for fault in faults_in(bits) if fault not in told])
+
+
+def _text(field: object) -> str:
+    """Return a name as the dialect's decoder gives it: text, or bytes padded with zeros."""
+    raw = field if isinstance(field, bytes) else str(field).encode()
+    return raw.rstrip(b"\0").decode("ascii", "replace")

@@ -1,0 +1,87 @@
+"""The firmware's ARM image under Unicorn: an emulated Cortex-M4F that comes by pip alone.
+
+Unicorn has neither interrupts nor semihosting: ``pil_boot`` is called once and then ``pil_tick`` for every frame.
+"""
+
+from __future__ import annotations
+
+import importlib
+import mmap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.errors import DeviceError, InputError
+from armsight.firmware.elf import read_elf
+
+_FLASH, _FLASH_BYTES = 0, 0x40000
+_RAM, _RAM_BYTES = 0x20000000, 0x10000
+_CONTROL, _CONTROL_BYTES = 0xE000E000, 0x1000  # the processor's own registers: here plain memory
+_FPU_ON = 0x40000000  # FPEXC.EN
+#: Where functions return to: the end of the flash, where nothing lies. The emulation ends there.
+_RETURN = _FLASH_BYTES - 16
+_THUMB = 1
+
+
+class UnicornMachine:
+    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.machine.Machine`.
+
+    Args:
+        image: ELF file of the board ``pil``.
+
+    Attributes:
+        uc: the emulated processor, for those who count its instructions.
+
+    Raises:
+        InputError: unicorn is not installed, or the file is no image.
+    """
+
+    def __init__(self, image: Path) -> None:
+        try:
+            unicorn: Any = importlib.import_module("unicorn")  # it comes without types
+            arm_const: Any = importlib.import_module("unicorn.arm_const")
+        except ImportError:
+            raise InputError("emulated:unicorn needs unicorn: pip install 'armsight[board]'") from None
+        elf = read_elf(image)
+        self._error: type[Exception] = unicorn.UcError
+        self._stack, self._link = arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
+        self._symbols, self._sizes = elf.symbols, elf.sizes
+        self.uc: Any = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        self.uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self.uc.mem_map(_FLASH, _FLASH_BYTES)
+        self.uc.mem_map(_CONTROL, _CONTROL_BYTES)
+        # The board's RAM is memory of ours, so that frames need no call to be written or read.
+        self._ram = mmap.mmap(-1, _RAM_BYTES)
+        self.uc.mem_map_ptr(_RAM, _RAM_BYTES, unicorn.UC_PROT_ALL, np.frombuffer(self._ram, np.uint8).ctypes.data)
+        for segment in elf.segments:
+            self.uc.mem_write(segment.load_address, segment.data)
+        self.uc.reg_write(arm_const.UC_ARM_REG_FPEXC, _FPU_ON)
+        self._stack_top = elf.symbols["stack_top"]
+        self._request = self._place("pil_request_frame")
+        self._answer = self._place("pil_answer_frame")
+        self._tick = self._symbols["pil_tick"] | _THUMB
+        self._call(self._symbols["pil_boot"] | _THUMB)
+
+    def tick(self, request: bytes) -> bytes:
+        """Run one tick on a request frame and return the answer frame."""
+        self._ram[self._request] = request
+        self._call(self._tick)
+        return self._ram[self._answer]
+
+    def close(self) -> None:
+        """End the emulation."""
+        self.uc = None
+
+    def _place(self, name: str) -> slice:
+        """Return where a variable lies in the RAM."""
+        start = self._symbols[name] - _RAM
+        return slice(start, start + self._sizes[name])
+
+    def _call(self, function: int) -> None:
+        try:
+            self.uc.reg_write(self._stack, self._stack_top)
+            self.uc.reg_write(self._link, _RETURN | _THUMB)
+            self.uc.emu_start(function, _RETURN)
+        except self._error as error:
+            raise DeviceError(f"the emulated board broke down: {error}") from None
