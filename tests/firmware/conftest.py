@@ -1,4 +1,4 @@
-"""The firmware's core as a shared library, built once for the whole run."""
+"""The firmware as a shared library, built once for the whole run."""
 
 import ctypes
 
@@ -7,15 +7,25 @@ from firmware_arm import LabArm, declare
 from firmware_build import build_host, compilers
 from firmware_layout import c
 
+from armsight.firmware import build
+
 
 @pytest.fixture(scope="session")
-def libraries(tmp_path_factory):
+def mavlink():
+    """The folder of the dialect's generated C headers."""
+    pytest.importorskip("pymavlink", reason="needs pymavlink to generate the dialect: pip install pymavlink")
+    with build.headers() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def libraries(tmp_path_factory, mavlink):
     """The host build of every compiler found, by the compiler's name."""
     found = compilers()
     if not found:
         pytest.skip("no C compiler: install gcc, or ziglang from PyPI")
     return {
-        name: declare(ctypes.CDLL(str(build_host(compiler, tmp_path_factory.mktemp(name)))))
+        name: declare(ctypes.CDLL(str(build_host(compiler, tmp_path_factory.mktemp(name), mavlink))))
         for name, compiler in found.items()
     }
 

@@ -1,40 +1,53 @@
-"""Build the firmware's core with whatever C compiler this machine has."""
+"""Compile the firmware for tests: the build's own flags, and whatever the test adds to them."""
 
-import importlib.util
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
-FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
-CORE = sorted((FIRMWARE / "core").glob("*.c"))
-HOST = [*CORE, FIRMWARE / "boards" / "host" / "host.c"]
+from armsight.firmware import build
+
+FIRMWARE = build.source_folder()
+HERE = Path(__file__).parent
+CORE = [source for source in build.host_sources() if source.startswith("core/")]
+WIRE = [source for source in build.host_sources() if source.startswith("wire/")]
+HOST = build.host_sources()
 SHARED = ("-O2", "-shared", "-fPIC")
-CORTEX_M4F = ("-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp", "-fno-unwind-tables")
+
+
+def own_compiler() -> list[str] | None:
+    """This machine's own C compiler."""
+    path = shutil.which("gcc") or shutil.which("cc")
+    return [path] if path else None
 
 
 def compilers() -> dict[str, list[str]]:
-    """The compilers found, by name: the machine's own, and the one that comes from PyPI."""
-    found = {}
-    own = next((path for name in ("gcc", "cc") if (path := shutil.which(name))), None)
-    if own:
-        found["own"] = [own]
-    if importlib.util.find_spec("ziglang"):
-        found["zig"] = [sys.executable, "-m", "ziglang", "cc"]
-    return found
+    """The compilers for this machine, by name: its own, and the one that comes from PyPI."""
+    own, found = own_compiler(), build.compilers()
+    return ({"own": own} if own else {}) | ({"zig": [*found["zig"].host]} if "zig" in found else {})
 
 
-def compile_c(compiler: list[str], target: Path, sources: list[Path], *flags: str) -> subprocess.CompletedProcess[str]:
-    """Compile ``sources`` into ``target`` with the firmware's flags; ARMSIGHT_FIRMWARE_CFLAGS adds to them."""
-    command = [*compiler, f"@{FIRMWARE / 'cflags.txt'}", *flags, f"-I{FIRMWARE / 'core'}"]
-    command += os.environ.get("ARMSIGHT_FIRMWARE_CFLAGS", "").split()
-    return subprocess.run([*command, "-o", target, *sources], capture_output=True, text=True, check=False)
+def is_gcc(compiler: list[str] | None) -> bool:
+    """Tell whether a compiler is GNU's."""
+    if compiler is None:
+        return False
+    return "Free Software Foundation" in subprocess.check_output([*compiler, "--version"], text=True)
 
 
-def build_host(compiler: list[str], folder: Path) -> Path:
+def compile_c(compiler, target, sources, *flags, mavlink=None) -> subprocess.CompletedProcess[str]:
+    """Compile ``sources`` into ``target`` with the firmware's flags; ARMSIGHT_FIRMWARE_CFLAGS adds to them.
+
+    ``mavlink`` is the folder of the generated headers, for sources that need them.
+    """
+    seen = build.includes(mavlink or HERE, "boards/pil", "boards/cortex_m")
+    command = [*compiler, "@cflags.txt", *flags, *seen, *os.environ.get("ARMSIGHT_FIRMWARE_CFLAGS", "").split()]
+    command += ["-o", str(target), *map(str, sources)]
+    return subprocess.run(command, cwd=FIRMWARE, capture_output=True, text=True, check=False)
+
+
+def build_host(compiler, folder: Path, mavlink: Path) -> Path:
     """Build the shared library of the host board into ``folder``."""
     library = folder / "firmware_host.so"
-    done = compile_c(compiler, library, HOST, *SHARED)
+    done = compile_c(compiler, library, HOST, *SHARED, mavlink=mavlink)
     assert done.returncode == 0, done.stderr
     return library

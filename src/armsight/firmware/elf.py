@@ -48,12 +48,14 @@ class Elf:
         segments: what is loaded.
         symbols: addresses by name, functions with the Thumb bit.
         sizes: bytes of each symbol, by name.
+        undefined: names it wants from elsewhere; none once it is linked.
         hard_float: whether floats are passed in floating-point registers and no soft-float helper is in it.
     """
 
     segments: tuple[Segment, ...]
     symbols: dict[str, int]
     sizes: dict[str, int]
+    undefined: frozenset[str]
     hard_float: bool
 
     @property
@@ -76,11 +78,14 @@ def read_elf(path: Path) -> Elf:
         programs_at, sections_at, flags = struct.unpack_from("<III", raw, 28)
         _, program_size, programs, section_size, sections, _ = struct.unpack_from("<6H", raw, 40)
         segments = [_segment(raw, programs_at + k * program_size) for k in range(programs)]
-        symbols, sizes = _symbols(raw, [sections_at + k * section_size for k in range(sections)])
+        table = _symbols(raw, [sections_at + k * section_size for k in range(sections)])
     except (struct.error, ValueError, IndexError) as error:
         raise InputError(f"{path}: not a whole ELF image: {error}") from error
-    hard_float = bool(flags & _HARD_FLOAT) and not any(map(_SOFT_FLOAT.match, symbols))
-    return Elf(tuple(segment for segment in segments if segment), symbols, sizes, hard_float)
+    symbols = {name: value for name, value, _, section in table if section}
+    undefined = frozenset(name for name, _, _, section in table if name and not section)
+    sizes = {name: size for name, _, size, section in table if section}
+    hard_float = bool(flags & _HARD_FLOAT) and not any(map(_SOFT_FLOAT.match, {*symbols, *undefined}))
+    return Elf(tuple(segment for segment in segments if segment), symbols, sizes, undefined, hard_float)
 
 
 def _segment(raw: bytes, at: int) -> Segment | None:
@@ -90,16 +95,15 @@ def _segment(raw: bytes, at: int) -> Segment | None:
     return Segment(address, load_address, raw[offset : offset + stored], size, bool(flags & _WRITABLE))
 
 
-def _symbols(raw: bytes, headers: list[int]) -> tuple[dict[str, int], dict[str, int]]:
+def _symbols(raw: bytes, headers: list[int]) -> list[tuple[str, int, int, int]]:
+    """Return name, value, size and section of every symbol; section 0 is elsewhere."""
     sections = [struct.unpack_from("<10I", raw, at) for at in headers]
-    symbols: dict[str, int] = {}
-    sizes: dict[str, int] = {}
+    found = []
     for _, kind, _, _, offset, length, link, _, _, entry in sections:
         if kind != _SYMBOLS:
             continue
         for at in range(offset, offset + length, entry):
-            name_at, value, size = struct.unpack_from("<III", raw, at)
+            name_at, value, size, _, _, section = struct.unpack_from("<IIIBBH", raw, at)
             text = sections[link][4] + name_at
-            name = raw[text : raw.index(b"\0", text)].decode()
-            symbols[name], sizes[name] = value, size
-    return symbols, sizes
+            found.append((raw[text : raw.index(b"\0", text)].decode(), value, size, section))
+    return found
