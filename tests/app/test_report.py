@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app import report
+from armsight.app import page, report
 from armsight.app.report import FIGURES, report_folder, write_report
 from armsight.app.report_draw import drawing, nice, plain, png
 from armsight.app.report_figures import (
@@ -286,7 +286,7 @@ def test_a_folder_without_permission_is_one_clear_error(tmp_path):
 
 
 def test_a_disk_that_fills_leaves_nothing_half_written(calibration, tmp_path, monkeypatch, undrawn):
-    replacing = report.replacing
+    replacing = page.replacing
 
     def failing(path, mode="w"):
         if path.name == "index.html":
@@ -294,7 +294,7 @@ def test_a_disk_that_fills_leaves_nothing_half_written(calibration, tmp_path, mo
         return replacing(path, mode)
 
     with monkeypatch.context() as patch:
-        patch.setattr(report, "replacing", failing)
+        patch.setattr(page, "replacing", failing)
         with pytest.raises(InputError, match=r"index.html: cannot be written: No space left on device"):
             write_report(calibration, tmp_path / "a")
     assert list((tmp_path / "a").iterdir()) == []
