@@ -135,7 +135,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
             "What the chapter left out",
             shown(
                 "errors",
-                "Errors against the truth. Potentiometers repeat themselves and are wrong; vision's error stays in its band.",
+                "Errors against the truth. Potentiometers repeat themselves and are wrong; vision stays in its band.",
             ),
         ),
         "loop": (
