@@ -1,0 +1,89 @@
+/* The Nucleo-F446RE as a board: what the common loop asks for, and the tick's timer.
+ *
+ * SysTick counts milliseconds and asks for PendSV, which has the lowest priority and runs the tick: so a tick that takes
+ * too long is seen while it runs, and no millisecond goes uncounted. The main loop serves the wire. Floating point is used
+ * by PendSV and the main loop; the processor keeps a place for its registers on entry and fills it only where both do
+ * (lazy stacking, its default). */
+#include "drivers.h"
+#include "loop.h"
+#include "registers.h"
+#include "start.h"
+
+static board_loop loop;
+static volatile uint32_t ticks;
+static volatile uint32_t overruns;
+static volatile uint32_t running;
+static uint32_t overruns_told;
+
+static void sense(core_inputs *inputs)
+{
+    const uint32_t seen = overruns;
+    inputs->tick = ticks;
+    inputs->overrun = seen - overruns_told;
+    overruns_told = seen;
+    inputs->stop_pressed = drives_stopped() ? 1u : 0u;
+    adc_read(inputs);
+}
+
+static void drive(const core_outputs *outputs)
+{
+    if (outputs->drives_on != 0u) {
+        drives_write(outputs->duty);
+    } else {
+        drives_off();
+    }
+}
+
+static const board_description nucleo = {
+    .name = "nucleo-f446re",
+    .baud = UART_BAUD,
+    .sense = sense,
+    .drive = drive,
+    .feed_watchdog = watchdog_feed,
+    .watchdog_reset = watchdog_was_here,
+    .receive = uart_receive,
+    .send = uart_send,
+    .read_copy = flash_read,
+    .write_copy = flash_write,
+};
+
+void systick_interrupt(void)
+{
+    ticks++;
+    if (running != 0u) {
+        overruns++;
+    }
+    SCB_ICSR = SCB_ICSR_PENDSVSET;
+}
+
+void pendsv_interrupt(void)
+{
+    running = 1u;
+    loop_tick(&loop);
+    running = 0u;
+}
+
+static void ticks_start(void)
+{
+    SCB_SHPR3 = FIELD(0xF0, 16); /* PendSV last, SysTick first */
+    SYSTICK->rvr = PROCESSOR_HZ / TICKS_PER_S - 1u;
+    SYSTICK->cvr = 0u;
+    SYSTICK->csr = SYSTICK_CSR_PROCESSOR | SYSTICK_CSR_TICKINT | SYSTICK_CSR_ENABLE;
+}
+
+void board_main(void)
+{
+    watchdog_set_long();
+    clock_start();
+    drives_start();
+    pins_start();
+    adc_start();
+    uart_start();
+    loop_start(&loop, &nucleo);
+    drives_run();
+    watchdog_set_short();
+    ticks_start();
+    for (;;) {
+        loop_poll(&loop);
+    }
+}

@@ -1,0 +1,27 @@
+"""The Nucleo's image, built once per compiler by the package's own build."""
+
+import functools
+import tempfile
+from pathlib import Path
+
+import pytest
+from stm32f4_emulator import Emulator
+
+from armsight.firmware.build import build_board, compilers
+
+COMPILERS = ("zig", "gcc")
+_folder = tempfile.TemporaryDirectory(prefix="armsight-stm32f4-")
+
+
+@functools.cache
+def image(compiler: str) -> Path:
+    """Return the ELF this compiler makes, or skip where there is none."""
+    found = compilers()
+    if compiler not in found:
+        pytest.skip(f"no {compiler} for ARM: pip install ziglang, or apt-get install gcc-arm-none-eabi gcc")
+    return build_board("stm32f4", Path(_folder.name) / f"{compiler}.elf", found[compiler])
+
+
+def fresh(compiler: str) -> Emulator:
+    """Return an emulated Nucleo with the image in it, before its reset."""
+    return Emulator(image(compiler))
