@@ -17,6 +17,7 @@ from armsight.errors import ArmsightError
 #: Command name -> module in this package that holds a click command called ``command``; loaded only when used.
 COMMANDS = {
     "arm": "arm",
+    "board": "board",
     "body": "body",
     "calibrate": "calibrate",
     "cameras": "cameras",

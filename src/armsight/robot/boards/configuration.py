@@ -11,8 +11,6 @@ A :data:`Configuration` is a structured numpy array of shape () laid out as ``co
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -24,8 +22,8 @@ from armsight.robot.boards.codes import Reaction
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
-#: Layout of the configuration this armsight knows, and the first word of a stored copy: ``firmware/core/config.h``.
-CONFIG_VERSION, _COPY_MAGIC = 1, 0x31435341
+#: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
+CONFIG_VERSION = 1
 
 GAINS = np.dtype(
     [
@@ -147,17 +145,6 @@ def lab_configuration() -> Configuration:
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
     config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
     return config
-
-
-def sealed(config: Configuration, serial: int = 1) -> bytes:
-    """Return a stored copy of a configuration (``config_copy``) as a board's memory holds it: for emulated boards.
-
-    Raises:
-        InputError: a value is outside its range.
-    """
-    check_configuration(config)
-    body = struct.pack("<III", _COPY_MAGIC, CONFIG_VERSION, serial) + config.tobytes()
-    return body + struct.pack("<I", zlib.crc32(body))
 
 
 def gains_array(config: Configuration) -> Array:
