@@ -7,13 +7,19 @@
 
 #define CHUNK 128u
 
+/* Return what config_load says of the two stored copies, which it leaves in loop->copies. */
+static uint32_t load(board_loop *loop, core_config *config)
+{
+    loop->board->read_copy(0u, &loop->copies[0]);
+    loop->board->read_copy(1u, &loop->copies[1]);
+    return config_load(config, &loop->copies[0], &loop->copies[1]);
+}
+
 void loop_start(board_loop *loop, const board_description *board)
 {
     core_config config;
     *loop = (board_loop){.board = board};
-    board->read_copy(0u, &loop->copies[0]);
-    board->read_copy(1u, &loop->copies[1]);
-    const uint32_t source = config_load(&config, &loop->copies[0], &loop->copies[1]);
+    const uint32_t source = load(loop, &config);
     core_init(&loop->core, &config, source, board->watchdog_reset());
     wire_init(&loop->wire, &(wire_setup){board->name, board->baud, source, &loop->core.config});
 }
@@ -31,14 +37,24 @@ void loop_tick(board_loop *loop)
 }
 
 /* Write a configuration beside the newest good copy; returns whether it is stored. */
-static bool store(board_loop *loop, const core_config *config)
+static bool write(board_loop *loop, const core_config *config)
 {
     uint32_t serial = 0u;
-    loop->board->read_copy(0u, &loop->copies[0]);
-    loop->board->read_copy(1u, &loop->copies[1]);
     const uint32_t which = config_next(&loop->copies[0], &loop->copies[1], &serial);
     config_seal(&loop->copies[which], config, serial);
     return loop->board->write_copy(which, &loop->copies[which]);
+}
+
+/* Store a configuration, and a second time where the other copy is broken or was never written. */
+static bool store(board_loop *loop, const core_config *config)
+{
+    core_config stored;
+    load(loop, &stored);
+    const bool done = write(loop, config);
+    if (done && load(loop, &stored) != CONFIG_NEWEST) {
+        return write(loop, config);
+    }
+    return done;
 }
 
 void loop_poll(board_loop *loop)

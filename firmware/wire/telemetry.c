@@ -41,9 +41,10 @@ void telemetry_put(wire_state *wire, const mavlink_message_t *message)
     if (length > WIRE_OUT_BYTES - (ring->written - ring->taken)) {
         return;
     }
-    for (uint32_t i = 0u; i < length; i++) {
-        ring->bytes[(ring->written + i) % WIRE_OUT_BYTES] = bytes[i];
-    }
+    const uint32_t from = ring->written % WIRE_OUT_BYTES;
+    const uint32_t first = length < WIRE_OUT_BYTES - from ? length : WIRE_OUT_BYTES - from;
+    memcpy(&ring->bytes[from], bytes, first);
+    memcpy(ring->bytes, &bytes[first], length - first);
     ring->written += length;
 }
 
@@ -169,17 +170,24 @@ static bool has_room(const wire_state *wire)
     return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
 }
 
+/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are refused, and no more. */
+static bool status_is_due(const wire_state *wire)
+{
+    const uint32_t since = wire_tick(wire) - wire->status_tick;
+    if (wire->greeted != 0u && (wire->status_urgent != 0u || since >= wire->periods.status)) {
+        return true;
+    }
+    return wire->status_due != 0u && since >= wire->periods.status / STATUS_GAP_DIVISOR;
+}
+
 void telemetry_write(wire_state *wire)
 {
     const uint32_t tick = wire_tick(wire);
-    const uint32_t since = tick - wire->status_tick;
-    const bool due = since >= wire->periods.status ||
-                     (wire->status_due != 0u && since >= wire->periods.status / STATUS_GAP_DIVISOR);
+    if (status_is_due(wire) && has_room(wire)) {
+        write_status(wire);
+    }
     if (wire->greeted == 0u) {
         return;
-    }
-    if ((due || wire->status_urgent != 0u) && has_room(wire)) {
-        write_status(wire);
     }
     if (tick - wire->joints_tick >= wire->periods.joints && has_room(wire)) {
         write_joints(wire);

@@ -6,6 +6,7 @@ import pytest
 from firmware_arm import LabArm, declare
 from firmware_build import build_host, compilers
 from firmware_layout import c
+from firmware_pil import Host, PilBoard, working_board
 
 from armsight.firmware import build
 
@@ -19,15 +20,31 @@ def mavlink():
 
 
 @pytest.fixture(scope="session")
-def libraries(tmp_path_factory, mavlink):
+def library_files(tmp_path_factory, mavlink):
     """The host build of every compiler found, by the compiler's name."""
     found = compilers()
     if not found:
         pytest.skip("no C compiler: install gcc, or ziglang from PyPI")
-    return {
-        name: declare(ctypes.CDLL(str(build_host(compiler, tmp_path_factory.mktemp(name), mavlink))))
-        for name, compiler in found.items()
-    }
+    return {name: build_host(compiler, tmp_path_factory.mktemp(name), mavlink) for name, compiler in found.items()}
+
+
+@pytest.fixture(scope="session")
+def libraries(library_files):
+    """The same, loaded."""
+    return {name: declare(ctypes.CDLL(str(path))) for name, path in library_files.items()}
+
+
+@pytest.fixture
+def working(library_files, tmp_path):
+    """An emulated board with a good configuration, and a host that has greeted it."""
+    return working_board(next(iter(library_files.values())), tmp_path)
+
+
+@pytest.fixture
+def fresh(library_files, tmp_path):
+    """An emulated board just unpacked, and a host that has not said anything yet."""
+    board = PilBoard(next(iter(library_files.values())), tmp_path)
+    return board, Host(board)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The records and codes of firmware/core/types.h as ctypes, read from the header so that they cannot drift apart."""
+"""The records and codes of the firmware's headers as ctypes, read from the headers so that they cannot drift apart."""
 
 import ctypes
 import re
@@ -6,9 +6,17 @@ from types import SimpleNamespace
 
 from firmware_build import FIRMWARE
 
-BASIC = {"float": ctypes.c_float, "uint32_t": ctypes.c_uint32, "uint16_t": ctypes.c_uint16, "int32_t": ctypes.c_int32}
-HEADER = re.sub(r"/\*.*?\*/", "", (FIRMWARE / "core" / "types.h").read_text(encoding="utf-8"), flags=re.DOTALL)
-NUMBERS = {name: int(value) for name, value in re.findall(r"#define (\w+) (\d+)u\n", HEADER)}
+HEADERS = ("core/types.h", "boards/pil/frame.h")
+BASIC = {
+    "float": ctypes.c_float,
+    "uint32_t": ctypes.c_uint32,
+    "uint16_t": ctypes.c_uint16,
+    "uint8_t": ctypes.c_uint8,
+    "int32_t": ctypes.c_int32,
+}
+HEADER = "".join((FIRMWARE / path).read_text(encoding="utf-8") for path in HEADERS)
+HEADER = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
+NUMBERS = {name: int(value, 0) for name, value in re.findall(r"#define (\w+) (\d\w*)u *\n", HEADER)}
 
 
 def _listed(which: str) -> dict[str, int]:

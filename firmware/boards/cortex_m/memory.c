@@ -18,7 +18,10 @@ void __aeabi_memset(void *to, size_t length, int value);
 void __aeabi_memset4(void *to, size_t length, int value);
 void __aeabi_memset8(void *to, size_t length, int value);
 
-typedef uint32_t __attribute__((may_alias)) word;
+/* A word anywhere: the processor reads and writes single words at any address. */
+typedef struct __attribute__((packed, may_alias)) word {
+    uint32_t bits;
+} word;
 
 extern char data_begin[], data_end[], data_stored[], bss_begin[], bss_end[]; /* of sections.ld */
 
@@ -32,14 +35,22 @@ void *memcpy(void *to, const void *from, size_t length)
 {
     uint8_t *target = to;
     const uint8_t *source = from;
-    if ((((uintptr_t)target | (uintptr_t)source) & 3u) == 0u) {
-        for (; length >= 16u; length -= 16u, target += 16, source += 16) {
-            const word *four = (const word *)(const void *)source;
-            const word a = four[0], b = four[1], c = four[2], d = four[3];
-            word *place = (word *)(void *)target;
-            place[0] = a, place[1] = b, place[2] = c, place[3] = d;
-            KEEP;
-        }
+    for (; length >= 16u; length -= 16u, target += 16, source += 16) {
+        const word *four = (const word *)(const void *)source;
+        const word a = four[0];
+        const word b = four[1];
+        const word c = four[2];
+        const word d = four[3];
+        word *place = (word *)(void *)target;
+        place[0] = a;
+        place[1] = b;
+        place[2] = c;
+        place[3] = d;
+        KEEP;
+    }
+    for (; length >= 4u; length -= 4u, target += 4, source += 4) {
+        *(word *)(void *)target = *(const word *)(const void *)source;
+        KEEP;
     }
     for (; length != 0u; length--) {
         *target++ = *source++;
@@ -51,12 +62,10 @@ void *memcpy(void *to, const void *from, size_t length)
 void *memset(void *to, int value, size_t length)
 {
     uint8_t *target = to;
-    const word fill = (uint8_t)value * 0x01010101u;
-    if (((uintptr_t)target & 3u) == 0u) {
-        for (; length >= 4u; length -= 4u, target += 4) {
-            *(word *)(void *)target = fill;
-            KEEP;
-        }
+    const word fill = {(uint8_t)value * 0x01010101u};
+    for (; length >= 4u; length -= 4u, target += 4) {
+        *(word *)(void *)target = fill;
+        KEEP;
     }
     for (; length != 0u; length--) {
         *target++ = (uint8_t)value;

@@ -1,11 +1,13 @@
-/* The host board: the core as a shared library, its functions called by name. A caller in another language lays the
- * records out by itself; host_size lets it find out whether it did so rightly. */
-#include "types.h"
+/* The host board: the firmware as a shared library, its functions called by name; pil_tick runs the emulated board. A
+ * caller in another language lays the records out by itself; host_size lets it find out whether it did so rightly. */
+#include "frame.h"
+#include "wire.h"
 
 #define RECORD_LIST(X)                                                                                             \
     X(joint_gains) X(gain_set) X(pot_config) X(joint_config) X(core_config) X(config_copy) X(move_command)         \
     X(core_command) X(core_inputs) X(core_outputs) X(pid_state) X(pid_demand) X(setpoint_state) X(pot_state)       \
-    X(joint_state) X(core_state)
+    X(joint_state) X(core_state) X(pil_request) X(pil_answer) X(wire_setup) X(wire_periods) X(wire_counters)       \
+    X(wire_state)
 
 typedef struct record_size {
     const char *name;
