@@ -127,7 +127,7 @@ class Chip(ClockAndFlash):
             self.length[f"{dma}.{register[:2]}"] = self[f"{dma}.{register[:2]}NDTR"]
         self[name] = value
 
-    def _transfer(self, stream: str, size: int, value: int | None) -> int:
+    def transfer(self, stream: str, size: int, value: int | None) -> int:
         """Move one item from or to memory; return it."""
         dma, index = stream.split(".S")
         control, left, total = self[f"{stream}CR"], self[f"{stream}NDTR"], self.length[stream]
@@ -170,13 +170,14 @@ class Chip(ClockAndFlash):
         triggered = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7
         triggered = triggered and self["TIM8.CCMR2"] >> 12 & 7 == 6 and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"]
         listens = cr2 & 1 and cr2 >> 28 & 3 == 1 and cr2 >> 24 & 15 == 14 and self["ADC1.CR1"] >> 8 & 1
+        listens = listens and not self["ADC1.SR"] >> 5 & 1  # an overrun stops the requests
         if not (triggered and listens and cr2 >> 8 & 3 == 3 and self[f"{stream}CR"] & 1):
             return
         if self[f"{stream}CR"] >> 25 & 7 != 0 or self[f"{stream}PAR"] != 0x4001204C:
             self.wrong("DMA2 stream 0 does not serve the converter")
         for _ in range(count):
             for channel in self.sequence():
-                self._transfer(stream, 2, self.levels.get(channel, 0))
+                self.transfer(stream, 2, self.levels.get(channel, 0))
 
     # wire
 
@@ -188,7 +189,7 @@ class Chip(ClockAndFlash):
             self.wrong("nobody takes the bytes of the wire")
             return
         for byte in data:
-            self._transfer(stream, 1, byte)
+            self.transfer(stream, 1, byte)
 
     def send(self, most: int) -> bytes:
         """Let the wire carry at most so many bytes away; return them."""
@@ -200,7 +201,7 @@ class Chip(ClockAndFlash):
                 self.wrong("DMA1 stream 6 does not serve USART2's sender")
             if self[f"{stream}PAR"] != 0x40004404:
                 self.wrong("DMA1 stream 6 does not write to USART2")
-            data.append(self._transfer(stream, 1, None))
+            data.append(self.transfer(stream, 1, None))
         return bytes(data)
 
     def get_usart2_dr(self, name: str) -> int:

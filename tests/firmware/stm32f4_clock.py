@@ -138,7 +138,7 @@ class ClockAndFlash:
                 self.wrong("the PLL's source is not ready")
             if not (1e6 <= vco_in <= 2e6 and 100e6 <= vco_in * (factors >> 6 & 511) <= 432e6):
                 self.wrong(f"PLL factors {factors:#x} out of range")
-            if not (2 <= factors >> 24 & 15 and 2 <= factors >> 28 & 7):
+            if (factors >> 24 & 15) < 2 or (factors >> 28 & 7) < 2:
                 self.wrong(f"PLLQ or PLLR of {factors:#x} out of range")
         if value >> 19 & 1 and not old >> 17 & 1:
             self.wrong("clock security without the external clock")

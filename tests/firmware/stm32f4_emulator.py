@@ -80,14 +80,16 @@ class Emulator:
 
     def _run(self, begin: int, until: int, turns: int = 1) -> None:
         self._turns_left = turns
-        self.uc.emu_start(begin | 1, until, timeout=MOST_US)
+        self.uc.emu_start(begin | 1, RETURN, timeout=MOST_US)
         reached = self.uc.reg_read(UC_ARM_REG_PC)
         assert reached == until, f"stopped at {reached:#x} instead of {until:#x}"
 
     def call(self, function: str | int, *arguments: int) -> int:
         """Call a function of the program; return what it returns."""
         at = self.symbols[function] if isinstance(function, str) else function
-        for register, value in zip((UC_ARM_REG_R0, UC_ARM_REG_R1, UC_ARM_REG_R2, UC_ARM_REG_R3), arguments, strict=False):
+        for register, value in zip(
+            (UC_ARM_REG_R0, UC_ARM_REG_R1, UC_ARM_REG_R2, UC_ARM_REG_R3), arguments, strict=False
+        ):
             self.uc.reg_write(register, value)
         self.uc.reg_write(UC_ARM_REG_LR, RETURN | 1)
         self._run(at, RETURN)
@@ -107,12 +109,16 @@ class Emulator:
 
     def interrupt(self, number: int) -> None:
         """Run an interrupt's handler and come back to where the main loop was."""
-        assert self.uc.reg_read(UC_ARM_REG_PRIMASK) == 0
+        assert not self.masked()
         before = self.uc.context_save()
         # The processor puts 26 words (with the floating-point registers' place) and at most one for alignment on the stack.
         self.uc.reg_write(UC_ARM_REG_SP, (self.uc.reg_read(UC_ARM_REG_SP) - 4 * 27) & ~7)
         self.call(self._vector(number))
         self.uc.context_restore(before)
+
+    def masked(self) -> bool:
+        """Tell whether interrupts wait."""
+        return bool(self.uc.reg_read(UC_ARM_REG_PRIMASK))
 
     def run_into(self, number: int, instructions: int) -> None:
         """Run so many instructions of a handler that never comes back."""

@@ -1,18 +1,18 @@
-"""Where the STM32F446's registers lie, written down from its reference manual a second time, apart from the firmware's header."""
+"""Where the STM32F446's registers lie: the tables of its reference manual once more, apart from the firmware's header."""
 
-TIM = {
-    name: 4 * i
-    for i, name in enumerate(
-        "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4 BDTR DCR DMAR".split()
-    )
-}
-GPIO = {
-    name: 4 * i for i, name in enumerate("MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR AFRL AFRH".split())
-}
-DMA = {"LISR": 0x00, "HISR": 0x04, "LIFCR": 0x08, "HIFCR": 0x0C} | {
-    f"S{stream}{name}": 0x10 + 0x18 * stream + 4 * i
+
+def _row(*names: str) -> dict[str, int]:
+    """Return registers that follow one another, by their offset."""
+    return {name: 4 * i for i, name in enumerate(names)}
+
+
+_TIM_BASE = _row("CR1", "CR2", "SMCR", "DIER", "SR", "EGR", "CCMR1", "CCMR2", "CCER", "CNT", "PSC", "ARR", "RCR")
+TIM = _TIM_BASE | {"CCR1": 0x34, "CCR2": 0x38, "CCR3": 0x3C, "CCR4": 0x40, "BDTR": 0x44}
+GPIO = _row("MODER", "OTYPER", "OSPEEDR", "PUPDR", "IDR", "ODR", "BSRR", "LCKR", "AFRL", "AFRH")
+DMA = _row("LISR", "HISR", "LIFCR", "HIFCR") | {
+    f"S{stream}{name}": 0x10 + 0x18 * stream + offset
     for stream in range(8)
-    for i, name in enumerate("CR NDTR PAR M0AR M1AR FCR".split())
+    for name, offset in _row("CR", "NDTR", "PAR", "M0AR", "M1AR", "FCR").items()
 }
 
 #: Peripheral: base address, registers by offset, and the bit that gives it its clock (none: always on).
