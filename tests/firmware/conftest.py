@@ -6,7 +6,8 @@ import pytest
 from firmware_arm import LabArm, declare
 from firmware_build import build_host, compilers
 from firmware_layout import c
-from firmware_pil import Host, PilBoard, working_board
+from firmware_pil import BAUD, Host, PilBoard, working_board
+from firmware_wire import BareWire
 
 from armsight.firmware import build
 
@@ -66,3 +67,9 @@ def moving(arm):
     arm.wander(500)
     assert (arm.outputs.state, arm.outputs.faults) == (c.STATE_ENABLED, 0)
     return arm
+
+
+@pytest.fixture
+def fresh_wire(library):
+    """A wire without a board, that nobody has greeted."""
+    return BareWire(library, BAUD)

@@ -69,8 +69,10 @@ class Host:
         self.heard: list = []
 
     def pack(self, kind: str, *fields) -> bytes:
-        """A message as bytes."""
-        return getattr(self.dialect, f"MAVLink_{kind}_message")(*fields).pack(self.out)
+        """A message as bytes, the next in the count of the frames."""
+        data = getattr(self.dialect, f"MAVLink_{kind}_message")(*fields).pack(self.out)
+        self.out.seq = (self.out.seq + 1) % 256
+        return data
 
     def hello(self, *, dialect=1, config=1, nonce=7) -> bytes:
         return self.pack("hello", dialect, config, nonce)
