@@ -140,7 +140,7 @@ def test_pixels_of_plain_squares_count_by_their_moments_as_one_by_one():
         ]
     found = []
     for pixels, flat in ((px, np.zeros_like(moments)), (px[:, ~far], moments)):
-        H = np.zeros((crossing.PARAMETERS + 1, crossing.PARAMETERS + 2))
+        H = np.zeros((crossing.PARAMETERS + 2, crossing.PARAMETERS + 2))
         work, n = crossing_work(pixels), pixels.shape[1]
         cost = crossing._assemble(n, work, flat, 0.0, 0.0, Q, SIDES, BOW, H)
         found.append(np.append(H[np.tril_indices(crossing.PARAMETERS)], [*H[crossing.PARAMETERS, :10], cost]))

@@ -39,14 +39,15 @@ from armsight.vision.markers.window import WINDOW_MAX_PX, WINDOW_SHARE, fill_up,
 
 #: How far the window of a first fit reaches at most, px.
 WINDOW_ROUGH_PX = 8.0
-#: The blur a fit starts with.
+#: The blur that the first fit of an image starts with, and that no window is drawn for less than.
 START_BLUR_PX = 1.0
 #: Pixels further from an edge than so many sigmas of its blur, and these px, are of plain squares. The error left is
 #: 5e-4 of the contrast at the most; a rough place asks for more room.
 NEAR_SIGMAS, NEAR_PX, NEAR_ROUGH_PX = 3.5, 0.25, 0.75
 #: A fit ends with the step that lowers the sum of squares by less than this share of one pixel's noise, a first one by
-#: less than this.
+#: less than this; or that moves the edges and their blur by less than this share of the blur.
 STOP, STOP_ROUGH = 0.05, 20.0
+SLIGHT, SLIGHT_ROUGH = 0.1, 0.3
 #: A window whose opposite quadrants differ by less, grey levels, shows nothing.
 PLAIN = 1.0
 #: A start further off than this leaves the window off centre; it is drawn again about the corner.
@@ -115,11 +116,12 @@ def _place(
     arm: float,
     rough: bool,
     known: bool,
+    blur: float,
     w: Work,
     q: Array,
     L: Array,
 ) -> int:
-    """Fit one corner, from q where that is known; q, w and L are left at the solution.
+    """Fit one corner, from q where that is known, else with a blur to begin with; q, w and L are left at the solution.
 
     Return how many pixels near the edges were fitted, or minus a verdict.
     """
@@ -136,10 +138,10 @@ def _place(
         n = thin(n, w, flat)
         fill_up(n, w)
         x0, y0 = np.rint(start[0]), np.rint(start[1])
-        first_guess(n, w, flat, x0, y0, start, square, START_BLUR_PX, q)
+        first_guess(n, w, flat, x0, y0, start, square, blur, q)
         if abs(q[7]) < PLAIN:
             return -_FAINT
-        if not fit_crossing(n, w, flat, x0, y0, q, sides, bow, L, STOP_ROUGH):
+        if not fit_crossing(n, w, flat, x0, y0, q, sides, bow, L, STOP_ROUGH, SLIGHT_ROUGH):
             return -_DIVERGED
         if rough:
             return n
@@ -153,7 +155,7 @@ def _place(
         if n < LANES or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
             return -_DIVERGED
         fill_up(n, w)
-        if not fit_crossing(n, w, flat, np.rint(centre[0]), np.rint(centre[1]), q, sides, bow, L, STOP):
+        if not fit_crossing(n, w, flat, np.rint(centre[0]), np.rint(centre[1]), q, sides, bow, L, STOP, SLIGHT):
             return -_DIVERGED
         if np.hypot(q[0] - centre[0], q[1] - centre[1]) < RECENTRE_PX:
             break
@@ -175,10 +177,10 @@ def _refine(
     verdict: Ids,
 ) -> None:
     """Fit every corner; models (N, PARAMETERS) holds the starts of those that are known, and receives the solutions."""
-    w, L = np.zeros(WORK, np.float32), np.zeros((PARAMETERS, PARAMETERS))
+    w, L, blur = np.zeros(WORK, np.float32), np.zeros((PARAMETERS, PARAMETERS)), START_BLUR_PX
     for i in range(uv0.shape[0]):
         q = models[i]
-        n = _place(image, uv0[i], squares[i], bows[i], arm, rough, known[i], w, q, L)
+        n = _place(image, uv0[i], squares[i], bows[i], arm, rough, known[i], blur, w, q, L)
         if n < 0:
             verdict[i] = -n
             continue
@@ -193,6 +195,7 @@ def _refine(
             verdict[i] = _MISFIT
         else:
             verdict[i] = _KEPT
+            blur = np.sqrt(0.5 * (q[4] + q[5]))  # the next one's is about the same
 
 
 def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -34,9 +34,8 @@ _BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost
 #: only what the pixels leave open: the blur of an edge that falls between two pixels.
 _BLUR2_PRIOR = (0.25, 0.25)
 
-#: A step that moves the edges by less than this share of their blur, at the corner and so far from it, needs no other:
-#: the next would be this share of it.
-_SLIGHT, _ARM_PX = 0.1, 10.0
+#: How far from the corner a turn of an edge moves it, px.
+_ARM_PX = 10.0
 
 _f = np.float32
 _ZERO, _HALF, _ONE, _TWO = _f(0.0), _f(0.5), _f(1.0), _f(2.0)
@@ -102,62 +101,63 @@ def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _products(n: int, w: Work, H: Array) -> None:
-    """Fill the lower half of H (11, 12) with the products of derivatives and residuals, summed over n pixels."""
-    for i in range(PARAMETERS + 1):
+    """Fill the lower half of H (12, 12) with the products of derivatives and residuals, summed over n pixels.
+
+    Two rows by four at a time, for eight sums under way keep the processor busy.
+    """
+    for i in range(0, PARAMETERS + 1, 2):
         o = JACOBIAN + i * ROOM
-        a = w[o : o + n]
-        for j in range(0, i + 1, 4):
+        a0, a1 = w[o : o + n], w[o + ROOM : o + ROOM + n]
+        for j in range(0, i + 2, 4):
             o = JACOBIAN + j * ROOM
             b0, b1 = w[o : o + n], w[o + ROOM : o + ROOM + n]
             b2, b3 = w[o + 2 * ROOM : o + 2 * ROOM + n], w[o + 3 * ROOM : o + 3 * ROOM + n]
-            s0, s1, s2, s3 = _ZERO, _ZERO, _ZERO, _ZERO
+            s0, s1, s2, s3, t0, t1, t2, t3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             for m in range(n):
-                s0 += a[m] * b0[m]
-                s1 += a[m] * b1[m]
-                s2 += a[m] * b2[m]
-                s3 += a[m] * b3[m]
+                s0 += a0[m] * b0[m]
+                s1 += a0[m] * b1[m]
+                s2 += a0[m] * b2[m]
+                s3 += a0[m] * b3[m]
+                t0 += a1[m] * b0[m]
+                t1 += a1[m] * b1[m]
+                t2 += a1[m] * b2[m]
+                t3 += a1[m] * b3[m]
             H[i, j], H[i, j + 1], H[i, j + 2], H[i, j + 3] = s0, s1, s2, s3
+            H[i + 1, j], H[i + 1, j + 1], H[i + 1, j + 2], H[i + 1, j + 3] = t0, t1, t2, t3
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _add_plain(flat: Array, x0: float, y0: float, q: Array, H: Array) -> None:
     """Add to H what the plain squares say: there the image is linear in x and y, and moments are all it takes."""
-    cx, cy, kx, ky = q[0] - x0, q[1] - y0, q[8], q[9]
-    B, S, p = np.zeros((PARAMETERS, 3)), np.empty((3, 3)), np.empty(3)
-    p[0], p[1], p[2] = 1.0 - kx * cx - ky * cy, kx, ky
+    cx, cy, kx, ky, B = q[0] - x0, q[1] - y0, q[8], q[9], np.zeros((PARAMETERS, 3))
+    light = 1.0 - kx * cx - ky * cy  # where x and y are zero
     for k in range(2):
-        m, sign = flat[k], 1.0 - 2.0 * k
+        count, x, y, xx, xy, yy, grey, grey_x, grey_y, grey_grey = flat[k]
+        sign = 1.0 - 2.0 * k
         level = q[6] + sign * q[7]
         B[0, 0], B[1, 0] = -kx * level, -ky * level
+        B[6, 0], B[6, 1], B[6, 2] = light, kx, ky
+        B[7, 0], B[7, 1], B[7, 2] = sign * light, sign * kx, sign * ky
         B[8, 0], B[8, 1], B[9, 0], B[9, 2] = -cx * level, level, -cy * level, level
-        S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = m[0], m[1], m[2], m[3], m[4], m[5]
-        S[1, 0], S[2, 0], S[2, 1] = m[1], m[2], m[4]
-        gx, gy, gz = m[6], m[7], m[8]
-        cost = m[9]
-        for i in range(3):
-            B[6, i], B[7, i] = p[i], sign * p[i]
-            cost -= 2.0 * level * p[i] * m[6 + i]
-            for j in range(3):
-                cost += level * level * p[i] * S[i, j] * p[j]
-        gx -= level * (S[0, 0] * p[0] + S[0, 1] * p[1] + S[0, 2] * p[2])
-        gy -= level * (S[1, 0] * p[0] + S[1, 1] * p[1] + S[1, 2] * p[2])
-        gz -= level * (S[2, 0] * p[0] + S[2, 1] * p[1] + S[2, 2] * p[2])
+        sum0, sum1, sum2 = count * light + x * kx + y * ky, x * light + xx * kx + xy * ky, y * light + xy * kx + yy * ky
+        H[PARAMETERS, PARAMETERS] += grey_grey - 2.0 * level * (light * grey + kx * grey_x + ky * grey_y)
+        H[PARAMETERS, PARAMETERS] += level * level * (light * sum0 + kx * sum1 + ky * sum2)
+        g0, g1, g2 = grey - level * sum0, grey_x - level * sum1, grey_y - level * sum2
         for i in (0, 1, 6, 7, 8, 9):
-            v0 = B[i, 0] * S[0, 0] + B[i, 1] * S[1, 0] + B[i, 2] * S[2, 0]
-            v1 = B[i, 0] * S[0, 1] + B[i, 1] * S[1, 1] + B[i, 2] * S[2, 1]
-            v2 = B[i, 0] * S[0, 2] + B[i, 1] * S[1, 2] + B[i, 2] * S[2, 2]
-            H[PARAMETERS, i] += B[i, 0] * gx + B[i, 1] * gy + B[i, 2] * gz
+            v0 = B[i, 0] * count + B[i, 1] * x + B[i, 2] * y
+            v1 = B[i, 0] * x + B[i, 1] * xx + B[i, 2] * xy
+            v2 = B[i, 0] * y + B[i, 1] * xy + B[i, 2] * yy
+            H[PARAMETERS, i] += B[i, 0] * g0 + B[i, 1] * g1 + B[i, 2] * g2
             for j in (0, 1, 6, 7, 8, 9):
                 if j <= i:
                     H[i, j] += v0 * B[j, 0] + v1 * B[j, 1] + v2 * B[j, 2]
-        H[PARAMETERS, PARAMETERS] += cost
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _assemble(
     n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, H: Array
 ) -> float:
-    """Fill the normal equations at q: H (11, 12), lower half, its last row the gradient; return the cost."""
+    """Fill the normal equations at q: H (12, 12), lower half, row 10 the gradient; return the cost."""
     full = (n + LANES - 1) // LANES * LANES
     evaluate(full, w, x0, y0, q, sides, bow)
     for i in range(PARAMETERS + 1):
@@ -198,11 +198,11 @@ def first_guess(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slight(x: Array, q: Array) -> bool:
+def _slight(x: Array, q: Array, share: float) -> bool:
     """Whether a step x from q moves and blurs the edges by so little that residuals follow it linearly."""
     blur2 = min(q[4], q[5]) + 1.0 / 12.0
     moved = abs(x[0]) + abs(x[1]) + _ARM_PX * max(abs(x[2]), abs(x[3]))
-    return bool(moved < _SLIGHT * np.sqrt(blur2) and max(abs(x[4]), abs(x[5])) < _SLIGHT * blur2)
+    return bool(moved < share * np.sqrt(blur2) and max(abs(x[4]), abs(x[5])) < share * blur2)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
@@ -218,8 +218,9 @@ def _carry(n: int, w: Work, x: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def fit_crossing(
-    n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, L: Array, stop: float
-) -> bool:
+    n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, L: Array, stop: float,
+    slight: float,
+) -> bool:  # fmt: skip
     """Minimise from q by Levenberg-Marquardt; the work space and L are left at the solution. False if it does not settle.
 
     Args:
@@ -231,10 +232,12 @@ def fit_crossing(
         q: (PARAMETERS,) start, and solution.
         sides: (2, 2) unit vectors along the edges.
         bow: (2, 2) how each edge bows, 1/px.
-        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information.
-        stop: a step is the last when it lowers the cost by less than this share of one pixel's noise.
+        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information, as ``normal.factor`` fills it.
+        stop: a step is the last when it lowers the cost by less than this share of one pixel's noise,
+        slight: or when it moves the edges and their blur by less than this share of the blur: the next would be that share
+            of it.
     """
-    H, T = np.empty((PARAMETERS + 1, PARAMETERS + 2)), np.empty((PARAMETERS + 1, PARAMETERS + 2))
+    H, T = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.empty((PARAMETERS + 2, PARAMETERS + 2))
     x, trial = np.empty(PARAMETERS), np.empty(PARAMETERS)
     pixels = n + flat[0, 0] + flat[1, 0]
     cost, damping, current = _assemble(n, w, flat, x0, y0, q, sides, bow, H), _LAMBDA, True
@@ -247,7 +250,7 @@ def fit_crossing(
         trial[4], trial[5] = max(trial[4], _BLUR2_MIN), max(trial[5], _BLUR2_MIN)
         gain = np.dot(x, g)  # how much lower the cost should get, or a little more
         x[:] = trial - q
-        done = damping <= 1.0 and (gain < stop * cost / pixels or _slight(x, q))
+        done = damping <= 1.0 and (gain < stop * cost / pixels or _slight(x, q, slight))
         if done and current:  # derivatives stay what they are
             q[:] = trial
             _carry(n, w, x)
@@ -280,36 +283,40 @@ def rough_noise(n: int, w: Work) -> float:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
-    """Return the variance of the noise and fill cov (2, 2), the covariance of the place.
+    """Return the variance of the noise and fill cov (2, 2), the covariance of the place; derivatives are used up.
 
-    The noise is that of the pixels that tell the place, as in ``normal.edge_noise``; here leverage is the squared length
-    of L^-1 times a pixel's derivatives.
+    The noise is that of the pixels that tell the place, as in ``normal.edge_noise``. Leverage is the squared length of
+    L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
     """
-    inverse = np.zeros((PARAMETERS, PARAMETERS))
+    H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
     for j in range(PARAMETERS):
-        inverse[j, j] = 1.0 / L[j, j]
+        inverse[j, j] = L[j, j]
         for i in range(j + 1, PARAMETERS):
             s = 0.0
             for m in range(j, i):
                 s -= L[i, m] * inverse[m, j]
-            inverse[i, j] = s / L[i, i]
-    jx, jy, r = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[_R : _R + n]
-    weight, power = _ZERO, _ZERO
+            inverse[i, j] = s * L[i, i]
+    n = (n + LANES - 1) // LANES * LANES  # derivatives and residuals are zero to the end of a vector
+    jx, jy, root = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[:n]
+    weight = _ZERO
     for m in range(n):
         v = jx[m] * jx[m] + jy[m] * jy[m]
         weight += v
-        power += v * r[m] * r[m]
-    left = w[:n]  # the pixels have done their work
-    for i in range(PARAMETERS):
-        left[:] = _ZERO
-        for j in range(i + 1):
-            share, o = _f(inverse[i, j]), JACOBIAN + j * ROOM
-            row = w[o : o + n]
-            for m in range(n):
-                left[m] += share * row[m]
+        root[m] = np.sqrt(v)  # where the columns were: the pixels have done their work
+    for i in range(PARAMETERS + 1):
+        o = JACOBIAN + i * ROOM
+        row = w[o : o + n]
         for m in range(n):
-            weight -= (jx[m] * jx[m] + jy[m] * jy[m]) * left[m] * left[m]
-    variance = max(float(power / weight), 1.0 / 12.0)
+            row[m] *= root[m]
+    _products(n, w, H)
+    leverage = 0.0
+    for i in range(PARAMETERS):
+        for j in range(i + 1):
+            s = 0.5 * inverse[i, j] * H[j, j]
+            for k in range(j):
+                s += inverse[i, k] * H[j, k]
+            leverage += 2.0 * inverse[i, j] * s
+    variance = max(H[PARAMETERS, PARAMETERS] / (float(weight) - leverage), 1.0 / 12.0)
     for i in range(2):
         for j in range(2):
             s = 0.0

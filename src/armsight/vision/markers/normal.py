@@ -26,41 +26,43 @@ def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def factor(A: Array, damping: float, L: Array) -> bool:
-    """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite."""
+    """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite.
+
+    Divisions are dear: L's diagonal is filled with its own inverse.
+    """
     for i in range(len(L)):
-        for j in range(i + 1):
+        for j in range(i):
             s = A[i, j]
-            if i == j:
-                s *= 1.0 + damping
             for m in range(j):
                 s -= L[i, m] * L[j, m]
-            if i == j:
-                if not s > 1e-12 * A[i, i]:
-                    return False
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
+            L[i, j] = s * L[j, j]
+        s = A[i, i] * (1.0 + damping)
+        for m in range(i):
+            s -= L[i, m] * L[i, m]
+        if not s > 1e-12 * A[i, i]:
+            return False
+        L[i, i] = 1.0 / np.sqrt(s)
     return True
 
 
 @numba.njit(cache=True, error_model="numpy")
 def solve(L: Array, g: Array, x: Array) -> None:
-    """Solve L L^T x = g."""
+    """Solve L L^T x = g with the factor that :func:`factor` fills."""
     for i in range(len(L)):
         s = g[i]
         for m in range(i):
             s -= L[i, m] * x[m]
-        x[i] = s / L[i, i]
+        x[i] = s * L[i, i]
     for i in range(len(L) - 1, -1, -1):
         s = x[i]
         for m in range(i + 1, len(L)):
             s -= L[m, i] * x[m]
-        x[i] = s / L[i, i]
+        x[i] = s * L[i, i]
 
 
 @numba.njit(cache=True, error_model="numpy")
 def invert(L: Array, inverse: Array) -> None:
-    """Fill the inverse of L L^T."""
+    """Fill the inverse of L L^T, L as :func:`factor` fills it."""
     unit, x = np.zeros(len(L)), np.empty(len(L))
     for i in range(len(L)):
         unit[:] = 0.0
