@@ -1,0 +1,1 @@
+"""Dense stereo: a pair in standard form goes in, a disparity for every pixel comes out. The contract is in ``method.py``."""

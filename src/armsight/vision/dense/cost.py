@@ -1,0 +1,209 @@
+"""What it costs to match two pixels: census and Birchfield and Tomasi's dissimilarity, a row at a time.
+
+A pair goes in; one byte comes out for every pixel of a row and every disparity, the disparities of a pixel side by side.
+The right image's rows are kept mirrored: the pixels that a left pixel is compared with, one further left for each step in
+disparity, then follow one another in memory, and the compiler uses vectors.
+
+Zabih and Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994; Birchfield and Tomasi,
+"A pixel dissimilarity measure that is insensitive to image sampling", PAMI 20(4), 1998.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from armsight.data import Image
+
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint32]
+ONE, TWO = np.uintp(1), np.uintp(2)
+#: Disparities are worked on in blocks of so many, the width of a vector; a search is padded to whole blocks.
+BLOCK = np.uintp(64)
+#: The census window is 5 x 5 pixels: 24 bits, one for each neighbour that is darker than the middle.
+_CENSUS_REACH = 2
+#: Beyond this many grey levels two pixels are just different: a glint must not cost more than a wrong surface.
+_BT_CUT = np.uint8(20)
+#: Cost of a match beyond the right image's edge, where nothing can be compared: about that of an undecided pixel.
+_OUTSIDE = np.uint8(13)
+#: The largest raw cost (24 bits and half of the cut), and the largest after smoothing, which adds three rows.
+RAW_MAX = 34
+COST_MAX = 3 * RAW_MAX
+
+
+class Pair(NamedTuple):
+    """A pair as the costs need it; what is the right image's is mirrored and padded by the search.
+
+    Attributes:
+        left: (H, W) grey.
+        left_low: (H, W) least grey level within half a pixel to either side.
+        left_high: (H, W) greatest.
+        left_census: (H, W) census words.
+        right: (H, W + pad) grey, mirrored.
+        right_low: (H, W + pad) mirrored.
+        right_high: (H, W + pad) mirrored.
+        right_census: (H, W + pad) mirrored.
+    """
+
+    left: Bytes
+    left_low: Bytes
+    left_high: Bytes
+    left_census: Words
+    right: Bytes
+    right_low: Bytes
+    right_high: Bytes
+    right_census: Words
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def popcount(typing: Any, x: Any) -> Any:
+    """Count the bits that are set: LLVM's ctpop, which numba does not offer by name."""
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return x(x), emit
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _census(padded: Bytes, out: Words) -> None:
+    """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
+    height, width = out.shape
+    for y in range(height):
+        row = out[y]
+        middle = padded[y + _CENSUS_REACH]
+        for j in range(2 * _CENSUS_REACH + 1):
+            other = padded[y + j]
+            for i in range(2 * _CENSUS_REACH + 1):
+                if i == _CENSUS_REACH and j == _CENSUS_REACH:
+                    continue
+                for x in range(width):
+                    row[x] = (row[x] << np.uint32(1)) | np.uint32(other[x + i] < middle[x + _CENSUS_REACH])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _half_way(padded: Bytes, low: Bytes, high: Bytes) -> None:
+    """Write the extreme grey levels (H, W) within half a pixel to either side, by linear interpolation."""
+    height, width = low.shape
+    for y in range(height):
+        row = padded[y + _CENSUS_REACH]
+        for x in range(width):
+            c = np.uint16(row[x + 2])
+            a = np.uint16(c + row[x + 1]) >> np.uint16(1)
+            b = np.uint16(c + row[x + 3]) >> np.uint16(1)
+            low[y, x] = min(c, min(a, b))
+            high[y, x] = max(c, max(a, b))
+
+
+def _looks(image: Image) -> tuple[Bytes, Bytes, Bytes, Words]:
+    """Return an image (H, W), its least and greatest levels half way to the neighbours, and its census words."""
+    reach = _CENSUS_REACH
+    padded = np.pad(image, reach, mode="edge")
+    low, high, words = np.empty(image.shape, np.uint8), np.empty(image.shape, np.uint8), np.zeros(image.shape, np.uint32)
+    _half_way(padded, low, high)
+    _census(padded, words)
+    return np.ascontiguousarray(padded[reach:-reach, reach:-reach]), low, high, words
+
+
+def prepare(left: Image, right: Image, pad: int) -> Pair:
+    """Look at both images of a pair.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        pad: first disparity of the search and how many there are, together.
+    """
+
+    def mirrored(a: NDArray[Any]) -> NDArray[Any]:
+        out = np.zeros((a.shape[0], a.shape[1] + pad), a.dtype)
+        out[:, : a.shape[1]] = a[:, ::-1]
+        return out
+
+    return Pair(*_looks(left), *(mirrored(a) for a in _looks(right)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _above(a: np.uint8, b: np.uint8) -> np.uint8:
+    """Return a - b where that is above zero, else zero."""
+    return np.uint8(max(a, b) - b)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _bt(g: np.uint8, g_low: np.uint8, g_high: np.uint8, r: np.uint8, r_low: np.uint8, r_high: np.uint8) -> np.uint8:
+    """Return half of Birchfield and Tomasi's dissimilarity (their equation 3) of two pixels, cut off."""
+    to_left = max(_above(g, r_high), _above(r_low, g))
+    to_right = max(_above(r, g_high), _above(g_low, r))
+    return np.uint8(min(min(to_left, to_right), _BT_CUT) >> np.uint8(1))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def raw_row(pair: Pair, y: int, first: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
+    """Write the raw costs of one row into ``out`` from ``base`` on: W times ``size`` bytes.
+
+    Census distance plus half of Birchfield and Tomasi's dissimilarity (their equation 3), cut off.
+    """
+    width = pair.left.shape[1]
+    words, right, low, high = pair.right_census[y], pair.right[y], pair.right_low[y], pair.right_high[y]
+    for x in range(width):
+        word, g, g_low, g_high = pair.left_census[y, x], pair.left[y, x], pair.left_low[y, x], pair.left_high[y, x]
+        inside = np.uintp(min(max(x - first + 1, 0), int(size)))
+        o, k = base + np.uintp(x) * size, np.uintp(width - 1 - x + first)
+        whole = inside - inside % BLOCK
+        for d in range(inside):
+            out[o + d] = np.uint8(popcount(word ^ words[k + d]))
+        for block in range(np.uintp(0), whole, BLOCK):
+            for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
+                d = block + e
+                out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
+        for d in range(whole, inside):
+            out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
+        for d in range(inside, size):
+            out[o + d] = _OUTSIDE
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_rows(raw: Bytes, above: np.uintp, at: np.uintp, below: np.uintp, out: Bytes) -> None:
+    """Add three rows of raw costs."""
+    for i in range(np.uintp(out.shape[0])):
+        out[i] = np.uint8(np.uint8(raw[above + i] + raw[at + i]) + raw[below + i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _mean(a: np.uint8, b: np.uint8) -> np.uint8:
+    """Return the mean, rounded up: one instruction."""
+    return np.uint8((np.uint16(a) + np.uint16(b) + np.uint16(1)) >> np.uint16(1))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _blur_along(a: Bytes, size: np.uintp, out: Bytes, base: np.uintp) -> None:
+    """Blur a row of costs over three pixels with weights 1 2 1."""
+    n = np.uintp(a.shape[0])
+    for i in range(size, n - size):
+        out[base + i] = _mean(_mean(a[i - size], a[i + size]), a[i])
+    for i in range(size):
+        last = n - size + i
+        out[base + i] = _mean(_mean(a[i], a[i + size]), a[i])
+        out[base + last] = _mean(_mean(a[last - size], a[last]), a[last])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def smooth_row(y: int, height: int, size: np.uintp, raw: Bytes, mixed: Bytes, out: Bytes, base: np.uintp) -> None:
+    """Write the costs of row y, smoothed over 3 x 3 pixels, into ``out`` from ``base`` on.
+
+    Args:
+        y: the row.
+        height: rows of the image.
+        size: disparities, padded.
+        raw: (3 * W * size,) raw costs of the rows y - 1, y and y + 1, each at its number modulo 3.
+        mixed: (W * size,) scratch.
+        out: where to.
+        base: first byte.
+    """
+    n = np.uintp(mixed.shape[0])
+    above, below = max(y - 1, 0) % 3, min(y + 1, height - 1) % 3
+    _add_rows(raw, np.uintp(above) * n, np.uintp(y % 3) * n, np.uintp(below) * n, mixed)
+    _blur_along(mixed, size, out, base)

@@ -1,0 +1,96 @@
+"""The contract of a dense method: a pair in standard form goes in, a disparity for every pixel of the left image comes out.
+
+To add a method: write one file with a class that fulfils :class:`Method`, and add one line to the registry in
+``methods.py``. The laws in tests/vision/dense are parametrised over that registry, so the new member inherits them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Image, Record
+from armsight.errors import InputError
+
+#: What a pixel's disparity is: nothing, measured, filled because the right camera cannot see it, or filled because what was
+#: measured there cannot be believed.
+NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
+
+
+@dataclass(frozen=True)
+class Search:
+    """Which disparities are tried.
+
+    Attributes:
+        first: the least, px.
+        count: how many, one pixel apart.
+    """
+
+    first: int
+    count: int
+
+    def __post_init__(self) -> None:
+        """Refuse a range that is none."""
+        if self.first < 0 or self.count < 2:
+            raise InputError(
+                f"a search must hold two disparities or more, none below 0 px; got {self.count} from {self.first} px on"
+            )
+
+    @property
+    def last(self) -> int:
+        """The greatest, px."""
+        return self.first + self.count - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Disparity(Record):
+    """A disparity for every pixel of the left image.
+
+    Attributes:
+        disparity: (H, W) px, column in the left image less column in the right one; filled where it was not measured;
+            NaN everywhere where nothing at all was.
+        state: (H, W) NOTHING, MEASURED, OCCLUDED or FILLED.
+        sigma_px: (H, W) standard deviation of what was measured; NaN elsewhere.
+        confidence: (H, W) of 0 to 1: share of the neighbourhood that measured the same surface; 0 elsewhere.
+        search: which disparities were tried.
+        problem: why nothing was measured; None where something was.
+    """
+
+    disparity: NDArray[np.float32]
+    state: NDArray[np.uint8]
+    sigma_px: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    search: Search
+    problem: str | None = None
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(H, W) whether a pixel's disparity was measured."""
+        return np.asarray(self.state == MEASURED)
+
+    @staticmethod
+    def none(shape: tuple[int, int], search: Search, problem: str) -> Disparity:
+        """Return an empty result with the reason."""
+        empty = np.full(shape, np.nan, np.float32)
+        return Disparity(empty, np.zeros(shape, np.uint8), empty, np.zeros(shape, np.float32), search, problem)
+
+
+class Method(Protocol):
+    """A way to find disparities."""
+
+    def match(self, left: Image, right: Image, search: Search) -> Disparity:
+        """Match a pair in standard form.
+
+        Args:
+            left: (H, W) uint8.
+            right: (H, W) uint8; what is at column u - d in row v here is at column u in row v of the left image.
+            search: which disparities to try.
+
+        Returns:
+            A disparity for every pixel, measured or filled. It is the same for any number of threads. What cannot be
+            matched is ``Disparity.none(reason)``, never an exception.
+        """
+        ...

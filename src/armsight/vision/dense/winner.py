@@ -1,0 +1,141 @@
+"""Which disparity wins: the least total, whether the right image agrees, where between two disparities it lies.
+
+Both kinds of matching that sum costs, local and semi-global, end here. The right image's choice is made from the same
+totals: the least over all left pixels that could be its match.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.vision.dense.cost import BLOCK
+
+Singles = NDArray[np.float32]
+Counts = NDArray[np.uint16]
+NOWHERE = np.uint16(65535)
+
+
+class Found(NamedTuple):
+    """What was found for every pixel of the left image.
+
+    Attributes:
+        disparity: (H, W) px, with the place between two disparities; the winner even where nothing agrees.
+        agreed: (H, W) whether the right image's choice is the same to one disparity.
+        curvature: (H, W) second difference of the totals at the winner; 0 at the ends of the search.
+        least: (H, W) the winner's total.
+    """
+
+    disparity: Singles
+    agreed: NDArray[np.bool_]
+    curvature: Singles
+    least: Singles
+
+
+def make_found(height: int, width: int) -> Found:
+    """Return room for what is found."""
+    single = [np.zeros((height, width), np.float32) for _ in range(3)]
+    return Found(single[0], np.zeros((height, width), np.bool_), single[1], single[2])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _tried(x: int, first: int, count: int) -> np.uintp:
+    """Return how many disparities lead from column x to a pixel of the right image; one where none does."""
+    return np.uintp(min(max(x - first + 1, 1), count))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, right: np.uintp) -> np.uint16:
+    """Return the first disparity of least total, and let every right pixel, from ``right`` on, keep its own least."""
+    least, whole = NOWHERE, count - count % BLOCK
+    for block in range(np.uintp(0), whole, BLOCK):
+        for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
+            d = block + e
+            t = total[at + d]
+            best_right[right + d] = min(best_right[right + d], t)
+            least = min(least, t)
+    for d in range(whole, count):
+        t = total[at + d]
+        best_right[right + d] = min(best_right[right + d], t)
+        least = min(least, t)
+    where = NOWHERE
+    for block in range(np.uintp(0), whole, BLOCK):
+        for e in range(BLOCK):
+            where = min(where, np.uint16(block + e) if total[at + block + e] == least else NOWHERE)
+        if where != NOWHERE:
+            return where
+    for d in range(whole, count):
+        where = min(where, np.uint16(d) if total[at + d] == least else NOWHERE)
+    return where
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def choose_row(
+    total: Counts,
+    at: np.uintp,
+    best_right: Counts,
+    y: int,
+    first: int,
+    count: int,
+    size: np.uintp,
+    found: Found,
+) -> None:
+    """Choose the disparities of row y.
+
+    Args:
+        total: totals, those of the row from ``at`` on, ``size`` for each pixel.
+        at: where the row begins.
+        best_right: (W + pad,) least total of every right pixel, mirrored; scratch.
+        y: the row.
+        first: first disparity of the search.
+        count: how many there are; ``size`` with the padding.
+        size: stride.
+        found: where to.
+    """
+    width = found.disparity.shape[1]
+    best_right[:] = NOWHERE
+    for phase in range(count):  # pixels that share no right pixel follow one another: none waits for what the last wrote
+        for x in range(phase, width, count):
+            n, right = _tried(x, first, count), np.uintp(width - 1 - x + first)
+            found.disparity[y, x] = _least_of(total, at + np.uintp(x) * size, n, best_right, right)
+    for x in range(width):
+        n = _tried(x, first, count)
+        o, d = at + np.uintp(x) * size, np.uintp(found.disparity[y, x])
+        least, offset, curvature = np.float32(total[o + d]), np.float32(0), np.float32(0)
+        if np.uintp(0) < d < n - np.uintp(1):
+            below, above = np.float32(total[o + d - np.uintp(1)]) - least, np.float32(total[o + d + np.uintp(1)]) - least
+            curvature = below + above
+            if curvature > 0:  # two lines of equal slope, not a parabola: the totals are sums of absolute differences
+                offset = np.float32(0.5) * (below - above) / max(below, above)
+        found.disparity[y, x] = np.float32(first) + np.float32(d) + offset
+        found.curvature[y, x] = curvature
+        found.least[y, x] = least
+    for x in range(width):
+        found.agreed[y, x] = _agreed(total, at, best_right, x, found.disparity[y, x], first, count, size, width)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _agreed(
+    total: Counts,
+    at: np.uintp,
+    best_right: Counts,
+    x: int,
+    disparity: float,
+    first: int,
+    count: int,
+    size: np.uintp,
+    width: int,
+) -> bool:
+    """Tell whether the right pixel that x was matched with chose x, or x's neighbour at the next disparity."""
+    d = int(disparity + 0.5) - first
+    if x - d - first < 0:
+        return False
+    least = total[at + np.uintp(x) * size + np.uintp(d)]
+    if d > 0 and x > 0:
+        least = min(least, total[at + np.uintp(x - 1) * size + np.uintp(d - 1)])
+    if d + 1 < count and x + 1 < width:
+        least = min(least, total[at + np.uintp(x + 1) * size + np.uintp(d + 1)])
+    return bool(least <= best_right[width - 1 - x + first + d])
