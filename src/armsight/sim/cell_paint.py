@@ -1,0 +1,331 @@
+"""One camera's images of the cell: what stands still is kept, the arm and the body are drawn where they are.
+
+The arm is cast anew within the pixels it can cover (cell_rays), at the middle of the exposure. Flat patterns (the body, a
+board, a card) are painted exactly over it by ``paint``, once for about every pixel they move during the exposure, and
+what of the arm is nearer stays before them. Then the lens's blur, light and vignetting, noise and rounding, as in
+``optics``. Noise comes from a long strip drawn once, begun elsewhere for every image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Ids, Image, Record
+from armsight.geometry.pose import exp_se3, inverse, transform
+from armsight.sim import cell_rays
+from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, pixel_rays, view
+from armsight.sim.cell_solids import Solids
+from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded
+from armsight.sim.paint import SUB, Grid, Slots, paint
+from armsight.sim.render import OUTLINE, Shutter, outline
+from armsight.sim.scene import CLEAR, Pattern, Placed
+from armsight.vision.camera import Camera
+
+Window = tuple[int, int, int, int]
+
+LENS = Optics(0.7, vignetting=0.25, light_gradient=(0.1, -0.1))
+#: Points around a pattern or a disc that bound it in the image.
+EDGE = 4 * OUTLINE
+_STRIP = 1 << 22  # numbers of noise that are kept
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearer(
+    rays: Array,
+    Ms: Array,
+    box: Window,
+    corner: tuple[int, int],
+    behind: Array,
+    depth: NDArray[np.float32],
+    ids: NDArray[np.int16],
+    coarse: Array,
+    slot: Slots,
+) -> None:
+    """Put back what of the arm is nearer than a pattern that was painted over it.
+
+    ``box`` is the painted part of the window whose first column and row are ``corner``; ``behind``, ``depth`` and ``ids``
+    are what was there before, and ``Ms`` takes rays to the pattern's plane, whose third coordinate is 1 / distance.
+    """
+    for v in range(box[1], box[3]):
+        M = Ms[min(v, Ms.shape[0] - 1)]
+        for u in range(box[0], box[2]):
+            if ids[v, u] == 0:
+                continue
+            d = rays[v + corner[1], u + corner[0]]
+            if (M[2, 0] * d[0] + M[2, 1] * d[1] + M[2, 2] * d[2]) * depth[v, u] < 1.0:
+                coarse[v, u] = behind[v, u]
+                slot[v, u] = -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _exposed(
+    still: Radiance,
+    light: Radiance,
+    gain: Radiance,
+    window: Window,
+    strip: Radiance,
+    start: int,
+    sensor: tuple[float, float, float],
+    out: Image,
+) -> None:
+    """Write grey levels: ``still`` has its gain already, ``light`` of the window has not.
+
+    ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.optics.Sensor`.
+    """
+    offset, read, shot = np.float32(sensor[0]), np.float32(sensor[1]), np.float32(sensor[2])
+    width = out.shape[1]
+    for v in range(out.shape[0]):
+        inside = window[1] <= v < window[3]
+        for u in range(width):
+            grey = still[v, u]
+            if inside and window[0] <= u < window[2]:
+                grey = light[v - window[1], u - window[0]] * gain[v, u]
+            noise = strip[start + v * width + u]
+            sigma = np.sqrt(read * read + shot * max(grey, np.float32(0.0))) if shot > 0.0 else read
+            level = np.rint(grey + offset + sigma * noise)
+            out[v, u] = np.uint8(min(max(level, np.float32(0.0)), np.float32(255.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSeen(Record):
+    """The arm at the moment of an exposure.
+
+    Attributes:
+        parts: what it is made of.
+        Ts_base_link: (7, 4, 4) its row frames.
+    """
+
+    parts: Solids
+    Ts_base_link: Array
+
+
+class _Face(NamedTuple):
+    """A pattern that faces the camera.
+
+    Attributes:
+        pattern: what it is.
+        Ts: (1 or H, 4, 4) its pose, or its pose as each row sees it.
+        boxes: (1 + K, 4) the pixels of its cells and of each disc.
+        uv: (N, 2) its edges in pixels.
+    """
+
+    pattern: Pattern
+    Ts: Array
+    boxes: Ids
+    uv: Array
+
+
+_Step = tuple[float, float, list[_Face]]
+
+
+@lru_cache(maxsize=64)
+def _edges(pattern: Pattern) -> Array:
+    """Return points ((1 + K) * EDGE, 3) around a pattern's cells and around each of its discs, m, pattern frame."""
+    angle = np.arange(EDGE) * (math.tau / EDGE)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    around = [outline(pattern), *(disc[:2] + 1.01 * disc[2] * circle for disc in pattern.discs)]
+    return np.column_stack([np.concatenate(around), np.zeros(len(around) * EDGE)])
+
+
+@lru_cache(maxsize=64)
+def _grid(pattern: Pattern) -> Grid:
+    """Return a pattern's cells as the painter takes them."""
+    values = np.pad(pattern.values, 1, constant_values=CLEAR)
+    return np.array(pattern.x_edges), np.array(pattern.y_edges), values
+
+
+class CellCamera:
+    """A camera that stands in the cell.
+
+    Attributes:
+        camera: its lens.
+        T_base_camera: (4, 4) where it is, m.
+        still: what stands still before it.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        T_base_camera: Array,
+        foot: Solids,
+        seed: int,
+        *,
+        sensor: Sensor | None = None,
+        more: Array | None = None,
+    ) -> None:
+        """Look at the cell once.
+
+        Args:
+            camera: its lens.
+            T_base_camera: (4, 4) where it is, m.
+            foot: the arm's solids, whose base stands still.
+            seed: of the clutter.
+            sensor: noise of 2 grey levels by default.
+            more: boxes that stand there besides, see cell_scene.
+        """
+        self.camera, self.T_base_camera = camera, T_base_camera
+        self._sensor = sensor or Sensor()
+        self.still: View = view(camera, T_base_camera, seed, foot, more)
+        self._rays = pixel_rays(camera)
+        width, height = camera.image_size_px
+        v, u = np.mgrid[: height + 1, : width + 1] - 0.5
+        corners = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height + 1, width + 1, 3)
+        self._corners = corners / corners[..., 2:]
+        self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
+        self._still_grey = self._blur(self.still.light.copy()) * self._gain
+        to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
+        self._lamp = to_lamp / np.linalg.norm(to_lamp)
+
+    @staticmethod
+    def _blur(light: Array) -> Radiance:
+        """Return an image without edge pixels through the lens."""
+        return blurred(light, np.full(light.shape, -1, np.int32), np.empty((0, SUB, SUB)), LENS.psf_sigma_px)
+
+    def image(
+        self, arm: ArmSeen | None, bodies: Sequence[Placed], shutter: Shutter, strip: Radiance, start: int
+    ) -> Image:
+        """Return what the camera hands out.
+
+        Args:
+            arm: where the arm is; None leaves it out.
+            bodies: flat patterns, placed in the camera's frame in the middle of the exposure of its middle row.
+            shutter: how long it looks.
+            strip: standard normal noise, from :func:`noise_strip`.
+            start: where in it this image's noise begins.
+
+        Returns:
+            (H, W) uint8.
+        """
+        width, height = self.camera.image_size_px
+        ends, radius, albedo = (np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+        if arm is not None:
+            ends, radius, albedo = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
+        boxes = capsule_boxes(self.camera, ends, radius)
+        steps = self._steps(bodies, shutter)
+        margin = _reach(LENS.psf_sigma_px)
+        crop = self._around(
+            [tuple(face.boxes[0].tolist()) for step in (steps[0], steps[-1]) for face in step[2]], 2 * margin
+        )
+        window = self._around([crop, *(tuple(box) for box in boxes.tolist())], margin)
+        u0, v0, u1, v1 = window
+        light = self.still.light[v0:v1, u0:u1].copy()
+        depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
+        cell_rays.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
+        seen = self._blur(light)
+        if crop[0] < crop[2] and crop[1] < crop[3]:
+            self._lay(seen, self._painted(steps, crop, window, (light, depth, ids)), crop, window, margin)
+        out: Image = np.empty((height, width), np.uint8)
+        s = self._sensor
+        _exposed(self._still_grey, seen, self._gain, window, strip, start, (s.offset, s.read_noise, s.shot_noise), out)
+        return out
+
+    def arm_ids(self, arm: ArmSeen) -> Image:
+        """Return (H, W) which of the arm's moving solids each pixel sees, counted from 1; 0 where it sees none."""
+        width, height = self.camera.image_size_px
+        capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
+        boxes = capsule_boxes(self.camera, *capsules[:2])
+        light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
+        cell_rays.moving(self._rays, (0, 0, width, height), boxes, capsules, self._lamp, light, depth, ids)
+        return ids
+
+    def _around(self, boxes: Sequence[tuple[int, ...]], margin: int) -> Window:
+        """Return what holds all boxes that are not empty, with a margin, within the image."""
+        width, height = self.camera.image_size_px
+        full = np.array([box for box in boxes if box[0] < box[2] and box[1] < box[3]])
+        if not len(full):
+            return 0, 0, 0, 0
+        u0, v0 = np.maximum(full[:, :2].min(axis=0) - margin, 0)
+        u1, v1 = np.minimum(full[:, 2:].max(axis=0) + margin, (width, height))
+        return int(u0), int(v0), int(u1), int(v1)
+
+    def _steps(self, bodies: Sequence[Placed], shutter: Shutter) -> list[_Step]:
+        """Return the parts of the exposure: time, s; weight; faces, farthest first."""
+        ways = [0.0]
+        first, last = ([self._seen(b, sign * shutter.exposure_s / 2, shutter) for b in bodies] for sign in (-1.0, 1.0))
+        for before, after in zip(first, last, strict=True):
+            ways += [float(np.abs(a.uv - b.uv).max()) for a, b in zip(before, after, strict=True)]
+        nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(max(ways)))
+        steps = []
+        for x, w in zip(nodes, weights, strict=True):
+            t = 0.5 * shutter.exposure_s * float(x)
+            faces = [face for body in bodies for face in self._seen(body, t, shutter)]
+            faces.sort(key=lambda face: -float(np.linalg.norm(face.Ts[0, :3, 3])))
+            steps.append((t, 0.5 * float(w), faces))
+        return steps
+
+    def _seen(self, body: Placed, t_s: float, shutter: Shutter) -> list[_Face]:
+        """Return what of a body faces the camera at a time."""
+        width, height = self.camera.image_size_px
+        moving = shutter.row_s > 0 and body.twist.any()
+        rows = (np.arange(height) - (height - 1) / 2) * shutter.row_s if moving else np.zeros(1)
+        Ts_camera_body = body.T_camera_body @ exp_se3(np.outer(rows + t_s, body.twist))
+        found = []
+        for pattern in body.patterns:
+            Ts = Ts_camera_body @ pattern.T_body_pattern
+            if not (np.linalg.det(Ts[:, :3, [0, 1, 3]]) > 0).all():
+                continue
+            uv = self.camera.project(transform(Ts[[0, -1]][:, None] if moving else Ts, _edges(pattern)).reshape(-1, 3))
+            parts = uv.reshape(-1, 1 + len(pattern.discs), EDGE, 2)
+            low = np.clip(np.floor(parts.min(axis=(0, 2))) - 1, 0, (width, height))
+            high = np.clip(np.ceil(parts.max(axis=(0, 2))) + 2, 0, (width, height))
+            found.append(_Face(pattern, Ts, np.concatenate([low, high], axis=1).astype(np.int64), uv))
+        return found
+
+    def _painted(
+        self,
+        steps: list[_Step],
+        crop: Window,
+        window: Window,
+        arm: tuple[Array, NDArray[np.float32], Image],
+    ) -> Radiance:
+        """Return the light of the crop with the patterns painted in, through the lens, over the whole exposure."""
+        u0, v0, u1, v1 = crop
+        part = np.s_[v0 - window[1] : v1 - window[1], u0 - window[0] : u1 - window[0]]
+        light, depth, ids = (np.ascontiguousarray(layer[part]) for layer in arm)
+        rays = np.ascontiguousarray(self._corners[v0 : v1 + 1, u0 : u1 + 1])
+        fine = np.empty((1 << 13, SUB, SUB))
+        total = np.zeros(light.shape, np.float32)
+        for _, weight, faces in steps:
+            coarse, slot, count = light.copy(), np.full(light.shape, -1, np.int32), 0
+            for pattern, Ts, boxes, _ in faces:
+                rows = Ts[v0:v1] if len(Ts) > 1 else Ts
+                Ms = np.ascontiguousarray(np.linalg.inv(rows[:, :3, [0, 1, 3]]))
+                inner = np.clip(boxes - (u0, v0, u0, v0), 0, (u1 - u0, v1 - v0) * 2).tolist()
+                for disc, box in zip((np.zeros(0), *pattern.discs), inner, strict=True):
+                    fine, count = paint(rays, Ms, tuple(box), _grid(pattern), np.array(disc), coarse, slot, fine, count)
+                _nearer(self._rays, Ms, tuple(inner[0]), (u0, v0), light, depth, ids, coarse, slot)
+            total += np.float32(weight) * blurred(coarse, slot, fine[:count], LENS.psf_sigma_px)
+        return total
+
+    def _lay(self, seen: Radiance, painted: Radiance, crop: Window, window: Window, margin: int) -> None:
+        """Lay the crop, but for a margin where its blur did not know what is around, into the window."""
+        width, height = self.camera.image_size_px
+        u0, v0, u1, v1 = crop
+        cut = (u0 + margin * (u0 > 0), v0 + margin * (v0 > 0), u1 - margin * (u1 < width), v1 - margin * (v1 < height))
+        seen[cut[1] - window[1] : cut[3] - window[1], cut[0] - window[0] : cut[2] - window[0]] = painted[
+            cut[1] - v0 : cut[3] - v0, cut[0] - u0 : cut[2] - u0
+        ]
+
+
+def _reach(sigma_px: float) -> int:
+    """Return how far the lens spreads light, px."""
+    return math.ceil(4.5 * sigma_px + 0.5)
+
+
+def noise_strip(seed: int, image_size_px: tuple[int, int]) -> Radiance:
+    """Return standard normal numbers, enough for every image to begin at another one of millions."""
+    width, height = image_size_px
+    return np.random.default_rng([seed, 3]).standard_normal(_STRIP + width * height, dtype=np.float32)
+
+
+def noise_start(seed: int, side: int, shot: int) -> int:
+    """Return where in the strip an image's noise begins."""
+    return int(np.random.default_rng([seed, 4, side, shot]).integers(_STRIP))

@@ -1,0 +1,182 @@
+"""The cell's two cameras as a source of shots: reading lets the cell's time pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from armsight.data import Array, Image, Shot
+from armsight.errors import DeviceError
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.sim.cell_camera import ShotTimes, Timing, shot_times
+from armsight.sim.cell_paint import ArmSeen, CellCamera, noise_start, noise_strip
+from armsight.sim.cell_solids import row_frames
+from armsight.sim.plant import TICK_S, ArmPlant
+from armsight.sim.render import Shutter
+from armsight.sim.scene import Pattern, Placed, plate
+
+#: A card that is held before the body: its sides, m; how far before it, m.
+_CARD_M, _CARD_BEFORE_M, _CARD_GREY = (0.34, 0.30), 0.08, 0.55
+#: Where the path is looked at within an exposure: its mean is the body's place in the image.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+class CellSource:
+    """The cell's cameras.
+
+    Fulfils :class:`armsight.vision.sources.source.Source`: ``read`` waits for the next shot, in the cell's time.
+    """
+
+    def __init__(
+        self,
+        plant: ArmPlant,
+        cameras: tuple[CellCamera, CellCamera],
+        timing: Timing,
+        body: tuple[tuple[Pattern, ...], Array],
+        clock: tuple[Callable[[], float], Callable[[float], None]],
+        seed: int,
+    ) -> None:
+        """Point the cameras at the arm.
+
+        Args:
+            plant: the arm.
+            cameras: left and right.
+            timing: when they look.
+            body: the patterns on the tool, and T_tool_body (4, 4), m.
+            clock: says the cell's time, s; lets so many seconds of it pass.
+            seed: of noise and timing.
+        """
+        self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
+        self._now, self._advance = clock
+        self._patterns, self._T_tool_body = body
+        self._strip = noise_strip(seed, timing.image_size_px)
+        self._next = 0
+        self._covers: list[tuple[float, float]] = []
+        self._gone_s, self._gone = np.inf, ""
+        self._pool = ThreadPoolExecutor(2)
+        #: Name of each shot that was handed out -> when it was taken, for judging only.
+        self.taken: dict[str, ShotTimes] = {}
+
+    def cover(self, from_s: float, to_s: float) -> None:
+        """Hold a card before the body from one time to another."""
+        self._covers.append((from_s, to_s))
+
+    def unplug(self, at_s: float, what: str = "left camera: no frame for 5 s: unplugged or stalled") -> None:
+        """Let the cameras be gone from a time on: what is read then raises DeviceError with these words."""
+        self._gone_s, self._gone = at_s, what
+
+    def read(self) -> Shot | None:
+        """Return the newest shot that has come, or wait for the next."""
+        shot = self.poll()
+        if shot is None:
+            wait_s = min(self._times(self._next).stamp_s, self._gone_s) - self._now()
+            self._advance(max(np.ceil(wait_s / TICK_S - 1e-9), 0.0) * TICK_S)
+            shot = self.poll()
+        return shot
+
+    def poll(self) -> Shot | None:
+        """Return the newest shot that has come and was not handed out yet; None where there is none. No time passes."""
+        now = self._now()
+        if now >= self._gone_s - 1e-9:
+            raise DeviceError(self._gone)
+        newest = self._next - 1
+        start = max(self._next, int((now - self._timing.delay_s) * self._timing.rate_hz) - 2)
+        for k in range(start, start + 5):
+            if self._times(k).stamp_s <= now + 1e-9:
+                newest = k
+        if newest < self._next:
+            return None
+        self._next = newest + 1
+        return self._shot(newest)
+
+    def close(self) -> None:
+        """Let go of the threads."""
+        self._pool.shutdown()
+
+    def still(self, patterns: tuple[Pattern, ...], T_left_body: Array, number: int) -> Shot:
+        """Return a shot of flat patterns that are held still before the cameras while the arm stands.
+
+        Args:
+            patterns: what is held.
+            T_left_body: (4, 4) where, m, left camera's frame.
+            number: of the shot; its noise follows from it.
+        """
+        now = ShotTimes(self._now(), self._now(), self._now())
+        return self._rendered(f"{number:03d}", now, Shutter(), -1 - number, Placed(patterns, T_left_body))
+
+    def _times(self, shot: int) -> ShotTimes:
+        return shot_times(self._timing, self._seed, shot)
+
+    def _shot(self, number: int) -> Shot:
+        times = self._times(number)
+        shot = self._rendered(f"{number:06d}", times, self._timing.shutter, number, None)
+        self.taken[shot.name] = times
+        return shot
+
+    def _rendered(self, name: str, times: ShotTimes, shutter: Shutter, number: int, held: Placed | None) -> Shot:
+        """Render both images, each in a thread of its own: they share nothing that changes."""
+        work = [
+            self._pool.submit(self._image, side, t, shutter, number, held)
+            for side, t in enumerate((times.left_s, times.right_s))
+        ]
+        left, right = (future.result() for future in work)
+        return Shot(name, left, right, times.stamp_s)
+
+    def _image(self, side: int, t_s: float, shutter: Shutter, number: int, held: Placed | None) -> Image:
+        """Render one camera's image of the arm in the middle of an exposure."""
+        camera = self._cameras[side]
+        bodies = [self._body(camera, t_s, shutter)]
+        if held is not None:
+            T_this_left = inverse(camera.T_base_camera) @ self._cameras[0].T_base_camera
+            bodies.append(held.seen_from(T_this_left))
+        if any(start <= t_s < end for start, end in self._covers):
+            bodies.append(_card(bodies[0].T_camera_body))
+        arm = ArmSeen(self._plant.parts, row_frames(self._plant.arm, self._q(np.array([t_s]))[0]))
+        # A shot that is held for the calibration draws its noise from numbers of its own.
+        start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
+        return camera.image(arm, bodies, shutter, self._strip, start)
+
+    def _q(self, t_s: Array) -> Array:
+        """Return the links' true angles (N, 6) at times (N,), by a cubic through the four nearest milliseconds."""
+        path = self._plant.path
+        at = np.clip(t_s / TICK_S, 0.0, len(path) - 1.0)
+        first = np.clip(np.floor(at).astype(int) - 1, 0, max(len(path) - 4, 0))
+        x = (at - first)[:, None]
+        p = [path[np.minimum(first + k, len(path) - 1), 6:] for k in range(4)]
+        weights = (
+            -(x - 1) * (x - 2) * (x - 3) / 6,
+            x * (x - 2) * (x - 3) / 2,
+            -x * (x - 1) * (x - 3) / 2,
+            x * (x - 1) * (x - 2) / 6,
+        )
+        return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
+
+    def _body(self, camera: CellCamera, t_s: float, shutter: Shutter) -> Placed:
+        """Return where the body is to a camera: its mean place during the exposure of its own rows, and its velocity."""
+        T_camera_base = inverse(camera.T_base_camera)
+
+        def at(times: Array) -> Array:
+            return np.asarray(T_camera_base @ self._plant.arm.forward(self._q(times)) @ self._T_tool_body)
+
+        reach = max(shutter.exposure_s, TICK_S) / 2
+        T = at(np.array([t_s]))[0]
+        rows_s = 0.0
+        if shutter.row_s:  # its rows are exposed at another time than the image's middle row
+            row = camera.camera.project(T[None, :3, 3])[0, 1]
+            rows_s = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
+        Ts = at(t_s + rows_s + reach * np.array([*_NODES, -1.0, 1.0]))
+        twist = log_se3(inverse(Ts[3]) @ Ts[4]) / (2 * reach)
+        mean = Ts[1] @ exp_se3(0.5 * (_WEIGHTS @ log_se3(inverse(Ts[1]) @ Ts[:3]))) if shutter.exposure_s else Ts[1]
+        return Placed(self._patterns, mean @ exp_se3(-rows_s * twist), twist)
+
+
+def _card(T_camera_body: Array) -> Placed:
+    """Return a card that faces the camera, before the body."""
+    p = T_camera_body[:3, 3]
+    z = p / np.linalg.norm(p)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    at = p - _CARD_BEFORE_M * z
+    return Placed((plate(*_CARD_M, _CARD_GREY),), pose(np.column_stack([x, np.cross(z, x), z]), at))
