@@ -124,7 +124,7 @@ def lab_configuration() -> Configuration:
     pot = joint["pot"]
     pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
     pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
-    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.08
+    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.04
     values = {
         "soft_min_rad": -2.4,
         "soft_max_rad": 2.4,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
-from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.codes import Reaction, Refusal
 from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome, joints_of, status_of, welcome_of
@@ -99,17 +99,28 @@ class Session:
         elif kind == "JOINTS":
             self.joints = joints_of(message, self._time_s(message.tick))
         elif kind == "BOARD_STATUS":
-            self.status = status_of(message, self._time_s(message.tick))
+            self._take_status(status_of(message, self._time_s(message.tick)))
         elif kind == "WELCOME":
             self._greeting = message
         elif kind == "CONFIG_PART":
             self._parts[message.offset] = bytes(message.bytes[: message.length])
 
+    def _take_status(self, status: BoardStatus) -> None:
+        """Keep a status; one that newly refuses us for want of a hello is of a board that forgot ours."""
+        if self._started and status.refusal == Refusal.NO_HELLO:
+            before = self.status
+            if (before.refused_count, before.refused_sequence) != (status.refused_count, status.refused_sequence):
+                raise self._anew()
+        self.status = status
+
+    def _anew(self) -> DeviceError:
+        return DeviceError(f"{self.name} has started anew: its drives are off; connect to it again")
+
     def _time_s(self, tick: int) -> float:
         """Return the time of a tick: they wrap, and messages of neighbouring ticks may come in any order."""
         ahead = (tick - self._tick + _WRAP // 2) % _WRAP - _WRAP // 2
         if self._started and ahead < -self.ticks_per_s:
-            raise DeviceError(f"{self.name} has started anew: its drives are off; connect to it again")
+            raise self._anew()
         self._tick += ahead
         return self._tick / self.ticks_per_s
 
