@@ -115,7 +115,8 @@ class Loop:
         self.estimator, self.log, self.on_shot = estimator, log, on_shot
         self.t_s = 0.0
         self._shot_s: float | None = None
-        self.pass_time(PERIOD_S)
+        while not log.joints:
+            self.pass_time(PERIOD_S)
 
     def pass_time(self, wait_s: float) -> None:
         """Let time pass and hear the joints."""
@@ -144,13 +145,14 @@ class Loop:
         self.log.poses.append((shot.name, float("nan") if shot.t_s is None else shot.t_s, result))
         return shot, began, result
 
-    def run(self, controller: Controller, duration_s: float, segment: Segment) -> None:
+    def run(self, controller: Controller, duration_s: float, segment: Segment, *, watch: bool = True) -> None:
         """Let a controller command the joints for a while.
 
         Args:
             controller: what commands.
             duration_s: how long.
             segment: what is done; its times are filled in.
+            watch: whether shots are measured.
 
         Raises:
             DeviceError: the board left the enabled state (its faults are told), or a device is gone.
@@ -160,7 +162,7 @@ class Loop:
             while self.t_s - begin_s < duration_s - 1e-9:
                 self.pass_time(PERIOD_S)
                 self._check_board()
-                looked = self.look()
+                looked = self.look() if watch else None
                 command, mode = controller.command(self.t_s, self.estimator)
                 self.board.send(command)
                 self.log.commands.append((self.t_s, command))

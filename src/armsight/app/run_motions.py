@@ -1,0 +1,56 @@
+"""Controllers that follow what was planned, and nothing else: potentiometers alone, as the chapter has it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from armsight.app.run_loop import PERIOD_S
+from armsight.data import Array, JointCommand
+from armsight.loop.estimators import Estimator
+from armsight.robot.trajectories import Joints, Trajectory
+
+
+class Planned:
+    """Sends a trajectory to the board as it was planned; stands at its end.
+
+    Args:
+        trajectory: joint angles over time.
+        start_s: when it begins, board's clock.
+        gravity: gives the duty that carries the arm at joint angles.
+    """
+
+    def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
+        self._trajectory, self._start_s, self._gravity = trajectory, start_s, gravity
+
+    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be a period from now."""
+        ahead = self._trajectory.at(t_s + PERIOD_S - self._start_s)
+        return JointCommand(ahead.q, ahead.qd, self._gravity(ahead.q), PERIOD_S), "planned"
+
+
+class Sweep:
+    """All joints to and fro with changing speed: the motion that tells how late the cameras are. A trajectory.
+
+    Args:
+        q_middle: (6,) about which they move, rad; there it begins and ends.
+        reach_rad: how far.
+        duration_s: of the whole.
+    """
+
+    def __init__(self, q_middle: Array, reach_rad: float = 0.12, duration_s: float = 4.0) -> None:
+        self.duration_s, self._middle, self._reach = duration_s, q_middle, reach_rad
+        self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0])
+
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the joints ``t_s`` seconds after the start."""
+        t = np.clip(np.asarray(t_s, float), 0.0, self.duration_s)[..., None]
+        x = np.pi * t / self.duration_s
+        window, window_d = np.sin(x) ** 2, np.pi / self.duration_s * np.sin(2 * x)
+        window_dd = 2 * (np.pi / self.duration_s) ** 2 * np.cos(2 * x)
+        s, c, w = np.sin(self._rates * t), np.cos(self._rates * t), self._rates
+        q = self._middle + self._reach * window * s
+        qd = self._reach * (window_d * s + window * w * c)
+        qdd = self._reach * (window_dd * s + 2 * window_d * w * c - window * w**2 * s)
+        return Joints(q, qd, qdd)

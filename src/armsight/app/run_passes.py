@@ -1,0 +1,50 @@
+"""The motions of a run, once with potentiometers alone and once with vision in the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from armsight.app.motion_file import MotionPlan
+from armsight.app.run_loop import PERIOD_S, Controller, Loop, Segment
+from armsight.app.run_motions import Planned
+from armsight.data import Array
+from armsight.robot.trajectories import Trajectory
+
+#: Makes a controller of a trajectory that begins at a time of the board's clock.
+Control = Callable[[Trajectory, float], Controller]
+
+
+def drive(
+    loop: Loop, plan: MotionPlan, control: Control, *, closed: bool, progress: Callable[[str], None]
+) -> tuple[float, float]:
+    """Drive all motions of a plan, with its rests.
+
+    Args:
+        loop: to run them in; the arm stands at the plan's start.
+        plan: the motions.
+        control: what commands the joints.
+        closed: whether that closes the loop on vision.
+        progress: called with a line about what is being done.
+
+    Returns:
+        When it began and ended, board's clock, s.
+
+    Raises:
+        DeviceError: the board or a camera failed.
+    """
+    begin_s = loop.t_s
+    phase = "closed_loop" if closed else "open_loop"
+    for motion in plan.motions:
+        progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
+        # The controller begins a period from now: its first command is for the first step of the way.
+        controller = control(motion.trajectory, loop.t_s + PERIOD_S)
+        segment = Segment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        loop.run(controller, motion.trajectory.duration_s, segment)
+        rest = Segment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        loop.run(controller, motion.rest_s, rest)
+    return begin_s, loop.t_s
+
+
+def planned(gravity: Callable[[Array], Array]) -> Control:
+    """Return what follows the plan with potentiometers alone."""
+    return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
