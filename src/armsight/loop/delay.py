@@ -1,0 +1,107 @@
+"""How late the camera's stamps are on the joints' clock, from a sweep of the arm that both watched.
+
+In: potentiometer readings and sightings of a few seconds of motion with changing speed. Out: :class:`Delay` with its sigma.
+First the lag at which the turns between successive sightings are those the joints made (turns do not depend on where the
+cameras are); then the filter that also runs the loop, with the delay in its state beside all that makes an arm's
+potentiometers wrong. That matters: backlash at constant speed looks like a delay (0.2 deg at 30 deg/s like 7 ms), and is
+told from one only by the speed changing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armsight.data import Array, JointStates
+from armsight.errors import CalibrationError, InputError
+from armsight.geometry.check import checked
+from armsight.geometry.rotation import log_so3
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior, Sighting, Verdict
+from armsight.robot.arm import Arm
+
+#: Lags that are looked at, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
+LAGS_S = np.arange(-0.1, 0.6, 2e-3)
+#: Fewest sightings.
+LEAST = 20
+#: How far the first step may be off, s, and how often the filter is run from its own answer.
+FIRST_SIGMA_S, PASSES = 5e-3, 2
+#: A delay worse known than this, s, is none: at 0.5 m/s it is 1 mm.
+MOST_SIGMA_S = 2e-3
+#: What the sides of the backlash, which the filter sees change a little late, leave of error; found on simulated sweeps, s.
+SYSTEMATIC_S = 1.5e-4
+#: Readings given to the filter ahead of a sighting, s.
+_AHEAD_S = 0.1
+
+
+def estimate_delay(
+    arm: Arm, states: JointStates, sightings: Sequence[Sighting], *, prior: Prior | None = None
+) -> Delay:
+    """Find how late the camera's stamps are.
+
+    Args:
+        arm: the arm, as its table says it is.
+        states: readings from before the first sighting to after the last.
+        sightings: what vision saw meanwhile, in order of time; 20 or more, while the joints moved to and fro.
+        prior: how far the arm may be off.
+
+    Raises:
+        InputError: too few sightings, or readings that do not cover them.
+        CalibrationError: the motion does not determine the delay.
+    """
+    t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), 6), "states.q")
+    stamps = np.array([sighting.t_s for sighting in sightings])
+    if len(stamps) < LEAST or not (np.diff(stamps) > 0).all():
+        raise InputError(f"a delay needs {LEAST} or more sightings in order of time, got {len(stamps)}")
+    inside = LAGS_S[(stamps[0] - LAGS_S >= t[0]) & (stamps[-1] - LAGS_S <= t[-1])] if len(t) else LAGS_S[:0]
+    if len(inside) < 3:
+        raise InputError(
+            "the potentiometer readings do not cover the sightings; log them from a second before to a second after"
+        )
+    delay = Delay(_coarse(arm, t, q, sightings, inside), FIRST_SIGMA_S)
+    for _ in range(PASSES):
+        delay = _filtered(arm, states, sightings, Delay(delay.delay_s, FIRST_SIGMA_S), prior)
+    if delay.sigma_s > MOST_SIGMA_S:
+        raise CalibrationError(
+            f"the sweep determines the camera's delay to {1e3 * delay.sigma_s:.1f} ms only, {1e3 * MOST_SIGMA_S:.0f} are "
+            "needed: move all joints to and fro, faster and with changing speed"
+        )
+    return Delay(delay.delay_s, float(np.hypot(delay.sigma_s, SYSTEMATIC_S)))
+
+
+def _coarse(arm: Arm, t: Array, q: Array, sightings: Sequence[Sighting], lags: Array) -> float:
+    """Return the lag at which the joints turned the tool as the sightings did, by least squares on the turns' angles."""
+    stamps = np.array([sighting.t_s for sighting in sightings])
+    seen = _turns(np.array([sighting.T_base_tool for sighting in sightings]))
+    cost = np.empty(len(lags))
+    for n, lag in enumerate(lags):
+        at = np.stack([np.interp(stamps - lag, t, q[:, i]) for i in range(6)], axis=1)
+        cost[n] = np.square(_turns(arm.forward(at)) - seen).sum()
+    best = int(np.clip(np.argmin(cost), 1, len(lags) - 2))
+    before, here, after = cost[best - 1 : best + 2]
+    bend = before - 2 * here + after
+    return float(lags[best] + (0.5 * (before - after) / bend * (lags[1] - lags[0]) if bend > 0 else 0.0))
+
+
+def _turns(Ts: Array) -> Array:
+    """Return the angles (N - 1,) between successive poses (N, 4, 4), rad."""
+    R = Ts[:, :3, :3]
+    return np.asarray(np.linalg.norm(log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:]), axis=1))
+
+
+def _filtered(arm: Arm, states: JointStates, sightings: Sequence[Sighting], delay: Delay, prior: Prior | None) -> Delay:
+    """Return the delay as a filter that runs over the sweep knows it at the end."""
+    estimator = KalmanEstimator(arm, prior=prior, delay=delay)
+    given = used = 0
+    for sighting in sightings:
+        upto = int(np.searchsorted(states.t_s, sighting.t_s - delay.delay_s + _AHEAD_S))
+        if upto > given:
+            estimator.joints(JointStates(states.t_s[given:upto], states.q[given:upto]))
+            given = upto
+        used += estimator.vision(sighting) is Verdict.USED
+    if used < len(sightings) / 2:
+        raise CalibrationError(
+            f"vision and potentiometers do not describe the same motion: {used} of {len(sightings)} sightings fit; is the "
+            "hand-eye calibration this arm's, and are both stamped by one clock?"
+        )
+    return estimator.learned().delay

@@ -1,0 +1,229 @@
+"""What makes potentiometers wrong, as one vector: its layout, its prior, and the tool's pose and derivative by it.
+
+The true pose is modelled as
+
+    T_base_tool = T_base_0 E_0 A_1(q_1 + d_1) E_1 ... A_6(q_6 + d_6) E_6 T_6_tool exp(x)
+
+with E_i = exp(e_i) a small motion of every link's frame (lengths, twists and zeros that differ from the table, and how the
+arm stands and holds its tool), d_i what its potentiometer does not say
+
+    d_i = c_i . b(q_i) - s_i w_i / 2 + k_i g_i(q) + r_i
+
+(b: linearity, a line and harmonics; w_i: backlash, s_i its side; k_i: compliance, g_i the gravity torque of a unit load;
+r_i: the rest, that forgets itself as the joint moves), and x what no joint explains, forgetting itself likewise. The
+derivatives are by the right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_tool_frame) e
+(Sola, "A micro Lie theory", 2018, eq. 31).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from armsight.data import Array
+from armsight.robot.kinematics.chain import Frame, after, after_link, after_turn, first_frame
+from armsight.robot.kinematics.trig import sincos
+
+#: Harmonics of a potentiometer's linearity: an eccentric wiper has one turn's, its bow another.
+HARMONICS = 3
+#: Functions of one joint's linearity.
+BASIS = 1 + 2 * HARMONICS
+#: Where the parts stand in the vector: the seven frames' tangents, linearity, backlash, compliance, rest, x, delay.
+LINKS, LINEARITY = 0, 42
+BACKLASH = LINEARITY + 6 * BASIS
+COMPLIANCE, REST, POSE, DELAY = BACKLASH + 6, BACKLASH + 12, BACKLASH + 18, BACKLASH + 24
+SIZE = DELAY + 1
+#: Zeros of the joints: the turn about z of the frame before each.
+ZEROS = np.arange(6) * 6 + 5
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How far an arm may be off before anything is seen: standard deviations.
+
+    The defaults are of a table-top arm with plastic-film potentiometers; a filter that is told less than the truth trusts
+    the potentiometers too much, one that is told more needs vision a little longer to learn.
+
+    Attributes:
+        link_m: shift of a link's frame along each axis, m.
+        link_rad: turn about each, rad.
+        stand_m: shift of the base and of the tool in the hand, beyond that, m.
+        stand_rad: turn of them, rad.
+        zero_rad: zero of a potentiometer, rad.
+        gain: its scale, relative.
+        harmonic_rad: amplitude of the first harmonic of its linearity; the k-th has it over k^1.5, rad.
+        backlash_rad: width of the backlash between potentiometer and link, rad.
+        compliance: sag per gravity torque of a unit load, rad/m.
+        rest_rad: what else a joint is off, rad.
+        rest_travel_rad: travel in which it forgets that, rad.
+        flip_rad: how uncertain a joint is after a change of side, beyond the width, rad.
+        pose_m: what no joint explains, m.
+        pose_rad: the same of the turn, rad.
+        pose_travel_rad: travel of all joints together in which that is forgotten, rad.
+        reading_rad: noise of one reading of a potentiometer, rad.
+    """
+
+    link_m: float = 1e-3
+    link_rad: float = float(np.deg2rad(0.3))
+    stand_m: float = 2e-3
+    stand_rad: float = float(np.deg2rad(0.3))
+    zero_rad: float = float(np.deg2rad(0.5))
+    gain: float = 2e-3
+    harmonic_rad: float = float(np.deg2rad(0.2))
+    backlash_rad: float = float(np.deg2rad(0.2))
+    compliance: float = 5e-3
+    rest_rad: float = float(np.deg2rad(0.02))
+    rest_travel_rad: float = 0.5
+    flip_rad: float = float(np.deg2rad(0.03))
+    pose_m: float = 1e-4
+    pose_rad: float = float(np.deg2rad(0.01))
+    pose_travel_rad: float = 1.0
+    reading_rad: float = float(np.deg2rad(0.02))
+
+    def sigmas(self, sigma_delay_s: float) -> Array:
+        """Return the standard deviations (SIZE,) of the vector."""
+        links = np.tile(np.repeat([self.link_m, self.link_rad], 3), (7, 1))
+        stand = np.repeat([self.stand_m, self.stand_rad], 3)
+        links[[0, 6]] = np.hypot(links[[0, 6]], stand)
+        links = links.ravel()
+        links[ZEROS] = np.hypot(links[ZEROS], self.zero_rad)
+        harmonics = np.repeat(self.harmonic_rad / np.arange(1, HARMONICS + 1) ** 1.5, 2)
+        linearity = np.tile(np.append(self.gain, harmonics), 6)
+        joints = np.repeat([self.backlash_rad, self.compliance, self.rest_rad], 6)
+        rest = np.repeat([self.pose_m, self.pose_rad], 3)
+        return np.concatenate([links, linearity, joints, rest, [sigma_delay_s]])
+
+
+@_kernel
+def _small_motions(x: Array, motions: Array) -> None:
+    """Write exp of the seven tangents at the head of x into motions (7 * 12,), row by row; angles below 0.3 rad."""
+    for i in range(7):
+        rx, ry, rz, a, b, c = x[6 * i], x[6 * i + 1], x[6 * i + 2], x[6 * i + 3], x[6 * i + 4], x[6 * i + 5]
+        u = a * a + b * b + c * c
+        f, g = 1 - u / 6 + u * u / 120, 0.5 - u / 24 + u * u / 720  # sin(t)/t and (1 - cos t)/t^2, t^2 = u
+        h = 1 / 6.0 - u / 120 + u * u / 5040  # (t - sin t)/t^3
+        m = motions[12 * i : 12 * i + 12]
+        m[0], m[5], m[10] = 1 - g * (b * b + c * c), 1 - g * (a * a + c * c), 1 - g * (a * a + b * b)
+        m[1], m[4] = g * a * b - f * c, g * a * b + f * c
+        m[2], m[8] = g * a * c + f * b, g * a * c - f * b
+        m[6], m[9] = g * b * c - f * a, g * b * c + f * a
+        # V rho = rho + g (phi x rho) + h (phi x (phi x rho))
+        kx, ky, kz = b * rz - c * ry, c * rx - a * rz, a * ry - b * rx
+        m[3] = rx + g * kx + h * (b * kz - c * ky)
+        m[7] = ry + g * ky + h * (c * kx - a * kz)
+        m[11] = rz + g * kz + h * (a * ky - b * kx)
+
+
+@_kernel
+def _loads(table: Array, q: Array, g: Array) -> None:
+    """Write the gravity torques (6,) about the joints of unit loads spread over the links beyond them, m."""
+    axes = np.empty((7, 6))
+    F = first_frame(table)
+    for i in range(6):
+        axes[i] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
+        s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
+        F = after_link(table, i, after_turn(table, i, c, s, F))
+    F = after(table, 48, F)
+    axes[6] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
+    x = y = 0.0
+    for i in range(5, -1, -1):
+        x, y = x + axes[i + 1, 3], y + axes[i + 1, 4]
+        n = 6 - i
+        # z . (p x -up) = z_y p_x - z_x p_y, p the mean of the frames beyond, seen from the axis
+        torque = axes[i, 1] * (x / n - axes[i, 3]) - axes[i, 0] * (y / n - axes[i, 4])
+        g[i] = table[6 * i + 5] * torque
+
+
+@_kernel
+def offsets_by(table: Array, q: Array, side: Array, B: Array) -> None:
+    """Write the derivative (6, SIZE) of what the joints are beyond their readings by the vector x, the zeros left out."""
+    g = np.empty(6)
+    _loads(table, q, g)
+    B[:] = 0.0
+    for i in range(6):
+        at = LINEARITY + BASIS * i
+        B[i, at] = q[i]
+        s, c = sincos(q[i])
+        sk, ck = s, c
+        for k in range(HARMONICS):
+            B[i, at + 1 + 2 * k], B[i, at + 2 + 2 * k] = sk, ck
+            sk, ck = sk * c + ck * s, ck * c - sk * s
+        B[i, BACKLASH + i], B[i, COMPLIANCE + i], B[i, REST + i] = -0.5 * side[i], g[i], 1.0
+
+
+@_kernel
+def _adjoint(F: Frame, G: Frame, out: Array) -> None:
+    """Write Ad(F^-1 G), (6, 6): what a small motion of the inner frame G is in the axes of F."""
+    px, py, pz = G[9] - F[9], G[10] - F[10], G[11] - F[11]
+    for row in range(3):
+        fx, fy, fz = F[3 * row], F[3 * row + 1], F[3 * row + 2]
+        for col in range(3):
+            gx, gy, gz = G[3 * col], G[3 * col + 1], G[3 * col + 2]
+            turned = fx * gx + fy * gy + fz * gz
+            out[row, col] = out[3 + row, 3 + col] = turned
+            out[3 + row, col] = 0.0
+            out[row, 3 + col] = fx * (py * gz - pz * gy) + fy * (pz * gx - px * gz) + fz * (px * gy - py * gx)
+
+
+@_kernel
+def pose_and_derivative(table: Array, x: Array, q: Array, side: Array, T: Array, H: Array) -> None:
+    """Write the tool's pose (4, 4) at readings q (6,) and its derivative (6, SIZE) by the vector x.
+
+    The column of the delay is left zero: it stands in no pose, only in when it was seen.
+    """
+    motions, B = np.empty(84), np.empty((6, SIZE))
+    _small_motions(x, motions)
+    offsets_by(table, q, side, B)
+    F = after(motions, 0, first_frame(table))
+    frames = [F]
+    for i in range(6):
+        angle = q[i]
+        for k in range(LINEARITY, POSE):
+            angle += B[i, k] * x[k]
+        s, c = sincos(table[6 * i + 5] * angle + table[6 * i + 4])
+        F = after(motions, 12 * (i + 1), after_link(table, i, after_turn(table, i, c, s, F)))
+        frames.append(F)
+    F = after(table, 48, F)
+    for row in range(6):
+        H[row, :] = 0.0
+        H[row, POSE + row] = 1.0
+    for i in range(7):
+        _adjoint(F, frames[i], H[:, 6 * i : 6 * i + 6])
+    for i in range(6):
+        for row in range(6):
+            J = table[6 * i + 5] * H[row, 6 * i + 5]
+            for k in range(LINEARITY + BASIS * i, LINEARITY + BASIS * (i + 1)):
+                H[row, k] = J * B[i, k]
+            for k in (BACKLASH + i, COMPLIANCE + i, REST + i):
+                H[row, k] = J * B[i, k]
+    _store_moved(F, x[POSE : POSE + 6], T)
+
+
+@_kernel
+def _store_moved(F: Frame, x: Array, T: Array) -> None:
+    """Write a frame, moved by a tangent (6,) of less than some mrad (third powers left out), into T (4, 4)."""
+    a, b, c = x[3], x[4], x[5]
+    R = np.array(
+        [
+            [1 - 0.5 * (b * b + c * c), 0.5 * a * b - c, 0.5 * a * c + b],
+            [0.5 * a * b + c, 1 - 0.5 * (a * a + c * c), 0.5 * b * c - a],
+            [0.5 * a * c - b, 0.5 * b * c + a, 1 - 0.5 * (a * a + b * b)],
+        ]
+    )
+    for row in range(3):
+        for col in range(3):
+            T[row, col] = F[row] * R[0, col] + F[3 + row] * R[1, col] + F[6 + row] * R[2, col]
+        T[row, 3] = F[9 + row] + F[row] * x[0] + F[3 + row] * x[1] + F[6 + row] * x[2]
+    T[3, 0] = T[3, 1] = T[3, 2] = 0.0
+    T[3, 3] = 1.0
+
+
+@_kernel
+def poses_and_derivatives(table: Array, x: Array, q: Array, side: Array, Ts: Array, Hs: Array) -> None:
+    """Write the same for readings q, side (N, 6) and vectors x (N, SIZE) into (N, 4, 4) and (N, 6, SIZE)."""
+    for n in range(len(q)):
+        pose_and_derivative(table, x[n], q[n], side[n], Ts[n], Hs[n])

@@ -1,0 +1,148 @@
+"""The contract of an estimator: potentiometer readings and sightings go in, where the tool is comes out.
+
+A member of this family takes the joints' readings as they come and what vision saw, late and out of order as it may be,
+and answers at any time within the last second or two. To write a new one: a class with the five methods of
+:class:`Estimator`; :class:`~armsight.loop.estimators.readings.Readings` keeps and smooths the joints for you; add it to the
+registry in ``__init__``. All times are on one clock, the board's (``JointStates.t_s``). Poses are ``T_base_tool``,
+covariances of their right tangent [translation m; rotation rad].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from armsight.data import Array, JointStates, Record
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting(Record):
+    """Where vision saw the tool.
+
+    Attributes:
+        t_s: the middle of the exposure as the camera stamps it, s; the camera's delay is still in it.
+        T_base_tool: (4, 4) pose of the tool, m.
+        cov_noise: (6, 6) covariance from what differs from shot to shot: pixel noise.
+        cov_common: (6, 6) covariance from what all shots share: the rig's calibration and the hand-eye's.
+    """
+
+    t_s: float
+    T_base_tool: Array
+    cov_noise: Array
+    cov_common: Array
+
+
+class Verdict(Enum):
+    """What became of a sighting."""
+
+    USED = "used"
+    WAITING = "waiting: newer than the newest potentiometer reading, used when that comes"
+    OUTLIER = "outlier: too far from where the arm can be"
+    REOPENED = "used: several agree against what was learned, so that was thrown open"
+    TOO_LATE = "too late: older than what is kept"
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How late a camera's stamps are on the board's clock: seen at ``t_s - delay_s``.
+
+    Attributes:
+        delay_s: the delay, s.
+        sigma_s: its standard deviation, common to all shots, s.
+        jitter_s: standard deviation of each shot's own, s.
+    """
+
+    delay_s: float
+    sigma_s: float
+    jitter_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Record):
+    """Where the tool is at N times.
+
+    Attributes:
+        t_s: (N,) times, s.
+        Ts_base_tool: (N, 4, 4) poses of the tool, m.
+        covs: (N, 6, 6) their covariance, all in.
+        covs_own: (N, 6, 6) the same without what all sightings share (``Sighting.cov_common``).
+        q: (N, 6) potentiometers, smoothed, rad.
+        qd: (N, 6) their speeds, rad/s.
+        vision_age_s: (N,) time since the newest sighting used, s; infinite before the first.
+    """
+
+    t_s: Array
+    Ts_base_tool: Array
+    covs: Array
+    covs_own: Array
+    q: Array
+    qd: Array
+    vision_age_s: Array
+
+    def __len__(self) -> int:
+        """Return N."""
+        return len(self.t_s)
+
+    def __getitem__(self, row: int) -> ArmEstimate:
+        """Return one of them."""
+        return ArmEstimate(
+            float(self.t_s[row]),
+            self.Ts_base_tool[row],
+            self.covs[row],
+            self.covs_own[row],
+            self.q[row],
+            self.qd[row],
+            float(self.vision_age_s[row]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ArmEstimate(Record):
+    """Where the tool is.
+
+    Attributes:
+        t_s: when, s.
+        T_base_tool: (4, 4) pose of the tool, m.
+        cov: (6, 6) its covariance, all in.
+        cov_own: (6, 6) the same without what all sightings share (``Sighting.cov_common``).
+        q: (6,) potentiometers, smoothed, rad.
+        qd: (6,) their speeds, rad/s.
+        vision_age_s: time since the newest sighting used, s; infinite before the first.
+    """
+
+    t_s: float
+    T_base_tool: Array
+    cov: Array
+    cov_own: Array
+    q: Array
+    qd: Array
+    vision_age_s: float
+
+
+class Estimator(Protocol):
+    """Says where the tool is, from potentiometers and vision."""
+
+    def joints(self, states: JointStates) -> None:
+        """Take readings of the potentiometers, in order of time."""
+        ...
+
+    def vision(self, sighting: Sighting) -> Verdict:
+        """Take what vision saw, in any order; returns what became of it."""
+        ...
+
+    def estimate(self, t_s: float | None = None) -> ArmEstimate:
+        """Return where the tool is at a time, by default that of the newest reading.
+
+        Raises:
+            InputError: no reading has come yet, or ``t_s`` is not within those kept.
+        """
+        ...
+
+    def track(self, t_s: Array) -> Track:
+        """Return the same at (N,) times: the fast way to an output at 1 kHz."""
+        ...
+
+    def tool(self, q: Array, qd: Array) -> Array:
+        """Return T_base_tool (4, 4) if the potentiometers were to read q (6,) moving at qd (6,), as far as is known now."""
+        ...

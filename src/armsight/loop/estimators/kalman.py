@@ -1,0 +1,302 @@
+"""An error-state Kalman filter: potentiometers carry the movement, vision says how far they are off.
+
+In: readings at 1 kHz, sightings at camera rate, late and out of order. Out: the tool's pose at 1 kHz with covariance. The
+state is not where the arm is but what makes its potentiometers wrong (``armerror``); it stands still but for what joint
+motion makes it forget, so between sightings there is nothing to integrate: the pose at any time is the model at that
+time's readings, and a late sighting goes in by taking up the state kept before it and the sightings after it again.
+What all sightings share (calibration) is no noise and is not averaged: the state is learned as vision sees it, and the
+shared covariance is added to what comes out (Schmidt, 1966: considered, not estimated). Equations: docs/loop.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from armsight.data import Array, JointStates, Record
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators import armerror
+from armsight.loop.estimators.armerror import BACKLASH, DELAY, POSE, REST, SIZE, ZEROS, Prior
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Sighting, Track, Verdict
+from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
+from armsight.robot.arm import Arm
+
+#: A sighting less likely than this is an outlier.
+CHANCE = 1e-6
+#: Outliers in a row that agree with each other and are then believed: no marker is mistaken the same way so often.
+STUBBORN = 6
+#: States kept for late sightings, s.
+HISTORY_S = 1.0
+#: Sightings newer than the readings that are kept waiting.
+MOST_WAITING = 16
+#: What is thrown open when vision insists, as after a bump: how the arm stands and holds its tool, and the joints' zeros.
+OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
+#: Linearisations per sighting at most, and the change (m, rad) that ends them.
+ITERATIONS, SETTLED = 4, 1e-6
+#: A joint slower than this keeps its side of the backlash, rad/s.
+MOVES_RAD_S = 1e-3
+_GATE = float(chi2.isf(CHANCE, 6))
+
+
+def _opened() -> Array:
+    """Return the variances (SIZE,) that are added where all is thrown open."""
+    sigmas = np.zeros(SIZE)
+    sigmas[:6] = sigmas[36:42] = np.repeat([OPEN_M, OPEN_RAD], 3)
+    sigmas[ZEROS] = OPEN_RAD
+    return np.asarray(sigmas**2)
+
+
+_OPENED = _opened()
+
+
+@dataclass(frozen=True, eq=False)
+class Learned(Record):
+    """What a filter has learned about an arm.
+
+    Attributes:
+        joint_offset: (6,) what the joints are beyond their readings where they stand now, rad.
+        sigma_joint_offset: (6,) standard deviations; wide where two joints' errors look alike to vision.
+        backlash: (6,) widths between potentiometer and link, rad.
+        sigma_backlash: (6,) standard deviations.
+        side: (6,) where each joint is in it, -1 to 1: 1 when it came up from below.
+        delay: how late the camera's stamps are.
+    """
+
+    joint_offset: Array
+    sigma_joint_offset: Array
+    backlash: Array
+    sigma_backlash: Array
+    side: Array
+    delay: Delay
+
+
+class _State(NamedTuple):
+    """The filter right after a sighting, or before the first.
+
+    ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``, ``travel`` (6,), ``flips`` (6,): when
+    that was and how far the joints had come; ``sighting``: what went in last.
+    """
+
+    t_s: float
+    x: Array
+    P: Array
+    travel: Array
+    flips: Array
+    sighting: Sighting | None
+
+
+class _Step(NamedTuple):
+    """What motion does to the state: factors (SIZE,) by which it is remembered, and variances (SIZE,) that are added."""
+
+    kept: Array
+    added: Array
+
+
+class KalmanEstimator:
+    """Fuses potentiometers and vision.
+
+    Args:
+        arm: the arm, as its table says it is.
+        prior: how far it may be off.
+        delay: how late the camera's stamps are; its sigma says how far the filter may correct it.
+    """
+
+    def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
+        self._arm, self._prior, self._delay = arm, prior or Prior(), delay
+        self._readings = Readings(self._prior.reading_rad)
+        self._sigmas = self._prior.sigmas(delay.sigma_s)
+        zero = np.zeros(6)
+        self._states = [_State(-np.inf, np.zeros(SIZE), np.diag(self._sigmas**2), zero, zero, None)]
+        self._waiting: list[Sighting] = []
+        self._outliers: list[Array] = []
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """The oldest and the newest time for which it can be asked, s."""
+        return self._readings.span_s
+
+    def joints(self, states: JointStates) -> None:
+        """Take readings of the potentiometers, in order of time."""
+        self._readings.add(states)
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            for sighting in waiting:
+                self.vision(sighting)
+
+    def vision(self, sighting: Sighting) -> Verdict:
+        """Take what vision saw, in any order; returns what became of it."""
+        oldest, newest = self.span_s
+        place = len(self._states)
+        while place > 1 and self._after(self._states[place - 1], sighting):
+            place -= 1
+        before = self._states[place - 1]
+        seen_s = self._seen_s(sighting, before)
+        if seen_s > newest:
+            self._waiting = [*self._waiting, sighting][-MOST_WAITING:]
+            return Verdict.WAITING
+        if seen_s < oldest or (place == 1 and before.sighting is not None and self._after(before, sighting)):
+            return Verdict.TOO_LATE
+        later = self._states[place:]
+        after, verdict = self._take(before, sighting)
+        if after is None:
+            return verdict
+        self._states[place:] = [after]
+        for state in later:
+            again, _ = self._take(self._states[-1], state.sighting) if state.sighting is not None else (None, verdict)
+            if again is not None:
+                self._states.append(again)
+        self._readings.set_backlash(self._backlash())
+        while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
+            del self._states[0]
+        return verdict
+
+    def estimate(self, t_s: float | None = None) -> ArmEstimate:
+        """Return where the tool is at a time, by default that of the newest reading."""
+        return self.track(np.array([self.span_s[1] if t_s is None else t_s]))[0]
+
+    def track(self, t_s: Array) -> Track:
+        """Return where the tool is at (N,) times."""
+        joints = self._readings.at(np.asarray(t_s, dtype=float))
+        state = self._states[-1]
+        step = self._moved(state, joints)
+        Ts, Hs = self._model(state.x * step.kept, joints.q, joints.side)
+        by_state = Hs * step.kept[:, None, :]
+        own = (by_state.reshape(-1, SIZE) @ state.P).reshape(Hs.shape) @ np.swapaxes(by_state, 1, 2)
+        own += (Hs * step.added[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._reading_noise(Hs, joints)
+        age = t_s - state.t_s
+        return Track(t_s, Ts, own + self._shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+
+    def tool(self, q: Array, qd: Array) -> Array:
+        """Return T_base_tool if the potentiometers were to read q (6,) moving at qd (6,), as far as is known now."""
+        now = self._readings.at(np.array([self.span_s[1]]))
+        state = self._states[-1]
+        side = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.side[0])
+        Ts, _ = self._model(state.x * self._moved(state, now).kept, q[None], side[None])
+        return np.asarray(Ts[0])
+
+    def learned(self) -> Learned:
+        """Return what has been learned about the arm."""
+        now = self._readings.at(np.array([self.span_s[1]]))
+        state = self._states[-1]
+        step = self._moved(state, now)
+        x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
+        by = np.empty((6, SIZE))
+        armerror.offsets_by(self._arm.table, now.q[0], now.side[0], by)
+        by[np.arange(6), ZEROS] = self._arm.direction
+        sigma = np.sqrt(np.diag(P))
+        return Learned(
+            by @ x,
+            np.sqrt(np.einsum("ij,jk,ik->i", by, P, by)),
+            x[BACKLASH : BACKLASH + 6],
+            sigma[BACKLASH : BACKLASH + 6],
+            now.side[0],
+            replace(self._delay, delay_s=self._delay.delay_s + float(x[DELAY]), sigma_s=float(sigma[DELAY])),
+        )
+
+    def _backlash(self) -> Array:
+        """Return the widths (6,) to reckon with: what is learned, as far as it is, else the middle of what gears have."""
+        state, part = self._states[-1], slice(BACKLASH, BACKLASH + 6)
+        known = 1 - np.diag(state.P)[part] / self._sigmas[part] ** 2
+        return np.asarray(known * state.x[part] + (1 - known) * GAP_RAD)
+
+    @staticmethod
+    def _after(state: _State, sighting: Sighting) -> bool:
+        """Say whether a state has seen what is newer than a sighting."""
+        return state.sighting is not None and state.sighting.t_s > sighting.t_s
+
+    def _seen_s(self, sighting: Sighting, state: _State) -> float:
+        """Return when a sighting was, by the delay as a state knows it, s."""
+        return sighting.t_s - self._delay.delay_s - float(state.x[DELAY])
+
+    def _model(self, x: Array, q: Array, side: Array) -> tuple[Array, Array]:
+        """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE)."""
+        Ts, Hs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, SIZE))
+        armerror.poses_and_derivatives(self._arm.table, x, q, side, Ts, Hs)
+        return Ts, Hs
+
+    def _moved(self, state: _State, joints: Smoothed) -> _Step:
+        """Return what the motion since a state does to it: factors and variances (N, SIZE)."""
+        prior = self._prior
+        travel = np.maximum(joints.travel - state.travel, 0.0)
+        flips = np.maximum(joints.flips - state.flips, 0.0)
+        kept, added = np.ones((len(travel), SIZE)), np.zeros((len(travel), SIZE))
+        rest, free = slice(REST, REST + 6), slice(POSE, POSE + 6)
+        kept[:, rest] = np.exp(-travel / prior.rest_travel_rad)
+        kept[:, free] = np.exp(-travel.sum(axis=1, keepdims=True) / prior.pose_travel_rad)
+        for part in (rest, free):
+            added[:, part] = self._sigmas[part] ** 2 * (1 - kept[:, part] ** 2)
+        added[:, rest] += 0.5 * prior.flip_rad**2 * flips  # a whole change of side moves it from -1 to 1
+        return _Step(kept, added)
+
+    def _reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
+        """Return the covariances (N, 6, 6) of poses from the readings' noise."""
+        J = Hs[:, :, ZEROS]
+        return np.asarray(J @ np.swapaxes(J, 1, 2) * (self._prior.reading_rad**2 * joints.variance[:, None, None]))
+
+    @staticmethod
+    def _shared(sighting: Sighting | None, Ts: Array) -> Array:
+        """Return what all sightings share, (N, 6, 6), seen in the axes of poses (N, 4, 4)."""
+        if sighting is None:
+            return np.zeros((len(Ts), 6, 6))
+        turn = np.zeros((len(Ts), 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ sighting.T_base_tool[:3, :3]
+        return np.asarray(turn @ sighting.cov_common @ np.swapaxes(turn, 1, 2))
+
+    def _take(self, before: _State, sighting: Sighting) -> tuple[_State | None, Verdict]:
+        """Return the state after a sighting, None where it is an outlier."""
+        t_s = max(self._seen_s(sighting, before), before.t_s)
+        joints = self._readings.at(np.array([t_s]))
+        step = self._moved(before, joints)
+        kept = step.kept[0]
+        x, P = before.x * kept, before.P * np.outer(kept, kept)
+        P[np.diag_indices(SIZE)] += step.added[0]
+        z, H, R = self._innovation(x, joints, sighting)
+        verdict = self._judge(z, H @ P @ H.T + R + sighting.cov_common)
+        if verdict is Verdict.OUTLIER:
+            return None, verdict
+        if verdict is Verdict.REOPENED:
+            P[np.diag_indices(SIZE)] += _OPENED
+        x, P = self._update(x, P, joints, sighting)
+        return _State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
+
+    def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
+        """Return how far a sighting is from the model (6,), its derivative (6, SIZE) by x, and the noise (6, 6)."""
+        Ts, Hs = self._model(x[None], joints.q, joints.side)
+        H = Hs[0]
+        velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
+        H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
+        R = sighting.cov_noise + self._reading_noise(Hs, joints)[0]
+        R += self._delay.jitter_s**2 * np.outer(velocity, velocity)
+        return log_se3(inverse(Ts[0]) @ sighting.T_base_tool), H, R
+
+    def _update(self, x: Array, P: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array]:
+        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993)."""
+        change = np.zeros(SIZE)
+        for _ in range(ITERATIONS):
+            z, H, R = self._innovation(x + change, joints, sighting)
+            # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
+            z += H[:, :DELAY] @ change[:DELAY]
+            PHt = P @ H.T
+            K = np.linalg.solve(H @ PHt + R, PHt.T).T
+            last, change = change, K @ z
+            if np.abs(change - last).max() < SETTLED:
+                break
+        P = P - K @ PHt.T
+        return x + change, (P + P.T) / 2
+
+    def _judge(self, z: Array, S: Array) -> Verdict:
+        """Say whether an innovation is to be believed."""
+        inverse_S = np.linalg.inv(S)
+        if z @ inverse_S @ z < _GATE:
+            self._outliers = []
+            return Verdict.USED
+        if self._outliers and (z - self._outliers[-1]) @ inverse_S @ (z - self._outliers[-1]) > _GATE:
+            self._outliers = []
+        self._outliers.append(z)
+        if len(self._outliers) < STUBBORN:
+            return Verdict.OUTLIER
+        self._outliers = []
+        return Verdict.REOPENED

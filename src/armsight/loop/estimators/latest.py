@@ -1,0 +1,62 @@
+"""The newest vision pose as it is: no filter, no joints in between; what a loop on bare vision has to work with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array, JointStates
+from armsight.geometry.pose import inverse
+from armsight.loop.estimators.armerror import Prior
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Sighting, Track, Verdict
+from armsight.loop.estimators.kalman import KalmanEstimator
+from armsight.robot.arm import Arm
+
+
+class LatestEstimator:
+    """Holds the newest sighting until the next; potentiometers alone before the first.
+
+    Args:
+        arm: the arm, as its table says it is.
+        prior: how far the arm may be off, for the covariance before the first sighting.
+        delay: how late the camera's stamps are.
+    """
+
+    def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
+        self._arm, self._delay = arm, delay
+        self._alone = KalmanEstimator(arm, prior=prior, delay=delay)  # never sees anything: potentiometers alone
+        self._newest: Sighting | None = None
+        self._offset = np.eye(4)
+
+    def joints(self, states: JointStates) -> None:
+        """Take readings of the potentiometers, in order of time."""
+        self._alone.joints(states)
+
+    def vision(self, sighting: Sighting) -> Verdict:
+        """Take what vision saw; older than the newest, it is not used."""
+        if self._newest is not None and sighting.t_s <= self._newest.t_s:
+            return Verdict.TOO_LATE
+        seen_s = float(np.clip(sighting.t_s - self._delay.delay_s, *self._alone.span_s))
+        at = self._alone.estimate(seen_s)
+        self._newest = sighting
+        self._offset = inverse(self._arm.forward(at.q)) @ sighting.T_base_tool
+        return Verdict.USED
+
+    def estimate(self, t_s: float | None = None) -> ArmEstimate:
+        """Return the newest sighting, whatever has moved since."""
+        return self.track(np.array([self._alone.span_s[1] if t_s is None else t_s]))[0]
+
+    def track(self, t_s: Array) -> Track:
+        """Return the newest sighting, N times."""
+        alone = self._alone.track(t_s)
+        if self._newest is None:
+            return alone
+        many, own = (len(t_s), 1, 1), self._newest.cov_noise
+        age = t_s - (self._newest.t_s - self._delay.delay_s)
+        Ts, covs, covs_own = (
+            np.tile(part, many) for part in (self._newest.T_base_tool, own + self._newest.cov_common, own)
+        )
+        return Track(alone.t_s, Ts, covs, covs_own, alone.q, alone.qd, age)
+
+    def tool(self, q: Array, qd: Array) -> Array:
+        """Return T_base_tool if the potentiometers were to read q (6,): the table's, moved as the newest sighting was."""
+        return np.asarray(self._arm.forward(q) @ self._offset)

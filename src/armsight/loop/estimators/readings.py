@@ -1,0 +1,200 @@
+"""The potentiometers' readings of the last seconds: smoothed, with speeds, and with what hysteresis depends on.
+
+In: JointStates. Out: joint angles and speeds at any time kept, and the variance that smoothing leaves of a reading's noise.
+At a time t a parabola is laid through the readings of up to :data:`SPAN_S` around it, or before it where it is the newest
+(local polynomial fit, Savitzky and Golay, Anal. Chem. 36, 1964). Beside each reading stands how far every joint has
+travelled and on which side of its backlash it should be: the play operator (Krasnosel'skii and Pokrovskii, "Systems with
+hysteresis", 1989), behind a dead zone that the readings' noise does not cross.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from armsight.data import Array, JointStates
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+
+#: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
+#: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
+SPAN_S = 0.049
+#: Readings kept, s.
+KEPT_S = 2.0
+#: Fewest readings for a parabola; fewer are averaged.
+_PARABOLA = 5
+#: Dead zone before a joint counts as moved, in standard deviations of a smoothed newest reading. Less, and noise changes
+#: the sides of narrow gaps; more, and the sides change late.
+_DEAD = 5.0
+#: Travel over which a joint changes the side of its backlash until that is known, rad: the middle of what gears have.
+GAP_RAD = np.deg2rad(0.2)
+#: The least of it, rad: narrower, noise would change it.
+LEAST_GAP_RAD = np.deg2rad(0.05)
+#: Rows of the memory; at 1 kHz twice what is kept.
+_ROWS = 4096
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+class Smoothed(NamedTuple):
+    """The joints at (N,) times.
+
+    Attributes:
+        q: (N, 6) angles, rad.
+        qd: (N, 6) speeds, rad/s.
+        variance: (N,) what is left of a reading's variance.
+        side: (N, 6) where the joint should be in its backlash, -1 to 1: 1 when it came up from below.
+        travel: (N, 6) how far the joint has moved in all, rad.
+        flips: (N, 6) how far ``side`` has moved in all.
+    """
+
+    q: Array
+    qd: Array
+    variance: Array
+    side: Array
+    travel: Array
+    flips: Array
+
+
+@_kernel
+def _fit(t: Array, q: Array, low: int, high: int, at: float, angles: Array, speeds: Array) -> float:
+    """Lay parabolas through rows low to high of q (N, 6); write value and slope at a time; return the variance left."""
+    n = high - low + 1
+    s1 = s2 = s3 = s4 = 0.0
+    for k in range(low, high + 1):
+        u = t[k] - at
+        s1, s2, s3, s4 = s1 + u, s2 + u * u, s3 + u * u * u, s4 + u * u * u * u
+    # The value's row of the inverse of the normal equations [n s1 s2; s1 s2 s3; s2 s3 s4], and the slope's.
+    a, b, c = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
+    d, e = n * s4 - s2 * s2, s1 * s2 - n * s3
+    determinant = n * a + s1 * b + s2 * c
+    plain = n < _PARABOLA
+    for i in range(6):
+        angles[i] = speeds[i] = 0.0
+    for k in range(low, high + 1):
+        u = t[k] - at
+        value = 1.0 / n if plain else (a + b * u + c * u * u) / determinant
+        slope = 0.0 if plain else (b + d * u + e * u * u) / determinant
+        for i in range(6):
+            angles[i] += value * q[k, i]
+            speeds[i] += slope * q[k, i]
+    return 1.0 / n if plain else a / determinant
+
+
+@_kernel
+def _window(t: Array, first: int, count: int, at: float) -> tuple[int, int]:
+    """Return the rows around a time: SPAN_S of them, around it as far as there are any, else before or after."""
+    last = first + count - 1
+    late = min(max(at + 0.5 * SPAN_S, t[first] + SPAN_S), t[last])
+    low = first + np.searchsorted(t[first : last + 1], late - SPAN_S)
+    high = first + np.searchsorted(t[first : last + 1], late, side="right") - 1
+    return min(low, high), high
+
+
+@_kernel
+def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
+    """Write travel, flips, side, and the place behind the dead zone, of rows begin to end into memory (N, 4, 6)."""
+    angles, speeds = np.empty(6), np.empty(6)
+    for k in range(begin, end):
+        low, high = _window(t, first, k - first + 1, t[k])
+        _fit(t, q, low, high, t[k], angles, speeds)
+        for i in range(6):
+            if k == first:
+                memory[k, :3, i] = 0.0
+                memory[k, 3, i] = angles[i]
+                continue
+            was, side = memory[k - 1, 3, i], memory[k - 1, 2, i]
+            moved = min(max(was, angles[i] - 0.5 * dead), angles[i] + 0.5 * dead)
+            now = min(max(side + 2 * (moved - was) / gap[i], -1.0), 1.0)
+            memory[k, 0, i] = memory[k - 1, 0, i] + abs(moved - was)
+            memory[k, 1, i] = memory[k - 1, 1, i] + abs(now - side)
+            memory[k, 2, i], memory[k, 3, i] = now, moved
+
+
+@_kernel
+def _smooth(
+    t: Array, q: Array, memory: Array, first: int, count: int, at: Array, qs: Array, qds: Array, hysteresis: Array
+) -> Array:
+    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 3, 6); return the variances (N,)."""
+    variance = np.empty(len(at))
+    for n in range(len(at)):
+        low, high = _window(t, first, count, at[n])
+        variance[n] = _fit(t, q, low, high, at[n], qs[n], qds[n])
+        k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
+        hysteresis[n] = memory[k, :3]
+    return variance
+
+
+class Readings:
+    """The last seconds of the potentiometers.
+
+    Args:
+        sigma_rad: noise of one reading, rad.
+    """
+
+    def __init__(self, sigma_rad: float) -> None:
+        # The variance that a parabola leaves at its end is 9/N.
+        self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
+        self._gap = np.full(6, GAP_RAD)
+        self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 4, 6))
+        self._first = self._count = 0
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """The oldest and the newest time kept, s.
+
+        Raises:
+            InputError: no reading has come yet.
+        """
+        if not self._count:
+            raise InputError("the estimator has no potentiometer readings yet; give it joints() first")
+        return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
+
+    def set_backlash(self, width_rad: Array) -> None:
+        """Say how wide the backlash of each joint is (6,), rad, for the readings from here on."""
+        self._gap = np.maximum(width_rad, LEAST_GAP_RAD)
+
+    def add(self, states: JointStates) -> None:
+        """Take readings.
+
+        Raises:
+            InputError: wrong shapes, NaN, or times that do not rise.
+        """
+        t = checked(states.t_s, (None,), "JointStates.t_s")
+        q = checked(states.q, (len(t), 6), "JointStates.q")
+        before = self._t[self._first + self._count - 1] if self._count else -np.inf
+        if len(t) and not (np.diff(t, prepend=before) > 0).all():
+            raise InputError("potentiometer readings must come in order of time; the times given do not rise")
+        half = _ROWS // 2
+        for part in range(0, len(t), half):
+            self._append(t[part : part + half], q[part : part + half])
+
+    def _append(self, t: Array, q: Array) -> None:
+        end = self._first + self._count
+        if end + len(t) > _ROWS:
+            keep = max(int(np.searchsorted(self._t[:end], self._t[end - 1] - KEPT_S)), end - _ROWS // 2)
+            for memory in (self._t, self._q, self._memory):
+                memory[: end - keep] = memory[keep:end].copy()
+            self._first, self._count, end = 0, end - keep, end - keep
+        self._t[end : end + len(t)], self._q[end : end + len(t)] = t, q
+        self._count += len(t)
+        # Only the very first row starts the hysteresis; later ones carry on from the row before.
+        _take(self._t, self._q, self._memory, self._first, end, end + len(t), self._dead, self._gap)
+
+    def at(self, t_s: Array) -> Smoothed:
+        """Return the joints at (N,) times within those kept.
+
+        Raises:
+            InputError: not within them.
+        """
+        oldest, newest = self.span_s
+        if len(t_s) and not (t_s.min() >= oldest and t_s.max() <= newest):
+            raise InputError(
+                f"times {t_s.min():.4f} to {t_s.max():.4f} s were asked for; readings are kept from {oldest:.4f} to "
+                f"{newest:.4f} s"
+            )
+        qs, qds, hysteresis = np.empty((len(t_s), 6)), np.empty((len(t_s), 6)), np.empty((len(t_s), 3, 6))
+        variance = _smooth(self._t, self._q, self._memory, self._first, self._count, t_s, qs, qds, hysteresis)
+        return Smoothed(qs, qds, variance, hysteresis[:, 2], hysteresis[:, 0], hysteresis[:, 1])

@@ -1,0 +1,184 @@
+"""The outer loop: corrects what the joints are told until the tool, as vision sees it, is where it is wanted.
+
+In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
+The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
+is what the estimator says the potentiometers must be off for the tool to be right at the place to be reached next; at rest,
+c integrates the tool's error itself. Tool errors become joint errors through the damped Jacobian. Gain, its margin, and
+what happens when vision is lost: docs/loop.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armsight.data import Array, JointCommand, Record
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators.estimator import ArmEstimate, Estimator
+from armsight.robot.arm import Arm
+from armsight.robot.trajectories import Joints, Trajectory
+from armsight.robot.trajectories.resolved_rate import _scale, _speeds
+
+#: A tool less well known than this is not corrected: sigma of its worst direction, m.
+MOST_SIGMA_M = 1e-3
+#: How long the correction is carried on without vision, s; then it is held.
+BRIDGE_S = 0.75
+#: The correction moves no faster than this share of each joint's speed limit, so that nothing jumps.
+RATE_SHARE = 0.1
+#: The correction is at most this, rad: an arm that needs more is not the arm of the table.
+MOST_RAD = np.deg2rad(5.0)
+#: Joints slower than this are at rest, rad/s: twice the noise of a smoothed speed.
+REST_RAD_S = 0.05
+
+
+class Mode(Enum):
+    """What the loop is closed on."""
+
+    VISION = "vision"
+    BRIDGED = "bridged: no sighting lately, the potentiometers carry on with what was learned"
+    POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long everything in the loop takes.
+
+    Attributes:
+        period_s: between two commands, s.
+        vision_period_s: between two sightings, s.
+        latency_s: from the middle of an exposure to the command that knows of it, s, as measured.
+        response_s: from a command to the joints being there, s: the time constant of their own loop, as measured.
+    """
+
+    period_s: float
+    vision_period_s: float
+    latency_s: float
+    response_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            InputError: not positive.
+        """
+        for name, value in vars(self).items():
+            least = 0.0
+            if not (np.isfinite(value) and value > least):
+                raise InputError(f"{name} is {value}; it must be a positive number of seconds")
+
+    @property
+    def gain(self) -> float:
+        """The share of an error that is taken away per command.
+
+        c[k+1] = c[k] - g e[k-d] comes to rest without overshoot up to g = d^d / (d+1)^(d+1), where the roots of
+        z^(d+1) - z^d + g meet on the real axis; it is stable up to 2 sin(pi / (4d + 2)) (Levin and May, 1976): 2 times as
+        much at d = 0, 4 at 1, pi e / 2 = 4.27 in the limit. The age of what is held between sightings counts as delay.
+        """
+        d = (self.latency_s + self.vision_period_s + self.response_s) / self.period_s
+        return float(d**d / (d + 1) ** (d + 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ServoStep(Record):
+    """One command and how it came about.
+
+    Attributes:
+        command: what the board is to be sent.
+        mode: what the loop is closed on.
+        correction: (6,) what is added to the motion's joints, rad.
+        error: (6,) from the tool as estimated to the tool as wanted at that time, [m; rad] in the tool's axes.
+        limited: what kept a joint from being corrected further, one text each.
+    """
+
+    command: JointCommand
+    mode: Mode
+    correction: Array
+    error: Array
+    limited: tuple[str, ...] = ()
+
+
+class PoseServo:
+    """Corrects the joints' commands by what is seen of the tool.
+
+    Args:
+        arm: the arm, as its table says it is; motions are planned with it.
+        timing: of the loop.
+    """
+
+    def __init__(self, arm: Arm, timing: Timing) -> None:
+        self.timing = timing
+        self._arm, self._scale = arm, _scale(arm)
+        self._correction = np.zeros(6)
+        self._goal: Joints | None = None
+        self._rest_s = 0.0
+
+    def step(
+        self, motion: Trajectory, t_s: float, estimator: Estimator, gravity_duty: ArrayLike = (0.0,) * 6
+    ) -> ServoStep:
+        """Make the next command.
+
+        Args:
+            motion: the motion under way; a next one must start where the last one ended.
+            t_s: time since its start, on the clock of the estimator's newest reading, s.
+            estimator: where the tool is.
+            gravity_duty: (6,) duty that carries the arm's weight, passed on.
+        """
+        duty = checked(gravity_duty, (6,), "gravity_duty")
+        estimate, ahead = estimator.estimate(), motion.at(t_s + self.timing.period_s)
+        goal = self._goal or motion.at(t_s)
+        error = log_se3(inverse(estimate.T_base_tool) @ self._arm.forward(motion.at(t_s).q))
+        mode = self._mode(estimate)
+        change = np.zeros(6)
+        if mode is not Mode.POTENTIOMETERS:
+            missing = self._missing(estimator, goal)
+            change = self._missing(estimator, ahead) - missing
+            if mode is Mode.VISION:
+                resting = self._resting(estimate, goal, ahead)
+                change += self.timing.gain * (self._joints(goal.q, error) if resting else missing)
+        return self._command(goal, ahead, change, duty, mode, error)
+
+    def _mode(self, estimate: ArmEstimate) -> Mode:
+        """Say what the loop may be closed on."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.cov_own[:3, :3])[-1]))
+        usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one sighting may be missed
+        if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MOST_SIGMA_M:
+            return Mode.POTENTIOMETERS
+        return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
+
+    def _missing(self, estimator: Estimator, goal: Joints) -> Array:
+        """Return what the correction lacks (6,) at a goal, as the estimator knows the arm."""
+        there = estimator.tool(goal.q + self._correction, goal.qd)
+        return self._joints(goal.q, log_se3(inverse(there) @ self._arm.forward(goal.q)))
+
+    def _joints(self, q: Array, error: Array) -> Array:
+        """Return the joint angles (6,) that make up for an error of the tool (6,), damped near singularities."""
+        return _speeds(self._arm.jacobian(q, "tool"), error, self._scale)[0]
+
+    def _resting(self, estimate: ArmEstimate, goal: Joints, ahead: Joints) -> bool:
+        """Say whether the arm has been at rest for as long as the newest sighting is old."""
+        still = not (goal.qd.any() or ahead.qd.any()) and bool(np.abs(estimate.qd).max() < REST_RAD_S)
+        self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
+        return still and self._rest_s > estimate.vision_age_s
+
+    def _command(self, goal: Joints, ahead: Joints, change: Array, duty: Array, mode: Mode, error: Array) -> ServoStep:
+        """Return the command with a change of the correction, as far as the limits allow."""
+        arm, period_s = self._arm, self.timing.period_s
+        step = ahead.q - goal.q
+        most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
+        wished = np.clip(self._correction + np.clip(change, -most, most), -MOST_RAD, MOST_RAD)
+        q_ref = np.clip(ahead.q + wished, arm.q_min, arm.q_max)
+        held = q_ref != ahead.q + wished
+        correction = q_ref - ahead.q
+        qd_ref = np.clip(ahead.qd + (correction - self._correction) / period_s, -arm.qd_max, arm.qd_max)
+        self._correction, self._goal = correction, ahead
+        said = [
+            *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
+            *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(np.abs(wished) >= MOST_RAD)),
+        ]
+        command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), duty, period_s)
+        return ServoStep(command, mode, correction, error, tuple(said))
