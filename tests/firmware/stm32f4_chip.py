@@ -16,9 +16,9 @@ class Chip(ClockAndFlash):
 
     def __init__(self) -> None:
         super().__init__()
-        self.sent = bytearray()
         self.inputs: dict[str, int] = {}
         self.levels: dict[int, int] = {}  # the converter's reading of each channel
+        self.place = 0  # of the converter in its scan
         self.pended = False
 
     # pins
@@ -164,8 +164,18 @@ class Chip(ClockAndFlash):
         register, number = ("SMPR2", channel) if channel < 10 else ("SMPR1", channel - 10)
         return (3, 15, 28, 56, 84, 112, 144, 480)[self[f"ADC1.{register}"] >> 3 * number & 7]
 
+    def set_adc_cr2(self, name: str, value: int) -> None:
+        """Without ADON a scan under way is given up."""
+        if not value & 1:
+            self.place = 0
+        self[name] = value
+
     def scans(self, count: int) -> None:
         """Let the PWM go through so many periods; each triggers a scan."""
+        self.conversions(count * len(self.sequence()))
+
+    def conversions(self, count: int) -> None:
+        """Let the converter do so many conversions of its scans, if it is triggered and somebody takes them."""
         stream, cr2 = "DMA2.S0", self["ADC1.CR2"]
         triggered = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7
         triggered = triggered and self["TIM8.CCMR2"] >> 12 & 7 == 6 and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"]
@@ -175,9 +185,10 @@ class Chip(ClockAndFlash):
             return
         if self[f"{stream}CR"] >> 25 & 7 != 0 or self[f"{stream}PAR"] != 0x4001204C:
             self.wrong("DMA2 stream 0 does not serve the converter")
+        sequence = self.sequence()
         for _ in range(count):
-            for channel in self.sequence():
-                self.transfer(stream, 2, self.levels.get(channel, 0))
+            self.transfer(stream, 2, self.levels.get(sequence[self.place], 0))
+            self.place = (self.place + 1) % len(sequence)
 
     # wire
 

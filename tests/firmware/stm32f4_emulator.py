@@ -21,6 +21,8 @@ from unicorn.arm_const import (
     UC_CPU_ARM_CORTEX_M4,
 )
 
+from armsight.firmware.elf import read_elf
+
 FLASH, FLASH_BYTES = 0x08000000, 512 * 1024
 RAM, RAM_BYTES = 0x20000000, 128 * 1024
 RETURN = 0x0807FF00  # where nothing lies: a call returns here
@@ -33,19 +35,16 @@ class Emulator:
     """One chip with a program in its flash memory."""
 
     def __init__(self, elf_path: Path) -> None:
-        from elftools.elf.elffile import ELFFile
-
         self.chip = Chip()
         self.uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
         self.uc.ctl_set_cpu_model(UC_CPU_ARM_CORTEX_M4)
         self.uc.mem_map(FLASH, FLASH_BYTES)
         self.uc.mem_map(RAM, RAM_BYTES)
         self.uc.mem_write(FLASH, b"\xff" * FLASH_BYTES)
-        with elf_path.open("rb") as file:
-            elf = ELFFile(file)
-            self.symbols = {s.name: s["st_value"] for s in elf.get_section_by_name(".symtab").iter_symbols()}
-            for segment in elf.iter_segments("PT_LOAD"):
-                self.uc.mem_write(segment["p_paddr"], segment.data())
+        elf = read_elf(elf_path)
+        self.symbols = elf.symbols
+        for segment in elf.segments:
+            self.uc.mem_write(segment.load_address, segment.data)
         for page in sorted({address & -PAGE for address in ADDRESS}):
             self.uc.mmio_map(page, PAGE, self._read, page, self._write, page)
         self.chip.memory_read = lambda at, size: bytes(self.uc.mem_read(at, size))

@@ -99,9 +99,7 @@ def test_a_reading_in_the_middle_of_a_scan_is_whole(emulator):
     put(emulator, dict.fromkeys(POT_PINS, 1000))
     emulator.chip.scans(16)
     put(emulator, dict.fromkeys(POT_PINS, 2000))
-    order = emulator.chip.sequence()
-    for channel in order[:10]:  # three potentiometers read anew
-        emulator.chip.transfer("DMA2.S0", 2, emulator.chip.levels.get(channel, 0))
+    emulator.chip.conversions(10)  # three potentiometers read anew
     assert list(read(emulator).counts) == [17000] * 3 + [16000] * 3
 
 
@@ -125,8 +123,7 @@ def test_it_is_started_again_from_the_first_channel_in_the_middle_of_a_scan(emul
     chip.scans(16)
     read(emulator)
     put(emulator, {pin: 100 + i for i, pin in enumerate(POT_PINS)})
-    for channel in chip.sequence()[:5]:
-        chip.transfer("DMA2.S0", 2, chip.levels.get(channel, 0))
+    chip.conversions(5)
     assert list(read(emulator).counts) == [OPEN] * 6
     chip.scans(20)
     assert list(read(emulator).counts) == [16 * (100 + i) for i in range(6)]

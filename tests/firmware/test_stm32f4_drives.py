@@ -150,11 +150,3 @@ def test_a_cut_wire_is_a_stop(emulator):
     emulator.chip.inputs.clear()
     emulator.chip.breaks()
     assert stopped(emulator)
-
-
-def test_the_converter_is_triggered_around_the_middle_of_the_pulses(emulator):
-    """Six currents at 68 clocks of 22.5 MHz each: half of them before the counter's 0, half after."""
-    chip = emulator.chip
-    six_currents_s = 6 * 68 / 22.5e6
-    assert chip["TIM8.CCR4"] / chip.apb2()[1] == pytest.approx(six_currents_s / 2, rel=1e-12)
-    assert chip["TIM8.CR2"] >> 4 & 7 == 7  # OC4REF is the trigger

@@ -1,6 +1,9 @@
 """From reset to the first tick on the Nucleo-F446RE: clocks, watchdog, pins, and what a fault does."""
 
+import ast
+import re
 import struct
+from pathlib import Path
 
 import pytest
 from stm32f4_build import COMPILERS, fresh, image
@@ -9,6 +12,7 @@ from stm32f4_registers import ADC_CHANNEL
 
 from armsight.firmware.elf import read_elf
 
+ROOT = Path(__file__).resolve().parents[2]
 PWM_PINS = ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8")
 DIRECTION_PINS = ("PB5", "PB6", "PB7", "PB8", "PB9", "PB10")
 ENABLE_PIN = "PC9"
@@ -135,18 +139,54 @@ def test_a_debugger_that_stops_the_processor_stops_the_motors(booted):
     assert booted.chip["DBGMCU.APB1_FZ"] == 1 << 12  # the watchdog with them
 
 
-def test_every_pin_does_what_the_table_says(booted):
+def documented() -> list[tuple[str, str, str, str]]:
+    """Return what, pin, connector and peripheral of each row of the documentation's pin table."""
+    text = (ROOT / "docs" / "add_a_board.md").read_text(encoding="utf-8")
+    return re.findall(r"^\| ([^|]+) \| (P[ABC]\d+) \| ([^|]+) \| [^|]*\| (\w+) \|$", text, flags=re.MULTILINE)
+
+
+def test_every_pin_does_what_the_documentation_says(booted):
+    chip, rows = booted.chip, documented()
+    assert len(rows) == 30
+    for what, pin, _, peripheral in rows:
+        analog = re.fullmatch(r"ADC1_IN(\d+)", peripheral)
+        assert chip.function(pin) == ("analog" if analog else peripheral), what
+        assert not analog or ADC_CHANNEL[pin] == int(analog[1])
+    pins = {what: pin for what, pin, _, _ in rows}
+    joints = range(1, 7)
+    assert [pins[f"PWM of joint {i}"] for i in joints] == list(PWM_PINS)
+    assert [pins[f"direction of joint {i}"] for i in joints] == list(DIRECTION_PINS)
+    scan = [f"current of joint {i}" for i in joints] + ["motor supply"] + [f"potentiometer {i}" for i in joints]
+    assert chip.sequence() == [ADC_CHANNEL[pins[what]] for what in scan]
+
+
+def test_no_other_pin_is_touched(booted):
+    """The debugger's are as after reset, and everything else is a floating input."""
+    used = {pin for _, pin, _, _ in documented()}
+    after_reset = {"PA13": "nothing", "PA14": "nothing", "PA15": "nothing", "PB3": "nothing", "PB4": "nothing"}
+    for pin in (f"P{port}{i}" for port in "ABC" for i in range(16)):
+        if pin not in used:
+            assert booted.chip.function(pin) == after_reset.get(pin, "input"), pin
+
+
+def test_the_wiring_picture_shows_the_same_pins():
+    script = (ROOT / "docs" / "images" / "wiring.py").read_text(encoding="utf-8")
+    drawn = ast.literal_eval(re.search(r"^JOINTS = (\(.*?^\))", script, flags=re.DOTALL | re.MULTILINE)[1])
+    place = {what: (pin, connector) for what, pin, connector, _ in documented()}
+    for joint, *shown in drawn:
+        wanted = ("potentiometer {}", "PWM of joint {}", "direction of joint {}", "current of joint {}")
+        assert [tuple(pin.split()) for pin in shown] == [place[what.format(joint)] for what in wanted]
+    for what, said in (("motor supply", "supply"), ("emergency stop", "stop"), ("enable of all bridges", "enable")):
+        assert f"{said}: {place[what][0]}  {place[what][1]}" in script
+
+
+def test_the_currents_are_read_around_the_middle_of_the_pulses(booted):
+    """The trigger comes half of their six conversions before the counter's 0, which is where a pulse has its middle."""
     chip = booted.chip
-    assert [chip.function(pin) for pin in PWM_PINS] == [
-        *(f"TIM1_CH{i}" for i in (1, 2, 3)),
-        *(f"TIM8_CH{i}" for i in (1, 2, 3)),
-    ]
-    assert {chip.function(pin) for pin in (*DIRECTION_PINS, ENABLE_PIN)} == {"output"}
-    assert (chip.function("PA6"), chip.function("PB12")) == ("TIM8_BKIN", "TIM1_BKIN")
-    assert (chip.function("PA2"), chip.function("PA3")) == ("USART2_TX", "USART2_RX")
-    assert {chip.function(pin) for pin in ADC_CHANNEL if pin not in ("PA2", "PA3", "PA6")} == {"analog"}
-    assert (chip.function("PA13"), chip.function("PA14")) == ("nothing", "nothing")  # the debugger's: as after reset
-    assert (chip["GPIOA.AFRH"] >> 20, chip["GPIOA.MODER"] >> 26) == (0, 0xA8000000 >> 26)
+    converter = chip.apb2()[0] / (2, 4, 6, 8)[chip["ADC.CCR"] >> 16 & 3]
+    six_s = sum(chip.sampling(channel) + 12 for channel in chip.sequence()[:6]) / converter
+    assert chip["TIM8.CCR4"] / chip.apb2()[1] == pytest.approx(six_s / 2, rel=1e-12)
+    assert chip["TIM8.CR2"] >> 4 & 7 == 7  # OC4REF is the trigger
 
 
 def test_an_open_emergency_stop_pulls_its_line_high(booted):
