@@ -27,7 +27,7 @@ def without_speckles(disparity: Singles) -> Singles:
     return np.where(coarse == -_FINE, np.float32(np.nan), disparity)
 
 
-def finished(found: Found, left: Image, search: Search, paths: int) -> Disparity:
+def finished(found: Found, left: Image, search: Search) -> Disparity:
     """Turn what was found into a result."""
     good = found.agreed & (found.curvature > 0)
     sure = without_speckles(np.where(good, found.disparity, np.float32(np.nan)))

@@ -89,7 +89,7 @@ class Semiglobal:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search, self.paths)
+        return finished(self.search(left, right, search), left, search)
 
     def search(self, left: Image, right: Image, search: Search) -> Found:
         """Find disparities, without judging, smoothing or filling them."""

@@ -1,0 +1,68 @@
+"""OpenCV's block matching and semi-global matching behind the same contract, to compare with and to fall back on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from armsight.data import Image
+from armsight.errors import InputError
+from armsight.vision.dense.finish import finished
+from armsight.vision.dense.method import Disparity, Search
+from armsight.vision.dense.winner import Found, Singles
+
+_WINDOW_BM, _WINDOW_SGBM = 15, 3
+#: What OpenCV's samples recommend: penalties of a slant and of a jump a pixel of the window, and a uniqueness of 10%.
+_P1, _P2, _UNIQUENESS = 8, 32, 10
+#: Name -> OpenCV's mode; None is StereoBM.
+MODES = {
+    "bm": None,
+    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
+    "hh": cv2.STEREO_SGBM_MODE_HH,
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+}
+
+
+@dataclass(frozen=True)
+class OpenCV:
+    """OpenCV's matchers.
+
+    Attributes:
+        mode: a key of MODES.
+    """
+
+    mode: str = "sgbm"
+
+    def __post_init__(self) -> None:
+        """Check the mode."""
+        if self.mode not in MODES:
+            raise InputError(f"unknown mode {self.mode!r} of OpenCV's matchers; known are {', '.join(MODES)}")
+
+    def match(self, left: Image, right: Image, search: Search) -> Disparity:
+        """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
+        d = self.disparity(left, right, search)
+        good = d >= search.first
+        none = np.zeros(d.shape, np.float32)
+        return finished(Found(d, good, good.astype(np.float32), none), left, search)
+
+    def disparity(self, left: Image, right: Image, search: Search) -> Singles:
+        """Return what OpenCV finds (H, W), px; below the search where it finds nothing.
+
+        The images are widened to the left, or columns that have less than the whole search to their left stay empty.
+        """
+        count, mode = -(-search.count // 16) * 16, MODES[self.mode]
+        wide = [cv2.copyMakeBorder(i, 0, 0, search.first + count, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
+        matcher: cv2.StereoMatcher
+        if mode is None:
+            bm = cv2.StereoBM.create(count, _WINDOW_BM)
+            bm.setMinDisparity(search.first)
+            matcher = bm
+        else:
+            area = _WINDOW_SGBM**2
+            matcher = cv2.StereoSGBM.create(
+                search.first, count, _WINDOW_SGBM, _P1 * area, _P2 * area, 1, 0, _UNIQUENESS, 0, 0, mode
+            )
+        found = matcher.compute(*wide)[:, search.first + count :]
+        return np.ascontiguousarray(found.astype(np.float32) / 16)
