@@ -1,5 +1,6 @@
 """The Nucleo's image, built once per compiler by the package's own build."""
 
+import atexit
 import functools
 import tempfile
 from pathlib import Path
@@ -11,6 +12,7 @@ from armsight.firmware.build import build_board, compilers
 
 COMPILERS = ("zig", "gcc")
 _folder = tempfile.TemporaryDirectory(prefix="armsight-stm32f4-")
+atexit.register(_folder.cleanup)
 
 
 @functools.cache

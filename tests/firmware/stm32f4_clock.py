@@ -243,6 +243,8 @@ class ClockAndFlash:
         """Keys: start, unlock, feed. Any but unlock locks."""
         self._watchdog_open = value == 0x5555
         self.fed += value == 0xAAAA
+        if value == 0xAAAA and self["IWDG.SR"]:
+            self.wrong("the watchdog is fed with its old time: the new one is still on its way")
         if value not in (0x5555, 0xAAAA, 0xCCCC):
             self.wrong(f"watchdog key {value:#x}")
 

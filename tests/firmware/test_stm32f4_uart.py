@@ -104,6 +104,11 @@ def test_a_piece_goes_out_and_the_next_waits_for_its_end(emulator):
     assert chip.wrongs == []
 
 
+def test_nothing_to_send_starts_nothing(emulator):
+    assert give(emulator, b"") == 0
+    assert emulator.chip.written("DMA1.S6CR") == []
+
+
 def test_a_long_message_is_taken_in_parts(emulator):
     data = bytes(range(256)) + b"the rest"
     assert give(emulator, data) == PIECE

@@ -69,12 +69,13 @@ uint32_t uart_receive(uint8_t *bytes, uint32_t room, uint32_t *overrun)
 
 uint32_t uart_send(const uint8_t *bytes, uint32_t length)
 {
-    if ((TX_STREAM->cr & DMA_CR_EN) != 0u) { /* it clears the bit by itself when all are sent */
+    if (length == 0u || (TX_STREAM->cr & DMA_CR_EN) != 0u) { /* it clears the bit by itself when all are sent */
         return 0u;
     }
-    const uint32_t taken = length < TX_BYTES ? length : TX_BYTES;
-    for (uint32_t i = 0u; i < taken; i++) {
-        tx[i] = bytes[i];
+    uint32_t taken = 0u;
+    while (taken < length && taken < TX_BYTES) {
+        tx[taken] = bytes[taken];
+        taken++;
     }
     DMA1->hifcr = DMA_FLAGS << TX_SHIFT;
     stream_start(TX_STREAM, tx, taken, DMA_CR_FROM_MEMORY);
