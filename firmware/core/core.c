@@ -46,9 +46,9 @@ static void measure(core_state *core, uint32_t i, uint32_t counts)
 /* Move a joint's reference by one tick; returns whether it is at rest. */
 static bool advance(joint_state *joint, const joint_config *config, bool slowing)
 {
-    bool rest = false;
+    bool resting = false;
     if (slowing) {
-        rest = setpoint_slow(&joint->setpoint, config->deceleration_rad_s2);
+        resting = setpoint_slow(&joint->setpoint, config->deceleration_rad_s2);
         joint->held_back = 0u;
     } else {
         setpoint_advance(&joint->setpoint);
@@ -60,18 +60,18 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
     /* Limits that were widened for a joint outside close in behind it. */
     joint->low_rad = number_clamp(joint->setpoint.position_rad, joint->low_rad, config->soft_min_rad);
     joint->high_rad = number_clamp(joint->setpoint.position_rad, config->soft_max_rad, joint->high_rad);
-    return rest;
+    return resting;
 }
 
 static void advance_arm(core_state *core)
 {
     const bool slowing = core->state == STATE_STOPPING;
-    bool rest = true;
+    bool resting = true;
     for (uint32_t i = 0u; i < JOINTS; i++) {
         const bool joint_rests = advance(&core->joint[i], &core->config.joint[i], slowing);
-        rest = rest && joint_rests;
+        resting = resting && joint_rests;
     }
-    if (slowing && rest) {
+    if (slowing && resting) {
         core->state = STATE_HOLDING;
     }
 }

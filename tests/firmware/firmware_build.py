@@ -21,10 +21,15 @@ def own_compiler() -> list[str] | None:
     return [path] if path else None
 
 
+#: More flags, for the machine's own compiler alone.
+MORE_FLAGS = os.environ.get("ARMSIGHT_FIRMWARE_CFLAGS", "").split()
+
+
 def compilers() -> dict[str, list[str]]:
     """The compilers for this machine, by name: its own, and the one that comes from PyPI."""
     own, found = own_compiler(), build.compilers()
-    return ({"own": own} if own else {}) | ({"zig": [*found["zig"].host]} if "zig" in found else {})
+    with_zig = "zig" in found and not MORE_FLAGS
+    return ({"own": own} if own else {}) | ({"zig": [*found["zig"].host]} if with_zig else {})
 
 
 def is_gcc(compiler: list[str] | None) -> bool:
@@ -40,7 +45,7 @@ def compile_c(compiler, target, sources, *flags, mavlink=None) -> subprocess.Com
     ``mavlink`` is the folder of the generated headers, for sources that need them.
     """
     seen = build.includes(mavlink or HERE, "boards/pil", "boards/cortex_m")
-    command = [*compiler, "@cflags.txt", *flags, *seen, *os.environ.get("ARMSIGHT_FIRMWARE_CFLAGS", "").split()]
+    command = [*compiler, "@cflags.txt", *flags, *seen, *MORE_FLAGS]
     command += ["-o", str(target), *map(str, sources)]
     return subprocess.run(command, cwd=FIRMWARE, capture_output=True, text=True, check=False)
 

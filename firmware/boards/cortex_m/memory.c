@@ -20,15 +20,15 @@ void __aeabi_memset8(void *to, size_t length, int value);
 
 /* A word anywhere: the processor reads and writes single words at any address. */
 typedef struct __attribute__((packed, may_alias)) word {
-    uint32_t bits;
+    uint32_t bits; // cppcheck-suppress unusedStructMember
 } word;
 
 extern char data_begin[], data_end[], data_stored[], bss_begin[], bss_end[]; /* of sections.ld */
 
 void memory_start(void)
 {
-    memcpy(data_begin, data_stored, (size_t)(data_end - data_begin));
-    memset(bss_begin, 0, (size_t)(bss_end - bss_begin));
+    memcpy(data_begin, data_stored, (uintptr_t)data_end - (uintptr_t)data_begin);
+    memset(bss_begin, 0, (uintptr_t)bss_end - (uintptr_t)bss_begin);
 }
 
 void *memcpy(void *to, const void *from, size_t length)

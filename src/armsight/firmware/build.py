@@ -167,11 +167,12 @@ def build_host(target: Path, compiler: Compiler) -> Path:
 
 
 def fingerprint() -> str:
-    """Return the SHA-256 of all sources, by which a build that is out of date is told."""
+    """Return the SHA-256 of the sources of what the package carries, by which a build that is out of date is told."""
     root = source_folder()
-    digest = hashlib.sha256()
-    for path in sorted(path for path in root.rglob("*") if path.suffix in {".c", ".h", ".ld", ".txt", ".xml"}):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    digest = hashlib.sha256((root / "cflags.txt").read_bytes())
+    for folder in ("core", "wire", "boards", "boards/host", "boards/pil", "boards/cortex_m", "boards/cortex_m/include"):
+        for path in sorted(path for path in (root / folder).iterdir() if path.is_file()):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 
