@@ -128,7 +128,7 @@ class JointPlant:
     def sense(self) -> Sensed:
         """Return what the converters read now."""
         _read(self.q, self._noise, self._fault, self._kept, self._counts)
-        return Sensed(self._counts, self._current_ma, self.supply_mv, self.stop_pressed)
+        return Sensed(self._counts.copy(), self._current_ma.copy(), self.supply_mv, self.stop_pressed)
 
     def step(self, duty: Array, drives_on: bool) -> None:
         """Let 1 ms pass with these duties (6,)."""

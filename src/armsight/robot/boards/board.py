@@ -77,7 +77,7 @@ class Board:
             DeviceError: the board is gone.
         """
         ticks = command.duration_s * self._session.ticks_per_s
-        if not 1 <= round(ticks) <= _LONGEST_TICKS or abs(ticks - round(ticks)) > 1e-6 * ticks:
+        if not 0.5 <= ticks <= _LONGEST_TICKS or abs(ticks - round(ticks)) > 1e-6 * ticks:
             raise InputError(
                 f"duration_s is {command.duration_s}; a whole number of the board's ticks is needed,"
                 f" of 1/{self._session.ticks_per_s} s, {_LONGEST_TICKS} at most"

@@ -139,7 +139,7 @@ class EmulatedLink:
         """Return what reaches the board in this tick."""
         self._credit += self._bytes_per_tick
         if not self._to_board:
-            self._credit = min(self._credit, self._bytes_per_tick)
+            self._credit = 0.0
             return b""
         count = min(int(self._credit), len(self._to_board), WIRE_BYTES)
         self._credit -= count

@@ -5,6 +5,8 @@ Whatever goes wrong with the link is told together with what the board's arm doe
 
 from __future__ import annotations
 
+import struct
+
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
 from armsight.robot.boards.codes import Reaction, Refusal
@@ -162,8 +164,7 @@ class Session:
 
     def _ask_reaction(self) -> str:
         """Return the words on what the arm does by itself without a host, from the end of the configuration."""
-        offset = CONFIG.itemsize - 8
-        ticks, reaction = (int.from_bytes(self.config_part(offset)[at : at + 4], "little") for at in (0, 4))
+        ticks, reaction = struct.unpack("<II", self.config_part(CONFIG.itemsize - 8))
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
         return f"; without commands the board {slows}{does} after {ticks / self.ticks_per_s * 1e3:.0f} ms"

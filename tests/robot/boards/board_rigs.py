@@ -1,0 +1,120 @@
+"""Boards for tests: the host build behind a lock-step link, and a link that plays back what a board might say."""
+
+import os
+import pty
+import select
+import threading
+import tty
+
+from armsight.data import JointCommand
+from armsight.errors import DeviceError
+from armsight.firmware import dialect
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import configured
+from armsight.sim.joints import JointPlant
+
+
+def host_board(config=None, **options):
+    """A configured board of the host build: (board, link, plant)."""
+    plant = JointPlant()
+    link = EmulatedLink(open_machine("host"), plant, **options)
+    return configured(link, config), link, plant
+
+
+def hold(q, duration_s=0.01):
+    """A command to be at rest at these angles."""
+    return JointCommand(q, [0.0] * 6, [0.0] * 6, duration_s)
+
+
+class ScriptedLink:
+    """A link whose far side is a function: bytes written -> bytes to be read."""
+
+    def __init__(self, answer=lambda data: b""):
+        self.answer, self.waiting, self.written, self.waited_s, self.closed = answer, b"", [], 0.0, False
+
+    def write(self, data):
+        self.written.append(bytes(data))
+        self.waiting += self.answer(bytes(data))
+
+    def read(self, wait_s=0.0):
+        self.waited_s += wait_s
+        taken, self.waiting = self.waiting, b""
+        return taken
+
+    def close(self):
+        self.closed = True
+
+
+class Speaker:
+    """Packs messages as a board would."""
+
+    def __init__(self):
+        self.mav = dialect().MAVLink(None, 1, 1)
+        self.mav.send = lambda message, **_: self.packed.append(message.pack(self.mav)) or self._count()
+        self.packed = []
+
+    def _count(self):
+        self.mav.seq = (self.mav.seq + 1) % 256
+
+    def say(self, kind, *fields):
+        self.packed.clear()
+        getattr(self.mav, f"{kind}_send")(*fields)
+        return self.packed[0]
+
+    def welcome(self, *, dialect_version=1, config_version=1, tick=0):
+        return self.say("welcome", dialect_version, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9")
+
+    def status(self, tick=0, *, state=0, refused=(0, 0, 0)):
+        sequence, count, refusal = refused
+        head = (tick, state, 0, [0] * 6, 0, 255, 0, 0, sequence, count, refusal)
+        return self.say("board_status", *head, 12000, 0, 0, 0, 0, 0, 0)
+
+    def joints(self, tick=0):
+        return self.say("joints", tick, *[[0.0] * 6 for _ in range(4)], [0] * 6)
+
+    def angles(self, tick, angle_rad=0.0):
+        return self.say("angles", tick, [angle_rad] * 6)
+
+    def config_part(self, offset, data):
+        return self.say("config_part", offset, 920, len(data), list(data.ljust(200, b"\0")))
+
+
+class PtyBoard:
+    """The host build behind a pseudo-terminal, as a real board behind its USB cable; it runs as fast as it is let.
+
+    Every poll of the far side lets one tick pass for a millisecond of real time, at most; nothing is asserted on times.
+    """
+
+    def __init__(self, link=None):
+        self.plant = JointPlant()
+        self.link = EmulatedLink(open_machine("host"), self.plant) if link is None else link
+        configured(self.link)
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        self._slave = slave
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        while not self._stop.wait(0.0005):
+            ready, _, _ = select.select([self.master], [], [], 0)
+            try:
+                if ready:
+                    self.link.write(os.read(self.master, 4096))
+                os.write(self.master, self.link.read(0.001))
+            except (OSError, DeviceError):
+                return
+
+    def pull(self):
+        """Pull the cable: the port is gone, the board runs on by hand (``link.step``)."""
+        self._stop.set()
+        self._thread.join()
+        os.close(self._slave)
+        os.close(self.master)
+
+    def close(self):
+        if not self._stop.is_set():
+            self.pull()

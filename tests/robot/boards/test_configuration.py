@@ -1,0 +1,137 @@
+"""The host's check of a configuration says the same as the firmware's own, and names what is wrong."""
+
+import ctypes
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from armsight import firmware
+from armsight.errors import InputError
+from armsight.robot.boards.configuration import CONFIG, check_configuration, check_gains, gains_array, lab_configuration
+
+
+@pytest.fixture(scope="module")
+def is_valid():
+    """The firmware's own word on a configuration."""
+    function = ctypes.CDLL(str(firmware.host_library())).config_is_valid
+    function.restype, function.argtypes = ctypes.c_bool, [ctypes.c_char_p]
+    return lambda config: function(config.tobytes())
+
+
+def paths(dtype, path=()):
+    """Every field of a record, by its path."""
+    for name in dtype.names:
+        base = dtype[name].subdtype[0] if dtype[name].subdtype else dtype[name]
+        if base.names:
+            yield from paths(base, (*path, name))
+        else:
+            yield (*path, name)
+
+
+FIELDS = list(paths(CONFIG))
+EDGES = [
+    0,
+    1,
+    2,
+    3,
+    100,
+    101,
+    1000,
+    1001,
+    10000,
+    10001,
+    60000,
+    60001,
+    -1,
+    1e-4,
+    1e-3,
+    0.01,
+    0.1,
+    13,
+    -13,
+    13.01,
+    20,
+    20.1,
+]
+
+
+def changed(path, joint, item, value):
+    config = lab_configuration()
+    place = config
+    for name in path[:-1]:
+        place = place[name]
+    place = place[path[-1]]
+    index = (joint,) if path[0] == "joint" else ()
+    if place.ndim > len(index):
+        index += (item,)
+    with np.errstate(all="ignore"):
+        place[index] = np.array(value).astype(place.dtype)
+    return config
+
+
+def test_the_labs_configuration_is_good(is_valid):
+    assert is_valid(lab_configuration())
+    check_configuration(lab_configuration())
+
+
+values = st.one_of(st.sampled_from(EDGES), st.floats(-2e4, 7e4), st.just(float("nan")), st.just(float("inf")))
+
+
+@given(path=st.sampled_from(FIELDS), joint=st.integers(0, 5), item=st.integers(0, 8), value=values)
+@example(path=("silence_ticks",), joint=0, item=0, value=1)
+@example(path=("joint", "pot", "jump_rad"), joint=2, item=0, value=1e-4)
+def test_the_host_refuses_what_the_board_would(is_valid, path, joint, item, value):
+    config = changed(path, joint, item, value)
+    try:
+        check_configuration(config)
+    except InputError as error:
+        assert not is_valid(config), error
+    else:
+        assert is_valid(config), path
+
+
+@pytest.mark.parametrize("path", FIELDS, ids=".".join)
+def test_every_range_is_held_on_both_sides(is_valid, path):
+    for value in EDGES:
+        config = changed(path, 1, 1, value)
+        try:
+            check_configuration(config)
+            good = True
+        except InputError:
+            good = False
+        assert good == is_valid(config), value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("joint", "soft_min_rad"), 2.5, "joint 2: soft_min_rad must be below soft_max_rad"),
+        (("joint", "pot", "direction"), 0, "joint 2: direction is 0; 1 or -1 is allowed"),
+        (("joint", "pot", "counts"), 1, "joint 2: the counts of the potentiometer's table must rise"),
+        (("joint", "pot", "angle_rad"), -2.6, "joint 2: the angles of the potentiometer's table"),
+        (("joint", "pot", "short_counts"), 65000, "joint 2: short_counts must be below open_counts"),
+        (("joint", "gains", "ki_per_rad_s"), 1001, "joint 2: ki_per_rad_s is 1001; 0 to 1000 is allowed"),
+        (("silence_reaction",), 3, "silence_reaction is 3; 1 .hold. or 2 .release. is allowed"),
+        (("supply_min_mv",), 15000, "supply_min_mv must be below supply_max_mv"),
+        (("pot_ticks",), 0, "pot_ticks is 0; 1 to 100 is allowed"),
+    ],
+)
+def test_what_is_wrong_is_named(path, value, said):
+    with pytest.raises(InputError, match=said):
+        check_configuration(changed(path, 1, 1, value))
+
+
+def test_something_else_is_no_configuration():
+    with pytest.raises(InputError, match="this is no configuration"):
+        check_configuration(np.zeros(3))
+    with pytest.raises(InputError, match="this is no configuration"):
+        check_configuration(np.zeros(2, CONFIG))
+
+
+def test_gains_keep_their_order():
+    config = lab_configuration()
+    config["joint"]["gains"][4] = (1, 2, 3, 4, 0.5, 6)
+    assert gains_array(config)[4].tolist() == [1, 2, 3, 4, 0.5, 6]
+    assert check_gains(gains_array(config)).shape == (6, 6)

@@ -1,0 +1,177 @@
+"""The lock-step link: who lets time pass, how fast bytes ride in, what can be made to go wrong."""
+
+import numpy as np
+import pytest
+from board_rigs import hold, host_board
+
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC
+from armsight.robot.boards.machines import MACHINES, open_machine
+from armsight.robot.boards.opening import configured, open_board
+from armsight.sim.joints import JointPlant
+
+
+class RecordingMachine:
+    """Keeps the requests and answers each with its tick."""
+
+    def __init__(self, **changed):
+        self.requests, self.changed, self.closed = [], changed, False
+
+    def tick(self, request):
+        frame = np.frombuffer(request, REQUEST)[0]
+        self.requests.append(frame)
+        answer = np.zeros((), ANSWER)
+        answer["magic"], answer["version"], answer["tick"] = ANSWER_MAGIC, 1, frame["tick"]
+        for name, value in self.changed.items():
+            answer[name] = value
+        return answer.tobytes()
+
+    def close(self):
+        self.closed = True
+
+
+def test_requests_carry_what_is_sensed():
+    machine, plant = RecordingMachine(), JointPlant()
+    plant.supply_mv, plant.stop_pressed = 11500, True
+    link = EmulatedLink(machine, plant)
+    link.step(2)
+    first, second = machine.requests
+    assert (first["magic"], first["version"], first["tick"], second["tick"]) == (REQUEST_MAGIC, 1, 1, 2)
+    assert (first["supply_mv"], first["stop_pressed"]) == (11500, 1)
+    assert np.abs(first["counts"].astype(int) - 32768).max() < 40
+    assert link.t_s == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("baud", [9600, 115200, 921600])
+def test_bytes_ride_in_at_the_baud_rate(baud):
+    machine = RecordingMachine()
+    link = EmulatedLink(machine, JointPlant(), baud)
+    link.step(50)  # what the wire could have carried meanwhile does not add up
+    sent = bytes(k % 251 for k in range(700))
+    link.write(sent[:400])
+    link.write(sent[400:])
+    link.step(900)
+    lengths = [int(frame["length"]) for frame in machine.requests[50:]]
+    arrived = b"".join(frame["bytes"][: frame["length"]].tobytes() for frame in machine.requests)
+    assert arrived == sent
+    ticks = len(sent) / (baud / 10_000)
+    last = max(k for k, length in enumerate(lengths) if length) + 1
+    assert abs(last - ticks) <= 1
+    assert max(lengths) <= np.ceil(baud / 10_000) + 1
+
+
+def test_wire_faults_stand_between_both_sides():
+    class Swap:
+        def to_board(self, tick, data):
+            return data[::-1]
+
+        def to_host(self, tick, data):
+            return data + bytes([tick])
+
+    machine = RecordingMachine(length=2)
+    link = EmulatedLink(machine, JointPlant(), faults=Swap())
+    link.write(b"abc")
+    assert link.read(0.002) == b"\0\0\1\0\0\2"
+    assert machine.requests[0]["bytes"][:3].tobytes() == b"cba"
+
+
+def test_a_world_that_owns_the_time_steps_the_link():
+    machine, asked = RecordingMachine(), []
+
+    def advance(dt_s):
+        asked.append(dt_s)
+        for _ in range(round(dt_s * 1000)):
+            link.step()
+
+    link = EmulatedLink(machine, JointPlant(), advance=advance)
+    link.read(0.003)
+    link.read()
+    assert asked == [0.003]
+    assert len(machine.requests) == 3
+
+
+def test_a_whole_board_runs_in_a_world_that_owns_the_time():
+    link = EmulatedLink(open_machine("host"), JointPlant(), advance=lambda dt_s: link.step(round(dt_s * 1000)))
+    board = configured(link)
+    board.enable()
+    assert board.status.state == State.ENABLED
+
+
+@pytest.mark.parametrize("changed", [{"magic": 0}, {"version": 2}, {"tick": 9}])
+def test_an_answer_of_another_image_is_refused(changed):
+    link = EmulatedLink(RecordingMachine(**changed), JointPlant())
+    with pytest.raises(
+        DeviceError, match="did not answer tick 1 with a frame of version 1: its image and this armsight"
+    ):
+        link.step()
+
+
+def test_a_closed_link_says_so_and_ends_its_machine():
+    machine = RecordingMachine()
+    link = EmulatedLink(machine, JointPlant())
+    link.close()
+    link.close()
+    assert machine.closed
+    for use in (link.read, link.step, lambda: link.write(b"x")):
+        with pytest.raises(DeviceError, match="the emulated board is closed"):
+            use()
+
+
+@pytest.mark.parametrize("baud", [0, -1])
+def test_a_baud_rate_must_be_one(baud):
+    with pytest.raises(InputError, match="baud"):
+        EmulatedLink(RecordingMachine(), JointPlant(), baud)
+
+
+def test_lost_time_is_told_by_its_own_fault():
+    for spoil, fault in (
+        (lambda link: link.miss(3), Fault.TICK_MISSED),
+        (lambda link: link.overrun(), Fault.TICK_OVERRUN),
+    ):
+        board, link, _ = host_board()
+        board.enable()
+        board.send(hold([0.0] * 6))
+        spoil(link)
+        board.receive(0.03)
+        assert [each.fault for each in board.status.faults] == [fault]
+        assert board.status.state == State.HOLDING
+
+
+def test_missed_time_moves_the_arm_on():
+    board, link, plant = host_board()
+    board.enable()
+    for k in range(40):
+        board.send(hold([0.01 * (k + 1)] * 6))
+        board.receive(0.01)
+    before, duty = plant.q.copy(), link.answer["outputs"]["duty"].copy()
+    link.miss(10)
+    assert (duty > 0.05).all()
+    assert (plant.q > before + 0.002).all()
+
+
+def test_a_power_cut_switches_the_drives_off():
+    board, link, _ = host_board()
+    board.enable()
+    assert link.answer["outputs"]["drives_on"]
+    link.restart()
+    link.step()
+    assert not link.answer["outputs"]["drives_on"]
+    assert Board(link).status.faults == ()
+
+
+def test_boards_are_opened_by_name():
+    board = open_board("emulated:host", JointPlant())
+    assert board.status.state == State.DISABLED
+    board.close()
+    with pytest.raises(InputError, match="no board 'emulated:avr'; there are emulated:unicorn, emulated:qemu"):
+        open_board("emulated:avr", JointPlant())
+    with pytest.raises(InputError, match="no board '/dev/ttyACM0'; .* and serial:PORT"):
+        open_board("/dev/ttyACM0")
+    with pytest.raises(InputError, match="emulated:host needs a plant"):
+        open_board("emulated:host")
+    with pytest.raises(InputError, match="no machine 'bochs'; there are unicorn, qemu, host"):
+        open_machine("bochs")
+    assert set(MACHINES) == {"unicorn", "qemu", "host"}

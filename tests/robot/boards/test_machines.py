@@ -1,0 +1,128 @@
+"""The machines: the same bits from every compiler on every one of them, and what is said where one cannot run."""
+
+import hashlib
+import shutil
+
+import pytest
+
+from armsight.app.board_scenarios import DRIVEN
+from armsight.app.board_selftest import run_scenario
+from armsight.errors import DeviceError, InputError
+from armsight.firmware import build
+from armsight.robot.boards import qemu
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.frames import ANSWER, REQUEST
+from armsight.robot.boards.host import HostMachine
+from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.qemu import QemuMachine
+from armsight.robot.boards.unicorn import UnicornMachine
+from armsight.sim.joints import JointPlant
+
+COMPILERS = ("zig", "gcc")
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """The emulated board's image by compiler, of this checkout's sources."""
+    folder = tmp_path_factory.mktemp("images")
+    found = build.compilers()
+    return {name: build.build_board("pil", folder / f"{name}.elf", found[name]) for name in COMPILERS if name in found}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The host library of this checkout's sources."""
+    return build.build_host(tmp_path_factory.mktemp("library") / "host.so", build.open_compiler())
+
+
+@pytest.fixture(scope="module")
+def expected(library):
+    """What each scenario does on the host build."""
+    return {name: run_scenario(scenario, HostMachine(library)) for name, scenario in DRIVEN.items()}
+
+
+@pytest.mark.parametrize("scenario", DRIVEN)
+def test_every_scenario_passes(expected, scenario):
+    assert expected[scenario].problems == ()
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("machine", [UnicornMachine, QemuMachine])
+def test_every_machine_and_compiler_gives_the_same_bits(images, expected, machine, compiler):
+    if compiler not in images:
+        pytest.skip(f"{compiler} is not installed")
+    if machine is QemuMachine and not shutil.which(qemu.PROGRAM):
+        pytest.skip(f"{qemu.PROGRAM} is not installed")
+    for name, scenario in DRIVEN.items():
+        assert run_scenario(scenario, machine(images[compiler])) == expected[name], name
+
+
+def test_one_bit_of_a_potentiometer_is_another_trace():
+    """What the hashes are made of is all that the firmware does: the smallest difference shows."""
+
+    class Nudged(JointPlant):
+        def sense(self):
+            sensed = super().sense()
+            if self.nudge:
+                sensed.counts.flags.writeable = True
+                sensed.counts[5] ^= 4
+            self.nudge = False
+            return sensed
+
+    traces = []
+    for nudge in (False, True):
+        trace, plant = hashlib.sha256(), Nudged()
+        plant.nudge = nudge
+        link = EmulatedLink(open_machine("host"), plant, watch=trace.update)
+        link.step(3)
+        traces.append(trace.digest())
+    assert traces[0] != traces[1]
+
+
+def test_two_host_boards_do_not_share_anything(library):
+    first, second = (EmulatedLink(HostMachine(library), JointPlant(seed=seed)) for seed in (1, 2))
+    first.step(5)
+    second.step(1)
+    assert first.answer["tick"] == 5
+    assert second.answer["tick"] == 1
+
+
+def test_a_missing_qemu_is_told(monkeypatch, images):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="qemu-system-arm is not installed: apt install qemu-system-arm, or use"):
+        QemuMachine(next(iter(images.values())))
+
+
+def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
+    if not shutil.which(qemu.PROGRAM):
+        pytest.skip(f"{qemu.PROGRAM} is not installed")
+    broken = tmp_path / "none.elf"
+    broken.write_bytes(b"\x7fELF nothing more")
+    machine = QemuMachine(broken)
+    with pytest.raises(DeviceError, match="the emulated board broke down: qemu-system-arm ended"):
+        for _ in range(3):
+            machine.tick(bytes(REQUEST.itemsize))
+    machine.close()
+    machine.close()
+
+
+def test_a_request_that_is_none_runs_no_tick(images):
+    machine = UnicornMachine(images[next(iter(images))])
+    answer = machine.tick(bytes(REQUEST.itemsize))
+    assert len(answer) == ANSWER.itemsize
+    assert answer[:4] == b"ASNO"
+
+
+def test_an_image_that_breaks_down_is_told(images):
+    machine = UnicornMachine(images[next(iter(images))])
+    machine._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
+    with pytest.raises(DeviceError, match="the emulated board broke down"):
+        machine.tick(bytes(REQUEST.itemsize))
+
+
+@pytest.mark.parametrize("machine", [UnicornMachine, HostMachine])
+def test_a_file_that_is_no_firmware_is_named(machine, tmp_path):
+    wrong = tmp_path / "wrong.so"
+    wrong.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="wrong.so"):
+        machine(wrong)
