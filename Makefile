@@ -20,7 +20,8 @@ bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings ar
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
 	cd benchmarks && for each in calibration markers kinematics motions; do ../$(BIN)/python $$each.py || exit 1; done
 
-$(VENV)/.armsight: pyproject.toml
+# The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
+$(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[all]"
 	touch $@
@@ -30,4 +31,4 @@ $(VENV)/.armsight-test: $(VENV)/.armsight
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo build src/armsight/firmware/built .pytest_cache .mypy_cache .ruff_cache .hypothesis

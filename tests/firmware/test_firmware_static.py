@@ -1,4 +1,4 @@
-"""What reads the sources, or runs them under guard: warnings, analysers, sanitizers, a fuzzer, and how much the tests reach."""
+"""What reads the sources or runs them under guard: warnings, analysers, sanitizers, a fuzzer; what the tests reach."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""The same trace, bit for bit, from every compiler on every machine; what the image needs of the processor, and its size."""
+"""The same trace, bit for bit, from every compiler on every machine; what the image needs, and its size."""
 
 import json
 
