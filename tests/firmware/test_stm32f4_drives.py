@@ -146,6 +146,17 @@ def test_a_stop_shorter_than_a_tick_is_not_forgotten(emulator, pin):
     assert not stopped(emulator)  # told once
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_what_the_line_did_before_its_pins_were_connected_is_no_stop(compiler):
+    emulator = fresh(compiler)
+    emulator.chip.inputs |= {"PA6": 0, "PB12": 0}
+    emulator.power_up("clock_start", "drives_start", "pins_start")
+    emulator.chip["TIM1.SR"] |= 1 << 7
+    emulator.chip["TIM8.SR"] |= 1 << 7
+    emulator.call("drives_run")
+    assert not stopped(emulator)
+
+
 def test_a_cut_wire_is_a_stop(emulator):
     emulator.chip.inputs.clear()
     emulator.chip.breaks()

@@ -209,6 +209,9 @@ def test_a_tick_that_takes_too_long_is_told_and_its_millisecond_counted(moving):
     moving.run(200)
     assert moving.status.faults == 1 << c.FAULT_TICK_MISSED | 1 << c.FAULT_TICK_OVERRUN
     assert moving.status.state == c.STATE_HOLDING
+    moving.order(c.COMMAND_CLEAR_FAULTS)  # refused as long as a cause stands: told once, it does not
+    moving.run(10)
+    assert (moving.status.state, moving.status.faults) == (c.STATE_ENABLED, 0)
 
 
 def test_the_watchdog_is_fed_once_a_tick_and_not_by_a_broken_core(moving):

@@ -71,6 +71,11 @@ def test_the_clocks_are_what_the_drivers_reckon_with(booted):
     assert abs(chip.apb1()[0] / chip["USART2.BRR"] / 921600 - 1) < 0.00375
 
 
+def test_the_tick_can_be_interrupted_by_its_timer_and_interrupts_nothing_else(booted):
+    """PendSV, which runs it, has the lowest priority; SysTick, which counts, the highest."""
+    assert booted.chip["SCB.SHPR3"] == 0xF0 << 16
+
+
 def test_the_clock_security_watches_the_external_clock(booted):
     assert booted.chip["RCC.CR"] >> 19 & 1
     assert booted.chip["RCC.CR"] >> 18 & 1  # the ST-Link's clock, no crystal

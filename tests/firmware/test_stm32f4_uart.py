@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stm32f4_build import COMPILERS, fresh
 from stm32f4_emulator import RAM
+from stm32f4_registers import NAMED
 
 RING = 1024
 PIECE = 256
@@ -82,6 +83,25 @@ def test_a_wrap_between_two_turns_is_not_taken_for_a_loss(emulator):
         data = bytes([turn]) * 92
         emulator.chip.receive(data)
         assert take(emulator) == (data, 0)
+
+
+def test_a_wrap_just_while_the_ring_is_looked_at_is_no_loss(emulator):
+    """Bytes come in between the reading of the flag and that of the position: the flag seen next time is an old one."""
+    chip, late = emulator.chip, [b"b" * 100]
+    chip.receive(b"a" * 1000)
+    assert take(emulator, 1000) == (b"a" * 1000, 0)
+    read = chip.read
+
+    def read_late(address, size):
+        value = read(address, size)
+        if address == NAMED["DMA1.HISR"] and late:
+            chip.receive(late.pop())
+        return value
+
+    chip.read = read_late
+    assert take(emulator, 1000) == (b"b" * 100, 0)
+    chip.receive(b"c" * 50)
+    assert take(emulator, 1000) == (b"c" * 50, 0)
 
 
 def test_a_byte_the_receiver_lost_is_counted_and_the_flag_cleared(emulator):
