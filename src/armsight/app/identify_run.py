@@ -1,0 +1,199 @@
+"""One identification from files to files: read, identify, hold against poses left out, and write what comes of it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.errors import CalibrationError, InputError
+from armsight.files import check_writable, write_text
+from armsight.loop.identify.corrected import Corrected
+from armsight.loop.identify.identify import Identified, identify
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.toml_write import table_text, zeros_text
+from armsight.loop.identify.validate import Errors, Validation, validate
+from armsight.robot.arm import Arm
+
+#: Parts for the held-out error where nothing is given to validate with; with more poses than this one part is enough.
+FOLDS, MANY = 5, 500
+#: What is written beside the report.
+FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json")
+
+
+@dataclass(frozen=True, eq=False)
+class Run(Record):
+    """What an identification came to.
+
+    Attributes:
+        arm: the nominal arm.
+        measured: what it was identified from.
+        found: the identified arm.
+        held_out: nominal and identified arm on poses that were not fitted to.
+        held_out_poses: (H, 6) joint angles of those, rad.
+        how: in words, which poses those are.
+        lines: (N,) lines of the file that the poses come from.
+        notes: what a person should know.
+    """
+
+    arm: Arm
+    measured: Measured
+    found: Identified
+    held_out: Validation
+    held_out_poses: Array
+    how: str
+    lines: Array
+    notes: tuple[str, ...]
+
+
+def run_identify(
+    arm: Arm,
+    measured: Measured,
+    lines: Array,
+    other: Measured | None,
+    *,
+    priors: Mapping[str, float] | None = None,
+    notes: tuple[str, ...] = (),
+    progress: Callable[[str], None] = lambda line: None,
+) -> Run:
+    """Identify an arm and hold it against poses left out.
+
+    Args:
+        arm: the nominal arm.
+        measured: joint angles, and where the tool was seen.
+        lines: (N,) lines of the file that they come from.
+        other: poses to validate with; None: parts of ``measured`` are left out in turn.
+        priors: as in :func:`identify`.
+        notes: of the reading.
+        progress: is told what is being done.
+    """
+    found = identify(arm, measured, priors=priors, progress=progress)
+    if other is not None:
+        held_out = validate(found, other)
+        how = f"{len(other)} poses of another file" + (", base and tool placed anew" if held_out.placed_anew else "")
+        poses = other.q
+    else:
+        held_out, poses, how = _left_out(arm, measured, priors, progress)
+    return Run(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
+
+
+def _left_out(
+    arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
+) -> tuple[Validation, Array, str]:
+    """Identify without a part, and measure on it; with few poses in turn for every part."""
+    order = np.random.default_rng(0).permutation(len(measured))
+    parts = np.array_split(order, min(FOLDS, len(order)))
+    tried = parts if len(measured) <= MANY else parts[:1]
+    done, rows = [], []
+    for i, part in enumerate(tried):
+        progress(f"error on poses left out, part {i + 1} of {len(tried)}")
+        try:
+            done.append(
+                validate(identify(arm, measured.rows(np.setdiff1d(order, part)), priors=priors), measured.rows(part))
+            )
+        except (InputError, CalibrationError) as error:
+            raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
+        rows.append(part)
+    over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
+    joined = Validation(_joined([v.nominal for v in done]), _joined([v.identified for v in done]), False, over)
+    how = f"{sum(map(len, rows))} poses left out" + (" in five turns" if len(tried) > 1 else " of the fit")
+    return joined, measured.q[np.concatenate(rows)], how
+
+
+def _joined(errors: list[Errors]) -> Errors:
+    return Errors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
+
+
+def _notes(found: Identified, measured: Measured, lines: Array) -> tuple[str, ...]:
+    """Say what a person should know about the data."""
+    notes = []
+    if len(found.left_out):
+        told = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
+        notes.append(f"{len(found.left_out)} poses taken for mistakes and left out: line {told}")
+    numbers = len(measured) * measured.size
+    free = int(found.solution.free.sum())
+    if numbers < 3 * len(found.model.nominal()):
+        notes.append(
+            f"{len(measured)} poses are {numbers} numbers for {len(found.model.nominal())} parameters: only {free} that "
+            "the poses can tell, and that pay, were fitted; `armsight identify plan` says where to look next"
+        )
+    return tuple(notes)
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """Return the JSON object of a run, SI units."""
+    found, sigma = run.found, np.sqrt(np.diag(run.found.cov))
+    nominal = found.model.nominal()
+    parameters = []
+    for k, p in enumerate(found.model.parameters):
+        free = bool(found.solution.free[k])
+        parameters.append(
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "nominal": None if p.kind in ("base", "tool") else float(nominal[k]),
+                "value": float(found.solution.x[k]),
+                "sigma": float(sigma[k]) if free else None,
+                "frozen": found.reasons.get(p.name),
+            }
+        )
+    return {
+        "model": run.arm.name,
+        "poses": len(run.measured),
+        "left_out_lines": [int(run.lines[k]) for k in found.left_out],
+        "validation": run.how,
+        "validation_placed_anew": run.held_out.placed_anew,
+        "nominal": run.held_out.nominal.summary(),
+        "identified": run.held_out.identified.summary(),
+        "residual_over_predicted": run.held_out.residual_over_predicted,
+        "noise_m": found.solution.noise[0],
+        "noise_rad": found.solution.noise[1] if found.model.full else None,
+        "parameters": parameters,
+        "correlated": [{"a": a, "b": b, "correlation": c} for a, b, c in found.correlated()],
+        "growth": [{"cause": s.cause, "parameters": list(s.names), "held_out_rms": s.rms} for s in found.steps],
+        "notes": list(run.notes),
+    }
+
+
+def check_folder(out: Path, apart_from: tuple[Path | None, ...]) -> Path:
+    """Make the folder of the results, before long work.
+
+    Raises:
+        InputError: it cannot be made or written to, or a result would replace what is read.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
+    for name in (*FILES, "report.html"):
+        check_writable(out / name, apart_from=apart_from)
+    return out
+
+
+def write_results(run: Run, out: Path) -> None:
+    """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
+    corrected = Corrected.of(run.found)
+    write_text(out / "corrected.toml", table_text(run.found))
+    write_text(out / "corrected.urdf", corrected.urdf())
+    write_text(out / "zeros.toml", zeros_text(run.found))
+    write_text(out / "parameters.csv", _parameters(run))
+    write_text(out / "identify.json", json.dumps(summary(run), indent=1) + "\n")
+
+
+def _parameters(run: Run) -> str:
+    """Return the parameters as CSV, SI units."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(("name", "unit", "nominal", "value", "sigma", "frozen"))
+    for p in summary(run)["parameters"]:
+        writer.writerow(
+            ["" if p[key] is None else p[key] for key in ("name", "unit", "nominal", "value", "sigma", "frozen")]
+        )
+    return out.getvalue()

@@ -1,0 +1,97 @@
+"""What a joint's true angle may differ by from what its sensor reads: linear in the unknown coefficients.
+
+gain: the sensor's scale. wave: linearity error of a sensor of one turn, sin and cos of its angle and of twice that.
+backlash: half of it to either side, by the direction of approach. sag: a compliant gear under the links' weight; the torque
+about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j link j's own vector.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.loop.identify import chain
+from armsight.loop.identify.measured import Measured
+from armsight.robot.arm import Arm
+
+#: Harmonics of one turn of a joint's sensor.
+WAVES = (1, 2)
+#: A joint whose weight never changes by more than this lever, m, cannot show sag.
+LEAST_LEVER_M = 1e-3
+
+
+class Feature(NamedTuple):
+    """A cause that moves one joint.
+
+    Attributes:
+        name: of the coefficient.
+        kind: "gain", "wave", "backlash" or "sag".
+        joint: 0 to 5.
+        unit: of the coefficient.
+        detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose weight sags; (0, 0) elsewhere.
+    """
+
+    name: str
+    kind: str
+    joint: int
+    unit: str
+    detail: tuple[int, int] = (0, 0)
+
+
+def all_features(backlash: bool) -> tuple[Feature, ...]:
+    """Return every cause there is; ``backlash`` where directions of approach are known."""
+    found = []
+    for i in range(6):
+        found.append(Feature(f"gain{i + 1}", "gain", i, "1"))
+        for n in WAVES:
+            found += [Feature(f"wave{i + 1}_{w}{n}", "wave", i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
+        if backlash:
+            found.append(Feature(f"backlash{i + 1}", "backlash", i, "rad"))
+        found += [Feature(f"sag{i + 1}_{j + 1}", "sag", i, "rad/m", (j, 0)) for j in range(i, 6)]
+    return tuple(found)
+
+
+def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | None, up_base: Array) -> Array:
+    """Return what one unit of every coefficient adds to its joint's angle.
+
+    Args:
+        arm: the nominal arm, whose links the levers of sag are taken from.
+        features: F of them.
+        q: (N, 6) joint angles, rad.
+        approach: (N, 6) directions of approach, or None.
+        up_base: (3,) unit vector against gravity, base.
+
+    Returns:
+        (N, F).
+    """
+    out = np.zeros((len(q), len(features)))
+    levers = _levers(arm, q, up_base) if any(f.kind == "sag" for f in features) else np.zeros((0, 6, 6))
+    for k, f in enumerate(features):
+        angle = q[:, f.joint]
+        if f.kind == "gain":
+            out[:, k] = angle
+        elif f.kind == "wave":
+            n, phase = f.detail
+            out[:, k] = np.cos(n * angle) if phase else np.sin(n * angle)
+        elif f.kind == "backlash" and approach is not None:
+            out[:, k] = -0.5 * approach[:, f.joint]
+        elif f.kind == "sag":
+            out[:, k] = levers[:, f.joint, f.detail[0]]
+    return out
+
+
+def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
+    """Return z_i . (L_j x g) (N, 6, 6) for unit gravity g: m of lever of link j about joint i, by the joint's direction."""
+    T = arm.T_base_0
+    modified = arm.convention == "modified"
+    m = chain.motion(chain.nominal_table(arm), arm.direction * q, modified, T[:3, :3], T[:3, 3])
+    z, at = m.axis[:, chain.OFFSET], np.concatenate([m.through[:, chain.OFFSET], m.o[None]])
+    pull = np.cross(at[1:] - at[:-1], -up_base)  # link j goes from axis j to axis j + 1
+    return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
+
+
+def approaches(measured: Measured) -> bool:
+    """Say whether directions of approach are known."""
+    return measured.approach is not None and bool(np.any(measured.approach != 0))

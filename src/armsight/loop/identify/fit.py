@@ -1,0 +1,223 @@
+"""Least squares of an arm's parameters to what was seen of it, with priors, gross errors left out, and sigmas.
+
+Gauss-Newton on whitened residuals with the priors as further measurements. Where the instrument's covariance is given, what
+the residuals show beyond it (the arm's repeatability, what the model does not know) is estimated and added: one sigma of
+place, one of turn. A pose further from the model than chance allows is left out; the scale for that is the median's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import brentq
+from scipy.stats import chi2
+
+from armsight.data import Array, Record
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+
+Mask = NDArray[np.bool_]
+#: A pose whose residual has a smaller chance than this is taken for a mistake.
+CHANCE = 1e-7
+#: Gauss-Newton steps at most; it stops when no step is more than this part of a sigma.
+STEPS, SMALL_STEP = 25, 1e-3
+#: Rounds of leaving out gross errors and estimating the noise.
+ROUNDS = 6
+#: Noise below this, m or rad, is none: what rounding of a printed file leaves.
+LEAST_NOISE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Record):
+    """A fitted model.
+
+    Attributes:
+        x: (P,) the vector.
+        free: (P,) which of its numbers were fitted.
+        cov: (P, P) their covariance; zero where not fitted.
+        noise: sigma, beyond the covariance given, of the place along one axis, m, and of the turn about one, rad.
+        used: (N,) whether a pose was used.
+        history: RMS of the weighted residuals after every step.
+    """
+
+    x: Array
+    free: Mask
+    cov: Array
+    noise: tuple[float, float]
+    used: Mask
+    history: tuple[float, ...]
+
+    def sigma(self) -> Array:
+        """Return the sigma (P,) of every parameter."""
+        return np.sqrt(np.diag(self.cov))
+
+
+def noise_cov(measured: Measured, noise: tuple[float, float]) -> Array:
+    """Return the covariance (N, M, M) of residuals."""
+    variances = np.full(measured.size, noise[0] ** 2)
+    if measured.R_rig_body is not None:
+        variances[3:] = noise[1] ** 2
+    base = np.zeros((len(measured), measured.size, measured.size)) if measured.cov is None else measured.cov
+    return np.asarray(base + np.diag(variances))
+
+
+def whitener(measured: Measured, noise: tuple[float, float]) -> Array:
+    """Return W (N, M, M) or, where all poses are alike, (M, M), with W^T W the inverse covariance."""
+    if measured.cov is None:
+        return np.diag(1 / np.sqrt(np.diag(noise_cov(measured.rows(np.arange(1)), noise)[0])))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise_cov(measured, noise))))
+
+
+def fit(
+    model: Model,
+    x: Array,
+    measured: Measured,
+    free: Mask,
+    prior: Array,
+    *,
+    used: Mask | None = None,
+    noise: tuple[float, float] | None = None,
+) -> Solution:
+    """Fit the free parameters.
+
+    Args:
+        model: the arm.
+        x: (P,) start.
+        measured: what was seen.
+        free: (P,) what to fit; the rest stays as in ``x``.
+        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
+        used: (N,) poses to use; None: gross errors are found.
+        noise: to start from; None: from the residuals at the start.
+    """
+    phi = model.feature_values(measured.q, measured.approach)
+    keep = np.ones(len(measured), bool) if used is None else used
+    noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
+    history: list[float] = []
+    for _ in range(ROUNDS):
+        part, part_phi = measured.rows(keep), phi[keep]
+        x, H = _newton(model, x, part, part_phi, free, prior, noise, history)
+        e = model.residuals(x, measured, phi)
+        before, noise = noise, _noise(part, e[keep], _taken(H, free, prior))
+        kept, keep = keep, (_sane(measured, e, noise) if used is None else keep)
+        if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=LEAST_NOISE):
+            break
+    part = measured.rows(keep)
+    x, H = _newton(model, x, part, phi[keep], free, prior, noise, history)
+    cov = np.zeros((len(x), len(x)))
+    cov[np.ix_(free, free)] = np.linalg.inv(H)
+    return Solution(x, free, cov, noise, keep, tuple(history))
+
+
+def weighted(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> tuple[Array, Array]:
+    """Return whitened residuals (N, M) and their derivative (N, M, P)."""
+    e, J = model.linearised(x, measured, phi)
+    W = whitener(measured, noise)
+    return (W @ e[..., None])[..., 0], W @ J
+
+
+def covariance(
+    model: Model,
+    x: Array,
+    measured: Measured,
+    phi: Array,
+    free: Mask,
+    prior: Array,
+    noise: tuple[float, float],
+) -> Array:
+    """Return the covariance (P, P) of the free parameters at a vector; zero for the others."""
+    _, J = weighted(model, x, measured, phi, noise)
+    J = J[:, :, free].reshape(-1, int(free.sum()))
+    cov = np.zeros((len(x), len(x)))
+    cov[np.ix_(free, free)] = np.linalg.inv(J.T @ J + np.diag(_pull(prior, free)))
+    return cov
+
+
+def _pull(prior: Array, free: Mask) -> Array:
+    """Return the information that the priors of the free parameters bring."""
+    return np.asarray(np.where(np.isfinite(prior) & (prior > 0), prior, np.inf)[free] ** -2.0)
+
+
+def _newton(
+    model: Model,
+    x: Array,
+    measured: Measured,
+    phi: Array,
+    free: Mask,
+    prior: Array,
+    noise: tuple[float, float],
+    history: list[float],
+) -> tuple[Array, Array]:
+    """Return the best vector, and the information (F, F) about its free parameters."""
+    nominal, pull = _nominal(model, x, prior), _pull(prior, free)
+    for _ in range(STEPS):
+        e, J = weighted(model, x, measured, phi, noise)
+        J = J[:, :, free].reshape(-1, int(free.sum()))
+        H, g = J.T @ J + np.diag(pull), J.T @ e.ravel() + pull * (x - nominal)[free]
+        scale = 1 / np.sqrt(np.diag(H))
+        factor = cho_factor(scale[:, None] * H * scale)
+        step = scale * cho_solve(factor, scale * g)
+        x = x.copy()
+        x[free] -= step
+        history.append(float(np.sqrt(np.mean(e**2))))
+        if np.abs(step / scale).max(initial=0.0) < SMALL_STEP:
+            break
+    return x, H
+
+
+def _nominal(model: Model, x: Array, prior: Array) -> Array:
+    """Return what the priors pull towards: the nominal arm; base and tool are not pulled."""
+    return np.where(np.isfinite(prior), model.nominal(), x)
+
+
+def _taken(H: Array, free: Mask, prior: Array) -> float:
+    """Return how many measurements' freedom the fit has taken: parameters, less the share that priors determine."""
+    p = prior[free]
+    return float(len(H) - np.sum(np.diag(np.linalg.inv(H)) / np.where(p > 0, p, np.inf) ** 2))
+
+
+def _robust_noise(e: Array) -> tuple[float, float]:
+    """Return sigmas along one axis from median residuals."""
+    middle = np.sqrt(chi2.median(3))
+    places = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
+    turn = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0
+    return max(float(np.median(np.linalg.norm(places, axis=1)) / middle), LEAST_NOISE), max(turn, LEAST_NOISE)
+
+
+def _noise(measured: Measured, e: Array, taken: float) -> tuple[float, float]:
+    """Return the sigmas that make the weighted squares as large as their number allows."""
+    share = max(1 - taken / e.size, 0.5 / len(e))
+    if measured.R_rig_body is None:
+        return _extra(e, measured.cov, share), 0.0
+    covs = (None, None) if measured.cov is None else (measured.cov[:, :3, :3], measured.cov[:, 3:, 3:])
+    return _extra(e[:, :3], covs[0], share), _extra(e[:, 3:], covs[1], share)
+
+
+def _extra(e: Array, cov: Array | None, share: float) -> float:
+    """Return sigma with sum e^T (cov + sigma^2)^-1 e = share x their number; the least where cov is already enough."""
+    whole = float(np.sqrt(np.mean(e**2) / share))
+    if cov is None:
+        return max(whole, LEAST_NOISE)
+    values, vectors = np.linalg.eigh(cov)
+    squares = np.einsum("nji,nj->ni", vectors, e) ** 2
+
+    def over(sigma: float) -> float:
+        return float((squares / (np.maximum(values, 0) + sigma**2)).sum() - share * e.size)
+
+    if over(LEAST_NOISE) <= 0 or whole <= LEAST_NOISE:
+        return LEAST_NOISE
+    return float(brentq(over, LEAST_NOISE, whole * 1.01))
+
+
+def squares(measured: Measured, e: Array, noise: tuple[float, float]) -> Array:
+    """Return the squared Mahalanobis lengths (N,) of residuals."""
+    return np.asarray((((whitener(measured, noise) @ e[..., None])[..., 0]) ** 2).sum(axis=1))
+
+
+def _sane(measured: Measured, e: Array, noise: tuple[float, float]) -> Mask:
+    """Say which poses are no mistakes, by the scale of the median."""
+    far = squares(measured, e, noise)
+    scale = max(float(np.median(far)) / chi2.median(measured.size), 1e-300)
+    return np.asarray(far / scale < chi2.isf(CHANCE, measured.size))

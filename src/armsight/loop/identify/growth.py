@@ -1,0 +1,231 @@
+"""Which causes pay: the model grows by the error on poses left out, one cause at a time, and gives back what does not pay.
+
+Everything is scored on one linearisation: with each fold's H = J^T J and g = J^T e, a fit to the other folds and its
+squared error on this one are a few small matrix products, so that hundreds of models cost no more than one. Folds are
+made of clusters of joint angles rather than of rows: what is kept must hold where the arm was not looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+from armsight.data import Array
+from armsight.loop.identify.fit import Mask, Solution, weighted
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+
+#: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
+FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
+#: A cause pays where it lowers the held-out squares by this many standard errors of the fall over the folds.
+PAYS = 1.0
+#: Parameters further from nominal than this many sigmas pay for sure: their own removal is not tried.
+SURE = 8.0
+#: What the placement alone is.
+PLACEMENT = ("base", "tool")
+_GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
+
+
+class Step(NamedTuple):
+    """One step of the growth.
+
+    Attributes:
+        cause: what was added or, with a minus, given back.
+        names: its parameters.
+        rms: held-out RMS of the weighted residuals after it.
+    """
+
+    cause: str
+    names: tuple[str, ...]
+    rms: float
+
+
+class Growth(NamedTuple):
+    """What pays.
+
+    Attributes:
+        free: (P,) the parameters kept.
+        steps: how the model grew.
+        reasons: name -> why a parameter was not kept.
+    """
+
+    free: Mask
+    steps: tuple[Step, ...]
+    reasons: dict[str, str]
+
+
+class _Folds(NamedTuple):
+    """Normal equations of every fold at one linearisation."""
+
+    H: Array
+    g: Array
+    c: Array
+    numbers: Array
+    pull: Array
+    home: Array
+
+    def losses(self, free: Mask) -> Array:
+        """Return the mean squared error of every fold (F,) under a fit of ``free`` to the others."""
+        fixed = np.where(free, 0.0, self.home)  # from the linearisation back to nominal
+        H, g = self.H.sum(axis=0), self.g.sum(axis=0)
+        rows = np.flatnonzero(free)
+        A = (H - self.H)[:, rows[:, None], rows] + np.diag(self.pull[rows])
+        b = (g - self.g)[:, rows] + ((H - self.H)[:, rows] @ fixed) - (self.pull * self.home)[rows]
+        scale = 1 / np.sqrt(np.einsum("fii->fi", A))
+        step = -np.linalg.solve(A * scale[:, :, None] * scale[:, None], (b * scale)[..., None])[..., 0] * scale
+        delta = np.broadcast_to(fixed, self.g.shape).copy()
+        delta[:, rows] = step
+        squares = self.c + 2 * np.einsum("fi,fi->f", self.g, delta) + np.einsum("fi,fij,fj->f", delta, self.H, delta)
+        return np.asarray(squares / self.numbers)
+
+
+def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
+    """Return the fold (N,) of every pose: poses that are near each other in joint angles are left out together."""
+    k = min(CLUSTERS, len(q) // CLUSTER)
+    if k < folds:
+        return np.random.default_rng(0).permutation(len(q)) % min(folds, len(q))
+    at = np.concatenate([np.cos(q), np.sin(q)], axis=1)
+    _, labels = kmeans2(at, k, iter=5, minit="++", seed=np.random.default_rng(0))
+    found, labels = np.unique(labels, return_inverse=True)
+    return np.asarray((np.random.default_rng(1).permutation(len(found)) % folds)[labels])
+
+
+def grown(
+    model: Model,
+    start: Solution,
+    measured: Measured,
+    free: Mask,
+    prior: Array,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Growth:
+    """Grow the model from base and tool alone.
+
+    Args:
+        model: the arm with every cause.
+        start: a fit to linearise at, with the poses used and the noise.
+        measured: the poses.
+        free: (P,) what the poses can tell.
+        prior: (P,) prior sigmas.
+        progress: is told what is tried.
+    """
+    part = measured.rows(start.used)
+    folds = _folds(model, start, part, folds_of(part.q), prior)
+    groups = _groups(model, free)
+    kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])
+    losses = folds.losses(kept)
+    steps = [Step("base and tool", _named(model, kept), _rms(losses, folds))]
+    while groups:
+        tried = {name: folds.losses(kept | mask) for name, mask in groups.items()}
+        paying = [name for name in tried if _pays(losses, tried[name], folds)]
+        if not paying:
+            break
+        name = min(paying, key=lambda n: _rms(tried[n], folds))
+        added = groups.pop(name)
+        kept, losses = kept | added, tried[name]
+        steps.append(Step(name, _named(model, added), _rms(losses, folds)))
+        progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
+    kept, given_back = _pruned(model, start, folds, kept, steps)
+    return Growth(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
+
+
+def _reasons(
+    model: Model, folds: _Folds, kept: Mask, groups: dict[str, Mask], given_back: dict[str, Array]
+) -> dict[str, str]:
+    """Say why what was not kept was not."""
+    rms = _rms(folds.losses(kept), folds)
+    reasons: dict[str, str] = {}
+    for mask in groups.values():
+        told = _unpaid(folds.losses(kept | mask), folds, rms)
+        reasons |= {model.names[k]: told for k in np.flatnonzero(mask)}
+    return reasons | {name: _unpaid(losses, folds, rms) for name, losses in given_back.items()}
+
+
+def _folds(model: Model, start: Solution, measured: Measured, labels: NDArray[np.int64], prior: Array) -> _Folds:
+    """Sum up the normal equations fold by fold."""
+    phi = model.feature_values(measured.q, measured.approach)
+    e, J = weighted(model, start.x, measured, phi, start.noise)
+    size = e.shape[1]
+    H, g, c, numbers = [], [], [], []
+    for k in range(int(labels.max()) + 1):
+        rows = labels == k
+        Jk, ek = J[rows].reshape(-1, J.shape[2]), e[rows].ravel()
+        H.append(Jk.T @ Jk)
+        g.append(Jk.T @ ek)
+        c.append(float(ek @ ek))
+        numbers.append(size * int(rows.sum()))
+    pull = np.where(np.isfinite(prior) & (prior > 0), prior, np.inf) ** -2.0
+    home = np.where(np.isfinite(prior), model.nominal() - start.x, 0.0)
+    return _Folds(np.array(H), np.array(g), np.array(c), np.array(numbers, float), pull, home)
+
+
+def _named(model: Model, mask: Mask) -> tuple[str, ...]:
+    return tuple(model.names[k] for k in np.flatnonzero(mask))
+
+
+def _groups(model: Model, free: Mask) -> dict[str, Mask]:
+    """Return the causes that can be added, each with its parameters."""
+    groups: dict[str, Mask] = {}
+    for k, p in enumerate(model.parameters):
+        if not free[k] or p.kind in PLACEMENT:
+            continue
+        name = _GROUPS.get(p.kind, f"{p.kind} of joint {p.joint + 1}")
+        if p.kind == "wave":
+            name += f", {p.name[-1]} a turn"
+        groups.setdefault(name, np.zeros(len(free), bool))[k] = True
+    return groups
+
+
+def _rms(losses: Array, folds: _Folds) -> float:
+    return float(np.sqrt(np.sum(losses * folds.numbers) / folds.numbers.sum()))
+
+
+def _pays(without: Array, with_it: Array, folds: _Folds) -> bool:
+    """Say whether the fall of the held-out squares is more than chance over the folds."""
+    fall = (without - with_it) * folds.numbers
+    return bool(fall.sum() > PAYS * np.sqrt(len(fall)) * fall.std(ddof=1))
+
+
+def _pruned(
+    model: Model, start: Solution, folds: _Folds, kept: Mask, steps: list[Step]
+) -> tuple[Mask, dict[str, Array]]:
+    """Give back, one at a time, parameters without which the held-out error is no worse."""
+    given_back: dict[str, Array] = {}
+    placement = np.array([p.kind in PLACEMENT for p in model.parameters])
+    while True:
+        doubtful = [int(k) for k in np.flatnonzero(kept & ~placement) if _doubt(folds, kept, int(k))]
+        losses = folds.losses(kept)
+        best = min(((_rms(folds.losses(_without(kept, k)), folds), k) for k in doubtful), default=None)
+        if best is None or best[0] > _rms(losses, folds):
+            return kept, given_back
+        k = best[1]
+        kept = _without(kept, k)
+        given_back[model.names[k]] = losses
+        steps.append(Step(f"-{model.names[k]}", (model.names[k],), best[0]))
+
+
+def _doubt(folds: _Folds, kept: Mask, k: int) -> bool:
+    """Say whether a parameter is so near its nominal value that leaving it there may cost nothing."""
+    rows = np.flatnonzero(kept)
+    A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
+    fixed = np.where(kept, 0.0, folds.home)
+    b = folds.g.sum(axis=0)[rows] + folds.H.sum(axis=0)[rows] @ fixed - (folds.pull * folds.home)[rows]
+    cov = np.linalg.inv(A)
+    i = int(np.flatnonzero(rows == k)[0])
+    off = float((-cov @ b)[i] - folds.home[k])
+    return abs(off) < SURE * float(np.sqrt(cov[i, i]))
+
+
+def _without(kept: Mask, k: int) -> Mask:
+    out = kept.copy()
+    out[k] = False
+    return out
+
+
+def _unpaid(losses_with: Array, folds: _Folds, rms: float) -> str:
+    change = _rms(losses_with, folds) / rms - 1
+    told = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
+    return f"does not pay: with it the held-out error {told}"

@@ -1,0 +1,222 @@
+"""Identify an arm: what each number of it is, with sigma, and how much better it then says where its tool is.
+
+In: the nominal arm and :class:`Measured`. Out: :class:`Identified`. Order: is this the arm at all; where base and tool are;
+what the poses can tell; a fit of the table; growth by the error on poses left out; the final fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import CalibrationError, InputError
+from armsight.loop.identify.diagnose import check_plausible, without_tool
+from armsight.loop.identify.evidence import scaled_prior
+from armsight.loop.identify.features import approaches
+from armsight.loop.identify.fit import Mask, Solution, covariance, fit
+from armsight.loop.identify.growth import PLACEMENT, Step, grown
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.observable import Observed, observed
+from armsight.loop.identify.place import placed
+from armsight.loop.identify.priors import prior_sigma
+from armsight.robot.arm import Arm
+
+#: Fewest poses: what places base and tool, with some to spare.
+LEAST_POINTS, LEAST_FULL = 6, 4
+#: Correlations larger than this are told.
+CORRELATED = 0.9
+_TABLE = ("offset", "d", "a", "alpha", "beta")
+
+
+@dataclass(frozen=True, eq=False)
+class Identified(Record):
+    """An identified arm.
+
+    Attributes:
+        model: the nominal arm with every parameter.
+        nominal: (P,) base and tool fitted, the rest nominal.
+        solution: the fit.
+        reasons: name -> why a parameter is not fitted, or what its value shares.
+        steps: how the model grew.
+        singular_values: of the Jacobian of what the poses can tell, in units of prior sigmas.
+        prior: (P,) prior sigmas, those of the causes as large as the data show them to be.
+        cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma holds what the causes that
+            did not pay, or hardly show, could still be, and what leaving them out has moved it. ``solution.cov`` is that
+            of the fitted ones, the rest taken for nominal.
+    """
+
+    model: Model
+    nominal: Array
+    solution: Solution
+    reasons: Mapping[str, str]
+    steps: tuple[Step, ...]
+    singular_values: Array
+    prior: Array
+    cov: Array
+
+    @property
+    def left_out(self) -> NDArray[np.int64]:
+        """Return the rows that were taken for mistakes."""
+        return np.asarray(np.flatnonzero(~self.solution.used), np.int64)
+
+    def value(self, name: str) -> tuple[float, float]:
+        """Return value and sigma of a parameter."""
+        k = self.model.names.index(name)
+        return float(self.solution.x[k]), float(np.sqrt(self.cov[k, k]))
+
+    def correlated(self) -> list[tuple[str, str, float]]:
+        """Return the pairs of fitted parameters whose correlation is over CORRELATED, strongest first."""
+        rows = np.flatnonzero(self.solution.free)
+        sigma = np.sqrt(np.diag(self.cov))[rows]
+        C = self.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma)
+        i, j = np.nonzero(np.triu(np.abs(C) > CORRELATED, 1))
+        names = self.model.names
+        pairs = [(names[rows[a]], names[rows[b]], float(C[a, b])) for a, b in zip(i, j, strict=True)]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def identify(
+    arm: Arm,
+    measured: Measured,
+    *,
+    priors: Mapping[str, float] | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Identified:
+    """Find what an arm really is.
+
+    Args:
+        arm: the nominal arm; where base and tool are is found from the data.
+        measured: joint angles, and where the tool was seen.
+        priors: sigma by name of a parameter or a kind, instead of ``priors.SIGMA``; 0 keeps one at its nominal value.
+        progress: is told what is being done.
+
+    Raises:
+        InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
+        CalibrationError: poses so alike that not even base and tool can be told.
+    """
+    _require_enough(measured)
+    arm = without_tool(arm)
+    progress("is this the arm")
+    check_plausible(arm, measured)
+    model, x = placed(Model.of(arm, measured, backlash=approaches(measured)), measured)
+    prior = prior_sigma(model, priors)
+    placement = _of(model, PLACEMENT)
+    at = _first(model, x, measured, prior)
+    _require_placed(model, at.x, measured, prior, at.noise, placement)
+    progress("base and tool")
+    start = fit(model, at.x, measured, placement, prior)
+    return _identified(model, start, measured, prior, placement, progress)
+
+
+def _identified(
+    model: Model, start: Solution, measured: Measured, prior: Array, placement: Mask, progress: Callable[[str], None]
+) -> Identified:
+    """Go from base and tool to the whole."""
+    progress("lengths, angles and zeros")
+    table = observed(model, start.x, measured, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
+    geometric = fit(model, start.x, measured, table, prior)
+    progress("every cause at once")
+    whole, prior, tellable = _everything(model, start, geometric, measured, prior)
+    progress("which causes pay")
+    growth = grown(model, whole, measured, tellable.free, prior, progress)
+    x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
+    progress("the fit")
+    solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)
+    nominal = fit(model, start.x, measured, placement, prior, used=solution.used)
+    reasons = {**tellable.reasons, **growth.reasons}
+    cov = _whole(model, solution, measured, tellable.possible, prior)
+    between = np.where(growth.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
+    cov = np.where(growth.free[:, None] & growth.free, cov + np.outer(between, between), 0.0)
+    return Identified(model, nominal.x, solution, reasons, growth.steps, tellable.singular_values, prior, cov)
+
+
+def _everything(
+    model: Model, start: Solution, geometric: Solution, measured: Measured, prior: Array
+) -> tuple[Solution, Array, Observed]:
+    """Fit all that may be off, twice: the first fit's noise tells how large the causes are, the second's what is seen."""
+    noise = geometric.noise
+    whole = geometric
+    scaled = prior
+    for _ in range(2):
+        seen = observed(model, start.x, measured, prior, noise)
+        whole = fit(model, whole.x, measured, seen.possible, scaled, noise=noise)
+        noise, scaled = whole.noise, scaled_prior(model, whole, measured, seen.possible, prior)
+    return whole, scaled, observed(model, start.x, measured, scaled, noise)
+
+
+def _of(model: Model, kinds: tuple[str, ...]) -> Mask:
+    return np.array([p.kind in kinds for p in model.parameters])
+
+
+def _whole(model: Model, solution: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
+    """Return the covariance (P, P) of all that the poses can tell, at the solution and with its noise."""
+    part = measured.rows(solution.used)
+    return covariance(model, solution.x, part, model.feature_values(part.q, part.approach), free, prior, solution.noise)
+
+
+def _first(model: Model, x: Array, measured: Measured, prior: Array) -> Solution:
+    """Return the closed-form placement as a solution, with the noise of its residuals."""
+    none = np.zeros(len(x), bool)
+    none[0] = True
+    return fit(model, x, measured, none, prior)
+
+
+def _require_enough(measured: Measured) -> None:
+    least = LEAST_POINTS if measured.R_rig_body is None else LEAST_FULL
+    if len(measured) < least:
+        raise InputError(
+            f"{len(measured)} poses are fewer than {least}, which base and tool alone need; 50 and more are advised"
+        )
+
+
+def _require_placed(
+    model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], placement: Mask
+) -> None:
+    """Refuse poses that do not even tell where base and tool are."""
+    told = observed(model, x, measured, np.where(placement, prior, 0.0), noise)
+    lost = [model.names[k] for k in np.flatnonzero(placement & ~told.free)]
+    if lost:
+        raise CalibrationError(
+            f"the poses are too alike: {', '.join(lost)} cannot be told from the others; move every joint between poses, "
+            "by 20 degrees and more"
+        )
+
+
+def contributions(found: Identified, measured: Measured) -> dict[str, float]:
+    """Return what each cause moves the tool by, RMS over the poses, m.
+
+    Causes are taken in the order in which the model grew, each beyond what base and tool and the causes before it take up,
+    so that what two could explain is counted once; the squares add up.
+
+    Args:
+        found: the identified arm.
+        measured: the poses.
+    """
+    model, s = found.model, found.solution
+    _, J = model.linearised(s.x, measured, model.feature_values(measured.q, measured.approach))
+    J = J[:, : 3 * measured.points].reshape(-1, len(s.x))
+    left = J @ np.where(_of(model, PLACEMENT), 0.0, s.x - found.nominal)
+    out: dict[str, float] = {}
+    Q = np.zeros((len(J), 0))
+    for step in found.steps:
+        names = [name for name in step.names if s.free[model.names.index(name)]]
+        if step.cause.startswith("-") or not names:
+            continue
+        columns = J[:, [model.names.index(name) for name in names]]
+        for _ in range(2):  # twice is enough against rounding
+            columns = columns - Q @ (Q.T @ columns)
+        new = np.linalg.qr(columns)[0]
+        taken = new @ (new.T @ left)
+        left, Q = left - taken, np.column_stack([Q, new])
+        if set(names) - set(_named_kinds(model, PLACEMENT)):
+            out[step.cause] = float(np.sqrt(np.sum(taken**2) / (len(measured) * measured.points)))
+    return out
+
+
+def _named_kinds(model: Model, kinds: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(p.name for p in model.parameters if p.kind in kinds)

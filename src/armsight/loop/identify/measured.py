@@ -1,0 +1,76 @@
+"""What an identification is made from: joint angles, and where an instrument saw the tool.
+
+The instrument's frame is called rig whatever it is (a stereo rig, a laser tracker). Either K points of the tool were
+tracked, or one body's full pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+
+Rows = NDArray[np.bool_] | NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured(Record):
+    """Joint angles, and where the tool was seen at them.
+
+    Attributes:
+        q: (N, 6) joint angles as the joints' sensors read them, rad.
+        p_rig: (N, K, 3) tracked points, m; K is 1 with full poses (the body's origin).
+        R_rig_body: (N, 3, 3) turn of the body, with full poses; None with points only.
+        cov: (N, M, M) covariance of what was seen; None where not known. Points: M = 3 K, along the rig's axes, m^2. Poses:
+            M = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
+        approach: (N, 6) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
+            None where nothing is known.
+    """
+
+    q: Array
+    p_rig: Array
+    R_rig_body: Array | None = None
+    cov: Array | None = None
+    approach: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes.
+
+        Raises:
+            InputError: shapes that do not belong together, or NaN.
+        """
+        n = len(checked(self.q, (None, 6), "q"))
+        k = checked(self.p_rig, (n, None, 3), "p_rig").shape[1]
+        if self.R_rig_body is not None:
+            checked(self.R_rig_body, (n, 3, 3), "R_rig_body")
+            if k != 1:
+                raise InputError(f"with full poses p_rig holds one point a row, the body's origin; got {k}")
+        if self.cov is not None:
+            checked(self.cov, (n, self.size, self.size), "cov")
+        if self.approach is not None:
+            checked(self.approach, (n, 6), "approach")
+        super().__post_init__()
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.q)
+
+    @property
+    def points(self) -> int:
+        """K, how many points were tracked."""
+        return int(self.p_rig.shape[1])
+
+    @property
+    def size(self) -> int:
+        """M, how many numbers were measured at each pose."""
+        return 6 if self.R_rig_body is not None else 3 * self.points
+
+    def rows(self, rows: Rows) -> Measured:
+        """Return a part of the poses."""
+        parts = (None if a is None else a[rows] for a in (self.R_rig_body, self.cov, self.approach))
+        return Measured(self.q[rows], self.p_rig[rows], *parts)

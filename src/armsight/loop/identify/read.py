@@ -1,0 +1,200 @@
+"""Read joint angles and where the tool was seen from a CSV file.
+
+Columns, in any order, others are passed over: q1_rad .. q6_rad (or q1_deg ..); then tracked points p1_x_mm, p1_y_mm,
+p1_z_mm, p2_x_mm, .. (or _m), with rx_deg, ry_deg, rz_deg where an instrument gives angles and it is said how they are
+meant; or full poses x_m, y_m, z_m, qw, qx, qy, qz, with cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 ..
+approach6 (1, -1, 0).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_table
+from armsight.loop.identify.measured import Measured
+
+#: How three angles are meant: a rotation vector, or turns about x, y, z in this order; capitals: about turned axes.
+TURNS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+
+
+class Read(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        measured: its good rows.
+        lines: (N,) the line of the file that each comes from.
+        notes: what was left out, and why.
+    """
+
+    measured: Measured
+    lines: Array
+    notes: tuple[str, ...]
+
+
+def read_poses(path: str | Path, *, turns: str | None = None) -> Read:
+    """Read a file.
+
+    Args:
+        path: a CSV file.
+        turns: how rx_deg, ry_deg, rz_deg are meant, one of TURNS; None: they are not used.
+
+    Raises:
+        InputError: unreadable, columns missing, cells that are no numbers, or hardly a row without gaps.
+    """
+    if turns is not None and turns not in TURNS:
+        raise InputError(f"turns are {turns!r}; known are {', '.join(TURNS)}")
+    rows = read_table(path)
+    if len(rows) < 2:
+        raise InputError(f"{path}: no rows; a first line of column names and one line a pose are needed")
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) != len(header):
+        raise InputError(f"{path}: line 1 names a column twice: {_twice(header)}")
+    columns = {name: i for i, name in enumerate(header)}
+    wanted = _wanted(path, columns, turns)
+    table, lines, notes = _numbers(path, rows, columns, wanted)
+    at = {name: table[:, i] for i, name in enumerate(wanted)}
+    unused = turns is None and "rx_deg" in columns and "qw" not in columns
+    if unused:
+        notes = (*notes, "rx_deg, ry_deg, rz_deg are not used: say how they are meant with --turns")
+    return Read(_measured(path, at, turns), lines, notes)
+
+
+def _twice(header: list[str]) -> str:
+    return next(name for name in header if header.count(name) > 1)
+
+
+def _wanted(path: str | Path, columns: dict[str, int], turns: str | None) -> list[str]:
+    """Return the columns to read."""
+    wanted = _alternative(
+        path, columns, [[f"q{i}_{unit}" for i in range(1, 7)] for unit in ("rad", "deg")], "joint angles"
+    )
+    poses = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+    if "qw" in columns:
+        wanted += _alternative(path, columns, [poses], "full poses")
+        wanted += [f"cov_{i}{j}" for i, j in _UPPER] if "cov_00" in columns else []
+    else:
+        k = 1
+        while k == 1 or any(f"p{k}_x_{unit}" in columns for unit in ("mm", "m")):
+            sets = [[f"p{k}_{axis}_{unit}" for axis in "xyz"] for unit in ("mm", "m")]
+            wanted += _alternative(path, columns, sets, f"point {k}")
+            k += 1
+        if turns is not None:
+            wanted += _alternative(path, columns, [["rx_deg", "ry_deg", "rz_deg"]], "angles")
+    if "approach1" in columns:
+        wanted += _alternative(path, columns, [[f"approach{i}" for i in range(1, 7)]], "directions of approach")
+    missing = [name for name in wanted if name not in columns]
+    if missing:
+        raise InputError(f"{path}: line 1: column {missing[0]} is missing")
+    return wanted
+
+
+def _alternative(path: str | Path, columns: dict[str, int], sets: list[list[str]], what: str) -> list[str]:
+    """Return the first set of names that is there as a whole."""
+    for names in sets:
+        if all(name in columns for name in names):
+            return names
+    begun = next((names for names in sets if any(name in columns for name in names)), None)
+    if begun is not None:
+        gone = next(name for name in begun if name not in columns)
+        raise InputError(f"{path}: line 1: column {gone} is missing ({what})")
+    ways = " or ".join(f"{names[0]} .. {names[-1]}" for names in sets)
+    raise InputError(f"{path}: line 1: no {what}; columns {ways} are needed, there are {', '.join(list(columns)[:8])}")
+
+
+def _numbers(
+    path: str | Path, rows: list[list[str]], columns: dict[str, int], wanted: list[str]
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return the cells wanted, the lines they are from, and what was left out."""
+    table, lines, gaps = [], [], []
+    for number, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        values = [_number(path, number, name, row, columns[name]) for name in wanted]
+        if np.isfinite(values).all():
+            table.append(values)
+            lines.append(number)
+        else:
+            gaps.append((number, wanted[int(np.argmin(np.isfinite(values)))]))
+    if len(gaps) > len(table):
+        line, name = gaps[0]
+        raise InputError(
+            f"{path}: {len(gaps)} of {len(gaps) + len(table)} rows have gaps; the first is line {line}: {name}"
+        )
+    if not table:
+        raise InputError(f"{path}: no rows; one line a pose is needed")
+    told = ", ".join(f"line {line} ({name})" for line, name in gaps[:5]) + (", .." if len(gaps) > 5 else "")
+    notes = (f"{len(gaps)} rows left out, empty or no finite number: {told}",) if gaps else ()
+    return np.array(table), np.array(lines, float), notes
+
+
+def _number(path: str | Path, line: int, name: str, row: list[str], at: int) -> float:
+    text = row[at].strip() if at < len(row) else ""
+    try:
+        return float(text) if text else float("nan")
+    except ValueError:
+        raise InputError(f"{path}: line {line}: {name} is {text!r}, must be a number") from None
+
+
+def _measured(path: str | Path, at: dict[str, Array], turns: str | None) -> Measured:
+    """Put the columns together, in SI."""
+    unit = "rad" if "q1_rad" in at else "deg"
+    q = np.stack([at[f"q{i}_{unit}"] for i in range(1, 7)], axis=1) * (1.0 if unit == "rad" else np.pi / 180)
+    approach = np.stack([at[f"approach{i}"] for i in range(1, 7)], axis=1) if "approach1" in at else None
+    if approach is not None and not np.isin(approach, (-1, 0, 1)).all():
+        raise InputError(f"{path}: a direction of approach must be 1 (the angle grew), -1 (it fell) or 0 (not known)")
+    if "qw" in at:
+        p, R = np.stack([at[f"{axis}_m"] for axis in "xyz"], axis=1), _rotations(path, at)
+        cov = _covariance(path, at, R) if "cov_00" in at else None
+        return Measured(q, p[:, None], R, cov, approach)
+    points, k = [], 1
+    while f"p{k}_x_mm" in at or f"p{k}_x_m" in at:
+        mm = f"p{k}_x_mm" in at
+        points.append(
+            np.stack([at[f"p{k}_{axis}_{'mm' if mm else 'm'}"] for axis in "xyz"], axis=1) * (1e-3 if mm else 1)
+        )
+        k += 1
+    p = np.stack(points, axis=1)
+    if turns is None:
+        return Measured(q, p, None, None, approach)
+    if p.shape[1] != 1:
+        raise InputError(f"{path}: angles go with one point, p1; there are {p.shape[1]}")
+    return Measured(q, p, _turns(at, turns), None, approach)
+
+
+def _rotations(path: str | Path, at: dict[str, Array]) -> Array:
+    quaternions = np.stack([at[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
+    size = np.linalg.norm(quaternions, axis=1)
+    if (np.abs(size - 1) > 1e-3).any():
+        raise InputError(
+            f"{path}: a quaternion qw, qx, qy, qz must have length 1; one has {size[np.argmax(np.abs(size - 1))]:.4g}"
+        )
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+
+
+def _turns(at: dict[str, Array], turns: str) -> Array:
+    angles = {axis: at[f"r{axis}_deg"] for axis in "xyz"}
+    order = "xyz" if turns == "rotvec" else turns.lower()
+    given = np.radians(np.stack([angles[axis] for axis in order], axis=1))
+    return np.asarray(
+        (Rotation.from_rotvec(given) if turns == "rotvec" else Rotation.from_euler(turns, given)).as_matrix()
+    )
+
+
+def _covariance(path: str | Path, at: dict[str, Array], R: Array) -> Array:
+    """Return covariances of the right tangent from those along the rig's axes that ``armsight measure`` writes."""
+    C = np.zeros((len(R), 6, 6))
+    for i, j in _UPPER:
+        C[:, i, j] = C[:, j, i] = at[f"cov_{i}{j}"]
+    back = np.zeros_like(C)
+    back[:, :3, :3] = back[:, 3:, 3:] = R.swapaxes(1, 2)
+    C = back @ C @ back.swapaxes(1, 2)
+    if np.linalg.eigvalsh(C).min() < 0:
+        raise InputError(f"{path}: cov_00 .. cov_55 are no covariance: an eigenvalue is negative")
+    return np.asarray(C)

@@ -1,0 +1,118 @@
+"""How well an arm says where its tool is, on poses it was not fitted to.
+
+Where the poses were taken in another set-up (the tracker moved, another target), base and tool are placed anew, for the
+nominal arm as for the identified one, and it is said.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.loop.identify.fit import fit, noise_cov
+from armsight.loop.identify.growth import PLACEMENT
+from armsight.loop.identify.identify import Identified
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.place import placed
+
+#: Another set-up: the error is this many times that of base and tool placed anew,
+OTHER = 5.0
+#: and this far, m: no arm moves so far by itself between two recordings of one set-up.
+OTHER_M = 0.02
+#: Poses needed to place base and tool anew.
+LEAST = 10
+
+
+class Errors(NamedTuple):
+    """Distances between where the tool was said and seen.
+
+    Attributes:
+        position_m: (N, K) of every point.
+        angle_rad: (N,) of the body's turn; empty with points only.
+    """
+
+    position_m: Array
+    angle_rad: Array
+
+    def summary(self) -> dict[str, float]:
+        """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
+        out: dict[str, float] = {}
+        for name, e in (("m", self.position_m), ("rad", self.angle_rad)):
+            if e.size:
+                out |= {f"mean_{name}": float(e.mean()), f"rms_{name}": float(np.sqrt(np.mean(e**2)))}
+                out[f"max_{name}"] = float(e.max())
+        return out
+
+
+class Validation(NamedTuple):
+    """Nominal and identified arm on one set of poses.
+
+    Attributes:
+        nominal: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's.
+        identified: errors of the identified arm.
+        placed_anew: whether base and tool were fitted to these very poses.
+        residual_over_predicted: RMS residual over the predicted sigma; 1 where the sigmas are honest.
+    """
+
+    nominal: Errors
+    identified: Errors
+    placed_anew: bool
+    residual_over_predicted: float
+
+
+def errors(model: Model, x: Array, measured: Measured) -> Errors:
+    """Return the errors of a parameter vector on poses."""
+    e = model.residuals(x, measured, model.feature_values(measured.q, measured.approach))
+    if measured.R_rig_body is None:
+        return Errors(np.linalg.norm(e.reshape(len(e), -1, 3), axis=2), np.zeros(0))
+    return Errors(np.linalg.norm(e[:, None, :3], axis=2), np.linalg.norm(e[:, 3:], axis=1))
+
+
+def validate(found: Identified, measured: Measured) -> Validation:
+    """Hold an identified arm against poses it was not fitted to.
+
+    Args:
+        found: the identified arm.
+        measured: the poses; points or full poses as it was identified with.
+
+    Raises:
+        InputError: another number of points, or points instead of poses.
+    """
+    model = found.model
+    if measured.points != model.points or (measured.R_rig_body is not None) != model.full:
+        raise InputError(
+            "the poses to validate with must have the same points, or full poses, as those identified with"
+        )
+    kept = [errors(model, x, measured) for x in (found.nominal, found.solution.x)]
+    kept_m = float(np.median(kept[1].position_m))
+    if len(measured) < LEAST or kept_m < OTHER_M:
+        return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
+    new_model, nominal, x = placed_anew(found, measured)
+    new = [errors(new_model, nominal, measured), errors(new_model, x, measured)]
+    if kept_m < OTHER * float(np.median(new[1].position_m)):
+        return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
+    return Validation(new[0], new[1], True, _over(new_model, found, x, measured))
+
+
+def placed_anew(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
+    """Return the model, the nominal and the identified vector with base and tool fitted to other poses."""
+    model, start = placed(found.model, measured)
+    place = np.array([p.kind in PLACEMENT for p in model.parameters])
+    out = []
+    for x in (found.nominal, found.solution.x):
+        out.append(fit(model, np.where(place, start, x), measured, place, found.prior).x)
+    return model, out[0], out[1]
+
+
+def _over(model: Model, found: Identified, x: Array, measured: Measured) -> float:
+    """Return the RMS of residuals over their predicted sigma: noise and the parameters' covariance."""
+    e, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
+    free = found.solution.free
+    P = found.solution.cov[np.ix_(free, free)]
+    C = noise_cov(measured, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
+    whitened = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+    return float(np.sqrt(np.sum(whitened) / e.size))
