@@ -1,5 +1,5 @@
-/* The converter: TIM8 starts a scan of all channels once a PWM period, DMA puts it into a ring of the last sixteen scans.
- * A tick adds up the ring, whichever scan is just being replaced: always the last sixteen readings of each channel. */
+/* The converter: TIM8 starts a scan of all channels once a PWM period, DMA puts it into a ring of the last sixteen
+ * scans. A tick adds up the ring, whichever scan is just being replaced: always the last sixteen of each channel. */
 #include "drivers.h"
 #include "registers.h"
 

@@ -67,8 +67,8 @@ bool watchdog_was_here(void);
 /* Read stored copy which (0 or 1) as it is. Any context but the tick. */
 void flash_read(uint32_t which, config_copy *copy);
 
-/* Write copy which (0 or 1) and return whether it reads back so. The processor stands still meanwhile, up to 0.6 s, and so
- * do the ticks: main loop only, with the drives off. */
+/* Write copy which (0 or 1) and return whether it reads back so. The processor stands still meanwhile, up to 0.6 s, and
+ * so do the ticks: main loop only, with the drives off. */
 bool flash_write(uint32_t which, const config_copy *copy);
 
 #endif

@@ -13,7 +13,7 @@
 #define CHANNELS_ON 0x111u     /* CC1E, CC2E, CC3E */
 #define PWM_PAIR (TIM_OC_PWM1_PRELOAD | FIELD(TIM_OC_PWM1_PRELOAD, 8))
 #define BRIDGE_OFF (TIM_BDTR_LOCK3 | TIM_BDTR_OSSI | TIM_BDTR_OSSR | TIM_BDTR_BKE | TIM_BDTR_BKP)
-/* The currents are read while the counter is near 0, in the middle of the pulses: half of the six conversions before. */
+/* The currents are read while the counter is near 0, a pulse's middle: half of the six conversions before it. */
 #define TRIGGER (3u * CONVERSION_CLOCKS * (TIMER_HZ / ADC_HZ))
 
 _Static_assert(PWM_STEPS <= 0xFFFFu, "the counter has 16 bits");

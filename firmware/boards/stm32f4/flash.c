@@ -6,7 +6,7 @@
 #define FIRST_ADDRESS 0x08004000u
 #define SECTOR_BYTES 0x4000u
 
-_Static_assert(sizeof(config_copy) <= SECTOR_BYTES && sizeof(config_copy) % 4u == 0u, "a copy is whole words of one sector");
+_Static_assert(sizeof(config_copy) <= SECTOR_BYTES && sizeof(config_copy) % 4u == 0u, "whole words of one sector");
 
 static uint32_t address(uint32_t which) { return FIRST_ADDRESS + which * SECTOR_BYTES; }
 
@@ -59,7 +59,7 @@ static bool reads(uint32_t at, const config_copy *copy)
 
 bool flash_write(uint32_t which, const config_copy *copy)
 {
-    __asm__ volatile("cpsid i" ::: "memory"); /* no interrupt could be fetched while the memory is busy; one tick stays due */
+    __asm__ volatile("cpsid i" ::: "memory"); /* none could be fetched while the memory is busy; one tick stays due */
     watchdog_set_long();
     settle();
     FLASH->keyr = FLASH_KEY1;

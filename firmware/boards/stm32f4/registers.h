@@ -1,5 +1,5 @@
-/* The registers of the STM32F446 this board uses. Names are the reference manual's (RM0390) in lower case; the processor's own
- * are ARMv7-M's. A gap named reserved keeps the offsets. */
+/* The registers of the STM32F446 this board uses. Names are the reference manual's (RM0390) in lower case; the
+ * processor's own are ARMv7-M's. A gap named reserved keeps the offsets. */
 #ifndef ARMSIGHT_STM32F4_REGISTERS_H
 #define ARMSIGHT_STM32F4_REGISTERS_H
 
@@ -103,7 +103,7 @@ typedef struct dma_registers {
 #define DMA_CR_MSIZE_HALF FIELD(1, 13)
 #define DMA_CR_PL(priority) FIELD(priority, 16)
 #define DMA_CR_CHSEL(channel) FIELD(channel, 25)
-#define DMA_HTIF BIT(4) /* half of the transfer; as stream 0 and 4 see it, stream 1 and 5 six bits further, 2 and 6 sixteen */
+#define DMA_HTIF BIT(4) /* half of the transfer; streams 0 and 4; 1 and 5 six bits further, 2 and 6 sixteen */
 #define DMA_TCIF BIT(5) /* the whole of it */
 #define DMA_FLAGS 0x3Du /* all five */
 
@@ -141,7 +141,7 @@ typedef struct tim_registers {
 #define TIM_CR2_TRGO_OC4REF FIELD(7, 4)
 #define TIM_SR_BIF BIT(7)
 #define TIM_EGR_UG BIT(0)
-#define TIM_OC_PWM1_PRELOAD FIELD(0xD, 3) /* OCxM = 110, OCxPE = 1, of the lower channel; eight bits further the upper */
+#define TIM_OC_PWM1_PRELOAD FIELD(0xD, 3) /* OCxM = 110, OCxPE = 1; the upper channel eight bits further */
 #define TIM_BDTR_LOCK3 FIELD(3, 8)
 #define TIM_BDTR_OSSI BIT(10)
 #define TIM_BDTR_OSSR BIT(11)

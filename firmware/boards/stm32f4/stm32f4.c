@@ -1,9 +1,9 @@
 /* The Nucleo-F446RE as a board: what the common loop asks for, and the tick's timer.
  *
- * SysTick counts milliseconds and asks for PendSV, which has the lowest priority and runs the tick: so a tick that takes
- * too long is seen while it runs, and no millisecond goes uncounted. The main loop serves the wire. Floating point is used
- * by PendSV and the main loop; the processor keeps a place for its registers on entry and fills it only where both do
- * (lazy stacking, its default). */
+ * SysTick counts milliseconds and asks for PendSV, which has the lowest priority and runs the tick: so a tick that
+ * takes too long is seen while it runs, and no millisecond goes uncounted. The main loop serves the wire. Floats are
+ * used by PendSV and the main loop; the processor keeps a place for its registers on entry and fills it only where
+ * both do (lazy stacking, its default). */
 #include "drivers.h"
 #include "loop.h"
 #include "registers.h"

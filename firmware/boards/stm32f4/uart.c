@@ -40,7 +40,7 @@ void uart_start(void)
 /* Return where the stream writes next, and add what was lost because nobody took it in time to *overrun. */
 static uint32_t rx_position(uint32_t *overrun)
 {
-    const bool wrapped = (DMA1->hisr >> RX_SHIFT & DMA_TCIF) != 0u; /* before the position: a wrap between is seen by both */
+    const bool wrapped = (DMA1->hisr >> RX_SHIFT & DMA_TCIF) != 0u; /* before the position */
     const uint32_t position = (RX_BYTES - RX_STREAM->ndtr) % RX_BYTES;
     if (wrapped || position < rx_taken) {
         DMA1->hifcr = DMA_TCIF << RX_SHIFT;
