@@ -101,7 +101,7 @@ def generate(language: str, target: Path) -> None:
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             done = mavgen.mavgen(options, [str(source_folder() / "wire" / "armsight.xml")])
-    except mavparse.MAVParseError as error:
+    except (mavparse.MAVParseError, SystemExit) as error:  # it exits where the schema is not met
         raise InputError(f"firmware/wire/armsight.xml: {error}") from error
     if not done:
         raise InputError(f"firmware/wire/armsight.xml: pymavlink refused it: {said.getvalue().strip()}")
@@ -144,16 +144,20 @@ def _found(*folders: str) -> list[str]:
     return [path.relative_to(root).as_posix() for folder in folders for path in sorted((root / folder).glob("*.c"))]
 
 
+def board_flags(board: str, mavlink: Path) -> list[str]:
+    """Return the flags every source of a board's image is compiled with."""
+    return [*_OPTIMISE, "-isystem", "boards/cortex_m/include", *includes(mavlink, f"boards/{board}", "boards/cortex_m")]
+
+
 def build_board(board: str, target: Path, compiler: Compiler) -> Path:
     """Build a board's image and return it; :class:`~armsight.errors.InputError` if it does not compute in hardware."""
     if board not in boards():
         raise InputError(f"no board {board!r}; there are {', '.join(boards())}")
     root = source_folder()
     script = next((root / "boards" / board).glob("*.ld")).relative_to(root).as_posix()
+    link = ("-nostdlib", "-Wl,--gc-sections", "-Wl,-e,reset", f"-T{script}")
     with headers() as mavlink:
-        ours = ["-isystem", "boards/cortex_m/include", *includes(mavlink, f"boards/{board}", "boards/cortex_m")]
-        link = ("-nostdlib", "-Wl,--gc-sections", "-Wl,-e,reset", f"-T{script}")
-        compile_c(compiler.arm, target, board_sources(board), *_OPTIMISE, *ours, *link)
+        compile_c(compiler.arm, target, board_sources(board), *board_flags(board, mavlink), *link)
     if not read_elf(target).hard_float:
         raise InputError(f"{target}: computes floats in software; {compiler.arm[0]} did not obey its flags")
     return target

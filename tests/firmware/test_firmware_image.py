@@ -1,0 +1,159 @@
+"""Images: how they are built and read, what is said when that fails, and how much memory they need."""
+
+import pytest
+from firmware_build import FIRMWARE
+from firmware_layout import c
+from firmware_pil import Host
+
+from armsight import firmware
+from armsight.errors import DeviceError, InputError
+from armsight.firmware import build, stack
+from armsight.firmware.elf import read_elf
+from armsight.robot.boards.machines import open_machine
+
+#: What every board's linker script keeps free for the stack.
+STACK_BYTES = 8 * 1024
+PAINT = 0xA5
+
+
+@pytest.fixture
+def compiler():
+    try:
+        return build.open_compiler()
+    except InputError as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.mark.parametrize("board", build.boards())
+def test_the_stack_of_every_board_has_a_bound_that_fits(board):
+    if "gcc" not in build.compilers():
+        pytest.skip("needs arm-none-eabi-gcc")
+    use = stack.stack_use(board)
+    assert use.total_bytes < STACK_BYTES
+    assert (use.main.functions[0], use.tick.functions[0]) == (stack.MAIN, stack.TICK)
+    assert use.total_bytes == use.main.stack_bytes + use.tick.stack_bytes + stack.INTERRUPT_BYTES
+
+
+def test_no_run_takes_more_stack_than_the_bound(tmp_path):
+    """The stack is painted before a run through every kind of message; what is no longer paint was used."""
+    found = build.compilers()
+    if "gcc" not in found:
+        pytest.skip("needs arm-none-eabi-gcc")
+    image = build.build_board("pil", tmp_path / "pil.elf", found["gcc"])
+    try:
+        machine = open_machine("unicorn", image)
+    except InputError as missing:
+        pytest.skip(str(missing))
+    top = read_elf(image).symbols["stack_top"]
+    machine.uc.mem_write(top - STACK_BYTES, bytes([PAINT]) * STACK_BYTES)
+    for request in requests():
+        machine.tick(request)
+    left = bytes(machine.uc.mem_read(top - STACK_BYTES, STACK_BYTES))
+    used = len(left.lstrip(bytes([PAINT])))
+    use = stack.stack_use("pil")
+    assert 1000 < used <= max(use.main.stack_bytes, use.tick.stack_bytes) + 64, "64: what calls them"
+    machine.close()
+
+
+def requests():
+    """Frames that carry one message of each kind a host sends, greeted, and some noise."""
+    host = Host(None)
+    said = [host.hello(), host.move(), host.order(c.COMMAND_DISABLE), host.pack("gains", host.next(), [0.1] * 36)]
+    said += [
+        host.pack("config_part", 0, 100, 200, [0] * 200),
+        host.store(b""),
+        host.pack("ping", 1, 0),
+        b"\xfd\xff" * 90,
+    ]
+    said += [host.pack("config_read", 0), host.stop()]
+    for tick, data in enumerate([*said, *[b""] * 30]):
+        request = c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION, tick=tick, length=len(data))
+        request.bytes[: len(data)] = data
+        yield bytes(request)
+
+
+def test_an_unknown_board_is_named_with_those_there_are(tmp_path, compiler):
+    with pytest.raises(InputError, match=r"no board 'arduino'; there are pil, stm32f4"):
+        build.build_board("arduino", tmp_path / "x.elf", compiler)
+
+
+def test_an_unknown_compiler_is_named_with_those_there_are(monkeypatch):
+    with pytest.raises(InputError, match=r"no firmware compiler 'tcc' \(.*\); zig needs pip install ziglang"):
+        build.open_compiler("tcc")
+    monkeypatch.setenv(build.COMPILER_VARIABLE, "tcc")
+    with pytest.raises(InputError, match="no firmware compiler 'tcc'"):
+        build.open_compiler()
+
+
+def test_no_compiler_at_all_is_told(monkeypatch):
+    monkeypatch.setattr(build, "compilers", dict)
+    monkeypatch.delenv(build.COMPILER_VARIABLE, raising=False)
+    with pytest.raises(InputError, match=r"no firmware compiler \(none found\)"):
+        build.open_compiler()
+
+
+def test_what_a_compiler_says_is_passed_on(tmp_path, compiler):
+    wrong = tmp_path / "wrong.c"
+    wrong.write_text("int forgotten(void) { return 1 }\n")
+    with pytest.raises(InputError, match=r"(?s)could not build wrong\.o:.*wrong\.c:1"):
+        build.compile_c(compiler.host, tmp_path / "wrong.o", [str(wrong)], "-c")
+
+
+def test_a_failed_build_leaves_the_last_one(tmp_path, compiler, monkeypatch):
+    built = tmp_path / "built"
+    built.mkdir()
+    (built / firmware.IMAGE).write_bytes(b"the last one")
+
+    def fail(*_given):
+        raise InputError("no")
+
+    monkeypatch.setattr(build, "build_host", fail)
+    with pytest.raises(InputError):
+        build.build_package(built, compiler)
+    assert [path.name for path in tmp_path.iterdir()] == ["built"]
+    assert (built / firmware.IMAGE).read_bytes() == b"the last one"
+
+
+def test_firmware_that_is_not_built_is_told_with_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(firmware, "BUILT", tmp_path)
+    for find in (firmware.image, firmware.host_library, firmware.dialect):
+        with pytest.raises(DeviceError, match=r"not built; run python -m armsight\.firmware\.build"):
+            find()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x7fELF", b"MZ" * 50, b"\x7fELF\x02\x01" + bytes(60)])
+def test_a_file_that_is_no_image_is_refused(tmp_path, content):
+    path = tmp_path / "x.elf"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.elf: not a"):
+        read_elf(path)
+
+
+def test_an_image_cut_short_is_refused(tmp_path):
+    whole = firmware.image().read_bytes()
+    for length in (60, len(whole) // 2):
+        path = tmp_path / "x.elf"
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"x\.elf: not a whole ELF image"):
+            read_elf(path)
+
+
+def test_a_board_is_built_from_the_command_line(tmp_path, capsys):
+    if not build.compilers():
+        pytest.skip("needs ziglang or arm-none-eabi-gcc")
+    assert build.main(["--board", "pil", "-o", str(tmp_path)]) == 0
+    assert str(tmp_path / "pil.elf") in capsys.readouterr().out
+    assert read_elf(tmp_path / "pil.elf").hard_float
+    assert build.main(["--board", "nano"]) == 2
+    assert capsys.readouterr().err.startswith("error: no board 'nano'")
+
+
+def test_a_dialect_that_is_wrong_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("pymavlink", reason="needs pymavlink")
+    source = tmp_path / "source" / "wire"
+    source.mkdir(parents=True)
+    good = (FIRMWARE / "wire" / "armsight.xml").read_text(encoding="utf-8")
+    (source / "armsight.xml").write_text(good.replace('type="uint32_t"', 'type="uint31_t"', 1), encoding="utf-8")
+    monkeypatch.setattr(build, "source_folder", lambda: tmp_path / "source")
+    with pytest.raises(InputError, match=r"armsight\.xml"):
+        build.generate("Python3", tmp_path / "dialect.py")
