@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from armsight.files import read_text, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3
 from armsight.vision.camera import DISTORTION_MODELS, Camera
+
+if TYPE_CHECKING:
+    from armsight.vision.rectify import Rectification
 
 FORMAT = "armsight-rig"
 VERSION = 1
@@ -111,6 +114,12 @@ class StereoRig(Record):
             self.sigma_px,
             self.provenance,
         )
+
+    def rectify(self) -> Rectification:
+        """Return how the rig's images become standard form, and points come back; see :func:`~armsight.vision.rectify.rectify`."""
+        from armsight.vision.rectify import rectify
+
+        return rectify(self)
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON, in one step.

@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.vision.dense.cost import BLOCK, prepare
-from armsight.vision.dense.finish import finished
+from armsight.vision.dense.finish import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.support import COSTS, SUPPORTS, match_planes
@@ -25,6 +25,8 @@ from armsight.vision.dense.winner import Found, make_found
 _STRIP_ROWS = 192
 #: The largest window whose sum of raw costs still fits two bytes.
 _REACH_MAX = 21
+#: See finish.py.
+_TRUST = Trust(0.15, 0.13)
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Block:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search)
+        return finished(self.search(left, right, search), left, search, _TRUST)
 
     def search(self, left: Image, right: Image, search: Search) -> Found:
         """Find disparities, without judging, smoothing or filling them."""

@@ -31,8 +31,8 @@ _BT_CUT = np.uint8(20)
 #: Cost of a match beyond the right image's edge, where nothing can be compared: about that of an undecided pixel.
 _OUTSIDE = np.uint8(13)
 #: The largest raw cost (24 bits and half of the cut), and the largest after smoothing, which adds three rows.
-RAW_MAX = 34
-COST_MAX = 3 * RAW_MAX
+_RAW_MAX = np.uint8(34)
+COST_MAX = 3 * 34
 
 
 class Pair(NamedTuple):
@@ -141,16 +141,16 @@ def _bt(g: np.uint8, g_low: np.uint8, g_high: np.uint8, r: np.uint8, r_low: np.u
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def raw_row(pair: Pair, y: int, first: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
+def raw_row(pair: Pair, y: int, first: int, count: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
     """Write the raw costs of one row into ``out`` from ``base`` on: W times ``size`` bytes.
 
-    Census distance plus half of Birchfield and Tomasi's dissimilarity (their equation 3), cut off.
+    Disparities beyond ``count`` cost the most there is. Census distance plus half of Birchfield and Tomasi's dissimilarity (their equation 3), cut off.
     """
     width = pair.left.shape[1]
     words, right, low, high = pair.right_census[y], pair.right[y], pair.right_low[y], pair.right_high[y]
     for x in range(width):
         word, g, g_low, g_high = pair.left_census[y, x], pair.left[y, x], pair.left_low[y, x], pair.left_high[y, x]
-        inside = np.uintp(min(max(x - first + 1, 0), int(size)))
+        inside = np.uintp(min(max(x - first + 1, 0), count))
         o, k = base + np.uintp(x) * size, np.uintp(width - 1 - x + first)
         whole = inside - inside % BLOCK
         for d in range(inside):
@@ -161,8 +161,10 @@ def raw_row(pair: Pair, y: int, first: int, size: np.uintp, out: Bytes, base: np
                 out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
         for d in range(whole, inside):
             out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
-        for d in range(inside, size):
+        for d in range(inside, np.uintp(count)):
             out[o + d] = _OUTSIDE
+        for d in range(np.uintp(count), size):
+            out[o + d] = _RAW_MAX
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.vision.dense.cost import BLOCK, ONE, Bytes, Pair, prepare, raw_row, smooth_row
-from armsight.vision.dense.finish import finished
+from armsight.vision.dense.finish import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.rows import seen, vote
 from armsight.vision.dense.strips import on_strips
@@ -34,6 +34,8 @@ _STRIP_ROWS = 96
 _HIGH, _LOW = np.int16(16000), np.int16(-16000)
 #: Entries beside a pixel's disparities, never the least: before the first and after the last.
 _GUARD = np.uintp(32)
+#: See finish.py.
+_TRUST = Trust(0.38)
 
 
 class Table(NamedTuple):
@@ -167,7 +169,7 @@ def _backward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _strip(pair: Pair, begin: int, end: int, first: int, size: np.uintp, out: Whole) -> None:
+def _strip(pair: Pair, begin: int, end: int, first: int, count: int, size: np.uintp, out: Whole) -> None:
     """Match the rows from ``begin`` to ``end``, each by itself."""
     height, width = pair.left.shape
     n, room = np.uintp(width) * size, (width + 3) * int(size + _GUARD)
@@ -181,7 +183,7 @@ def _strip(pair: Pair, begin: int, end: int, first: int, size: np.uintp, out: Wh
     for y in range(begin, end):
         for row in range(y - 1, y + 2):
             if 0 <= row < height and (y == begin or row == y + 1):
-                raw_row(pair, row, first, size, raw, np.uintp(row % 3) * n)
+                raw_row(pair, row, first, count, size, raw, np.uintp(row % 3) * n)
         smooth_row(y, height, size, raw, mixed, costs, np.uintp(0))
         _forward(table, pair.left, y, costs, size)
         _backward(table, pair.left, y, costs, size, out[y])
@@ -193,7 +195,7 @@ class Scanline:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search)
+        return finished(self.search(left, right, search), left, search, _TRUST)
 
     def search(self, left: Image, right: Image, search: Search) -> Found:
         """Find disparities, without judging, smoothing or filling them."""
@@ -201,10 +203,11 @@ class Scanline:
         pair, whole = prepare(left, right, search.first + int(size)), np.zeros(left.shape, np.int16)
 
         def work(begin: int, end: int) -> None:
-            _strip(pair, begin, end, search.first, size, whole)
+            _strip(pair, begin, end, search.first, search.count, size, whole)
 
         on_strips(left.shape[0], _STRIP_ROWS, work)
         found = make_found(*left.shape)
+        whole[whole >= search.count] = -1
         voted = vote(whole, left, search.count)
         found.agreed[:] = (whole >= 0) & seen(voted, search.first)
         found.curvature[:] = 1

@@ -16,7 +16,7 @@ import numpy as np
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.vision.dense.cost import BLOCK, Bytes, Pair, prepare, raw_row, smooth_row
-from armsight.vision.dense.finish import finished
+from armsight.vision.dense.finish import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.paths import ADD, RUN_UP, WRITE, Work, cost_base, forward, leftward, make_work
 from armsight.vision.dense.strips import on_strips
@@ -30,16 +30,18 @@ _RUN_UP = 24
 #: window. P2, of a jump, falls by half at an edge of _EDGE grey levels, for depth breaks where light does; the most of
 #: the two and the largest cost must fit a byte.
 _P1, _P2, _EDGE = 12, 80, 16
+#: See finish.py.
+_TRUST = Trust(0.15, 0.25)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _costs(pair: Pair, y: int, direction: int, begun: bool, first: int, size: np.uintp, work: Work) -> None:
+def _costs(pair: Pair, y: int, direction: int, begun: bool, first: int, count: int, size: np.uintp, work: Work) -> None:
     """Put the costs of row y into the arena; the rows before it are there already once the strip has begun."""
     height, width = pair.left.shape
     n = np.uintp(width) * size
     for row in range(y - 1, y + 2):
         if 0 <= row < height and (not begun or row == y + direction):
-            raw_row(pair, row, first, size, work.raw, np.uintp(row % 3) * n)
+            raw_row(pair, row, first, count, size, work.raw, np.uintp(row % 3) * n)
     smooth_row(y, height, size, work.raw, work.mixed, work.arena, cost_base(width, size))
 
 
@@ -55,7 +57,7 @@ def _strip(
     top, bottom = max(0, begin - _RUN_UP), min(height, end + _RUN_UP)
     for y in range(top, end):
         at = np.uintp(y - begin if both_ways and y >= begin else 0) * n
-        _costs(pair, y, 1, y > top, first, size, work)
+        _costs(pair, y, 1, y > top, first, count, size, work)
         keep = WRITE if y >= begin else RUN_UP
         forward(work, pair.left, y, y - 1 if y > top else -1, sides, keep, size, at, p1, p2)
         if y >= begin:
@@ -65,7 +67,7 @@ def _strip(
     if both_ways:
         for y in range(bottom - 1, begin - 1, -1):
             at = np.uintp(y - begin if y < end else 0) * n
-            _costs(pair, y, -1, y < bottom - 1, first, size, work)
+            _costs(pair, y, -1, y < bottom - 1, first, count, size, work)
             keep = ADD if y < end else RUN_UP
             forward(work, pair.left, y, y + 1 if y < bottom - 1 else -1, sides, keep, size, at, p1, p2)
             if y < end:
@@ -89,7 +91,7 @@ class Semiglobal:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search)
+        return finished(self.search(left, right, search), left, search, _TRUST)
 
     def search(self, left: Image, right: Image, search: Search) -> Found:
         """Find disparities, without judging, smoothing or filling them."""

@@ -59,7 +59,7 @@ def _census(left: Image, right: Image, d: int, reach: int) -> Singles:
     pair = prepare(left, right, d + 1)
     out = np.empty((left.shape[0], left.shape[1]), np.uint8)
     for y in range(left.shape[0]):
-        raw_row(pair, y, d, np.uintp(1), out[y], np.uintp(0))
+        raw_row(pair, y, d, 1, np.uintp(1), out[y], np.uintp(0))
     return out.astype(np.float32)
 
 

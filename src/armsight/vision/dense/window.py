@@ -57,14 +57,14 @@ def match_windows(
     best_right = np.empty(width + first + int(size), np.uint16)
     known = max(begin - reach, 0)
     for row in range(known, min(begin + reach, height - 1) + 1):
-        raw_row(pair, row, first, size, raw, np.uintp(row % held) * n)
+        raw_row(pair, row, first, count, size, raw, np.uintp(row % held) * n)
     for y in range(begin - reach, begin + reach + 1):
         _start(columns, raw, np.uintp(min(max(y, 0), height - 1) % held) * n)
     for y in range(begin, end):
         if y > begin:
             new, old = min(y + reach, height - 1), max(y - reach - 1, 0)
             if new == y + reach:
-                raw_row(pair, new, first, size, raw, np.uintp(new % held) * n)
+                raw_row(pair, new, first, count, size, raw, np.uintp(new % held) * n)
             _slide(columns, raw, np.uintp(new % held) * n, np.uintp(old % held) * n)
         _sum_row(columns, reach, size, total)
         choose_row(total, np.uintp(0), best_right, y, first, count, size, found)

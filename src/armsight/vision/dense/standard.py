@@ -1,0 +1,146 @@
+"""Is it a pair, and is it in standard form: checks before any matching, each with what to do about it.
+
+The two images must be of one size, their rows must show the same rows of the scene, and what is seen must lie further left
+in the right image than in the left one. The last two are told from a few hundred corners that look alike in both images.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import SIDES, Array, Image, Shot
+from armsight.errors import InputError
+from armsight.vision.dense.method import Disparity, Method, Search
+from armsight.vision.image import grey
+
+_CORNERS = 1500
+#: A corner's match must be this much better than its next best, and there must be so many before anything is concluded.
+_RATIO, _ENOUGH = 0.75, 30
+#: Rows that the images may be apart, px: at the first the matching suffers, beyond the second it is no pair in standard form.
+_VERTICAL_NOTE_PX, VERTICAL_MAX_PX = 1.0, 2.5
+#: Share of corners that must lie on the wrong side before the images are taken for exchanged.
+_EXCHANGED = 0.8
+#: An image that, with its pixel noise smoothed away, stays within so many grey levels of its surroundings almost everywhere
+#: has no texture to match.
+_TEXTURE, _TEXTURED_SHARE = 1.5, 0.002
+
+
+def plain_grey(image: NDArray[np.generic], side: str) -> Image:
+    """Return an image as 8-bit grey, floats of 0 to 255 included.
+
+    Raises:
+        InputError: a shape or a type that is no image, or numbers that are NaN or infinite.
+    """
+    if image.dtype.kind != "f":
+        return grey(image)
+    if not np.isfinite(image).all():
+        bad = int(np.count_nonzero(~np.isfinite(image)))
+        raise InputError(f"{side} image: {bad} values are NaN or infinite; every pixel must be a finite number")
+    if image.min() < 0 or image.max() > 255:
+        raise InputError(
+            f"{side} image: floats must lie in 0 to 255, got {image.min():g} to {image.max():g}; scale them first"
+        )
+    return grey(np.rint(image).astype(np.uint8))
+
+
+def alike(left: Image, right: Image) -> Array:
+    """Return (N, 4) columns and rows of corners that look alike in both images: u and v left, u and v right."""
+    finder = cv2.ORB.create(_CORNERS, 1.2, 4, fastThreshold=8)
+    places, words = zip(*(finder.detectAndCompute(image, None) for image in (left, right)), strict=True)
+    if any(w is None or len(w) < 2 for w in words):
+        return np.zeros((0, 4))
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(words[0], words[1], k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < _RATIO * p[1].distance]
+    return np.array([[*places[0][m.queryIdx].pt, *places[1][m.trainIdx].pt] for m in good]).reshape(-1, 4)
+
+
+def vertical_offset_px(corners: Array) -> Array:
+    """Return what the rows are apart: (N,) a plane through the corners' vertical differences, outliers left out, px."""
+    A = np.column_stack([np.ones(len(corners)), corners[:, :2] - corners[:, :2].mean(axis=0)])
+    off = corners[:, 3] - corners[:, 1]
+    kept = np.abs(off - np.median(off)) <= 3 + 3 * np.median(np.abs(off - np.median(off)))
+    for _ in range(3):
+        plane = np.linalg.lstsq(A[kept], off[kept], rcond=None)[0]
+        gap = np.abs(off - A @ plane)
+        kept = gap <= 1 + 3 * np.median(gap[kept])
+    return np.asarray(A @ plane)
+
+
+def check_standard(left: Image, right: Image) -> str | None:
+    """Tell whether two images are a pair in standard form, as far as corners tell.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+
+    Returns:
+        A remark where they are a little off; None where nothing is.
+
+    Raises:
+        InputError: another size, exchanged, or not in standard form.
+    """
+    if left.shape != right.shape:
+        (h, w), (k, m) = left.shape, right.shape
+        raise InputError(f"the left image is {w}x{h} px and the right one {m}x{k}; both must be of one size")
+    corners = alike(left, right)
+    if len(corners) < _ENOUGH:
+        return None
+    apart = vertical_offset_px(corners)
+    size = float(np.sqrt((apart**2).mean()))
+    if size > VERTICAL_MAX_PX:
+        raise InputError(
+            f"the images are not in standard form: what is in one row of the left image is {size:.1f} px off that row in the "
+            f"right one (median {np.median(apart):+.1f}); rectify them first, or give the RIG.json they were taken with"
+        )
+    level = np.abs(corners[:, 3] - corners[:, 1] - apart) <= 3
+    if level.sum() >= _ENOUGH and (corners[level, 2] > corners[level, 0] + 1).mean() > _EXCHANGED:
+        raise InputError("left and right image are exchanged: what is near lies further right in the right one; swap them")
+    if size > _VERTICAL_NOTE_PX:
+        return f"the rows of the two images are {size:.1f} px apart: matching suffers; calibrate again"
+    return None
+
+
+def check_search(search: Search, width: int) -> None:
+    """Refuse a search that leaves the image.
+
+    Raises:
+        InputError: the greatest disparity is not within the image.
+    """
+    if search.last >= width:
+        raise InputError(
+            f"disparities up to {search.last} px are outside an image {width} px wide; the greatest must be below its width"
+        )
+
+
+def untextured(image: Image, side: str) -> str | None:
+    """Say that an image has nothing to match, or None."""
+    smooth, surround = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) for sigma in (1.5, 6.0))
+    if float((np.abs(smooth - surround) > _TEXTURE).mean()) > _TEXTURED_SHARE:
+        return None
+    return f"the {side} image has no texture: its grey levels are the same everywhere, to {_TEXTURE:g}"
+
+
+def match_pair(method: Method, left: NDArray[np.generic], right: NDArray[np.generic], search: Search) -> Disparity:
+    """Check a pair in standard form and match it.
+
+    Args:
+        method: how.
+        left: (H, W) or (H, W, 3) BGR; uint8, uint16, or floats of 0 to 255.
+        right: the same.
+        search: which disparities to try.
+
+    Returns:
+        The disparities; empty, with the reason, where there is nothing to match.
+
+    Raises:
+        InputError: not images, not of one size, exchanged, not in standard form, or a search that leaves the image.
+    """
+    images = [plain_grey(image, side) for image, side in zip((left, right), SIDES, strict=True)]
+    check_search(search, images[0].shape[1])
+    for image, side in zip(images, SIDES, strict=True):
+        if (problem := untextured(image, side)) is not None and images[0].shape == images[1].shape:
+            return Disparity.none((image.shape[0], image.shape[1]), search, problem)
+    check_standard(*images)
+    return method.match(*images, search)

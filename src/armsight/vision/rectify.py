@@ -1,0 +1,171 @@
+"""Standard form: a pair as two equal cameras side by side would have seen it, and back.
+
+Both cameras are turned about their own centres until the rows of both images are the same planes through the baseline (the
+chapter's "standard form"; Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA 12(1),
+2000). A scene point is then in one row, and its column in the left image less that in the right one, the disparity d, tells
+its depth: z = f b / d. Both images have one principal point, so that what is infinitely far has no disparity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Image, Record, Side
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, pose
+from armsight.vision.camera import Camera
+
+if TYPE_CHECKING:
+    from armsight.vision.rig import StereoRig
+
+
+#: How far two unit rays may be apart and be the same: a raw pixel is kept to a float's precision.
+_SAME_RAY = 1e-5
+#: Rows that are worked on at a time, and pixels between those that are looked at twice.
+_ROWS, _STEP = 32, 8
+#: Least sine of the angle between the view and the baseline: below it one camera is behind the other.
+_ASIDE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification(Record):
+    """How a rig's images become standard form.
+
+    Attributes:
+        rig: the rig.
+        image_size_px: (width, height) of both images in standard form.
+        focal_px: f, of both.
+        principal_px: (column, row) of the principal point, of both.
+        T_left_rectleft: (4, 4) a rotation.
+        T_right_rectright: (4, 4) a rotation.
+        map_left: (H, W, 2) the raw pixel that each pixel shows; NaN where the camera sees nothing.
+        map_right: the same of the right image.
+    """
+
+    rig: StereoRig
+    image_size_px: tuple[int, int]
+    focal_px: float
+    principal_px: tuple[float, float]
+    T_left_rectleft: Array
+    T_right_rectright: Array
+    map_left: NDArray[np.float32]
+    map_right: NDArray[np.float32]
+
+    def images(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """Turn raw images into standard form; what a camera does not see is black.
+
+        Raises:
+            InputError: an image is not of the size its camera was calibrated at.
+        """
+        out = []
+        for side, camera, image in (("left", self.rig.left, left), ("right", self.rig.right, right)):
+            if (image.shape[1], image.shape[0]) != tuple(camera.image_size_px):
+                width, height = camera.image_size_px
+                raise InputError(
+                    f"{side} image: {image.shape[1]}x{image.shape[0]} px, but the rig was calibrated at {width}x{height}"
+                )
+            place = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
+            out.append(np.asarray(cv2.remap(image, place, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)))
+        return out[0], out[1]
+
+    def seen(self, side: Side) -> NDArray[np.bool_]:
+        """(H, W) where an image in standard form shows something: where disparity is defined, in the left one."""
+        camera = self.rig.left if side == "left" else self.rig.right
+        place = self.map_left if side == "left" else self.map_right
+        high = np.array(camera.image_size_px) - 1
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((place >= 0) & (place <= high)).all(axis=2))
+
+    def to_rect(self, uv: Array, side: Side) -> Array:
+        """Take raw pixels (N, 2) to standard form (N, 2); NaN where there is none."""
+        camera = self.rig.left if side == "left" else self.rig.right
+        T = self.T_left_rectleft if side == "left" else self.T_right_rectright
+        ray = camera.unproject(uv) @ T[:3, :3]
+        z = np.where(ray[:, 2] > 0, ray[:, 2], np.nan)
+        return np.asarray(self.focal_px * ray[:, :2] / z[:, None] + self.principal_px)
+
+    def to_raw(self, uv_rect: Array, side: Side) -> Array:
+        """Take pixels in standard form (N, 2) to raw ones (N, 2); NaN where the camera sees nothing."""
+        camera = self.rig.left if side == "left" else self.rig.right
+        T = self.T_left_rectleft if side == "left" else self.T_right_rectright
+        return camera.project(_rays(uv_rect, self.focal_px, self.principal_px) @ T[:3, :3].T)
+
+    def points(self, uv_rect: Array, disparity: Array) -> Array:
+        """Take pixels (N, 2) of the left image in standard form and their disparities (N,) to points (N, 3), m, left frame.
+
+        NaN where a disparity is not that of a point in front of the cameras.
+        """
+        z = np.asarray(self.depth(np.asarray(disparity, np.float64)))
+        rays = _rays(uv_rect, self.focal_px, self.principal_px)
+        return np.asarray((rays * z[:, None]) @ self.T_left_rectleft[:3, :3].T)
+
+    def depth(self, disparity: NDArray[np.floating[Any]]) -> Array:
+        """Return depths, m, along the axis of the left camera in standard form, of disparities; NaN where there is none."""
+        d = np.where(np.asarray(disparity) > 0, disparity, np.nan).astype(np.float64)
+        return np.asarray(self.focal_px * self.rig.baseline_m / d)
+
+
+def _rays(uv: Array, focal_px: float, principal: tuple[float, float]) -> Array:
+    """Return rays (N, 3) of unit depth through pixels (N, 2) in standard form."""
+    return np.column_stack([(uv - np.asarray(principal)) / focal_px, np.ones(len(uv))])
+
+
+def rectify(rig: StereoRig) -> Rectification:
+    """Put a rig's images into standard form.
+
+    The new axes: x along the baseline, z as near to both optical axes as can be. The images keep the left one's size and the
+    mean focal length; what the two cameras look at on average is in the middle.
+
+    Raises:
+        InputError: the baseline lies along the optical axes: there is no standard form.
+    """
+    baseline = rig.T_left_right[:3, 3] / rig.baseline_m
+    ahead = np.array([0.0, 0.0, 1.0]) + rig.T_left_right[:3, 2]
+    if baseline[0] <= 0:
+        raise InputError("the right camera is on the left camera's left: exchange the two in the rig file")
+    z = ahead - (ahead @ baseline) * baseline
+    if np.linalg.norm(z) < _ASIDE * np.linalg.norm(ahead):
+        raise InputError("one camera is behind the other, along their view: such a rig has no standard form")
+    z = z / np.linalg.norm(z)
+    R_left_rect = np.column_stack([baseline, np.cross(z, baseline), z])
+    T_left_rectleft = pose(R_left_rect, np.zeros(3))
+    T_right_rectright = pose(inverse(rig.T_left_right)[:3, :3] @ R_left_rect, np.zeros(3))
+    focal = float(np.mean([camera.intrinsics[:2].mean() for camera in rig.cameras]))
+    size = np.array(rig.left.image_size_px)
+    turns = (T_left_rectleft[:3, :3], T_right_rectright[:3, :3])
+    looks = [_middle_ray(camera) @ R for camera, R in zip(rig.cameras, turns, strict=True)]
+    column, row = (size - 1) / 2 - np.mean([focal * look[:2] / look[2] for look in looks], axis=0)
+    principal = (float(column), float(row))
+    maps = [_map(camera, R, size, focal, principal) for camera, R in zip(rig.cameras, turns, strict=True)]
+    return Rectification(rig, rig.left.image_size_px, focal, principal, T_left_rectleft, T_right_rectright, *maps)
+
+
+def _middle_ray(camera: Camera) -> Array:
+    """Return the ray (3,) through the middle of a camera's image."""
+    return np.asarray(camera.unproject((np.array([camera.image_size_px]) - 1) / 2)[0])
+
+
+def _map(
+    camera: Camera, R_camera_rect: Array, size: NDArray[np.int64], focal: float, principal: tuple[float, float]
+) -> NDArray[np.float32]:
+    """Return the raw pixel (H, W, 2) of every pixel in standard form, NaN where there is none."""
+    width, height = int(size[0]), int(size[1])
+    out = np.empty((height, width, 2), np.float32)
+    for top in range(0, height, _ROWS):
+        v, u = np.mgrid[top : min(top + _ROWS, height), :width].astype(np.float64)
+        rays = _rays(np.column_stack([u.ravel(), v.ravel()]), focal, principal) @ R_camera_rect.T
+        out[top : top + _ROWS] = camera.project(rays).reshape(*u.shape, 2)
+    # Far off its axis a distortion polynomial folds back: what does not lead back to its own ray is no view. Folds are
+    # far larger than a few pixels, so that these are looked at only.
+    v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
+    rays = _rays(np.column_stack([u.ravel(), v.ravel()]), focal, principal) @ R_camera_rect.T
+    ahead = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    gap = np.abs(camera.unproject(out[v.ravel(), u.ravel()].astype(np.float64)) - ahead).max(axis=1)
+    folded = ~(gap < _SAME_RAY).reshape(u.shape)
+    out[np.kron(folded, np.ones((_STEP, _STEP), bool))[:height, :width]] = np.nan
+    return out
