@@ -1,157 +1,127 @@
-"""The main job on a rendered recording with truth: calibrate, measure, and hold every figure against the truth."""
+"""The whole experiment in the workcell: real physics, rendered cameras, the real ARM binary, held against the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from scipy.stats import chi2
 
-from armsight.app.poses import csv_text, pose_record
-from armsight.data import Array, Image, Missed, PoseEstimate, Record
+from armsight.app.experiment import Outcome, Progress, run_experiment
+from armsight.app.motion_file import CHAPTER, MotionPlan, read_motions
+from armsight.app.rate_study import rate_study
+from armsight.app.run_calibrate import calibrated, handeye_poses
+from armsight.app.run_folder import Finished, write_run
+from armsight.app.run_station import Station
+from armsight.app.studies import Study, vision_studies
+from armsight.data import Array
 from armsight.errors import ArmsightError
-from armsight.files import replacing, write_text
-from armsight.geometry.pose import inverse, log_se3
-from armsight.sim.bench import BOARD, demo_recording
-from armsight.sim.recording import Truth
-from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.files import write_text
+from armsight.geometry.pose import inverse
+from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
-from armsight.vision.image import grey
-from armsight.vision.markers.board import open_board
-from armsight.vision.markers.targets import open_target
-from armsight.vision.measure import measure
-from armsight.vision.rig import StereoRig
-from armsight.vision.sources import FolderSource
 
-Progress = Callable[[str], None]
+#: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
+_AMOUNTS = {False: (24, 30, 12), True: (14, 14, 0)}
 
 
-@dataclass(frozen=True, eq=False)
-class DemoResult(Record):
-    """What the demo measured, against the truth.
+@dataclass(frozen=True)
+class Demo:
+    """What to run.
 
     Attributes:
-        calibration: of the rendered board.
-        truth: of the measured shots.
-        estimates: one per shot: the pose, or why there is none.
-        errors: (N, 6) tangents from the estimate to the truth, [m; rad], body axes; NaN where a shot was missed.
-        sigmas: (N, 6) predicted standard deviations of the same.
-        inside: (N,) squared error in standard deviations (6 degrees of freedom).
-        picture: the first measured image with the pose drawn in.
+        folder: where to.
+        arm: nominal, used, worn, or a TOML file.
+        cameras: as the workcell takes them.
+        seed: of everything.
+        machine: what runs the firmware.
+        rig: parallel or verging.
+        quick: fewer calibration shots and no studies.
     """
 
-    calibration: Calibration
-    truth: Truth
-    estimates: tuple[PoseEstimate | Missed, ...]
-    errors: Array
-    sigmas: Array
-    inside: Array
-    picture: Image
-
-    def summary(self) -> dict[str, Any]:
-        """Return the figures, SI units in the keys."""
-        good = np.isfinite(self.inside)
-        position, turned = (np.linalg.norm(self.errors[good][:, part], axis=1) for part in (slice(3), slice(3, 6)))
-        held, rig, true = self.calibration.heldout, self.calibration.rig, self.truth.rig
-        return {
-            "shots": len(good),
-            "measured": int(good.sum()),
-            "position_rms_m": _rms(position),
-            "position_max_m": float(position.max()),
-            "position_sigma_rms_m": _rms(np.linalg.norm(self.sigmas[good][:, :3], axis=1)),
-            "orientation_rms_rad": _rms(turned),
-            "orientation_max_rad": float(turned.max()),
-            "orientation_sigma_rms_rad": _rms(np.linalg.norm(self.sigmas[good][:, 3:], axis=1)),
-            "inside_95_share": float((self.inside[good] <= chi2.ppf(0.95, 6)).mean()),
-            "heldout_epipolar_rms_px": held.epipolar_rms_px,
-            "heldout_rigid_rms_m": held.rigid_rms_m,
-            "baseline_error_m": rig.baseline_m - true.baseline_m,
-            "focal_error_px": float(rig.left.intrinsics[0] - true.left.intrinsics[0]),
-        }
+    folder: Path
+    arm: str = "worn"
+    cameras: str = "1280x720@60"
+    seed: int = 0
+    machine: str = "unicorn"
+    rig: str = "parallel"
+    quick: bool = False
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def run_demo(folder: Path, *, seed: int = 0, progress: Progress = lambda message: None) -> DemoResult:
-    """Render a recording, calibrate on its board, measure its end-effector, compare with the truth.
-
-    Args:
-        folder: receives the recording, ``rig.json``, ``poses.csv`` and ``pose.png``.
-        seed: of poses, background and noise.
-        progress: called with a line about what is being done.
-
-    Raises:
-        ArmsightError: a file cannot be written, or nothing was measured.
-    """
-    progress("rendering a recording with truth")
-    of_board, of_arm = demo_recording(folder, seed=seed)
-    progress("looking for the board")
-    board = open_board(BOARD)
-    pairs = []
-    source = FolderSource(str(folder / "board"))
-    while (shot := source.read()) is not None:
-        assert shot.left is not None
-        assert shot.right is not None
-        pairs.append(Pair(shot.name, board.detect(grey(shot.left)), board.detect(grey(shot.right))))
-    sizes = (of_board.rig.left.image_size_px, of_board.rig.right.image_size_px)
-    calibration = calibrate_boards(board, pairs, sizes, progress=progress)
-    calibration.rig.save(folder / "rig.json")
-    progress("measuring the end-effector")
-    target = open_target(str(folder / "plate.toml"))
-    estimates, records, picture = [], [], None
-    source = FolderSource(str(folder / "arm"))
-    while (shot := source.read()) is not None:
-        estimate = measure(calibration.rig, target, shot)
-        estimates.append(estimate)
-        records.append(pose_record(shot.name, shot.t_s, target.body, estimate))
-        if picture is None and isinstance(estimate, PoseEstimate) and shot.left is not None:
-            picture = drawn(calibration.rig, grey(shot.left), estimate)
-    write_text(folder / "poses.csv", csv_text(records))
-    if picture is None:
-        raise ArmsightError(f"none of the {len(estimates)} rendered shots could be measured")
-    with replacing(folder / "pose.png", "wb") as file:
-        file.write(cv2.imencode(".png", picture)[1].tobytes())
-    return _compared(calibration, of_arm, estimates, picture)
-
-
-def _compared(
-    calibration: Calibration, truth: Truth, estimates: list[PoseEstimate | Missed], picture: Image
-) -> DemoResult:
-    """Hold every estimate against the truth."""
-    errors, sigmas = np.full((len(estimates), 6), np.nan), np.full((len(estimates), 6), np.nan)
-    inside = np.full(len(estimates), np.nan)
-    for n, estimate in enumerate(estimates):
-        if isinstance(estimate, PoseEstimate):
-            errors[n] = log_se3(inverse(estimate.T_left_body) @ truth.Ts_left_body[n])
-            sigmas[n] = np.sqrt(np.diag(estimate.cov))
-            inside[n] = errors[n] @ np.linalg.solve(estimate.cov, errors[n])
-    return DemoResult(calibration, truth, tuple(estimates), errors, sigmas, inside, picture)
-
-
-def drawn(rig: StereoRig, image: Image, estimate: PoseEstimate, axis_m: float = 0.05) -> Image:
-    """Draw a measured pose into the left image: the points as dots, the body's axes red, green, blue (x, y, z).
-
-    Args:
-        rig: the calibrated pair.
-        image: (H, W) grey.
-        estimate: the measured pose.
-        axis_m: length of the axes.
+def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str, Any]:
+    """Run the experiment in a workcell, and write its folder.
 
     Returns:
-        (H, W, 3) BGR image.
+        The summary, as summary.json has it.
+
+    Raises:
+        ArmsightError: an unknown name, a folder that cannot be written to, or the run could not be made; what was measured
+            is in the folder.
     """
-    out = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    T, shift = estimate.T_left_body, 4
-    ends = np.concatenate([T[:3, 3][None], T[:3, 3] + axis_m * T[:3, :3].T, estimate.points.p_left])
-    uv = np.round(rig.left.project(ends) * 2**shift).astype(int)
-    for i, colour in enumerate(((60, 60, 230), (80, 200, 80), (230, 120, 40)), start=1):
-        cv2.arrowedLine(out, tuple(uv[0].tolist()), tuple(uv[i].tolist()), colour, 2, cv2.LINE_AA, shift, 0.12)
-    for p in uv[4:]:
-        cv2.circle(out, tuple(p.tolist()), 3 << shift, (0, 220, 255), 1, cv2.LINE_AA, shift)
-    return out
+    began = time.perf_counter()
+    boards, handeyes, study_shots = _AMOUNTS[demo.quick]
+    progress("building the workcell")
+    with Workcell(arm=demo.arm, cameras=demo.cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig) as cell:
+        progress("showing the board")
+        calibration = calibrated(cell.board_spec, cell.board_shots(boards), progress)
+        calibration.rig.save(demo.folder / "rig.json")
+        write_text(demo.folder / "body.toml", cell.body_text)
+        plan = read_motions(cell.model)
+        write_text(demo.folder / "motion.toml", CHAPTER.read_text(encoding="utf-8"))
+        targets = handeye_poses(cell.model, np.vstack([cell.model.home, cell.poses]), handeyes, demo.seed)
+        outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
+        studies = _studies(demo, calibration, outcome, plan, study_shots, progress)
+        progress("drawing")
+        facts = {
+            "seed": demo.seed,
+            "arm": demo.arm,
+            "cameras": demo.cameras,
+            "board": cell.board.welcome.board,
+            "machine": demo.machine,
+            "wall_s": time.perf_counter() - began,
+        }
+        finished = Finished(
+            cell.model, calibration.rig, outcome, plan, _truth(cell, outcome), facts, studies, cell.picture()
+        )
+    summary = write_run(finished, demo.folder)
+    if outcome.ended_by is not None:
+        raise ArmsightError(f"{outcome.ended_by}; what was measured until then is in {demo.folder}")
+    if outcome.interrupted:
+        raise KeyboardInterrupt
+    return summary
+
+
+def station_of(cell: Workcell) -> Station:
+    """Return a workcell as a station like any other."""
+    sync_s = float(np.hypot(cell.timing.sync_s / np.sqrt(3), cell.timing.skew_s))
+    return Station(cell.model, cell.board, cell.poll, cell.target, cell.gravity_duty, cell.timing.rate_hz, sync_s)
+
+
+def _truth(cell: Workcell, outcome: Outcome) -> tuple[Array, Array] | None:
+    """Return where the tool really was: times and poses in the base that the hand-eye calibration defined.
+
+    The true poses are those of the body before the true cameras; base and tool are what the calibration says they are, for
+    an arm that is off has none of its own. How far they are from the frames of the true table stands in the summary.
+    """
+    if outcome.handeye is None:
+        return None
+    truth, mounting = cell.truth, outcome.handeye.mounting
+    T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
+    return truth.t_s, mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
+
+
+def _studies(
+    demo: Demo, calibration: Calibration, outcome: Outcome, plan: MotionPlan, shots: int, progress: Progress
+) -> list[Study]:
+    """Make the studies, unless that is left out or the run ended early."""
+    if not shots or outcome.closed_s is None or outcome.ended_by is not None or outcome.interrupted:
+        return []
+
+    def at_rate(rate_hz: float) -> Workcell:
+        cameras = f"{demo.cameras.partition('@')[0]}@{rate_hz:g}"
+        return Workcell(arm=demo.arm, cameras=cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig)
+
+    found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
+    return [*found, rate_study(at_rate, station_of, calibration.rig, outcome, plan, progress)]

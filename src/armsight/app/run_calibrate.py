@@ -165,10 +165,11 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     there = Segment("calibration", "sweep's start", "joints", False, trajectory=way)
     loop.run(Planned(way, loop.t_s, gravity), way.duration_s + DELAY_REST_S, there, watch=False)
     sweep = Sweep(q_middle)
-    looked = len(loop.log.sightings)
+    looked = len(loop.log.poses)
     controller = Planned(sweep, loop.t_s, gravity)
     loop.run(controller, sweep.duration_s, Segment("calibration", "sweep", "joints", False, trajectory=sweep))
-    seen = [sighting for _, sighting in loop.log.sightings[looked:]]
+    assert loop.mounting is not None
+    seen = [loop.mounting.sighting(p, t) for _, t, p in loop.log.poses[looked:] if isinstance(p, PoseEstimate)]
     loop.run(controller, DELAY_REST_S, Segment("calibration", "", "", False), watch=False)
     states = JointStates(
         np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from armsight.app.run_loop import Log, Segment
 from armsight.app.run_tracks import ToolTrack
-from armsight.data import Array, Record
-from armsight.loop.estimators import Verdict
+from armsight.data import Array, PoseEstimate, Record
+from armsight.loop.estimators import Mounting, Verdict
 from armsight.robot.arm import Arm
 
 
@@ -49,12 +49,15 @@ class RunData(Record):
     outliers: int
 
 
-def assembled(log: Log, arm: Arm, delay_s: float, truth: tuple[Array, Array] | None = None) -> RunData:
+def assembled(
+    log: Log, arm: Arm, mounting: Mounting, delay_s: float, truth: tuple[Array, Array] | None = None
+) -> RunData:
     """Bring a log onto one axis of time.
 
     Args:
         log: of the run.
         arm: the nominal arm.
+        mounting: where cameras and body are.
         delay_s: how late the camera's stamps are.
         truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
     """
@@ -70,7 +73,7 @@ def assembled(log: Log, arm: Arm, delay_s: float, truth: tuple[Array, Array] | N
             ).q
     planned = np.isfinite(q_wanted).all(axis=1)
     named = _Named(log.segments)
-    seen = [(s.t_s - delay_s, s) for _, s in log.sightings]
+    seen = [mounting.sighting(p, t - delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(
         t_s,
@@ -78,9 +81,9 @@ def assembled(log: Log, arm: Arm, delay_s: float, truth: tuple[Array, Array] | N
         q_wanted,
         named.track(t_s, arm.forward(q)),
         named.track(
-            np.array([t for t, _ in seen]),
-            np.array([s.T_base_tool for _, s in seen]).reshape(-1, 4, 4),
-            np.array([s.cov_noise + s.cov_common for _, s in seen]).reshape(-1, 6, 6),
+            np.array([s.t_s for s in seen]),
+            np.array([s.T_base_tool for s in seen]).reshape(-1, 4, 4),
+            np.array([s.cov_noise + s.cov_common for s in seen]).reshape(-1, 6, 6),
         ),
         named.track(
             np.concatenate([part.t_s for part in fused]),
@@ -92,7 +95,7 @@ def assembled(log: Log, arm: Arm, delay_s: float, truth: tuple[Array, Array] | N
         tuple(log.segments),
         np.array(log.latency_s),
         np.array(log.modes),
-        len(log.poses) - len(log.sightings),
+        len(log.poses) - len(seen),
         sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
     )
 

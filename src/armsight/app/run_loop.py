@@ -13,11 +13,11 @@ from typing import Protocol
 
 import numpy as np
 
+from armsight.app.run_station import Station
 from armsight.app.run_tracks import ToolTrack
-from armsight.data import JointCommand, JointStates, PoseEstimate, Shot
+from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
-from armsight.loop.estimators import Estimator, Mounting, Sighting, Verdict
-from armsight.robot.boards.board import Board
+from armsight.loop.estimators import Estimator, Mounting, Verdict
 from armsight.robot.boards.codes import State
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.follow import Follower
@@ -67,9 +67,8 @@ class Log:
     Attributes:
         joints: the potentiometers, batch by batch.
         fused: where the estimator had the tool at each reading, batch by batch.
-        sightings: each used shot's, with the name of the shot.
-        verdicts: what the estimator made of each of them.
-        poses: each shot's name, stamp and pose, or why there is none.
+        poses: each shot's name, stamp and pose (the cameras' skew in its covariance), or why there is none.
+        verdicts: what the estimator made of those it was given.
         commands: when each was sent, and what.
         modes: what each was based on.
         latency_s: our time from an image to the command that knows it, image by image, s.
@@ -78,9 +77,8 @@ class Log:
 
     joints: list[JointStates] = field(default_factory=list)
     fused: list[ToolTrack] = field(default_factory=list)
-    sightings: list[tuple[str, Sighting]] = field(default_factory=list)
+    poses: list[tuple[str, float, PoseEstimate | Missed]] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
-    poses: list[tuple[str, float, object]] = field(default_factory=list)
     commands: list[tuple[float, JointCommand]] = field(default_factory=list)
     modes: list[str] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
@@ -91,32 +89,32 @@ class Loop:
     """Runs controllers on a board with cameras beside it.
 
     Args:
-        board: the joints.
-        poll: returns the newest shot not handed out yet, or None; raises DeviceError where a camera is gone.
+        station: the board, the cameras.
         follower: measures the body.
-        mounting: where cameras and body are.
-        estimator: says where the tool is.
         log: where all is kept.
-        on_shot: called with each shot that was looked at, after its command is on its way.
+        estimator: says where the tool is.
+
+    Attributes:
+        mounting: where cameras and body are; None before that is known: the estimator then hears the joints alone.
+        on_shot: called with each shot that was looked at and what came of it, after its command is on its way.
+        t_s: time of the newest reading, board's clock.
     """
 
-    def __init__(
-        self,
-        board: Board,
-        poll: Callable[[], Shot | None],
-        follower: Follower,
-        mounting: Mounting,
-        estimator: Estimator,
-        log: Log,
-        *,
-        on_shot: Callable[[Shot, object], None] = lambda shot, result: None,
-    ) -> None:
-        self.board, self.poll, self.follower, self.mounting = board, poll, follower, mounting
-        self.estimator, self.log, self.on_shot = estimator, log, on_shot
+    def __init__(self, station: Station, follower: Follower, log: Log, estimator: Estimator) -> None:
+        self.board, self.station, self.follower = station.board, station, follower
+        self.estimator, self.log = estimator, log
+        self.mounting: Mounting | None = None
+        self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.t_s = 0.0
         self._shot_s: float | None = None
+        self._last: tuple[float, Array] | None = None
         while not log.joints:
             self.pass_time(PERIOD_S)
+
+    def begin(self, estimator: Estimator) -> None:
+        """Take another estimator from here on; it hears the last readings first."""
+        self.estimator = estimator
+        estimator.joints(self.log.joints[-1])
 
     def pass_time(self, wait_s: float) -> None:
         """Let time pass and hear the joints."""
@@ -130,20 +128,39 @@ class Loop:
         none = np.full(len(states.t_s), "")
         self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
 
-    def look(self) -> tuple[Shot, float, object] | None:
+    def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
-        shot = self.poll()
+        shot = self.station.poll()
         if shot is None:
             return None
         began = time.perf_counter()
         result = self.follower.measure(shot)
         self._shot_s = self.t_s
-        if isinstance(result, PoseEstimate) and shot.t_s is not None:
-            sighting = self.mounting.sighting(result, shot.t_s)
-            self.log.sightings.append((shot.name, sighting))
-            self.log.verdicts.append(self.estimator.vision(sighting))
-        self.log.poses.append((shot.name, float("nan") if shot.t_s is None else shot.t_s, result))
+        if shot.t_s is None:
+            result = Missed("the shot has no time")
+        elif isinstance(result, PoseEstimate):
+            result = self._with_skew(result, shot.t_s)
+            if self.mounting is not None:
+                self.log.verdicts.append(self.estimator.vision(self.mounting.sighting(result, shot.t_s)))
+        self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
         return shot, began, result
+
+    def _with_skew(self, pose: PoseEstimate, t_s: float) -> PoseEstimate:
+        """Widen the covariance by what the cameras' unsynchronised exposures do to a moving body.
+
+        Between the exposures it moves v dt along the baseline, which is taken for disparity: the depth is off by
+        Z / B v dt along the line of sight.
+        """
+        p = pose.T_left_body[:3, 3]
+        last, self._last = self._last, (t_s, p)
+        if last is None or not 0.0 < t_s - last[0] < STALLED_S:
+            return pose
+        baseline = self.follower.rig.T_left_right[:3, 3]
+        along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))
+        off = pose.T_left_body[:3, :3].T @ p * (self.station.sync_s * along / np.linalg.norm(baseline))
+        extra = np.zeros((6, 6))
+        extra[:3, :3] = np.outer(off, off)
+        return replace(pose, cov=pose.cov + extra, cov_noise=pose.cov_noise + extra)
 
     def run(self, controller: Controller, duration_s: float, segment: Segment, *, watch: bool = True) -> None:
         """Let a controller command the joints for a while.

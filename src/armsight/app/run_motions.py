@@ -9,6 +9,7 @@ import numpy as np
 from armsight.app.run_loop import PERIOD_S
 from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
+from armsight.loop.servo import PoseServo
 from armsight.robot.trajectories import Joints, Trajectory
 
 
@@ -54,3 +55,26 @@ class Sweep:
         qd = self._reach * (window_d * s + window * w * c)
         qdd = self._reach * (window_dd * s + 2 * window_d * w * c - window * w**2 * s)
         return Joints(q, qd, qdd)
+
+
+class Closed:
+    """Sends a trajectory corrected by what vision sees.
+
+    Args:
+        servo: the outer loop; one for all motions, as it carries its correction over.
+        trajectory: joint angles over time.
+        start_s: when it begins, board's clock.
+        gravity: gives the duty that carries the arm at joint angles.
+    """
+
+    def __init__(
+        self, servo: PoseServo, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]
+    ) -> None:
+        self._servo, self._trajectory, self._start_s, self._gravity = servo, trajectory, start_s, gravity
+
+    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be a period from now for the tool to be right."""
+        since = t_s - self._start_s
+        duty = self._gravity(self._trajectory.at(since + PERIOD_S).q)
+        step = self._servo.step(self._trajectory, since, estimator, duty)
+        return step.command, step.mode.name.lower()

@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_loop import PERIOD_S, Controller, Loop, Segment
-from armsight.app.run_motions import Planned
+from armsight.app.run_motions import Closed, Planned
 from armsight.data import Array
+from armsight.loop.servo import PoseServo
 from armsight.robot.trajectories import Trajectory
 
 #: Makes a controller of a trajectory that begins at a time of the board's clock.
@@ -15,8 +16,14 @@ Control = Callable[[Trajectory, float], Controller]
 
 
 def drive(
-    loop: Loop, plan: MotionPlan, control: Control, *, closed: bool, progress: Callable[[str], None]
-) -> tuple[float, float]:
+    loop: Loop,
+    plan: MotionPlan,
+    control: Control,
+    *,
+    closed: bool,
+    progress: Callable[[str], None],
+    started: Callable[[str, str, float], None] = lambda motion, kind, duration_s: None,
+) -> None:
     """Drive all motions of a plan, with its rests.
 
     Args:
@@ -25,26 +32,28 @@ def drive(
         control: what commands the joints.
         closed: whether that closes the loop on vision.
         progress: called with a line about what is being done.
-
-    Returns:
-        When it began and ended, board's clock, s.
+        started: called with name, kind and duration of each motion as it begins.
 
     Raises:
         DeviceError: the board or a camera failed.
     """
-    begin_s = loop.t_s
     phase = "closed_loop" if closed else "open_loop"
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
         # The controller begins a period from now: its first command is for the first step of the way.
         controller = control(motion.trajectory, loop.t_s + PERIOD_S)
         segment = Segment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)
         rest = Segment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
         loop.run(controller, motion.rest_s, rest)
-    return begin_s, loop.t_s
 
 
 def planned(gravity: Callable[[Array], Array]) -> Control:
     """Return what follows the plan with potentiometers alone."""
     return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
+
+
+def closed_on(servo: PoseServo, gravity: Callable[[Array], Array]) -> Control:
+    """Return what follows the plan with the loop closed on vision."""
+    return lambda trajectory, start_s: Closed(servo, trajectory, start_s, gravity)
