@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from armsight.app.run_summary import judge, path_errors, rest_errors, rms, sprea
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
 from armsight.app.studies import Study
 from armsight.data import Array, Image, Missed, PoseEstimate
+from armsight.errors import InputError
 from armsight.files import write_text
 from armsight.robot.arm import Arm
 from armsight.vision.image import grey
@@ -251,3 +253,17 @@ def drawn(rig: StereoRig, image: Image, estimate: PoseEstimate, axis_m: float = 
     for p in uv[4:]:
         cv2.circle(out, tuple(p.tolist()), 3 << shift, (0, 220, 255), 1, cv2.LINE_AA, shift)
     return out
+
+
+def open_folder(folder: Path) -> None:
+    """Make a run's folder, before the long work begins.
+
+    Raises:
+        InputError: it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: no run can be written here: {error.strerror}") from None

@@ -26,6 +26,7 @@ COMMANDS = {
     "measure": "measure",
     "record": "record",
     "rig": "rig",
+    "run": "run",
 }
 
 
