@@ -22,6 +22,7 @@ COMMANDS = {
     "calibrate": "calibrate",
     "cameras": "cameras",
     "demo": "demo",
+    "dense": "dense",
     "identify": "identify",
     "measure": "measure",
     "record": "record",

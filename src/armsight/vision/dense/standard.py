@@ -6,11 +6,13 @@ in the right image than in the left one. The last two are told from a few hundre
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import SIDES, Array, Image, Shot
+from armsight.data import SIDES, Array, Image
 from armsight.errors import InputError
 from armsight.vision.dense.method import Disparity, Method, Search
 from armsight.vision.image import grey
@@ -79,11 +81,8 @@ def check_standard(left: Image, right: Image) -> str | None:
         A remark where they are a little off; None where nothing is.
 
     Raises:
-        InputError: another size, exchanged, or not in standard form.
+        InputError: exchanged, or not in standard form.
     """
-    if left.shape != right.shape:
-        (h, w), (k, m) = left.shape, right.shape
-        raise InputError(f"the left image is {w}x{h} px and the right one {m}x{k}; both must be of one size")
     corners = alike(left, right)
     if len(corners) < _ENOUGH:
         return None
@@ -100,6 +99,17 @@ def check_standard(left: Image, right: Image) -> str | None:
     if size > _VERTICAL_NOTE_PX:
         return f"the rows of the two images are {size:.1f} px apart: matching suffers; calibrate again"
     return None
+
+
+def check_sizes(left: Image, right: Image) -> None:
+    """Refuse images of two sizes.
+
+    Raises:
+        InputError: they are.
+    """
+    if left.shape != right.shape:
+        (h, w), (k, m) = left.shape, right.shape
+        raise InputError(f"the left image is {w}x{h} px and the right one {m}x{k}; both must be of one size")
 
 
 def check_search(search: Search, width: int) -> None:
@@ -122,7 +132,13 @@ def untextured(image: Image, side: str) -> str | None:
     return f"the {side} image has no texture: its grey levels are the same everywhere, to {_TEXTURE:g}"
 
 
-def match_pair(method: Method, left: NDArray[np.generic], right: NDArray[np.generic], search: Search) -> Disparity:
+def match_pair(
+    method: Method,
+    left: NDArray[np.generic],
+    right: NDArray[np.generic],
+    search: Search,
+    note: Callable[[str], None] = lambda line: None,
+) -> Disparity:
     """Check a pair in standard form and match it.
 
     Args:
@@ -130,6 +146,7 @@ def match_pair(method: Method, left: NDArray[np.generic], right: NDArray[np.gene
         left: (H, W) or (H, W, 3) BGR; uint8, uint16, or floats of 0 to 255.
         right: the same.
         search: which disparities to try.
+        note: told what is a little wrong with the pair.
 
     Returns:
         The disparities; empty, with the reason, where there is nothing to match.
@@ -138,9 +155,12 @@ def match_pair(method: Method, left: NDArray[np.generic], right: NDArray[np.gene
         InputError: not images, not of one size, exchanged, not in standard form, or a search that leaves the image.
     """
     images = [plain_grey(image, side) for image, side in zip((left, right), SIDES, strict=True)]
+    check_sizes(*images)
     check_search(search, images[0].shape[1])
     for image, side in zip(images, SIDES, strict=True):
-        if (problem := untextured(image, side)) is not None and images[0].shape == images[1].shape:
+        if (problem := untextured(image, side)) is not None:
             return Disparity.none((image.shape[0], image.shape[1]), search, problem)
-    check_standard(*images)
+    remark = check_standard(*images)
+    if remark is not None:
+        note(remark)
     return method.match(*images, search)

@@ -1,0 +1,84 @@
+"""Pictures of disparity maps: colours with a scale, what was not measured set apart; and where a map is wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Image
+from armsight.vision.dense.judge import Truth
+from armsight.vision.dense.method import MEASURED, NOTHING, Disparity
+
+_BAR_PX, _MARGIN_PX, _CAPTION_PX = 18, 62, 26
+_INK, _PAPER = (41, 31, 31), (255, 255, 255)
+_FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+#: Colours (BGR) of an error map: right, off by more than each threshold, and no truth.
+_RIGHT, _OFF_1, _OFF_2, _OFF_4, _UNKNOWN = (225, 225, 225), (120, 200, 250), (40, 130, 235), (30, 30, 170), (90, 60, 40)
+
+
+def _colours(values: NDArray[np.floating[Any]], low: float, high: float) -> Image:
+    """Return colours (..., 3) BGR for values between low and high."""
+    share = np.clip(np.nan_to_num((values - low) / max(high - low, 1e-9)), 0, 1)
+    return np.asarray(cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO))
+
+
+def _write(canvas: Image, text: str, place: tuple[int, int]) -> None:
+    """Put a line of text on a canvas; it is plain ASCII, for OpenCV's font has nothing else."""
+    cv2.putText(canvas, text, place, _FONT, _SIZE, _INK, 1, cv2.LINE_AA)
+
+
+def paint_disparity(result: Disparity) -> Image:
+    """Return a picture (BGR) of a disparity map with its scale; what was filled is paler, in stripes."""
+    height, width = result.disparity.shape
+    canvas = np.full((height + _CAPTION_PX, width + _BAR_PX + _MARGIN_PX, 3), _PAPER, np.uint8)
+    some = np.isfinite(result.disparity) & (result.state != NOTHING)
+    if not some.any():
+        canvas[:height, :width] = (200, 200, 200)
+        _write(canvas, "nothing measured", (4, height + 17))
+        return canvas
+    low, high = (float(q) for q in np.percentile(result.disparity[some], (0.5, 99.5)))
+    picture = _colours(result.disparity, low, high)
+    v, u = np.mgrid[:height, :width]
+    pale = some & (result.state != MEASURED) & ((u + v) % 6 < 3)
+    picture[pale] = (0.35 * picture[pale] + 0.65 * 255).astype(np.uint8)
+    picture[~some] = (200, 200, 200)
+    canvas[:height, :width] = picture
+    _bar(canvas, height, width, low, high)
+    shares = [f"{100 * np.mean(result.state == k):.0f}% {name}" for k, name in enumerate(("", "measured", "hidden", "filled")) if k]
+    _write(canvas, ", ".join(shares), (4, height + 17))
+    return canvas
+
+
+def _bar(canvas: Image, height: int, width: int, low: float, high: float) -> None:
+    """Draw the scale with five numbers beside the picture."""
+    left = width + 10
+    values = np.linspace(high, low, height)[:, None]
+    canvas[:height, left : left + _BAR_PX] = np.repeat(_colours(values, low, high), _BAR_PX, axis=1)
+    for k in range(5):
+        y = round(k * (height - 1) / 4)
+        value = high + (low - high) * k / 4
+        _write(canvas, f"{value:.3g}" + (" px" if k == 0 else ""), (left + _BAR_PX + 3, min(max(y + 4, 10), height - 2)))
+
+
+def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
+    """Return a picture (BGR) of where a map is off by more than 1, 2 and 4 px; what only the left camera sees is darker."""
+    height, width = disparity.shape
+    error = np.abs(disparity - truth.disparity)
+    picture = np.full((height, width, 3), _RIGHT, np.uint8)
+    for threshold, colour in ((1.0, _OFF_1), (2.0, _OFF_2), (4.0, _OFF_4)):
+        picture[~(error <= threshold)] = colour
+    hidden = truth.known & ~truth.seen
+    picture[hidden] = (0.75 * picture[hidden]).astype(np.uint8)
+    picture[~truth.known] = _UNKNOWN
+    canvas = np.full((height + _CAPTION_PX, width, 3), _PAPER, np.uint8)
+    canvas[:height] = picture
+    x = 4
+    for name, colour in (("right", _RIGHT), ("> 1 px", _OFF_1), ("> 2", _OFF_2), ("> 4", _OFF_4), ("no truth", _UNKNOWN)):
+        cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), colour, -1)
+        cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), _INK, 1)
+        _write(canvas, name, (x + 14, height + 17))
+        x += 24 + 8 * len(name)
+    return canvas
