@@ -186,8 +186,12 @@ class Campaign:
         else:
             self.violate(f"the arm cannot be enabled again: {self.board.status}")
         self.periods(int(self.rng.integers(80, 160)))
-        while np.abs(self.plant.qd).max() < 0.2 and not self.fault_was:
+        for _ in range(500):
+            if np.abs(self.plant.qd).max() > 0.2:
+                break
             self.period()
+        else:
+            self.violate("the arm cannot be brought into motion")
         if self.fault_was:
             self.violate(f"fault {self.outputs['first_fault']} before the next one strikes")
 

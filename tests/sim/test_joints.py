@@ -1,4 +1,4 @@
-"""Six joints to drive: their motion against the motor's equations solved by hand, their readings, and what breaks on them."""
+"""Six joints to drive: their motion against the motor's equations solved by hand, their readings, and what breaks."""
 
 import math
 

@@ -6,11 +6,11 @@ image fills is written: what a board stores between its pieces (its configuratio
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import which
 
 from armsight.errors import DeviceError, InputError
 from armsight.files import replacing
@@ -103,9 +103,9 @@ def flash(built: Built, programmer: str | None = None) -> str:
     """
     if built.board not in FLASHED:
         raise InputError(f"{built.board} is no board to plug in; there is {', '.join(FLASHED)}")
-    name = programmer or next((each for each in PROGRAMMERS if shutil.which(each)), None)
+    name = programmer or next((each for each in PROGRAMMERS if which(each)), None)
     lies = ", ".join(f"{piece} (to {address:#010x})" for address, piece in built.pieces)
-    if name is None or shutil.which(name) is None:
+    if name is None or which(name) is None:
         missing = f"{name} is not installed" if name else f"none of {', '.join(PROGRAMMERS)} is installed"
         raise DeviceError(f"{missing}: apt install stlink-tools, openocd or dfu-util; the firmware lies in {lies}")
     for command in PROGRAMMERS[name](built):

@@ -27,6 +27,14 @@ def hold(q, duration_s=0.01):
     return JointCommand(q, [0.0] * 6, [0.0] * 6, duration_s)
 
 
+def keep_on(board, *, sends=None, times=100, wait_s=0.02):
+    """Receive again and again, and send something each time: for what is to raise sooner or later."""
+    for _ in range(times):
+        if sends is not None:
+            board.send(sends)
+        board.receive(wait_s)
+
+
 class ScriptedLink:
     """A link whose far side is a function: bytes written -> bytes to be read."""
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from board_rigs import ScriptedLink, Speaker, hold, host_board
+from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
@@ -59,7 +59,7 @@ def test_a_board_of_another_version_is_refused_by_name(versions):
 
 def test_nothing_on_the_wire_is_told_as_such():
     link = ScriptedLink()
-    with pytest.raises(DeviceError, match="no board answers .nothing comes.: is it the right port"):
+    with pytest.raises(DeviceError, match=r"no board answers .nothing comes.: is it the right port"):
         Board(link)
     assert link.closed
     assert link.waited_s == pytest.approx(1.0)  # 20 hellos, 50 ms each
@@ -196,7 +196,7 @@ def test_gains_are_taken_whole_or_refused_by_name():
     board.confirm(board.set_gains(gains))
     assert np.array_equal(gains_array(board.configuration()), gains.astype(np.float32))
     gains[4, 0] = 100.5
-    with pytest.raises(InputError, match="joint 5: kp_per_rad is 100.5; 0 to 100 is allowed; nothing was changed"):
+    with pytest.raises(InputError, match=r"joint 5: kp_per_rad is 100\.5; 0 to 100 is allowed; nothing was changed"):
         board.set_gains(gains)
     with pytest.raises(DeviceError, match="a number is outside its range"):
         board.confirm(board.set_gains(gains, checked=False))
@@ -223,7 +223,7 @@ def test_a_configuration_is_not_stored_with_the_drives_on():
         board.store(lab_configuration())
     broken = lab_configuration()
     broken["joint"]["duty_limit"][1] = 1.5
-    with pytest.raises(InputError, match="joint 2: duty_limit is 1.5; 0 to 1 is allowed; nothing was changed"):
+    with pytest.raises(InputError, match=r"joint 2: duty_limit is 1\.5; 0 to 1 is allowed; nothing was changed"):
         board.store(broken)
 
 
@@ -255,8 +255,7 @@ def test_a_silent_board_is_told_with_what_its_arm_does(reaction, does):
     board.receive(0.01)
     link._faults = Mute()
     with pytest.raises(DeviceError, match=f"has sent nothing for .* cable pulled.* the board {does}.* after 250 ms"):
-        for _ in range(60):
-            board.receive(0.02)
+        keep_on(board)
 
 
 def test_a_link_that_breaks_is_told_with_what_the_arm_does():
@@ -277,9 +276,7 @@ def test_a_board_that_started_anew_is_told():
     board, link, _ = host_board()
     link.restart(watchdog=True)
     with pytest.raises(DeviceError, match="has started anew: its drives are off; connect to it again"):
-        for _ in range(5):
-            board.send(hold(ZERO))
-            board.receive(0.02)
+        keep_on(board, sends=hold(ZERO), times=5)
     assert [each.fault for each in Board(link).status.faults] == [Fault.WATCHDOG]
 
 

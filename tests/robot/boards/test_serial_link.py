@@ -11,10 +11,10 @@ import sys
 import numpy as np
 import pytest
 import serial
-from board_rigs import PtyBoard, hold
+from board_rigs import PtyBoard, hold, keep_on
 
 from armsight.app.board_selftest import selftest
-from armsight.errors import DeviceError
+from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.opening import open_board
 from armsight.robot.boards.serial import SerialLink, list_ports
@@ -73,7 +73,7 @@ def test_a_port_that_is_refused_is_told(monkeypatch, code, said):
 
 def test_a_missing_pyserial_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(Exception, match="pip install 'armsight.board.'"):
+    with pytest.raises(InputError, match=r"pip install 'armsight.board.'"):
         SerialLink("/dev/ttyACM0")
 
 
@@ -129,9 +129,7 @@ def test_a_cable_pulled_in_motion_is_told_and_the_arm_stops_by_itself(cable):
         f"{cable.port} is gone: was the cable pulled.*without commands the board slows down and holds.* after 100 ms"
     )
     with pytest.raises(DeviceError, match=wanted):
-        for _ in range(100):
-            board.send(far)
-            board.receive(0.001)
+        keep_on(board, sends=far, wait_s=0.001)
     board.close()
     # The board knows nothing of cables: it hears nothing for 100 ms and then slows the arm down and holds it.
     moved = cable.plant.q.copy()
