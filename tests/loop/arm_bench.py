@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from armsight.data import JointStates, PoseEstimate
-from armsight.loop.estimators import Mounting, Prior
+from armsight.loop.estimators import Mounting, Prior, Track
 from armsight.robot.models import MODELS
 
 ARM = MODELS["six_r"]
@@ -71,11 +72,11 @@ class TrueArm:
     """An arm that differs from its table, and remembers on which side of its gears it stands."""
 
     smalls: list = field(default_factory=lambda: [np.eye(4)] * 7)
-    linearity: object = lambda q: 0.0 * q  # noqa: E731 - (N, 6) to (N, 6)
+    linearity: object = lambda q: 0.0 * q
     backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))
     compliance: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    rest: object = lambda travel: 0.0 * travel  # noqa: E731 - joints' wander by travel (N, 6)
-    loose: object = lambda travel: np.zeros((len(travel), 6))  # noqa: E731 - the pose's, by travel of all joints (N,)
+    rest: object = lambda travel: 0.0 * travel
+    loose: object = lambda travel: np.zeros((len(travel), 6))
     held: np.ndarray | None = None
     travelled: np.ndarray = field(default_factory=lambda: np.zeros(6))
     last: np.ndarray | None = None
@@ -107,12 +108,12 @@ class Wander:
         keep = np.exp(-step / length)
         draws = rng.normal(size=(n, width))
         draws[1:] *= np.sqrt(1 - keep**2)
-        for k in range(1, n):
-            draws[k] += keep * draws[k - 1]
-        self._grid, self._paths = np.arange(n) * step, draws * sigma
+        self._grid, self._paths = np.arange(n) * step, lfilter([1.0], [1.0, -keep], draws, axis=0) * sigma
 
     def joints(self, travel):
-        return np.stack([np.interp(travel[:, i], self._grid, self._paths[:, i]) for i in range(travel.shape[1])], axis=1)
+        return np.stack(
+            [np.interp(travel[:, i], self._grid, self._paths[:, i]) for i in range(travel.shape[1])], axis=1
+        )
 
     def pose(self, travel):
         return np.stack([np.interp(travel, self._grid, path) for path in self._paths.T], axis=1)
@@ -199,22 +200,32 @@ def states(t, q):
 
 
 def off(T, T_true):
-    """Right tangent (6,) from an estimate to the truth, to first order."""
+    """Right tangents (..., 6) from estimates to the truth, to first order."""
     D = np.linalg.inv(T) @ T_true
-    return np.concatenate([D[:3, 3], Rotation.from_matrix(D[:3, :3]).as_rotvec()])
+    turn = Rotation.from_matrix(D[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*D.shape[:-2], 3)
+    return np.concatenate([D[..., :3, 3], turn], axis=-1)
 
 
-def run(rng, estimator, arm, shaft, *, rate_hz=60.0, delay_s=0.04, jitter_s=0.0, reading=None, blind=(), offset_s=0.0, mount=None):
-    """Play a motion to an estimator as it would come in time; returns the track at 1 kHz and the true poses.
+def distance_mm(T, T_true):
+    """Distances (...,) between the origins of poses, mm."""
+    return 1e3 * np.linalg.norm(T[..., :3, 3] - T_true[..., :3, 3], axis=-1)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def run(rng, estimator, arm, shaft, *, rate_hz=60.0, late_s=0.0, jitter_s=0.0, blind=(), mount=None, arrives_s=0.04):
+    """Play a motion to an estimator as it would come in time; returns what it said at 1 kHz, and the true poses (N, 4, 4).
 
     Args:
+        late_s: by how much the camera's stamps are late.
         blind: pairs of times between which vision sees nothing, s.
-        offset_s: what the camera stamps are late by; they arrive ``delay_s`` after the exposure.
+        arrives_s: how long after its exposure a sighting comes.
     """
-    sigma = Prior().reading_rad if reading is None else reading
     t = np.arange(len(shaft)) * TICK_S
     Ts = arm.tool(shaft)
-    q = shaft + rng.normal(size=shaft.shape) * sigma
+    q = shaft + rng.normal(size=shaft.shape) * Prior().reading_rad
     true, mounting = mounts(rng) if mount is None else mount
     shots = np.arange(0.02, t[-1] - 0.001, 1 / rate_hz) + rng.uniform(0, 1e-3)
     shots = [s for s in shots if not any(a <= s <= b for a, b in blind)]
@@ -225,7 +236,7 @@ def run(rng, estimator, arm, shaft, *, rate_hz=60.0, delay_s=0.04, jitter_s=0.0,
         u = real / TICK_S - k
         step = np.linalg.inv(Ts[k]) @ Ts[k + 1]
         between = Ts[k] @ small(u * off(np.eye(4), step))
-        events.append((s + delay_s, mounting.sighting(seen(rng, between, true), s + offset_s)))
+        events.append((s + arrives_s, mounting.sighting(seen(rng, between, true), s + late_s)))
     tracks, done = [], 0
     chunk = 16
     for begin in range(0, len(t), chunk):
@@ -235,7 +246,9 @@ def run(rng, estimator, arm, shaft, *, rate_hz=60.0, delay_s=0.04, jitter_s=0.0,
             estimator.vision(events[done][1])
             done += 1
         tracks.append(estimator.track(t[begin : begin + chunk]))
-    return tracks, Ts, t
+    parts = [[getattr(track, name) for track in tracks] for name in ("t_s", "Ts_base_tool", "covs", "covs_own", "q", "qd")]
+    ages = np.concatenate([track.vision_age_s for track in tracks])
+    return Track(*(np.concatenate(part) for part in parts), ages), Ts
 
 
 class Cell:
@@ -247,8 +260,7 @@ class Cell:
         self.rate_hz, self.delay_s, self.response_s = rate_hz, delay_s, response_s
         self.shaft = np.array(q, float)
         self.tick, self.next_shot_s, self.blind = 0, 0.01, False
-        self.coming, self.T = [], None
-        self.rows_t, self.rows_q = [], []
+        self.coming, self.reference = [], self.shaft
 
     @property
     def t_s(self):
@@ -256,7 +268,7 @@ class Cell:
 
     def advance(self, command, ticks):
         """Let the joints follow a command; returns the true poses (ticks, 4, 4)."""
-        start = getattr(self, "reference", self.shaft.copy())
+        start = self.reference
         shafts = np.empty((ticks, 6))
         for n in range(ticks):
             share = (n + 1) / ticks
@@ -264,7 +276,7 @@ class Cell:
             speed = 0.0 if command is None else (command.q_ref - start) / (ticks * TICK_S)
             self.shaft = self.shaft + TICK_S * (speed + (reference - self.shaft) / self.response_s)
             shafts[n] = self.shaft
-        self.reference = self.shaft.copy() if command is None else command.q_ref.copy()
+        self.reference = self.shaft if command is None else command.q_ref
         Ts = self.arm.tool(shafts)
         for n in range(ticks):
             self.tick += 1
@@ -277,5 +289,4 @@ class Cell:
         self.estimator.joints(states(t, shafts + self.rng.normal(size=shafts.shape) * Prior().reading_rad))
         while self.coming and self.coming[0][0] <= self.t_s:
             self.estimator.vision(self.coming.pop(0)[1])
-        self.T = Ts[-1]
         return Ts

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 from armsight.data import Array, JointCommand, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.resolved_rate import _scale, _speeds
+from armsight.robot.trajectories.walk import behind
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
 MOST_SIGMA_M = 1e-3
@@ -32,8 +32,8 @@ BRIDGE_S = 0.75
 RATE_SHARE = 0.1
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
 MOST_RAD = np.deg2rad(5.0)
-#: Joints slower than this are at rest, rad/s: twice the noise of a smoothed speed.
-REST_RAD_S = 0.05
+#: Joints measured slower than this are at rest, rad/s: four sigma of a smoothed speed; and wanted slower than this, they are to.
+REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
 
 class Mode(Enum):
@@ -91,7 +91,7 @@ class ServoStep(Record):
         command: what the board is to be sent.
         mode: what the loop is closed on.
         correction: (6,) what is added to the motion's joints, rad.
-        error: (6,) from the tool as estimated to the tool as wanted at that time, [m; rad] in the tool's axes.
+        error: (6,) from the tool as estimated to the tool as wanted now, [m; rad] in base axes.
         limited: what kept a joint from being corrected further, one text each.
     """
 
@@ -131,7 +131,7 @@ class PoseServo:
         duty = checked(gravity_duty, (6,), "gravity_duty")
         estimate, ahead = estimator.estimate(), motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
-        error = log_se3(inverse(estimate.T_base_tool) @ self._arm.forward(motion.at(t_s).q))
+        error = behind(self._arm.forward(motion.at(t_s).q), estimate.T_base_tool)
         mode = self._mode(estimate)
         change = np.zeros(6)
         if mode is not Mode.POTENTIOMETERS:
@@ -153,15 +153,16 @@ class PoseServo:
     def _missing(self, estimator: Estimator, goal: Joints) -> Array:
         """Return what the correction lacks (6,) at a goal, as the estimator knows the arm."""
         there = estimator.tool(goal.q + self._correction, goal.qd)
-        return self._joints(goal.q, log_se3(inverse(there) @ self._arm.forward(goal.q)))
+        return self._joints(goal.q, behind(self._arm.forward(goal.q), there))
 
     def _joints(self, q: Array, error: Array) -> Array:
         """Return the joint angles (6,) that make up for an error of the tool (6,), damped near singularities."""
-        return _speeds(self._arm.jacobian(q, "tool"), error, self._scale)[0]
+        return _speeds(self._arm.jacobian(q), error, self._scale)[0]
 
     def _resting(self, estimate: ArmEstimate, goal: Joints, ahead: Joints) -> bool:
         """Say whether the arm has been at rest for as long as the newest sighting is old."""
-        still = not (goal.qd.any() or ahead.qd.any()) and bool(np.abs(estimate.qd).max() < REST_RAD_S)
+        wanted = max(np.abs(goal.qd).max(), np.abs(ahead.qd).max())
+        still = bool(wanted < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         return still and self._rest_s > estimate.vision_age_s
 

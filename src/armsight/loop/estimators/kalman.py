@@ -34,8 +34,8 @@ HISTORY_S = 1.0
 MOST_WAITING = 16
 #: What is thrown open when vision insists, as after a bump: how the arm stands and holds its tool, and the joints' zeros.
 OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
-#: Linearisations per sighting at most, and the change (m, rad) that ends them.
-ITERATIONS, SETTLED = 4, 1e-6
+#: Linearisations per sighting at most, and the change (m, rad) that ends them: it leaves about its square.
+ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
 _GATE = float(chi2.isf(CHANCE, 6))
@@ -253,13 +253,13 @@ class KalmanEstimator:
         kept = step.kept[0]
         x, P = before.x * kept, before.P * np.outer(kept, kept)
         P[np.diag_indices(SIZE)] += step.added[0]
-        z, H, R = self._innovation(x, joints, sighting)
+        z, H, R = first = self._innovation(x, joints, sighting)
         verdict = self._judge(z, H @ P @ H.T + R + sighting.cov_common)
         if verdict is Verdict.OUTLIER:
             return None, verdict
         if verdict is Verdict.REOPENED:
             P[np.diag_indices(SIZE)] += _OPENED
-        x, P = self._update(x, P, joints, sighting)
+        x, P = self._update(x, P, joints, sighting, first)
         return _State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
 
     def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
@@ -272,18 +272,20 @@ class KalmanEstimator:
         R += self._delay.jitter_s**2 * np.outer(velocity, velocity)
         return log_se3(inverse(Ts[0]) @ sighting.T_base_tool), H, R
 
-    def _update(self, x: Array, P: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array]:
-        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993)."""
-        change = np.zeros(SIZE)
-        for _ in range(ITERATIONS):
-            z, H, R = self._innovation(x + change, joints, sighting)
-            # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
-            z += H[:, :DELAY] @ change[:DELAY]
+    def _update(
+        self, x: Array, P: Array, joints: Smoothed, sighting: Sighting, first: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array]:
+        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993), from a first look."""
+        (z, H, R), change = first, np.zeros(SIZE)
+        for left in range(ITERATIONS, 0, -1):
             PHt = P @ H.T
             K = np.linalg.solve(H @ PHt + R, PHt.T).T
             last, change = change, K @ z
-            if np.abs(change - last).max() < SETTLED:
+            if left == 1 or np.abs(change - last).max() < SETTLED:
                 break
+            z, H, R = self._innovation(x + change, joints, sighting)
+            # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
+            z += H[:, :DELAY] @ change[:DELAY]
         P = P - K @ PHt.T
         return x + change, (P + P.T) / 2
 

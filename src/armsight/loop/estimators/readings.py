@@ -28,6 +28,8 @@ _PARABOLA = 5
 #: Dead zone before a joint counts as moved, in standard deviations of a smoothed newest reading. Less, and noise changes
 #: the sides of narrow gaps; more, and the sides change late.
 _DEAD = 5.0
+#: Within the dead zone a joint's place settles to its readings with this time constant, s: slow corrections count as moves.
+_SETTLE_S = 0.3
 #: Travel over which a joint changes the side of its backlash until that is known, rad: the middle of what gears have.
 GAP_RAD = np.deg2rad(0.2)
 #: The least of it, rad: narrower, noise would change it.
@@ -107,6 +109,7 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
                 continue
             was, side = memory[k - 1, 3, i], memory[k - 1, 2, i]
             moved = min(max(was, angles[i] - 0.5 * dead), angles[i] + 0.5 * dead)
+            moved += (angles[i] - moved) * min((t[k] - t[k - 1]) / _SETTLE_S, 1.0)
             now = min(max(side + 2 * (moved - was) / gap[i], -1.0), 1.0)
             memory[k, 0, i] = memory[k - 1, 0, i] + abs(moved - was)
             memory[k, 1, i] = memory[k - 1, 1, i] + abs(now - side)

@@ -1,0 +1,97 @@
+"""The memory of the potentiometers: smoothing, hysteresis, what is kept."""
+
+import numpy as np
+import pytest
+from arm_bench import states
+
+from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, SPAN_S, Readings
+
+SIGMA = 3e-4
+
+
+def filled(q_of_t, seconds, sigma=1e-9, noise=None):
+    readings = Readings(sigma)
+    t = np.arange(round(seconds * 1000)) * 1e-3
+    q = q_of_t(t)[:, None] * np.ones(6)
+    readings.add(states(t, q if noise is None else q + noise))
+    return readings, t
+
+
+def test_parabolas_pass_unharmed_with_their_slope():
+    readings, t = filled(lambda t: 0.3 - 0.7 * t + 2.0 * t**2, 0.5)
+    at = np.array([0.0, 0.01, 0.2005, t[-1]])
+    out = readings.at(at)
+    assert np.allclose(out.q[:, 3], 0.3 - 0.7 * at + 2.0 * at**2, atol=1e-12)
+    assert np.allclose(out.qd[:, 3], -0.7 + 4.0 * at, atol=1e-9)
+
+
+@pytest.mark.parametrize("back_s", [0.0, 0.01, 0.1])
+def test_the_variance_left_is_what_is_left(back_s):
+    rng = np.random.default_rng(1)
+    left = []
+    for _ in range(300):
+        readings, t = filled(lambda t: 0.0 * t, 0.2, SIGMA, SIGMA * rng.normal(size=(200, 6)))
+        out = readings.at(np.array([t[-1] - back_s]))
+        left.append(out.q[0])
+    # The variance of 1800 draws is within 5 sqrt(2 / 1800) of itself.
+    assert np.var(left) == pytest.approx(SIGMA**2 * out.variance[0], rel=5 * np.sqrt(2 / 1800))
+    # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2).
+    assert out.variance[0] < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
+
+
+def test_the_side_is_the_play_operators():
+    def q_of_t(t):
+        return 0.2 * np.sin(3 * t) + 0.05 * np.sin(11 * t)
+
+    readings, t = filled(q_of_t, 1.9)
+    out = readings.at(t)
+    held, sides, q = q_of_t(t)[0], [], q_of_t(t)
+    for angle in q:
+        held = min(max(held, angle - GAP_RAD / 2), angle + GAP_RAD / 2)
+        sides.append((angle - held) / (GAP_RAD / 2))
+    # The parabola's end is off by q''' SPAN^3 / 120, at most 72 * SPAN^3 / 120 = 7e-5 rad, 0.04 of half a gap.
+    # At the very start there are too few readings for a parabola.
+    assert np.abs(out.side[:, 0] - sides)[50:].max() < 0.1
+    travel = np.abs(np.diff(q)).sum()
+    assert out.travel[-1, 0] == pytest.approx(travel, rel=1e-2)
+    assert (np.diff(out.travel, axis=0) >= 0).all()
+    assert (np.diff(out.flips, axis=0) >= 0).all()
+
+
+def test_noise_at_rest_neither_travels_nor_changes_sides():
+    rng = np.random.default_rng(2)
+
+    def q_of_t(t):
+        u = np.minimum(t / 0.5, 1.0)
+        return 0.3 * u**3 * (10 - 15 * u + 6 * u**2)
+
+    readings, t = filled(q_of_t, 2.0, SIGMA, SIGMA * rng.normal(size=(2000, 6)))
+    moving, resting = readings.at(np.array([0.5])), readings.at(t[-1:])
+    assert moving.side.min() > 0.99
+    assert resting.side.min() > 0.9
+    assert (resting.travel - moving.travel).max() < 10 * SIGMA
+
+
+def test_what_came_in_parts_is_as_what_came_at_once():
+    def q_of_t(t):
+        return 0.4 * np.sin(5 * t)
+
+    readings = Readings(1e-9)
+    t = np.arange(20_000) * 1e-3
+    for part in np.array_split(t, 700):
+        readings.add(states(part, q_of_t(part)[:, None] * np.ones(6)))
+    oldest, newest = readings.span_s
+    assert newest == t[-1]
+    assert newest - oldest >= KEPT_S
+    at = np.linspace(newest - KEPT_S, newest, 50)
+    assert np.allclose(readings.at(at).q[:, 0], q_of_t(at), atol=5**3 * 0.4 * SPAN_S**3 / 100)
+    # One swing to and fro in 2 pi / 5 s travels 1.6 rad.
+    assert readings.at(t[-1:]).travel[0, 0] == pytest.approx(np.abs(np.diff(q_of_t(t))).sum(), rel=1e-2)
+
+
+def test_few_readings_are_averaged_and_one_is_itself():
+    readings = Readings(SIGMA)
+    readings.add(states([1.0], np.full((1, 6), 0.2)))
+    out = readings.at(np.array([1.0]))
+    assert (out.q == 0.2).all()
+    assert out.variance[0] == 1
