@@ -1,4 +1,4 @@
-"""Build the firmware with the package: its image and host library are never in the repository (pyproject.toml has the rest)."""
+"""Build the firmware with the package: no binary is in the repository. All else is in pyproject.toml."""
 
 import shutil
 import sys

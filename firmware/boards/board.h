@@ -1,5 +1,5 @@
-/* The contract of a board: one struct literal. To add a board: fill one in, call loop_start, loop_tick from its 1 kHz timer and
- * loop_poll from its main loop (docs/add_a_board.md). */
+/* The contract of a board: one struct literal. To add a board: fill one in, call loop_start, loop_tick from its 1 kHz
+ * timer and loop_poll from its main loop (docs/add_a_board.md). */
 #ifndef ARMSIGHT_BOARD_H
 #define ARMSIGHT_BOARD_H
 
@@ -11,7 +11,8 @@ typedef struct board_description {
     const char *name; /* at most 16 characters, told in WELCOME */
     uint32_t baud;    /* bits a second on the wire, 8N1: the telemetry's rate follows from it */
 
-    /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts, current_ma. */
+    /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts,
+     * current_ma. */
     void (*sense)(core_inputs *inputs);
 
     /* Tick. Put the duties to the motors; with drives_on 0 switch their drivers off. */
@@ -23,8 +24,8 @@ typedef struct board_description {
     /* Before the first tick. Tell whether the watchdog restarted the board. */
     bool (*watchdog_reset)(void);
 
-    /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which there
-     * was no room since the last call. */
+    /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which
+     * there was no room since the last call. */
     uint32_t (*receive)(uint8_t *bytes, uint32_t room, uint32_t *overrun);
 
     /* Main loop. Take bytes for the host and return how many were taken; the others are offered again. */

@@ -1,6 +1,7 @@
 #include "loop.h"
 
 #include <stddef.h>
+#include <string.h>
 
 #include "config.h"
 #include "core.h"
@@ -18,7 +19,8 @@ static uint32_t load(board_loop *loop, core_config *config)
 void loop_start(board_loop *loop, const board_description *board)
 {
     core_config config;
-    *loop = (board_loop){.board = board};
+    memset(loop, 0, sizeof *loop); /* a compound literal may take its size of stack */
+    loop->board = board;
     const uint32_t source = load(loop, &config);
     core_init(&loop->core, &config, source, board->watchdog_reset());
     wire_init(&loop->wire, &(wire_setup){board->name, board->baud, source, &loop->core.config});

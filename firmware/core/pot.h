@@ -6,7 +6,8 @@
 
 #include "types.h"
 
-/* Return the joint angle (rad) at counts (0 to 65535): straight lines between the nodes, and on beyond the outer ones. */
+/* Return the joint angle (rad) at counts (0 to 65535): straight lines between the nodes, and on beyond the outer
+ * ones. */
 float pot_angle(const pot_config *config, uint32_t counts);
 
 /* Take this tick's counts. A reading out of its band, or one further off than the joint can have moved, is not

@@ -130,7 +130,8 @@ static void take_move(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_move_t move;
     mavlink_msg_move_decode(message, &move);
-    core_command *command = order_admit(wire, move.sequence) ? order_append(wire, COMMAND_MOVE, move.sequence) : NULL;
+    const bool admitted = order_admit(wire, move.sequence);
+    core_command *command = admitted ? order_append(wire, COMMAND_MOVE, move.sequence) : NULL;
     if (command == NULL) {
         return;
     }
@@ -158,7 +159,8 @@ static void take_gains(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_gains_t gains;
     mavlink_msg_gains_decode(message, &gains);
-    core_command *command = order_admit(wire, gains.sequence) ? order_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
+    const bool admitted = order_admit(wire, gains.sequence);
+    core_command *command = admitted ? order_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
     if (command != NULL) {
         memcpy(&command->gains, gains.gains, sizeof command->gains);
     }

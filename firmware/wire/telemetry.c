@@ -59,7 +59,8 @@ uint32_t wire_output(const wire_state *wire, const uint8_t **bytes)
 
 void wire_sent(wire_state *wire, uint32_t length) { wire->output.taken += length; }
 
-/* Return the newest report of the tick. It writes the other one next: this one is whole unless two ticks passed meanwhile. */
+/* Return the newest report of the tick. It writes the other one next: this one is whole unless two ticks passed
+ * meanwhile. */
 static uint32_t copy_report(wire_state *wire, uint32_t number)
 {
     for (;;) {
@@ -170,7 +171,8 @@ static bool has_room(const wire_state *wire)
     return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
 }
 
-/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are refused, and no more. */
+/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are refused, and no
+ * more. */
 static bool status_is_due(const wire_state *wire)
 {
     const uint32_t since = wire_tick(wire) - wire->status_tick;

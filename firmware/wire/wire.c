@@ -1,6 +1,7 @@
 #include "wire.h"
 
 #include <stddef.h>
+#include <string.h>
 
 #include "inside.h"
 
@@ -8,7 +9,9 @@
 
 void wire_init(wire_state *wire, const wire_setup *setup)
 {
-    *wire = (wire_state){.setup = *setup, .periods = wire_periods_at(setup->baud)};
+    memset(wire, 0, sizeof *wire); /* a compound literal may take its size of stack */
+    wire->setup = *setup;
+    wire->periods = wire_periods_at(setup->baud);
     wire->report.outputs.first_joint = NO_JOINT;
 }
 
@@ -19,8 +22,9 @@ static void await(wire_input *input)
     input->message.len = 0u;
 }
 
-/* Tell whether the header that was just read belongs to no message of ours. MAVLink's own check would also refuse messages
- * whose trailing zeros were left out, and without one a false begin swallows up to 255 bytes of good messages. */
+/* Tell whether the header that was just read belongs to no message of ours. MAVLink's own check would also refuse
+ * messages whose trailing zeros were left out, and without one a false begin swallows up to 255 bytes of good
+ * messages. */
 static bool is_foreign(const wire_input *input)
 {
     const mavlink_parse_state_t state = input->framing.parse_state;
@@ -66,8 +70,8 @@ static uint32_t take_byte(wire_state *wire, uint8_t byte)
     }
 }
 
-/* Read the held bytes on from number next. What is no message after all costs its first byte only: the others are read again,
- * so that a message within it is found. */
+/* Read the held bytes on from number next. What is no message after all costs its first byte only: the others are
+ * read again, so that a message within it is found. */
 static void read_held(wire_state *wire, uint32_t next)
 {
     wire_input *input = &wire->input;

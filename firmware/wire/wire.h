@@ -1,7 +1,9 @@
-/* The wire: the host's bytes become commands for the core, its reports become telemetry. MAVLink 2, dialect armsight.xml.
+/* The wire: the host's bytes become commands for the core, its reports become telemetry. MAVLink 2, dialect
+ * armsight.xml.
  *
- * Two contexts meet here: wire_before_tick and wire_after_tick belong to the tick; everything else to the main loop, which the
- * tick may interrupt. They meet in a mailbox for one command, a count of stops, and two reports written in turn.
+ * Two contexts meet here: wire_before_tick and wire_after_tick belong to the tick; everything else to the main loop,
+ * which the tick may interrupt. They meet in a mailbox for one command, a count of stops, and two reports written in
+ * turn.
  */
 #ifndef ARMSIGHT_WIRE_H
 #define ARMSIGHT_WIRE_H
@@ -141,11 +143,13 @@ void wire_receive(wire_state *wire, const uint8_t *bytes, uint32_t length, uint3
 /* Hand the next command to the tick, and write the telemetry that is due. Main loop, after wire_receive. */
 void wire_poll(wire_state *wire);
 
-/* Return the configuration the board must store now and tell of by wire_stored, NULL without. Main loop, after wire_poll. */
+/* Return the configuration the board must store now and tell of by wire_stored, NULL without. Main loop, after
+ * wire_poll. */
 const core_config *wire_to_store(const wire_state *wire);
 void wire_stored(wire_state *wire, bool done);
 
-/* Point *bytes to what waits to go out and return how much of it lies there in one piece; then tell how many went. Main loop. */
+/* Point *bytes to what waits to go out and return how much of it lies there in one piece; then tell how many went.
+ * Main loop. */
 uint32_t wire_output(const wire_state *wire, const uint8_t **bytes);
 void wire_sent(wire_state *wire, uint32_t length);
 

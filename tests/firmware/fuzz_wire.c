@@ -1,8 +1,9 @@
-/* Feeds the emulated board whatever bytes a fuzzer makes up: raw ones, and messages whose frame is right and whose content is
- * not. Aborts if what comes out is not what it must be, or if the link is not usable again 20 ms after the last bad byte.
+/* Feeds the emulated board whatever bytes a fuzzer makes up: raw ones, and messages whose frame is right and whose
+ * content is not. Aborts if what comes out is not what it must be, or if the link is not usable again 20 ms after the
+ * last bad byte.
  *
- * Built with clang's -fsanitize=fuzzer, or with -DSHAKE by any compiler: then it draws its own inputs, as many as its argument
- * says. */
+ * Built with clang's -fsanitize=fuzzer, or with -DSHAKE by any compiler: then it draws its own inputs, as many as its
+ * argument says. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -73,7 +74,8 @@ static uint32_t frame(uint8_t *bytes, uint32_t kind, const uint8_t *content, uin
     memset(&message, 0, sizeof message);
     message.msgid = kind & 0xFFFFFFu;
     memcpy(_MAV_PAYLOAD_NON_CONST(&message), content, length < entry->max_msg_len ? length : entry->max_msg_len);
-    mavlink_finalize_message_buffer(&message, 255u, 1u, &framing, entry->min_msg_len, entry->max_msg_len, entry->crc_extra);
+    mavlink_finalize_message_buffer(&message, 255u, 1u, &framing, entry->min_msg_len, entry->max_msg_len,
+                                    entry->crc_extra);
     return mavlink_msg_to_send_buffer(bytes, &message);
 }
 
@@ -124,7 +126,8 @@ static void require_usable(void)
     require(after == before + 1u, "the link is not usable again");
 }
 
-/* Each step of the data is a control byte and what it says: below 128 so many raw bytes, else a message of that kind, or time. */
+/* Each step of the data is a control byte and what it says: below 128 so many raw bytes, else a message of that kind,
+ * or time. */
 static uint32_t step(const uint8_t *data, uint32_t size)
 {
     uint8_t bytes[MAVLINK_MAX_PACKET_LEN];

@@ -114,21 +114,11 @@ def test_the_tests_reach_the_branches_of_the_core(tmp_path, gcc):
     counted.mkdir()
     flags = f"--coverage -fprofile-update=single -dumpdir {counted}/ -O0"
     chosen = [str(HERE / f"test_firmware_{name}.py") for name in CORE_TESTS]
-    again = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--basetemp",
-        str(tmp_path / "again"),
-        *chosen,
-    ]
+    again = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", str(tmp_path / "again")]
+    counting = {**os.environ, "ARMSIGHT_FIRMWARE_CFLAGS": flags}
     ran = subprocess.run(
-        again, cwd=FIRMWARE.parent, env={**os.environ, "ARMSIGHT_FIRMWARE_CFLAGS": flags}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+        [*again, *chosen], cwd=FIRMWARE.parent, env=counting, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stdout[-3000:]
     told = subprocess.run(
         [gcov, "-b", "-n", *map(str, counted.glob("*.gcda"))], cwd=FIRMWARE, capture_output=True, text=True, check=True

@@ -60,7 +60,7 @@ def test_the_wheel_is_for_this_platform_and_any_python_3(wheel):
 
 
 def test_what_is_unpacked_from_the_wheel_runs_and_builds(wheel, tmp_path):
-    """Without a package beside it, in another place: the host library ticks, and another image is built of the sources."""
+    """Without a package beside it, in another place: the host library ticks, and the image is built again."""
     with zipfile.ZipFile(wheel) as file:
         file.extractall(tmp_path)
     script = (
@@ -72,8 +72,8 @@ def test_what_is_unpacked_from_the_wheel_runs_and_builds(wheel, tmp_path):
         "made = build.build_board('pil', pathlib.Path('again.elf'), build.open_compiler('zig'));"
         "assert made.read_bytes() == firmware.image().read_bytes()"
     )
+    alone = {"PYTHONPATH": str(tmp_path), "HOME": str(tmp_path), "PATH": ""}
     ran = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path), "HOME": str(tmp_path), "PATH": ""},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", script], cwd=tmp_path, env=alone, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stderr

@@ -112,7 +112,7 @@ def test_a_length_no_message_has_is_refused_at_the_header(working, length):
 @pytest.mark.parametrize("host_ticks", [1, 4, 16, 100])
 @pytest.mark.parametrize("cut", [1, 9, 10, 11, 50, 90])
 def test_a_cut_message_is_given_up_in_time(working, host_ticks, cut):
-    """A host is cut off within a message and comes back: what it sends 20 ms later is obeyed, however seldom it sends."""
+    """A host is cut off within a message and comes back: what it sends 20 ms later is obeyed, however seldom."""
     board, host = working
     board.run(5, host.order(c.COMMAND_ENABLE))
     board.run(5, host.move()[:cut])

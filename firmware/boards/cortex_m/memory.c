@@ -1,10 +1,11 @@
-/* Memory: filled at reset, and what compilers ask for where there is no C library: memcpy, memset, and the run-time ABI's names for them. Any context. */
+/* Memory: filled at reset, and what compilers ask for where there is no C library: memcpy, memset, and the run-time
+ * ABI's names for them. Any context. */
 #include <stddef.h>
 #include <stdint.h>
 
 #include "memory.h"
 
-#define KEEP __asm__ volatile("" ::: "memory") /* else a compiler makes of the loop a call of the function it stands in */
+#define KEEP __asm__ volatile("" ::: "memory") /* else the loop becomes a call of the function it stands in */
 
 void *memcpy(void *to, const void *from, size_t length);
 void *memset(void *to, int value, size_t length);

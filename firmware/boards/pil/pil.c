@@ -76,7 +76,7 @@ static const board_description board = {
     .write_copy = write_copy,
 };
 
-_Static_assert((BAUD + BAUD_PER_BYTE) / BAUD_PER_BYTE < FRAME_BYTES, "an answer has room for what the wire carries in a tick");
+_Static_assert((BAUD + BAUD_PER_BYTE) / BAUD_PER_BYTE < FRAME_BYTES, "an answer has room for what a tick carries");
 
 static void restart(bool watchdog)
 {
@@ -91,7 +91,8 @@ void pil_start(void) { restart(false); }
 bool pil_begin(void)
 {
     const pil_request *request = &pil_request_frame;
-    const bool known = request->magic == FRAME_REQUEST && request->version == FRAME_VERSION && request->length <= FRAME_BYTES;
+    const bool known =
+        request->magic == FRAME_REQUEST && request->version == FRAME_VERSION && request->length <= FRAME_BYTES;
     pil_answer_frame.magic = known ? FRAME_ANSWER : FRAME_REFUSED;
     pil_answer_frame.version = FRAME_VERSION;
     pil_answer_frame.tick = request->tick;

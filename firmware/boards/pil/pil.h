@@ -1,5 +1,6 @@
-/* The emulated board, in lock-step with Python: one request, one tick, one answer. The same code runs on the host (shared
- * library), under Unicorn (pil_tick is called) and under QEMU (startup.c: the middle part runs in the SysTick interrupt). */
+/* The emulated board, in lock-step with Python: one request, one tick, one answer. The same code runs on the host
+ * (shared library), under Unicorn (pil_tick is called) and under QEMU (startup.c: the middle part runs in the SysTick
+ * interrupt). */
 #ifndef ARMSIGHT_PIL_H
 #define ARMSIGHT_PIL_H
 

@@ -1,11 +1,13 @@
-/* Semihosting: what QEMU does for the firmware (Arm, "Semihosting for AArch32 and AArch64"). Main loop; no emulated time passes. */
+/* Semihosting: what QEMU does for the firmware (Arm, "Semihosting for AArch32 and AArch64"). Main loop; no emulated
+ * time passes. */
 #ifndef ARMSIGHT_SEMIHOST_H
 #define ARMSIGHT_SEMIHOST_H
 
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Open a file of the machine QEMU runs on, to read or to write; returns its handle, below 0 where it cannot be opened. */
+/* Open a file of the machine QEMU runs on, to read or to write; returns its handle, below 0 where it cannot be
+ * opened. */
 int32_t semihost_open(const char *path, bool writing);
 
 /* Read or write length bytes, waiting for them; returns whether all came or went. */

@@ -1,5 +1,5 @@
-/* The emulated board's machine: vectors, SysTick, and frames by semihosting. Under QEMU reset runs it all; under Unicorn, which
- * has neither SysTick nor semihosting, Python calls pil_boot once and then pil_tick. */
+/* The emulated board's machine: vectors, SysTick, and frames by semihosting. Under QEMU reset runs it all; under
+ * Unicorn, which has neither SysTick nor semihosting, Python calls pil_boot once and then pil_tick. */
 #include <stddef.h>
 
 #include "memory.h"

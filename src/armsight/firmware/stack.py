@@ -15,7 +15,7 @@ from pathlib import Path
 from armsight.errors import InputError
 from armsight.firmware import build
 
-#: What the processor itself pushes for an interrupt: 8 words, 17 of the floating-point unit, 1 to align (ARMv7-M, B1.5.7).
+#: What the processor pushes for an interrupt: 8 words, 17 of the floating-point unit, 1 to align (ARMv7-M, B1.5.7).
 INTERRUPT_BYTES = 26 * 4
 #: The board's functions with which the main loop and the tick begin.
 MAIN, TICK = "loop_poll", "loop_tick"
@@ -58,7 +58,7 @@ class StackUse:
 
 
 def stack_use(board: str) -> StackUse:
-    """Return the stack a board needs; :class:`~armsight.errors.InputError` without gcc for ARM, or if there is no bound."""
+    """Return the stack a board needs; :class:`~armsight.errors.InputError` without gcc for ARM, or without a bound."""
     compiler = build.open_compiler("gcc")
     frames: dict[str, int] = {}
     calls: dict[str, set[str]] = {}
