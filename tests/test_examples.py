@@ -58,3 +58,12 @@ def test_follow_a_plate(capsys):
     found = np.array(re.findall(r"sigma ([\d.]+) mm, error ([\d.]+) mm$", "\n".join(lines), re.MULTILINE), float)
     assert len(found) == 9
     assert (found[:, 1] <= 5.54 * (found[:, 0] + 5e-4) + 5e-4).all()  # see test_measure_a_board
+
+
+def test_render_a_recording(tmp_path, capsys):
+    run("05", tmp_path)
+    rig, truth = StereoRig.load(tmp_path / "rig.json"), Truth.load(tmp_path / "arm").rig
+    along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
+    sigma = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along))
+    assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5 * sigma)
+    assert f"baseline {1e3 * rig.baseline_m:.3f} mm" in capsys.readouterr().out
