@@ -246,7 +246,9 @@ def run(rng, estimator, arm, shaft, *, rate_hz=60.0, late_s=0.0, jitter_s=0.0, b
             estimator.vision(events[done][1])
             done += 1
         tracks.append(estimator.track(t[begin : begin + chunk]))
-    parts = [[getattr(track, name) for track in tracks] for name in ("t_s", "Ts_base_tool", "covs", "covs_own", "q", "qd")]
+    parts = [
+        [getattr(track, name) for track in tracks] for name in ("t_s", "Ts_base_tool", "covs", "covs_own", "q", "qd")
+    ]
     ages = np.concatenate([track.vision_age_s for track in tracks])
     return Track(*(np.concatenate(part) for part in parts), ages), Ts
 

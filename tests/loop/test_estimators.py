@@ -85,9 +85,9 @@ def test_times_that_do_not_rise_or_are_not_kept_are_refused(estimator):
     still(estimator, 0.2, start_s=10.0)
     with pytest.raises(InputError, match="order of time"):
         estimator.joints(states([10.1], MIDDLE[None]))
-    with pytest.raises(InputError, match="kept from 10.0000 to 10.1990"):
+    with pytest.raises(InputError, match=r"kept from 10\.0000 to 10\.1990"):
         estimator.estimate(9.0)
-    with pytest.raises(InputError, match="JointStates.q"):
+    with pytest.raises(InputError, match=r"JointStates\.q"):
         estimator.joints(states([11.0], np.zeros((1, 5))))
 
 

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from arm_bench import ARM, MIDDLE, drawn, loads, product, small
-from asserts import numeric_jacobian
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, BASIS, COMPLIANCE, LINEARITY, POSE, REST, SIZE, Prior
 from armsight.robot.models import MODELS
+from asserts import numeric_jacobian
 
 ODD = dataclasses.replace(
     MODELS["puma560"],
@@ -71,7 +71,7 @@ def test_it_is_a_slow_arm_with_the_same_errors():
     joints += -side * x[BACKLASH:COMPLIANCE] / 2 + x[COMPLIANCE:REST] * loads(q[None])[0] + x[REST:POSE]
     T = product(joints[None], [small(x[6 * i : 6 * i + 6]) for i in range(7)])[0] @ small(x[POSE : POSE + 6])
     found, _ = evaluated(ARM, x, q, side)
-    # Half the product of the last motion's turn (3 sigma: 5e-4) and shift (3e-4) is left out; series elsewhere end at 1e-13.
+    # Half the product of the last motion's turn (3 sigma: 5e-4) and shift (3e-4) is left out; nothing else is.
     assert np.abs(found - T).max() < 7.5e-8
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Sighting, Track, Verdict
-from armsight.loop.estimators.kalman import KalmanEstimator, Learned
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, Sighting, Track, Verdict
+from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.estimators.latest import LatestEstimator
 from armsight.loop.estimators.mounting import Mounting
 

@@ -120,6 +120,27 @@ class ArmEstimate(Record):
     vision_age_s: float
 
 
+@dataclass(frozen=True, eq=False)
+class Learned(Record):
+    """What a filter has learned about an arm.
+
+    Attributes:
+        joint_offset: (6,) what the joints are beyond their readings where they stand now, rad.
+        sigma_joint_offset: (6,) standard deviations; wide where two joints' errors look alike to vision.
+        backlash: (6,) widths between potentiometer and link, rad.
+        sigma_backlash: (6,) standard deviations.
+        side: (6,) where each joint is in it, -1 to 1: 1 when it came up from below.
+        delay: how late the camera's stamps are.
+    """
+
+    joint_offset: Array
+    sigma_joint_offset: Array
+    backlash: Array
+    sigma_backlash: Array
+    side: Array
+    delay: Delay
+
+
 class Estimator(Protocol):
     """Says where the tool is, from potentiometers and vision."""
 

@@ -10,17 +10,17 @@ shared covariance is added to what comes out (Schmidt, 1966: considered, not est
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from armsight.data import Array, JointStates, Record
+from armsight.data import Array, JointStates
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, POSE, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Sighting, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.robot.arm import Arm
 
@@ -50,27 +50,6 @@ def _opened() -> Array:
 
 
 _OPENED = _opened()
-
-
-@dataclass(frozen=True, eq=False)
-class Learned(Record):
-    """What a filter has learned about an arm.
-
-    Attributes:
-        joint_offset: (6,) what the joints are beyond their readings where they stand now, rad.
-        sigma_joint_offset: (6,) standard deviations; wide where two joints' errors look alike to vision.
-        backlash: (6,) widths between potentiometer and link, rad.
-        sigma_backlash: (6,) standard deviations.
-        side: (6,) where each joint is in it, -1 to 1: 1 when it came up from below.
-        delay: how late the camera's stamps are.
-    """
-
-    joint_offset: Array
-    sigma_joint_offset: Array
-    backlash: Array
-    sigma_backlash: Array
-    side: Array
-    delay: Delay
 
 
 class _State(NamedTuple):

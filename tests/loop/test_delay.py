@@ -1,0 +1,70 @@
+"""The camera's delay from a sweep: how near, and what is refused."""
+
+import numpy as np
+import pytest
+from arm_bench import ARM, MIDDLE, TICK_S, drawn, mounts, seen, states, worn
+
+from armsight.errors import CalibrationError, InputError
+from armsight.loop.delay import estimate_delay
+from armsight.loop.estimators import Prior
+
+
+def sweep(rng, world, late_s, rate_hz, amplitude_deg=12.0):
+    """Six seconds of all joints to and fro at different speeds, from rest to rest; what came late by so much."""
+    t = np.arange(6000) * TICK_S
+    ramp = np.clip(t - 0.5, 0, 1) * np.clip((5.3 - t) / 0.8, 0, 1)
+    swing = np.sin(2 * np.pi * rng.uniform(0.4, 0.9, 6) * t[:, None]) * (ramp**2 * (3 - 2 * ramp))[:, None]
+    shaft = MIDDLE + np.radians(amplitude_deg) * swing
+    Ts = world(rng).tool(shaft)
+    true, mounting = mounts(rng)
+    rows = np.arange(700, 5200, 1000 / rate_hz).astype(int)
+    sightings = [mounting.sighting(seen(rng, Ts[k], true), t[k] + late_s) for k in rows]
+    return states(t, shaft + rng.normal(size=shaft.shape) * Prior().reading_rad), sightings
+
+
+@pytest.mark.parametrize(("world", "late_s", "rate_hz"), [(worn, 0.085, 60), (worn, 0.02, 15), (drawn, 0.3, 30)])
+def test_it_is_found_to_a_fraction_of_a_millisecond(world, late_s, rate_hz):
+    joints, sightings = sweep(np.random.default_rng(rate_hz), world, late_s, rate_hz)
+    delay = estimate_delay(ARM, joints, sightings)
+    assert delay.sigma_s < 4e-4
+    assert delay.delay_s == pytest.approx(late_s, abs=4 * delay.sigma_s)
+
+
+def test_its_sigma_is_honest():
+    scores = []
+    for seed in range(8):
+        rng = np.random.default_rng(50 + seed)
+        late_s = rng.uniform(0, 0.1)
+        delay = estimate_delay(ARM, *sweep(rng, drawn, late_s, 15))
+        scores.append((delay.delay_s - late_s) / delay.sigma_s)
+    # A sum of eight squares of one sigma is below 27.9 but for 1 in 2000.
+    assert np.square(scores).sum() < 27.9
+
+
+def test_a_camera_ahead_of_the_joints_clock_is_found_too():
+    joints, sightings = sweep(np.random.default_rng(2), worn, -0.04, 30)
+    delay = estimate_delay(ARM, joints, sightings)
+    assert delay.delay_s == pytest.approx(-0.04, abs=4 * delay.sigma_s)
+
+
+def test_an_arm_that_hardly_moves_is_refused():
+    joints, sightings = sweep(np.random.default_rng(3), worn, 0.03, 15, amplitude_deg=0.05)
+    with pytest.raises(CalibrationError, match="move all joints to and fro, faster"):
+        estimate_delay(ARM, joints, sightings)
+
+
+def test_another_arms_motion_is_refused():
+    joints, _ = sweep(np.random.default_rng(4), worn, 0.03, 30)
+    _, sightings = sweep(np.random.default_rng(5), worn, 0.03, 30)
+    with pytest.raises(CalibrationError, match="do not describe the same motion"):
+        estimate_delay(ARM, joints, sightings)
+
+
+def test_too_little_is_refused():
+    joints, sightings = sweep(np.random.default_rng(6), worn, 0.03, 30)
+    with pytest.raises(InputError, match="20 or more sightings in order of time, got 10"):
+        estimate_delay(ARM, joints, sightings[:10])
+    with pytest.raises(InputError, match="20 or more sightings in order of time"):
+        estimate_delay(ARM, joints, sightings[::-1])
+    with pytest.raises(InputError, match="do not cover the sightings"):
+        estimate_delay(ARM, states(joints.t_s[:2000], joints.q[:2000]), sightings)
