@@ -1,7 +1,7 @@
 """The firmware's ARM image under QEMU: a whole Cortex-M4F machine, mps2-an386, with its interrupts and SysTick.
 
-Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in instructions
-and jumps on while it waits for its timer, so that it runs as fast as it can and always the same.
+Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in instructions, 128 ns
+each, so that it runs as fast as it can and always the same; so long an instruction makes the wait for the timer short.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from armsight.robot.boards.frames import ANSWER
 
 PROGRAM = "qemu-system-arm"
 _MACHINE = (
-    *("-M", "mps2-an386", "-icount", "shift=5,align=off,sleep=off", "-display", "none"),
+    *("-M", "mps2-an386", "-icount", "shift=7,align=off,sleep=off", "-display", "none"),
     *("-monitor", "none", "-serial", "none", "-parallel", "none", "-semihosting-config", "enable=on,target=native"),
 )
 _END_S = 5.0
