@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim import cell_rays
-from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, pixel_rays, view
+from armsight.sim.cell_noise import Window, exposed
+from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, corner_rays, pixel_rays, view
 from armsight.sim.cell_solids import Solids
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded
 from armsight.sim.paint import SUB, Grid, Slots, paint
@@ -29,12 +30,9 @@ from armsight.sim.render import OUTLINE, Shutter, outline
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
-Window = tuple[int, int, int, int]
-
 LENS = Optics(0.7, vignetting=0.25, light_gradient=(0.1, -0.1))
 #: Points around a pattern or a disc that bound it in the image.
 EDGE = 4 * OUTLINE
-_STRIP = 1 << 22  # numbers of noise that are kept
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -63,35 +61,6 @@ def _nearer(
             if (M[2, 0] * d[0] + M[2, 1] * d[1] + M[2, 2] * d[2]) * depth[v, u] < 1.0:
                 coarse[v, u] = behind[v, u]
                 slot[v, u] = -1
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _exposed(
-    still: Radiance,
-    light: Radiance,
-    gain: Radiance,
-    window: Window,
-    strip: Radiance,
-    start: int,
-    sensor: tuple[float, float, float],
-    out: Image,
-) -> None:
-    """Write grey levels: ``still`` has its gain already, ``light`` of the window has not.
-
-    ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.optics.Sensor`.
-    """
-    offset, read, shot = np.float32(sensor[0]), np.float32(sensor[1]), np.float32(sensor[2])
-    width = out.shape[1]
-    for v in range(out.shape[0]):
-        inside = window[1] <= v < window[3]
-        for u in range(width):
-            grey = still[v, u]
-            if inside and window[0] <= u < window[2]:
-                grey = light[v - window[1], u - window[0]] * gain[v, u]
-            noise = strip[start + v * width + u]
-            sigma = np.sqrt(read * read + shot * max(grey, np.float32(0.0))) if shot > 0.0 else read
-            level = np.rint(grey + offset + sigma * noise)
-            out[v, u] = np.uint8(min(max(level, np.float32(0.0)), np.float32(255.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,12 +142,10 @@ class CellCamera:
         """
         self.camera, self.T_base_camera = camera, T_base_camera
         self._sensor = sensor or Sensor()
-        self.still: View = view(camera, T_base_camera, seed, foot, more)
-        self._rays = pixel_rays(camera)
+        self._corners = corner_rays(camera)
+        self._rays = pixel_rays(self._corners)
+        self.still: View = view(camera, self._rays, T_base_camera, seed, foot, more)
         width, height = camera.image_size_px
-        v, u = np.mgrid[: height + 1, : width + 1] - 0.5
-        corners = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height + 1, width + 1, 3)
-        self._corners = corners / corners[..., 2:]
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
         self._still_grey = self._blur(self.still.light.copy()) * self._gain
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
@@ -198,7 +165,7 @@ class CellCamera:
             arm: where the arm is; None leaves it out.
             bodies: flat patterns, placed in the camera's frame in the middle of the exposure of its middle row.
             shutter: how long it looks.
-            strip: standard normal noise, from :func:`noise_strip`.
+            strip: standard normal noise, from :func:`~armsight.sim.cell_noise.noise_strip`.
             start: where in it this image's noise begins.
 
         Returns:
@@ -214,17 +181,22 @@ class CellCamera:
         crop = self._around(
             [tuple(face.boxes[0].tolist()) for step in (steps[0], steps[-1]) for face in step[2]], 2 * margin
         )
-        window = self._around([crop, *(tuple(box) for box in boxes.tolist())], margin)
+        window = self._around([crop, *(tuple(box) for box in boxes.tolist())], 2 * margin)
         u0, v0, u1, v1 = window
         light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
         cell_rays.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
-        seen = self._blur(light)
+        seen = self._blur(light) if light.size else light.astype(np.float32)
         if crop[0] < crop[2] and crop[1] < crop[3]:
-            self._lay(seen, self._painted(steps, crop, window, (light, depth, ids)), crop, window, margin)
+            core = self._core(crop, margin)
+            painted = self._painted(steps, crop, window, (light, depth, ids))
+            seen[_part(core, window)] = painted[_part(core, crop)]
         out: Image = np.empty((height, width), np.uint8)
         s = self._sensor
-        _exposed(self._still_grey, seen, self._gain, window, strip, start, (s.offset, s.read_noise, s.shot_noise), out)
+        core = self._core(window, margin)
+        light_core = np.ascontiguousarray(seen[_part(core, window)])
+        noises = (s.offset, s.read_noise, s.shot_noise)
+        exposed(self._still_grey, light_core, self._gain, core, strip, start, noises, out)
         return out
 
     def arm_ids(self, arm: ArmSeen) -> Image:
@@ -288,8 +260,7 @@ class CellCamera:
     ) -> Radiance:
         """Return the light of the crop with the patterns painted in, through the lens, over the whole exposure."""
         u0, v0, u1, v1 = crop
-        part = np.s_[v0 - window[1] : v1 - window[1], u0 - window[0] : u1 - window[0]]
-        light, depth, ids = (np.ascontiguousarray(layer[part]) for layer in arm)
+        light, depth, ids = (np.ascontiguousarray(layer[_part(crop, window)]) for layer in arm)
         rays = np.ascontiguousarray(self._corners[v0 : v1 + 1, u0 : u1 + 1])
         fine = np.empty((1 << 13, SUB, SUB))
         total = np.zeros(light.shape, np.float32)
@@ -305,27 +276,18 @@ class CellCamera:
             total += np.float32(weight) * blurred(coarse, slot, fine[:count], LENS.psf_sigma_px)
         return total
 
-    def _lay(self, seen: Radiance, painted: Radiance, crop: Window, window: Window, margin: int) -> None:
-        """Lay the crop, but for a margin where its blur did not know what is around, into the window."""
+    def _core(self, window: Window, margin: int) -> Window:
+        """Return a window but for a margin where its blur did not know what is around; none at the image's border."""
         width, height = self.camera.image_size_px
-        u0, v0, u1, v1 = crop
-        cut = (u0 + margin * (u0 > 0), v0 + margin * (v0 > 0), u1 - margin * (u1 < width), v1 - margin * (v1 < height))
-        seen[cut[1] - window[1] : cut[3] - window[1], cut[0] - window[0] : cut[2] - window[0]] = painted[
-            cut[1] - v0 : cut[3] - v0, cut[0] - u0 : cut[2] - u0
-        ]
+        u0, v0, u1, v1 = window
+        return u0 + margin * (u0 > 0), v0 + margin * (v0 > 0), u1 - margin * (u1 < width), v1 - margin * (v1 < height)
+
+
+def _part(part: Window, window: Window) -> tuple[slice, slice]:
+    """Return the rows and columns of a part of a window."""
+    return slice(part[1] - window[1], part[3] - window[1]), slice(part[0] - window[0], part[2] - window[0])
 
 
 def _reach(sigma_px: float) -> int:
     """Return how far the lens spreads light, px."""
     return math.ceil(4.5 * sigma_px + 0.5)
-
-
-def noise_strip(seed: int, image_size_px: tuple[int, int]) -> Radiance:
-    """Return standard normal numbers, enough for every image to begin at another one of millions."""
-    width, height = image_size_px
-    return np.random.default_rng([seed, 3]).standard_normal(_STRIP + width * height, dtype=np.float32)
-
-
-def noise_start(seed: int, side: int, shot: int) -> int:
-    """Return where in the strip an image's noise begins."""
-    return int(np.random.default_rng([seed, 4, side, shot]).integers(_STRIP))

@@ -20,6 +20,7 @@ AMBIENT, LAMP, GLOSS = 0.45, 0.75, 0.25
 BOX = 10
 PLAIN, TILES, GRAIN, PRINT = 0, 1, 2, 3
 _FAR = 1e9
+_NOTHING = np.float32(0.25)  # light from where nothing is
 _ORIGIN = np.zeros(3)
 _STEP = 1e-4  # a shadow's ray starts so far off its surface, m
 
@@ -75,8 +76,11 @@ def _capsule_normal(p: Array, a: Array, b: Array, radius: float, out: Array) -> 
 def _box(o: Array, d: Array, box: Array) -> tuple[float, int]:
     """Return how far along a ray a box is met and through which face (1, 2, 3, negative: the lower); _FAR, 0 if not."""
     c, s = box[6], box[7]
-    x, y = o[0] - box[0], o[1] - box[1]
-    local_o = (c * x + s * y, c * y - s * x, o[2] - box[2])
+    x, y, z = o[0] - box[0], o[1] - box[1], o[2] - box[2]
+    along = x * d[0] + y * d[1] + z * d[2]
+    if x * x + y * y + z * z - along * along > box[3] * box[3] + box[4] * box[4] + box[5] * box[5]:
+        return _FAR, 0  # past the ball around it
+    local_o = (c * x + s * y, c * y - s * x, z)
     local_d = (c * d[0] + s * d[1], c * d[1] - s * d[0], d[2])
     near, far, face = -_FAR, _FAR, 0
     for i in range(3):
@@ -190,7 +194,7 @@ def still(
         boxes: (N, BOX).
         capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
         lamp_base: (3,) where the lamp is, m.
-        light: (H, W) added to: the light that comes from each pixel.
+        light: (H, W) the light that comes from each pixel.
         depth: (H, W) distance of the surface, m.
         ids: (H, W) which surface it is: boxes, then capsules; -1 where there is none.
     """
@@ -207,7 +211,7 @@ def still(
             t, which, face = _meet(p_base, d, boxes, ends, radius)
             depth[v, u], ids[v, u] = t, which
             if which < 0:
-                light[v, u] += np.float32(0.25)
+                light[v, u] = _NOTHING
                 continue
             far = 0.0
             for i in range(3):
@@ -224,7 +228,7 @@ def still(
                 p[i] += _STEP * n[i]
             if cosine > 0.0 and _meet(p, way, boxes, ends, radius)[0] < far:
                 cosine = 0.0
-            light[v, u] += np.float32(own * factor * (AMBIENT + LAMP * max(cosine, 0.0)))
+            light[v, u] = np.float32(own * factor * (AMBIENT + LAMP * max(cosine, 0.0)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

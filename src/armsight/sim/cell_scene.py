@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +22,7 @@ from armsight.vision.camera import Camera
 LAMP_BASE = np.array([1.5, -1.1, 2.2])
 #: Albedo of the links and of the joints' housings.
 LINK_ALBEDO, HOUSING_ALBEDO = 0.62, 0.30
+_EDGE = 0.02  # light that changes by more from a pixel to its neighbours is looked at more closely
 _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
@@ -96,19 +98,26 @@ def furniture(seed: int) -> tuple[Array, tuple[Array, Array, Array]]:
     return table, (ends, radii, rng.uniform(0.3, 0.75, len(radii)))
 
 
-def pixel_rays(camera: Camera, shift: tuple[float, float] = (0.0, 0.0)) -> Array:
-    """Return the unit rays (H, W, 3) of a camera's pixels, or of places beside their centres, px."""
+def corner_rays(camera: Camera) -> Array:
+    """Return the rays (H + 1, W + 1, 3) of depth one through the corners of a camera's pixels."""
     width, height = camera.image_size_px
-    v, u = np.mgrid[:height, :width]
-    rays = camera.unproject(np.stack([u.ravel() + shift[0], v.ravel() + shift[1]], axis=1))
-    return rays.reshape(height, width, 3)
+    v, u = np.mgrid[: height + 1, : width + 1] - 0.5
+    rays = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height + 1, width + 1, 3)
+    return np.asarray(rays / rays[..., 2:])
 
 
-def view(camera: Camera, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None) -> View:
-    """Return what stands still before a camera, four rays a pixel.
+def pixel_rays(corners: Array) -> Array:
+    """Return the unit rays (H, W, 3) of pixels from those of their corners, good to a thousandth of a pixel."""
+    rays = corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1]
+    return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+
+
+def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None) -> View:
+    """Return what stands still before a camera: a ray a pixel, four more where light changes.
 
     Args:
         camera: the camera.
+        rays: (H, W, 3) its pixels'.
         T_base_camera: (4, 4) where it is, m.
         seed: of the clutter.
         foot: the arm's solids; its base stands still.
@@ -120,13 +129,22 @@ def view(camera: Camera, T_base_camera: Array, seed: int, foot: Solids, more: Ar
     still = foot.link == 0
     ends, radius = np.concatenate([ends, foot.ends[still]]), np.append(radius, foot.radius[still])
     capsules = (ends, radius, np.append(albedo, np.full(int(still.sum()), HOUSING_ALBEDO)))
-    width, height = camera.image_size_px
-    total = np.zeros((height, width), np.float32)
-    depth, ids = np.empty((height, width), np.float32), np.empty((height, width), np.int16)
     R, p = np.ascontiguousarray(T_base_camera[:3, :3]), np.ascontiguousarray(T_base_camera[:3, 3])
-    for shift in _SAMPLES:
-        cell_rays.still(pixel_rays(camera, shift), R, p, boxes, capsules, LAMP_BASE, total, depth, ids)
-    return View(total.astype(np.float64) / len(_SAMPLES), depth, ids)
+
+    def cast(some: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Image]:
+        shape = some.shape[:2]
+        out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int16))
+        cell_rays.still(some, R, p, boxes, capsules, LAMP_BASE, *out)
+        return out
+
+    first, depth, ids = cast(rays)
+    square = np.ones((3, 3), np.uint8)
+    v, u = np.nonzero(cv2.dilate(first, square) - cv2.erode(first, square) > _EDGE)
+    light = first.astype(np.float64)
+    light[v, u] = np.mean(
+        [cast(camera.unproject(np.stack([u + x, v + y], axis=1))[None])[0][0] for x, y in _SAMPLES], axis=0
+    )
+    return View(light, depth, ids)
 
 
 def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tuple[Array, Array, Array]:
@@ -156,7 +174,7 @@ def capsule_boxes(camera: Camera, ends: Array, radius: Array) -> Ids:
     """
     corners = ends[:, :, None] + radius[:, None, None, None] * _CUBE
     size = np.array(camera.image_size_px)
-    uv = camera.project(corners.reshape(-1, 3)).reshape(len(radius), -1, 2)
+    uv = camera.project(corners.reshape(-1, 3)).reshape(len(radius), 2 * len(_CUBE), 2)
     near = ~(corners[..., 2] > 0.05).all(axis=(1, 2))  # too close to be bounded by its corners
     low = np.clip(np.floor(np.nan_to_num(uv.min(axis=1))) - 1, 0, size)
     high = np.clip(np.ceil(np.nan_to_num(uv.max(axis=1))) + 2, 0, size)

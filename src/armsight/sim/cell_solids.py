@@ -62,7 +62,7 @@ def solids(arm: Arm) -> Solids:
             parts.append((i + 1, foot, knee, radii[i], False))
         if abs(a) > _SHORTEST_M:
             parts.append((i + 1, knee, hand, radii[i], False))
-        if 0 < i < 5:
+        if 0 < i < 5 or max(abs(a), abs(d)) <= _SHORTEST_M:
             axle = np.array([0.0, 0.0, radii[i]])
             parts.append((i + 1, -axle, axle, _HOUSING * radii[i], True))
     link, foot, hand, radius, housing = (np.array(column) for column in zip(*parts, strict=True))
@@ -128,7 +128,7 @@ def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
     )
     for i in range(6):
         beyond = parts.link > i
-        r = np.cross(Ts[i + 1, :3, 2], centres[beyond] - Ts[i + 1, :3, 3])
-        own = 0.4 * parts.mass[beyond] * parts.radius[beyond] ** 2
-        out[i] = parts.mass[beyond] @ (r**2).sum(axis=1) + own.sum()
+        r = centres[beyond] - Ts[i + 1, :3, 3]
+        off_axis = (r**2).sum(axis=1) - (r @ Ts[i + 1, :3, 2]) ** 2
+        out[i] = parts.mass[beyond] @ (off_axis + 0.4 * parts.radius[beyond] ** 2)
     return out

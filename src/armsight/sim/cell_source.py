@@ -9,15 +9,19 @@ import numpy as np
 
 from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError
-from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.sim.cell_camera import ShotTimes, Timing, shot_times
-from armsight.sim.cell_paint import ArmSeen, CellCamera, noise_start, noise_strip
+from armsight.sim.cell_noise import noise_start, noise_strip
+from armsight.sim.cell_paint import ArmSeen, CellCamera
+from armsight.sim.cell_scene import arm_capsules, capsule_boxes
 from armsight.sim.cell_solids import row_frames
 from armsight.sim.plant import TICK_S, ArmPlant
-from armsight.sim.render import Shutter
+from armsight.sim.render import Shutter, outline
 from armsight.sim.scene import Pattern, Placed, plate
 
-#: A card that is held before the body: its sides, m; how far before it, m.
+#: The body is within so far of its origin, m.
+_BODY_M = 0.12
+#: A card that is held before the body: its sides, m; how far before it, m; its grey.
 _CARD_M, _CARD_BEFORE_M, _CARD_GREY = (0.34, 0.30), 0.08, 0.55
 #: Where the path is looked at within an exposure: its mean is the body's place in the image.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -94,6 +98,28 @@ class CellSource:
     def close(self) -> None:
         """Let go of the threads."""
         self._pool.shutdown()
+
+    def clear(self, pattern: Pattern, T_left_body: Array) -> bool:
+        """Tell whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
+
+        Args:
+            pattern: what is held.
+            T_left_body: (4, 4) where, m, left camera's frame.
+        """
+        q = self._plant.path[-1, 6:]
+        p_body = (self._plant.arm.forward(q) @ self._T_tool_body)[:3, 3]
+        edge = np.column_stack([outline(pattern), np.zeros(len(outline(pattern)))])
+        for camera in self._cameras:
+            T_camera_base = inverse(camera.T_base_camera)
+            ends, radius, _ = arm_capsules(self._plant.parts, row_frames(self._plant.arm, q), camera.T_base_camera)
+            ball = np.tile(transform(T_camera_base, p_body), (1, 2, 1))
+            ends, radius = np.concatenate([ends, ball]), np.append(radius, _BODY_M)
+            p = transform(T_camera_base @ self._cameras[0].T_base_camera @ T_left_body @ pattern.T_body_pattern, edge)
+            uv, boxes = camera.camera.project(p), capsule_boxes(camera.camera, ends, radius)
+            over = (boxes[:, :2] < uv.max(axis=0)).all(axis=1) & (boxes[:, 2:] > uv.min(axis=0)).all(axis=1)
+            if (over & (ends[..., 2].min(axis=1) - radius < p[:, 2].max())).any():
+                return False
+        return True
 
     def still(self, patterns: tuple[Pattern, ...], T_left_body: Array, number: int) -> Shot:
         """Return a shot of flat patterns that are held still before the cameras while the arm stands.

@@ -9,6 +9,7 @@ Presets and amounts: docs/workcell.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -134,10 +135,10 @@ class Workcell:
         self._T_tool_body = mount @ exp_se3(off)
         self._T_base_rig = placed_rig(self.model, self._rig, mount, seed)
         places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
-        left, right = (
-            CellCamera(camera, place, self.plant.parts, seed)
-            for camera, place in zip(self._rig.cameras, places, strict=True)
-        )
+        with ThreadPoolExecutor(2) as pool:
+            left, right = pool.map(
+                lambda camera, place: CellCamera(camera, place, self.plant.parts, seed), self._rig.cameras, places
+            )
         clock = (lambda: self.t_s, self.advance)
         self.source = CellSource(self.plant, (left, right), timing, (body_patterns(), self._T_tool_body), clock, seed)
         self.target: Composite = body_target()
@@ -179,15 +180,18 @@ class Workcell:
         return np.array(found)
 
     def board_shots(self, count: int) -> Iterator[Shot]:
-        """Show a board at many places and turns, as a person would who calibrates; no time passes.
+        """Show a board at many places and turns, as a person would who calibrates, past the arm; no time passes.
 
         Args:
             count: how many shots.
         """
-        pattern = chessboard(9, 6, 0.030)
+        pattern, shown = chessboard(9, 6, 0.030), 0
         rng = np.random.default_rng([self._seed, 10])
-        for n, T in enumerate(board_poses(rng, self._rig, pattern, count, fill=_BOARD_FILL)):
-            yield self.source.still((pattern,), T, n)
+        while shown < count:
+            for T in board_poses(rng, self._rig, pattern, count, fill=_BOARD_FILL):
+                if shown < count and self.source.clear(pattern, T):
+                    yield self.source.still((pattern,), T, shown)
+                    shown += 1
 
     def cover(self, from_s: float, to_s: float) -> None:
         """Hold a card before the body from one time to another: it is not seen meanwhile."""
