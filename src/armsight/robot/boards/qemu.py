@@ -1,7 +1,7 @@
 """The firmware's ARM image under QEMU: a whole Cortex-M4F machine, mps2-an386, with its interrupts and SysTick.
 
-Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in instructions, 128 ns
-each, so that it runs as fast as it can and always the same; so long an instruction makes the wait for the timer short.
+Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in
+instructions, 128 ns each: it runs as fast as it can and always the same, and does not wait long for its timer.
 """
 
 from __future__ import annotations
