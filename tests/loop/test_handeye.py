@@ -42,7 +42,7 @@ def test_without_noise_the_answer_is_exact(eye):
 @pytest.mark.parametrize("in_hand", [False, True])
 def test_the_derivative_is_the_derivative(in_hand):
     A, B, cov, Z, X = recording(5, "in_hand" if in_hand else "to_hand", n=4)
-    poses = Poses(A, B, cov, in_hand)
+    poses = Poses(A, B, cov, in_hand, np.array([0.1, 0.0, 0.05]))
 
     def f(x):
         return residuals(poses, Z @ exp_se3(x[:6]), X @ exp_se3(x[6:]))[0]

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.handeye_fit import Fit, Poses, fit, information
+from armsight.geometry.pose import inverse, log_se3, transform
+from armsight.loop.handeye_fit import SHARES, Fit, Poses, Share, fit, information
 from armsight.loop.handeye_start import starts
 
 Eye = Literal["to_hand", "in_hand"]
@@ -29,6 +29,8 @@ FOLDS = 10
 LEAST = 4
 #: Starts that are refined; the best of them by likelihood is kept.
 REFINED = 3
+#: Another share than the first must lower the held-out error by this factor: less is chance with tens of poses.
+CLEARLY = 1.1
 #: A direction worse determined than this (sigma, m or rad, for an arm that is off by 1 mm and 1 mrad) is not determined.
 UNDETERMINED = 1.0
 
@@ -38,7 +40,7 @@ class HeldOut(Record):
     """How far poses left out of the fit were predicted wrong.
 
     Attributes:
-        position_m: (N,) distance between the body's origin seen and predicted; NaN where a pose was not used.
+        position_m: (N,) distance between the body's middle seen and predicted; NaN where a pose was not used.
         angle_rad: (N,) angle between the body's turns seen and predicted.
     """
 
@@ -67,8 +69,11 @@ class HandEye(Record):
         T_base_still: (4, 4) what stands still, in the base: the rig, or in_hand the body.
         T_flange_held: (4, 4) what the flange carries: the body, or in_hand the rig.
         cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, in this order, m and rad.
-        sigma_flange_m: how far the flange is off what the joints say, sigma along one axis, m; vision's unknown share too.
+        sigma_flange_m: how far the flange is off what the joints say, sigma along one axis, m.
         sigma_flange_rad: the same of its turn about one axis, rad.
+        sigma_seen_m: how far what is seen is off beyond its covariance, sigma of the body's middle along one axis, m.
+        sigma_seen_rad: the same of its turn about one axis, rad.
+        share: who was found to have the share of the error that was not given, one of ``handeye_fit.SHARES``.
         held_out: the error on poses left out of the fit.
         used: (N,) whether a pose was used, and not taken for a mistake.
     """
@@ -79,6 +84,9 @@ class HandEye(Record):
     cov: Array
     sigma_flange_m: float
     sigma_flange_rad: float
+    sigma_seen_m: float
+    sigma_seen_rad: float
+    share: Share
     held_out: HeldOut
     used: NDArray[np.bool_]
 
@@ -120,7 +128,9 @@ def calibrate_handeye(
     covs: ArrayLike | None = None,
     *,
     eye: Eye = "to_hand",
+    centre: ArrayLike | None = None,
     folds: int = FOLDS,
+    shares: tuple[Share, ...] = SHARES,
     progress: Callable[[str], None] = lambda line: None,
 ) -> HandEye:
     """Find where the rig is to the arm.
@@ -128,26 +138,32 @@ def calibrate_handeye(
     Args:
         Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m; the turns must differ about two axes at least.
         Ts_rig_body: (N, 4, 4) the body in the rig at the same instants, m (``PoseEstimate.T_left_body``).
-        covs: (N, 6, 6) covariance of the latter, right tangent (``PoseEstimate.cov``); None: not known, then all scatter
-            counts as the arm's.
+        covs: (N, 6, 6) covariance of the latter, right tangent (``PoseEstimate.cov``); None: not known.
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
+        centre: (3,) the middle of the body's points, body frame, m: what is seen turns about it where vision is off.
+            None: the body's origin.
         folds: parts for the held-out error; each is predicted by a fit to the others.
+        shares: who may have the share of the error that is not given; the held-out error of place chooses.
         progress: is told what is being done.
 
     Raises:
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
         CalibrationError: the motions leave a direction undetermined.
     """
-    poses = _poses(Ts_base_flange, Ts_rig_body, covs, eye)
+    poses = _poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
     progress("hand-eye: fitting")
-    result = _best(poses, starts(poses.A, poses.turned)[:REFINED])
-    _require_determined(poses, result)
-    progress("hand-eye: errors on poses left out")
-    held_out = _held_out(poses, result, folds)
-    return HandEye(eye, result.Z, result.X, result.cov, *result.sigma_flange, held_out, result.used)
+    candidates = starts(poses.A, poses.turned)[:REFINED]
+    found: list[HandEye] = []
+    for share in shares:
+        result = _best(poses, candidates, share)
+        _require_determined(poses, result)
+        progress(f"hand-eye: errors on poses left out ({share})")
+        held_out = _held_out(poses, result, folds, share)
+        found.append(HandEye(eye, result.Z, result.X, result.cov, *result.sigma, share, held_out, result.used))
+    return min(found, key=lambda h: h.held_out.rms()[0] * (1.0 if h.share == shares[0] else CLEARLY))
 
 
-def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye) -> Poses:
+def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
     """Check what is given once."""
     if eye not in ("to_hand", "in_hand"):
         raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
@@ -163,18 +179,18 @@ def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye) -> Pose
     if n < LEAST:
         raise InputError(f"hand-eye calibration needs {LEAST} or more poses, got {n}; 15 and more are advised")
     cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
-    return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand")
+    return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
 
 
-def _best(poses: Poses, candidates: list[tuple[Array, Array]]) -> Fit:
-    """Return the fit that uses most poses, and of those the one with the smallest flange errors."""
-    fits = [fit(poses, candidate) for candidate in candidates]
-    return min(fits, key=lambda f: (-int(f.used.sum()), f.sigma_flange[0] + f.sigma_flange[1]))
+def _best(poses: Poses, candidates: list[tuple[Array, Array]], share: Share) -> Fit:
+    """Return the fit that uses most poses, and of those the one with the smallest sigmas."""
+    fits = [fit(poses, candidate, share) for candidate in candidates]
+    return min(fits, key=lambda f: (-int(f.used.sum()), sum(f.sigma)))
 
 
 def _require_determined(poses: Poses, result: Fit) -> None:
     """Refuse motions that leave a direction of the twelve open."""
-    H = information(poses.rows(result.used), result.Z, result.X, (1e-3, 1e-3))
+    H = information(poses.rows(result.used), result.Z, result.X, (1e-3, 1e-3, 0.0, 0.0))
     values, vectors = np.linalg.eigh(H)
     if values[0] > 1 / UNDETERMINED**2:
         return
@@ -199,17 +215,17 @@ def _held(poses: Poses) -> str:
     return "flange-rig" if poses.in_hand else "flange-body"
 
 
-def _held_out(poses: Poses, result: Fit, folds: int) -> HeldOut:
+def _held_out(poses: Poses, result: Fit, folds: int, share: Share) -> HeldOut:
     """Predict every used pose by a fit to the other parts."""
     used = np.flatnonzero(result.used)
     position, angle = np.full(len(poses.A), np.nan), np.full(len(poses.A), np.nan)
     order = np.random.default_rng(0).permutation(used)
     for part in np.array_split(order, min(max(folds, 2), len(used))):
         others = np.setdiff1d(used, part)
-        f = fit(poses.rows(others), (result.X, result.Z))
+        f = fit(poses.rows(others), (result.X, result.Z), share)
         A, B = poses.A[part], poses.B[part]
         seen = A @ f.X @ B if poses.in_hand else A @ f.X
         wanted = np.broadcast_to(f.Z, B.shape) if poses.in_hand else f.Z @ B
-        position[part] = np.linalg.norm(seen[:, :3, 3] - wanted[:, :3, 3], axis=1)
+        position[part] = np.linalg.norm(transform(seen, poses.centre) - transform(wanted, poses.centre), axis=1)
         angle[part] = np.linalg.norm(log_se3(inverse(wanted) @ seen)[:, 3:], axis=1)
     return HeldOut(position, angle)

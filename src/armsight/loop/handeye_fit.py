@@ -1,14 +1,16 @@
-"""Maximum likelihood of a hand-eye calibration: poses with covariance, and an arm that is off by an unknown amount.
+"""Maximum likelihood of a hand-eye calibration: poses with covariance, an arm and a vision that are off by unknown amounts.
 
 In: poses of the flange and of what is seen, with covariance, and a start. Out: both unknown transforms, their covariance,
-and how far the arm itself is off. The residual of a pose is the tangent, in the axes of what the camera measured, of the
-motion left over; its covariance is the vision's plus that of the flange (one sigma for its place, one for its turn, both
-estimated: restricted likelihood, Patterson and Thompson, Biometrika 58, 1971), carried over by the adjoint.
+and how far arm and vision are off. The residual of a pose is the tangent, in the axes of what the camera measured, of the
+motion left over. Its covariance is what is given, plus that of an unknown share (``SHARES``): of the flange, about the
+flange, or of what is seen, about its middle, carried over by the adjoint. Its sigmas of place and turn are those of the
+greatest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +25,19 @@ from armsight.geometry.rotation import skew
 CHANCE = 1e-5
 #: Gauss-Newton steps at most, and the step (m, rad) below which it has converged.
 STEPS, CONVERGED = 30, 1e-10
-#: The flange's sigmas are looked for between these, m and rad: beyond, they are zero, or no arm.
+#: Poses that the sigmas are estimated from at most, spread evenly.
+MOST = 200
+#: The sigmas are looked for between these, m and rad: beyond, they are zero, or no arm.
 LEAST_SIGMA, MOST_SIGMA = 1e-7, 0.1
+
+
+Sigmas = tuple[float, float, float, float]
+Share = Literal["flange", "seen", "places"]
+#: Who has the share of the error that nobody gave: the flange (its joints), what is seen, or what is seen with its turns
+#: hardly believed: an arm's turns and its places may contradict each other by more than either scatters.
+SHARES: tuple[Share, ...] = ("flange", "seen", "places")
+#: Sigma of turns that are hardly believed, rad: enough to determine what places leave open.
+HARDLY = 0.005
 
 
 def adjoint(T: Array) -> Array:
@@ -45,16 +58,18 @@ class Poses(Record):
         B: (N, 4, 4) T_rig_body, m.
         cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
         in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
+        centre: (3,) the middle of what is seen of the body, body frame, m.
     """
 
     A: Array
     B: Array
     cov: Array
     in_hand: bool
+    centre: Array
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
         """Return a part of the poses."""
-        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand)
+        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre)
 
     @property
     def turned(self) -> Array:
@@ -70,14 +85,15 @@ class Fit(Record):
         Z: (4, 4) what stands still, in the base.
         X: (4, 4) what the flange carries, in the flange.
         cov: (12, 12) covariance of the right tangents of Z and X, in this order.
-        sigma_flange: sigma of the flange's place along one axis, m, and of its turn about one axis, rad.
+        sigma: sigmas along or about one axis: the flange's place, m, and turn, rad; the body's middle's, and turn, beyond
+            the covariance given.
         used: (N,) whether a pose was used.
     """
 
     Z: Array
     X: Array
     cov: Array
-    sigma_flange: tuple[float, float]
+    sigma: Sigmas
     used: NDArray[np.bool_]
 
 
@@ -111,21 +127,24 @@ def _small_adjoint(xi: Array) -> Array:
     return out
 
 
-def covariances(poses: Poses, carry: Array, sigma: tuple[float, float]) -> Array:
-    """Return the covariance (N, 6, 6) of residuals: the vision's, and the flange's carried over."""
-    variances = np.repeat(np.square(sigma), 3)
-    return np.asarray(poses.cov + (carry * variances) @ np.swapaxes(carry, 1, 2))
+def covariances(poses: Poses, carry: Array, sigma: Sigmas) -> Array:
+    """Return the covariance (N, 6, 6) of residuals: what is given, the flange's carried over, and the body's."""
+    flange, body = np.repeat(np.square(sigma[:2]), 3), np.repeat(np.square(sigma[2:]), 3)
+    about = np.eye(6)
+    about[:3, 3:] = skew(poses.centre)  # the adjoint of the shift from the body's origin to its middle
+    return np.asarray(poses.cov + (carry * flange) @ np.swapaxes(carry, 1, 2) + (about * body) @ about.T)
 
 
-def fit(poses: Poses, start: tuple[Array, Array]) -> Fit:
-    """Fit both transforms, the flange's sigmas, and which poses are mistakes.
+def fit(poses: Poses, start: tuple[Array, Array], share: Share) -> Fit:
+    """Fit both transforms, the unknown sigmas, and which poses are mistakes.
 
     Args:
         poses: at least three.
         start: X and Z near the answer.
+        share: who has the share of the error that is not given.
     """
     X, Z = start
-    sigma = _robust_sigma(poses, Z, X)
+    sigma = _robust_sigma(poses, Z, X, share)
     used = np.ones(len(poses.A), bool)
     for _ in range(8):
         e, _, carry = residuals(poses, Z, X)
@@ -135,8 +154,8 @@ def fit(poses: Poses, start: tuple[Array, Array]) -> Fit:
             keep = far <= np.sort(far)[max(3, len(keep) // 2) - 1]
         part = poses.rows(keep)
         Z, X = _newton(part, Z, X, sigma)
-        sigma_new = _variance(part, Z, X, sigma)
-        settled = bool((keep == used).all()) and bool(np.allclose(sigma_new, sigma, rtol=1e-3, atol=1e-8))
+        sigma_new = _variance(part, Z, X, sigma, share)
+        settled = bool((keep == used).all()) and bool(np.allclose(sigma_new, sigma, rtol=0.02, atol=1e-8))
         used, sigma = keep, sigma_new
         if settled:
             break
@@ -145,7 +164,7 @@ def fit(poses: Poses, start: tuple[Array, Array]) -> Fit:
     return Fit(Z, X, np.asarray(np.linalg.inv(information(part, Z, X, sigma))), sigma, used)
 
 
-def information(poses: Poses, Z: Array, X: Array, sigma: tuple[float, float]) -> Array:
+def information(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> Array:
     """Return the information (12, 12) about the right tangents of Z and X."""
     _, J, carry = residuals(poses, Z, X)
     WJ = np.linalg.solve(covariances(poses, carry, sigma), J)
@@ -157,15 +176,22 @@ def _squares(e: Array, cov: Array) -> Array:
     return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(cov, e[..., None])[..., 0]))
 
 
-def _robust_sigma(poses: Poses, Z: Array, X: Array) -> tuple[float, float]:
-    """Return sigmas of place and turn along one axis from the median residual, which mistakes do not reach."""
+def _shared(place: float, turn: float, share: Share) -> Sigmas:
+    """Return the four sigmas of a share."""
+    if share == "flange":
+        return place, turn, 0.0, 0.0
+    return 0.0, 0.0, place, turn if share == "seen" else HARDLY
+
+
+def _robust_sigma(poses: Poses, Z: Array, X: Array, share: Share) -> Sigmas:
+    """Return sigmas along one axis from the median residual, which mistakes do not reach."""
     e, _, _ = residuals(poses, Z, X)
     middle = np.sqrt(chi2.median(3))
     place, turn = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
-    return max(place, LEAST_SIGMA), max(turn, LEAST_SIGMA)
+    return _shared(max(place, LEAST_SIGMA), max(turn, LEAST_SIGMA), share)
 
 
-def _newton(poses: Poses, Z: Array, X: Array, sigma: tuple[float, float]) -> tuple[Array, Array]:
+def _newton(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> tuple[Array, Array]:
     """Minimise the weighted squares over both transforms."""
     for _ in range(STEPS):
         e, J, carry = residuals(poses, Z, X)
@@ -177,16 +203,22 @@ def _newton(poses: Poses, Z: Array, X: Array, sigma: tuple[float, float]) -> tup
     return Z, X
 
 
-def _variance(poses: Poses, Z: Array, X: Array, sigma: tuple[float, float]) -> tuple[float, float]:
-    """Return the flange's sigmas of the greatest restricted likelihood."""
+def _variance(poses: Poses, Z: Array, X: Array, sigma: Sigmas, share: Share) -> Sigmas:
+    """Return the sigmas of the greatest restricted likelihood."""
+    if len(poses.A) > MOST:
+        poses = poses.rows(np.linspace(0, len(poses.A) - 1, MOST).astype(np.int64))
     e, _, carry = residuals(poses, Z, X)
-    share = max(1 - 12 / e.size, 1 / e.size)  # of the residuals' freedom that the fit has left
+    freedom = max(1 - 12 / e.size, 1 / e.size)  # what the fit has left of the residuals'
+    low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
+
+    def shared(logs: Array) -> Sigmas:
+        place, turn = np.exp(np.clip(logs, low, high))
+        return _shared(float(place), float(turn), share)
 
     def cost(logs: Array) -> float:
-        s = np.exp(np.clip(logs, np.log(LEAST_SIGMA), np.log(MOST_SIGMA)))
-        C = covariances(poses, carry, (s[0], s[1]))
-        return float(share * np.linalg.slogdet(C)[1].sum() + _squares(e, C).sum())
+        C = covariances(poses, carry, shared(logs))
+        return float(freedom * np.linalg.slogdet(C)[1].sum() + _squares(e, C).sum())
 
-    best = minimize(cost, np.log(sigma), method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4})
-    place, turn = np.exp(np.clip(best.x, np.log(LEAST_SIGMA), np.log(MOST_SIGMA)))
-    return float(place), float(turn)
+    start = np.log(np.maximum(sigma[:2] if share == "flange" else sigma[2:], LEAST_SIGMA))
+    best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-3})
+    return shared(best.x)
