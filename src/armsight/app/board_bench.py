@@ -48,12 +48,14 @@ class Bench:
         link: the wire to it.
         plant: the emulated arm; None where the board is a real one.
         problems: filled with what is not as it must be.
-        amplitude_rad: how far the joints swing.
+        amplitude_rad: how far the joints swing from their home, at most.
+        home_rad: (6,) where that is; where they are at first, without it.
         name: what errors call the board.
 
     Attributes:
         board: the board, hello said.
         plant: the emulated arm, if there is one.
+        home_rad: (6,) what the joints swing about.
         wire: the link, whose bytes to the board can be spoiled.
     """
 
@@ -64,6 +66,7 @@ class Bench:
         problems: list[str],
         *,
         amplitude_rad: float = 0.4,
+        home_rad: Array | None = None,
         name: str = "the emulated board",
     ) -> None:
         self.wire = SpoiledLink(link)
@@ -71,7 +74,8 @@ class Bench:
         self.plant = plant
         self._problems = problems
         self._amplitude_rad = amplitude_rad
-        self._start_rad = np.zeros(JOINTS)
+        self.home_rad = self.readings(0.02)[-1] if home_rad is None else home_rad
+        self._start_rad, self._side = np.zeros(JOINTS), np.ones(JOINTS)
         self._t_s = 0.0
 
     def expect(self, holds: bool, what: str) -> None:
@@ -88,8 +92,9 @@ class Bench:
             self.expect(not status.faults, f"{when}: {told}")
 
     def enable(self) -> None:
-        """Switch the drives on; the joints swing about where they are."""
+        """Switch the drives on; the joints will swing from where they are to the side of their home."""
         self._start_rad = self.readings(0.02)[-1]
+        self._side = np.where(self._start_rad > self.home_rad, -1.0, 1.0)
         self._t_s = 0.0
         self.board.enable()
 
@@ -104,10 +109,10 @@ class Bench:
         """Return the next command of the swing: where the joints are to be a period later."""
         self._t_s += PERIOD_S
         rate = 2 * math.pi * _SINE_HZ
-        at, phase = rate * self._t_s, np.ones(JOINTS)
+        at, half = rate * self._t_s, self._amplitude_rad / 2 * self._side
         # 1 - cos begins at rest.
-        q = self._start_rad + self._amplitude_rad / 2 * (1 - math.cos(at)) * phase
-        return JointCommand(q, self._amplitude_rad / 2 * rate * math.sin(at) * phase, np.zeros(JOINTS), PERIOD_S)
+        q = self._start_rad + half * (1 - math.cos(at))
+        return JointCommand(q, half * rate * math.sin(at), np.zeros(JOINTS), PERIOD_S)
 
     def swing(self, duration_s: float) -> Array:
         """Swing on for so long; returns how far the readings (N, 6) were from where the joints were told to be."""

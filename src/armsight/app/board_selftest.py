@@ -11,6 +11,7 @@ from typing import Any
 from armsight import firmware
 from armsight.app.board_bench import Bench
 from armsight.app.board_scenarios import AT_REST, DRIVEN, EMULATED_ONLY, Scenario
+from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.board import Board
@@ -132,11 +133,13 @@ def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -
     port = board.removeprefix(SERIAL)
     chosen = {name: run for name, run in DRIVEN.items() if name not in EMULATED_ONLY} if drives else AT_REST
     scenarios = {}
+    home_rad: Array | None = None
     for name, scenario in chosen.items():
         told(name)
         problems: list[str] = []
         link = SerialLink(port, baud)
-        bench = Bench(link, None, problems, amplitude_rad=_SMALL_RAD, name=port)
+        bench = Bench(link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, name=port)
+        home_rad = bench.home_rad
         try:
             scenario(bench)
         except ArmsightError as error:

@@ -94,10 +94,11 @@ class PtyBoard:
     Every poll of the far side lets one tick pass for a millisecond of real time, at most; nothing is asserted on times.
     """
 
-    def __init__(self, link=None):
+    def __init__(self, *, fresh=False):
         self.plant = JointPlant()
-        self.link = EmulatedLink(open_machine("host"), self.plant) if link is None else link
-        configured(self.link)
+        self.link = EmulatedLink(open_machine("host"), self.plant)
+        if not fresh:
+            configured(self.link)
         self.master, slave = pty.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)

@@ -18,6 +18,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.opening import open_board
 from armsight.robot.boards.serial import SerialLink, list_ports
+from armsight.sim.joints import PotFault
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
@@ -158,6 +159,18 @@ def test_the_self_test_of_a_real_board_keeps_its_drives_off(cable):
     assert np.array_equal(cable.plant.q, start)
     assert result.record()["elf"] == {"flash_bytes": None, "ram_bytes": None, "hard_float": None}
     assert result.record()["scenarios"]["nominal"] == {"passed": True, "trace_sha256": None}
+
+
+def test_a_bare_board_passes_at_rest():
+    """Nothing stored and no potentiometer wired: what a board looks like on its first day."""
+    cable = PtyBoard(fresh=True)
+    for joint in range(6):
+        cable.plant.break_pot(joint, PotFault.OPEN)
+    try:
+        result = selftest(f"serial:{cable.port}", told=lambda _: None)
+    finally:
+        cable.close()
+    assert [each.problems for each in result.scenarios.values()] == [()] * 4
 
 
 def test_a_board_of_another_baud_rate_or_none_at_all_is_told():

@@ -17,6 +17,7 @@ from armsight.app.board_selftest import selftest
 from armsight.app.cli.progress import steps
 from armsight.firmware import build
 from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import ConfigSource
 from armsight.robot.boards.configuration import gains_array
 from armsight.robot.boards.opening import SERIAL, open_board
 from armsight.robot.boards.serial import BAUD
@@ -131,6 +132,10 @@ def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: 
     click.echo(json.dumps(board_words.gains_facts(values)) if as_json else board_words.gains_text(values))
     if store:
         click.echo("stored: in use after the board's next start, too", err=True)
+        if board.welcome.config_source == ConfigSource.FACTORY:
+            click.echo(
+                "the rest of what was stored are factory values: see docs/firmware.md before motors turn", err=True
+            )
 
 
 @command.command("selftest")
