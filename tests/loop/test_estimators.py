@@ -1,5 +1,8 @@
 """What every estimator promises, and what a sighting is."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from arm_bench import ARM, MIDDLE, MOUNT, SHOT, TICK_S, mounts, off, seen, small, states
@@ -77,8 +80,8 @@ def test_a_track_is_its_estimates(estimator):
 def test_the_tool_is_where_the_estimate_says_at_the_readings_of_now(estimator):
     still(estimator, 0.3)
     estimator.vision(plain(0.2, shift_m=2e-3))
-    T = estimator.tool(MIDDLE, np.zeros(6))
-    assert np.allclose(T, estimator.estimate().T_base_tool, atol=1e-9)
+    T = estimator.tool(MIDDLE[None], np.zeros((1, 6)))
+    assert np.allclose(T[0], estimator.estimate().T_base_tool, atol=1e-9)
 
 
 def test_times_that_do_not_rise_or_are_not_kept_are_refused(estimator):
@@ -106,13 +109,14 @@ def test_a_sighting_is_the_measurement_carried_to_the_tool_with_its_covariance()
 
 
 def test_a_mounting_comes_from_a_hand_eye_calibration():
-    from armsight.loop.handeye import HandEye
-
-    T_rig, T_body = small([1, 0, 0.2, 0.1, 0.2, 0.3]), small([0.01, 0, 0.05, 0, 0.3, 0])
+    T_base_rig, T_flange_body = small([1, 0, 0.2, 0.1, 0.2, 0.3]), small([0.01, 0, 0.05, 0, 0.3, 0])
     cov = np.diag(np.tile(MOUNT, 2) ** 2)
-    mounting = Mounting.of(HandEye("to_hand", T_rig, T_body, cov, 0, 0, None, np.ones(1)), ARM)
-    assert np.allclose(ARM.T_flange_tool @ mounting.T_tool_body, T_body)
-    assert np.allclose(mounting.T_base_rig, T_rig)
+    handeye = SimpleNamespace(T_base_rig=T_base_rig, T_flange_body=T_flange_body, cov=cov)
+    arm = dataclasses.replace(ARM, T_flange_tool=small([0, 0, 0.1, 0, 0, 1.0]))
+    mounting = Mounting.of(handeye, arm)
+    assert np.allclose(arm.T_flange_tool @ mounting.T_tool_body, T_flange_body)
+    assert np.array_equal(mounting.T_base_rig, T_base_rig)
+    assert np.array_equal(mounting.cov, cov)
 
 
 def test_a_sighting_needs_its_time():

@@ -32,7 +32,7 @@ BRIDGE_S = 0.75
 RATE_SHARE = 0.1
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
 MOST_RAD = np.deg2rad(5.0)
-#: Joints measured slower than this are at rest, rad/s: four sigma of a smoothed speed; and wanted slower than this, they are to.
+#: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and wanted slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
 
@@ -133,13 +133,14 @@ class PoseServo:
         goal = self._goal or motion.at(t_s)
         error = behind(self._arm.forward(motion.at(t_s).q), estimate.T_base_tool)
         mode = self._mode(estimate)
+        resting = self._resting(estimate, goal, ahead)
         change = np.zeros(6)
         if mode is not Mode.POTENTIOMETERS:
-            missing = self._missing(estimator, goal)
-            change = self._missing(estimator, ahead) - missing
+            last, following = self._missing(estimator, goal, ahead)
+            push = following - last
             if mode is Mode.VISION:
-                resting = self._resting(estimate, goal, ahead)
-                change += self.timing.gain * (self._joints(goal.q, error) if resting else missing)
+                push += self.timing.gain * (error if resting else last)
+            change = _speeds(self._arm.jacobian(goal.q), push, self._scale)[0]
         return self._command(goal, ahead, change, duty, mode, error)
 
     def _mode(self, estimate: ArmEstimate) -> Mode:
@@ -150,14 +151,10 @@ class PoseServo:
             return Mode.POTENTIOMETERS
         return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
 
-    def _missing(self, estimator: Estimator, goal: Joints) -> Array:
-        """Return what the correction lacks (6,) at a goal, as the estimator knows the arm."""
-        there = estimator.tool(goal.q + self._correction, goal.qd)
-        return self._joints(goal.q, behind(self._arm.forward(goal.q), there))
-
-    def _joints(self, q: Array, error: Array) -> Array:
-        """Return the joint angles (6,) that make up for an error of the tool (6,), damped near singularities."""
-        return _speeds(self._arm.jacobian(q), error, self._scale)[0]
+    def _missing(self, estimator: Estimator, goal: Joints, ahead: Joints) -> Array:
+        """Return how far the tool would be behind (2, 6) at two goals with this correction."""
+        q, qd = np.stack([goal.q, ahead.q]), np.stack([goal.qd, ahead.qd])
+        return behind(self._arm.forward(q), estimator.tool(q + self._correction, qd))
 
     def _resting(self, estimate: ArmEstimate, goal: Joints, ahead: Joints) -> bool:
         """Say whether the arm has been at rest for as long as the newest sighting is old."""

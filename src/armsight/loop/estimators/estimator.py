@@ -165,5 +165,5 @@ class Estimator(Protocol):
         ...
 
     def tool(self, q: Array, qd: Array) -> Array:
-        """Return T_base_tool (4, 4) if the potentiometers were to read q (6,) moving at qd (6,), as far as is known now."""
+        """Return T_base_tool (N, 4, 4) if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
         ...

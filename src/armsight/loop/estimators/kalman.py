@@ -149,12 +149,11 @@ class KalmanEstimator:
         return Track(t_s, Ts, own + self._shared(state.sighting, Ts), own, joints.q, joints.qd, age)
 
     def tool(self, q: Array, qd: Array) -> Array:
-        """Return T_base_tool if the potentiometers were to read q (6,) moving at qd (6,), as far as is known now."""
+        """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
         now = self._readings.at(np.array([self.span_s[1]]))
         state = self._states[-1]
-        side = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.side[0])
-        Ts, _ = self._model(state.x * self._moved(state, now).kept, q[None], side[None])
-        return np.asarray(Ts[0])
+        side = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.side)
+        return self._model(state.x * self._moved(state, now).kept, q, side)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
@@ -191,9 +190,9 @@ class KalmanEstimator:
         return sighting.t_s - self._delay.delay_s - float(state.x[DELAY])
 
     def _model(self, x: Array, q: Array, side: Array) -> tuple[Array, Array]:
-        """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE)."""
+        """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE); x may be one for all."""
         Ts, Hs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, SIZE))
-        armerror.poses_and_derivatives(self._arm.table, x, q, side, Ts, Hs)
+        armerror.poses_and_derivatives(self._arm.table, np.broadcast_to(x, (len(q), SIZE)).copy(), q, side, Ts, Hs)
         return Ts, Hs
 
     def _moved(self, state: _State, joints: Smoothed) -> _Step:

@@ -58,5 +58,5 @@ class LatestEstimator:
         return Track(alone.t_s, Ts, covs, covs_own, alone.q, alone.qd, age)
 
     def tool(self, q: Array, qd: Array) -> Array:
-        """Return T_base_tool if the potentiometers were to read q (6,): the table's, moved as the newest sighting was."""
+        """Return T_base_tool if the potentiometers were to read q (N, 6): the table's, moved as the newest sighting was."""
         return np.asarray(self._arm.forward(q) @ self._offset)
