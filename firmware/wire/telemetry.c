@@ -8,7 +8,7 @@
 #define STATUS_TICKS 20u       /* 50 Hz where the wire carries it */
 #define STATUS_EVERY 4u        /* and not more often than every so many ANGLES */
 #define STATUS_GAP_DIVISOR 4u  /* STATUS of orders comes at most as many times more often than by itself */
-#define USED_PER_BAUD 80u      /* bytes a second to use of 1000 baud: 80 % of what it carries */
+#define USED_PER_25_BAUD 2u    /* bytes a second to use: 80 % of what the wire carries */
 #define BACKLOG_PER_BAUD 1000u /* telemetry waits while more than 10 ms of it wait to go out, */
 #define BACKLOG_BYTES 512u     /* or more than this */
 
@@ -25,7 +25,7 @@ wire_periods wire_periods_at(uint32_t baud)
         const uint32_t bytes_per_s = FRAME(ANGLES) * TICKS_PER_S / periods.angles +
                                      FRAME(JOINTS) * TICKS_PER_S / periods.joints +
                                      FRAME(BOARD_STATUS) * TICKS_PER_S / periods.status;
-        if (bytes_per_s <= baud / 1000u * USED_PER_BAUD) {
+        if (bytes_per_s + 3u <= baud / 25u * USED_PER_25_BAUD) { /* 3: what the divisions left out */
             break;
         }
         periods = periods_of(angles);
@@ -59,18 +59,13 @@ uint32_t wire_output(const wire_state *wire, const uint8_t **bytes)
 
 void wire_sent(wire_state *wire, uint32_t length) { wire->output.taken += length; }
 
-/* Return the newest report of the tick. It writes the other one next: this one is whole unless two ticks passed
- * meanwhile. */
-static uint32_t copy_report(wire_state *wire, uint32_t number)
+/* Take the tick's report; again if a tick came meanwhile. */
+static void copy_report(wire_state *wire)
 {
-    for (;;) {
-        wire->report = wire->shared.report[number % 2u];
-        const uint32_t now = atomic_load(&wire->shared.report_count);
-        if (now == number) {
-            return number;
-        }
-        number = now;
-    }
+    do {
+        wire->reports_read = atomic_load(&wire->shared.report_count);
+        wire->report = wire->shared.report;
+    } while (wire->reports_read != atomic_load(&wire->shared.report_count));
 }
 
 bool telemetry_fetch(wire_state *wire)
@@ -80,11 +75,10 @@ bool telemetry_fetch(wire_state *wire)
     const uint32_t refused = outputs->refused_count;
     const uint32_t state = outputs->state;
     const uint32_t faults = outputs->faults;
-    const uint32_t number = atomic_load(&wire->shared.report_count);
-    if (number == wire->reports_read) {
+    if (wire->reports_read == atomic_load(&wire->shared.report_count)) {
         return false;
     }
-    wire->reports_read = copy_report(wire, number);
+    copy_report(wire);
     if (wire->stop_waits != 0u && wire->reports_read != wire->stop_report) {
         wire->stop_waits = 0u;
         order_obeyed(wire, wire->stop_sequence);

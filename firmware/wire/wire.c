@@ -153,9 +153,9 @@ void wire_before_tick(wire_state *wire, core_inputs *inputs)
         shared->stops_taken = stops;
         inputs->stop_pressed = 1u;
     }
-    shared->mail_taken = atomic_load(&shared->mail_full);
-    if (shared->mail_taken != 0u) {
+    if (atomic_load(&shared->mail_full) != 0u) {
         inputs->command = shared->mail;
+        atomic_store(&shared->mail_full, 0u);
     } else {
         inputs->command.kind = COMMAND_NONE;
     }
@@ -164,12 +164,7 @@ void wire_before_tick(wire_state *wire, core_inputs *inputs)
 void wire_after_tick(wire_state *wire, const core_inputs *inputs, const core_outputs *outputs)
 {
     wire_shared *shared = &wire->shared;
-    const uint32_t number = atomic_load(&shared->report_count) + 1u;
-    wire_report *report = &shared->report[number % 2u];
-    report->outputs = *outputs;
-    report->supply_mv = inputs->supply_mv;
-    atomic_store(&shared->report_count, number);
-    if (shared->mail_taken != 0u) {
-        atomic_store(&shared->mail_full, 0u);
-    }
+    shared->report.outputs = *outputs;
+    shared->report.supply_mv = inputs->supply_mv;
+    atomic_fetch_add(&shared->report_count, 1u);
 }

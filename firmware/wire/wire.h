@@ -2,8 +2,8 @@
  * armsight.xml.
  *
  * Two contexts meet here: wire_before_tick and wire_after_tick belong to the tick; everything else to the main loop,
- * which the tick may interrupt. They meet in a mailbox for one command, a count of stops, and two reports written in
- * turn.
+ * which the tick may interrupt. They meet in a mailbox for one command, a count of stops, and a report that is
+ * read again if a tick came meanwhile.
  */
 #ifndef ARMSIGHT_WIRE_H
 #define ARMSIGHT_WIRE_H
@@ -99,8 +99,7 @@ typedef struct wire_shared {
     _Atomic uint32_t mail_full;
     _Atomic uint32_t stops;        /* STOPs that came */
     uint32_t stops_taken;          /* the tick's */
-    uint32_t mail_taken;           /* the tick's */
-    wire_report report[2];         /* number n is in report[n % 2] */
+    wire_report report;            /* the tick's: read again if report_count has changed meanwhile */
     _Atomic uint32_t report_count; /* how many there were */
 } wire_shared;
 

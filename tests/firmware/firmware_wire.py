@@ -35,6 +35,8 @@ def declare_wire(library):
     library.wire_output.restype = word
     library.wire_output.argtypes = [pointer, ctypes.POINTER(ctypes.POINTER(ctypes.c_uint8))]
     library.wire_sent.argtypes = [pointer, word]
+    library.wire_to_store.restype, library.wire_to_store.argtypes = pointer, [pointer]
+    library.wire_stored.argtypes = [pointer, ctypes.c_bool]
     for name in ("wire_poll", "wire_before_tick", "wire_after_tick"):
         getattr(library, name).argtypes = [pointer] * {"wire_poll": 1, "wire_before_tick": 2, "wire_after_tick": 3}[
             name
@@ -45,12 +47,12 @@ def declare_wire(library):
 class BareWire:
     """A wire whose ticks do nothing but take commands and give reports."""
 
-    def __init__(self, library, baud: int):
+    def __init__(self, library, baud: int, *, name: bytes = b"bare"):
         self.library, self.baud = declare_wire(library), baud
         self.state = ctypes.create_string_buffer(library.host_size(b"wire_state"))
         self.config = lab_config(library)
         self.inputs, self.outputs = c.core_inputs(), c.core_outputs()
-        setup = Setup(b"bare", baud, c.CONFIG_NEWEST, ctypes.addressof(self.config))
+        setup = Setup(name, baud, c.CONFIG_NEWEST, ctypes.addressof(self.config))
         library.wire_init(self.state, ctypes.byref(setup))
         self.sent, self.waiting, self.line = bytearray(), bytearray(), 0.0
         self.host = Host(self)
@@ -58,6 +60,14 @@ class BareWire:
     def receive(self, data: bytes, *, overrun: int = 0) -> None:
         """Let these bytes come in, and so many be lost."""
         self.library.wire_receive(self.state, data, len(data), overrun)
+
+    def to_store(self) -> bool:
+        """Tell whether a configuration waits to be stored."""
+        return self.library.wire_to_store(self.state) is not None
+
+    def stored(self, done: bool) -> None:
+        """Tell the wire what became of it."""
+        self.library.wire_stored(self.state, done)
 
     def tick(self, ticks: int = 1) -> None:
         """Run ticks; the wire takes away what its baud rate carries."""

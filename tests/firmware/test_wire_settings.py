@@ -6,7 +6,8 @@ import math
 import pytest
 from firmware_arm import lab_config
 from firmware_layout import c
-from firmware_pil import PART
+from firmware_pil import BAUD, PART
+from firmware_wire import BareWire
 
 
 def send(board, host, config, *, parts=None, crc=None):
@@ -153,3 +154,34 @@ def test_a_frame_that_is_none_is_refused_and_no_tick_is_run(working, field, valu
     setattr(board.request, field, kept)
     board.request.magic = c.FRAME_REQUEST
     board.tick()
+
+
+def test_what_could_not_be_stored_is_refused_and_what_comes_meanwhile_waits(fresh_wire):
+    """A board whose memory fails; it takes its time to say so."""
+    wire, host = fresh_wire, fresh_wire.host
+    wire.receive(host.hello())
+    for part in host.parts(wire.config):
+        wire.receive(part)
+    wire.receive(host.store(wire.config) + host.order(c.COMMAND_DISABLE))
+    spoilt = host.pack("config_part", 0, len(bytes(wire.config)), 4, [0xEE] * 200)
+    assert not wire.to_store()
+    wire.tick(3)
+    assert wire.to_store()
+    wire.receive(spoilt)
+    wire.tick(20)
+    assert wire.outputs.obeyed_count == 0, "it waits behind the configuration"
+    wire.stored(False)
+    wire.tick(30)
+    status = host.newest("BOARD_STATUS")
+    assert (status.refused_sequence, status.refusal, status.config_stored) == (1, c.REFUSAL_CONFIG_BROKEN, 0)
+    assert status.obeyed_sequence == 2
+    wire.receive(host.store(wire.config))
+    wire.tick(3)
+    assert wire.to_store(), "the part that came meanwhile was left out"
+
+
+def test_a_name_may_take_all_its_place(library):
+    wire = BareWire(library, BAUD, name=b"sixteen_letters_")
+    wire.receive(wire.host.hello())
+    wire.tick(5)
+    assert wire.host.newest("WELCOME").board == "sixteen_letters_"
