@@ -77,6 +77,7 @@ class Bench:
         self.home_rad = self.readings(0.02)[-1] if home_rad is None else home_rad
         self._start_rad, self._side = np.zeros(JOINTS), np.ones(JOINTS)
         self._t_s = 0.0
+        self._driven = False
 
     def expect(self, holds: bool, what: str) -> None:
         """Note what is wrong where something does not hold."""
@@ -94,6 +95,7 @@ class Bench:
     def enable(self) -> None:
         """Switch the drives on; the joints will swing from where they are to the side of their home."""
         self._start_rad = self.readings(0.02)[-1]
+        self._driven = True
         self._side = np.where(self._start_rad > self.home_rad, -1.0, 1.0)
         self._t_s = 0.0
         self.board.enable()
@@ -137,8 +139,8 @@ class Bench:
         self.board.confirm(self.board.order(Order.DISABLE))
 
     def end(self) -> None:
-        """Leave a real board as harmless as it can be: drives off if it still listens, then let go of it."""
+        """Let go of a real board; where its drives were used, leave them off and its faults cleared, if it listens."""
         with contextlib.suppress(ArmsightError):
-            if self.board.status.drives_on:
-                self.disable()
+            if self._driven:
+                self.clear()
         self.board.close()
