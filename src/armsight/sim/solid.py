@@ -45,10 +45,10 @@ class Solid(Record):
 
 
 def box(size_m: Array, **grain: float) -> Solid:
-    """Return a box (3,) about the origin."""
+    """Return a box (3,), m, about the origin."""
     v = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])  # counter-clockwise from outside
     return Solid(v, triangles, **grain)  # type: ignore[arg-type]
 
 

@@ -109,6 +109,10 @@ class Rectification(Record):
         d = np.where(np.asarray(disparity) > 0, disparity, np.nan).astype(np.float64)
         return np.asarray(self.focal_px * self.rig.baseline_m / d)
 
+    def disparity_of(self, depth_m: float) -> float:
+        """Return the disparity of a depth, px."""
+        return self.focal_px * self.rig.baseline_m / depth_m
+
 
 def _rays(uv: Array, focal_px: float, principal: tuple[float, float]) -> Array:
     """Return rays (N, 3) of unit depth through pixels (N, 2) in standard form."""

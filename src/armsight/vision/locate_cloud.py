@@ -1,0 +1,227 @@
+"""Where a body without markers is: its known surface is laid on a point cloud.
+
+A surface (a mesh's, or what a reference shot showed), a cloud with its uncertainty and a first pose, such as the arm's, go in;
+a pose with covariance comes out. Iterative closest points, from each measured point to the tangent plane of the surface there
+(Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a reach that shrinks to what the
+cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from armsight.data import Array, Missed, Record
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.geometry.pose import exp_se3, inverse, transform
+
+#: Distance between the points a mesh is sampled at, m, and the neighbours that a normal of a cloud is fitted to.
+_SPACING_M, _NEIGHBOURS = 0.002, 24
+#: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the noise.
+_SHRINK, _SIGMAS = 0.9, 10.0
+#: How well the edge of a body is seen in a disparity map, sideways, m: about a pixel and a half at arm's length.
+_SIDEWAYS_M = 0.002
+_STEPS, _SETTLED_M = 100, 1e-6
+#: Points of a cloud at most (a fixed draw of them), at least, and how many neighbours share one error: disparities are
+#: smoothed over 9 x 9 px, half of it by weight.
+_MOST, _LEAST, _SHARED = 20000, 100, 40
+#: A direction that the surface leaves open (a sphere's turn): its pose is no measurement beyond this, m or rad.
+_OPEN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Surface(Record):
+    """Points of a body's surface.
+
+    Attributes:
+        points: (N, 3) m, body frame.
+        normals: (N, 3) unit, outward.
+    """
+
+    points: Array
+    normals: Array
+
+    @staticmethod
+    def of_mesh(vertices: Array, triangles: NDArray[np.int64], spacing_m: float = _SPACING_M) -> Surface:
+        """Sample a mesh evenly.
+
+        Args:
+            vertices: (V, 3) m, body frame.
+            triangles: (T, 3) rows of vertices, counter-clockwise seen from outside.
+            spacing_m: distance between points, about.
+
+        Raises:
+            InputError: no triangle has an area.
+        """
+        corners = checked(vertices, (None, 3), "vertices")[np.asarray(triangles)]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1) / 2
+        if not (area > 0).any():
+            raise InputError("a mesh needs triangles that have an area")
+        counts = np.ceil(area / spacing_m**2).astype(int)
+        owner = np.repeat(np.arange(len(corners)), counts)
+        rank = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+        # A low-discrepancy sequence (Roberts' R2), folded into the triangle: even, and the same every time.
+        s, t = np.modf(np.outer(rank + 0.5, (0.7548776662466927, 0.5698402909980532)))[0].T
+        fold = s + t > 1
+        s, t = np.where(fold, 1 - s, s), np.where(fold, 1 - t, t)
+        a, b, c = corners[owner].transpose(1, 0, 2)
+        points = a + s[:, None] * (b - a) + t[:, None] * (c - a)
+        return Surface(points, cross[owner] / (2 * area[owner])[:, None])
+
+    @staticmethod
+    def of_cloud(points: Array, towards: Array) -> Surface:
+        """Take a cloud of a reference shot for the surface.
+
+        Args:
+            points: (N, 3) m, in the frame that is to be the body's.
+            towards: (3,) where the camera was, same frame; normals face it.
+        """
+        p = checked(points, (None, 3), "points")
+        near = cKDTree(p).query(p, k=min(_NEIGHBOURS, len(p)))[1]
+        gathered = p[near] - p[near].mean(axis=1, keepdims=True)
+        normals = np.linalg.eigh(np.einsum("nki,nkj->nij", gathered, gathered))[1][:, :, 0]
+        away = np.einsum("ni,ni->n", normals, p - towards) > 0
+        return Surface(p, np.where(away[:, None], -normals, normals))
+
+
+@dataclass(frozen=True, eq=False)
+class CloudPose(Record):
+    """Where a body was found in a cloud.
+
+    Attributes:
+        T_left_body: (4, 4) its pose.
+        cov: (6, 6) covariance of the tangent [translation m; rotation rad], perturbation on the right.
+        rms_m: RMS distance of the points from the surface, along its normals.
+        points: how many points of the cloud lie on the body.
+    """
+
+    T_left_body: Array
+    cov: Array
+    rms_m: float
+    points: int
+
+
+def locate_cloud(
+    surface: Surface, p_left: Array, sigma_m: Array, T_left_body: Array, *, reach_m: float = 0.03
+) -> CloudPose | Missed:
+    """Find a body in a point cloud.
+
+    Args:
+        surface: the body's.
+        p_left: (N, 3) measured points, m, left camera's frame; the body and whatever else is in view.
+        sigma_m: (N,) standard deviation of their depths, m.
+        T_left_body: (4, 4) first pose, such as the arm's.
+        reach_m: how far off the first pose may be, m, at the body's surface.
+
+    Returns:
+        The pose, or why there is none: nothing of the body near the first pose, or a surface that leaves the pose open.
+    """
+    T: Array = checked(T_left_body, (4, 4), "T_left_body")
+    p, sigma = checked(p_left, (None, 3), "p_left"), checked(sigma_m, (None,), "sigma_m")
+    tree = cKDTree(surface.points)
+    near = tree.query(transform(inverse(T), p), distance_upper_bound=2 * reach_m)[0] <= 2 * reach_m
+    p, sigma = p[near], sigma[near]
+    if len(p) > _MOST:
+        drawn = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
+        p, sigma = p[drawn], sigma[drawn]
+    reach, shared = reach_m, max(1.0, _SHARED * len(p) / max(np.count_nonzero(near), 1))
+    for _ in range(_STEPS):
+        fit = _planes(surface, tree, p, sigma, T, reach)
+        if fit is None:
+            return Missed(f"fewer than {_LEAST} points of the cloud lie near the body's surface at the first pose")
+        H, g, gaps, least_reach = fit
+        if np.linalg.eigvalsh(H)[0] <= 1 / _OPEN**2:
+            return Missed("the body's surface in view does not fix its pose: it can slide or turn along itself")
+        step = -np.linalg.solve(H, g)
+        T = T @ exp_se3(step)
+        settled = reach <= least_reach and np.abs(step).max() < _SETTLED_M
+        reach = max(reach * _SHRINK, least_reach)
+        if settled:
+            break
+    cov = np.linalg.inv(H) * shared * max(1.0, float(np.mean(gaps[:, 1] ** 2)))
+    return CloudPose(T, np.asarray(cov), float(np.sqrt(np.mean(gaps[:, 0] ** 2))), len(gaps))
+
+
+def _planes(
+    surface: Surface, tree: cKDTree, p: Array, sigma: Array, T: Array, reach: float
+) -> tuple[Array, Array, Array, float] | None:
+    """Linearise the distances of points to the planes of the surface near them.
+
+    Returns:
+        (6, 6) information, (6,) gradient, (M, 2) distances of the points that count, m and in sigmas, and the reach that
+        their noise asks for; None where too few count.
+    """
+    p_body = transform(inverse(T), p)
+    far, rows = tree.query(p_body, distance_upper_bound=reach)
+    eye = inverse(T)[:3, 3]
+    found = np.isfinite(far)
+    found[found] = np.einsum("ni,ni->n", surface.normals[rows[found]], eye - p_body[found]) > 0  # the side in view
+    if np.count_nonzero(found) < _LEAST:
+        return None
+    q, n, x = surface.points[rows[found]], surface.normals[rows[found]], p_body[found]
+    gap = np.einsum("ni,ni->n", n, x - q)
+    view = x - eye
+    slant = np.abs(np.einsum("ni,ni->n", n, view)) / np.linalg.norm(view, axis=1)
+    noise = sigma[found] * np.maximum(slant, 0.2)  # the error lies along the view
+    weight = np.clip(1 - (gap / reach) ** 2, 0, None) ** 2 / noise**2
+    J = -np.concatenate([n, np.cross(x, n)], axis=1)  # of n . (exp(-xi) x - q)
+    H = J.T @ (weight[:, None] * J)
+    H_edge, g_edge = _overhang(x, q, n, gap, weight * noise**2, float(np.median(far[found])))
+    H, g = H + H_edge, J.T @ (weight * gap) + g_edge
+    inside = np.abs(gap) < _SIGMAS * noise * 2
+    least_reach = _SIGMAS * float(np.median(np.maximum(noise, np.abs(gap))))
+    gaps = np.column_stack([gap, gap / noise])[inside] if inside.any() else np.column_stack([gap, gap / noise])
+    return H, g, gaps, least_reach
+
+
+def _overhang(x: Array, q: Array, n: Array, gap: Array, weight: Array, spacing: float) -> tuple[Array, Array]:
+    """Let points that stick out beyond the surface's edge pull it under them: planes alone do not hold it sideways.
+
+    Args:
+        x: (M, 3) points, body frame.
+        q: (M, 3) points of the surface nearest to them.
+        n: (M, 3) its normals there.
+        gap: (M,) distances from the planes, m.
+        weight: (M,) 0 to 1.
+        spacing: usual distance from the nearest point of the surface, m.
+
+    Returns:
+        (6, 6) information and (6,) gradient.
+    """
+    aside = x - q - gap[:, None] * n
+    out = np.linalg.norm(aside, axis=1)
+    beyond = out > 3 * spacing
+    if not beyond.any():
+        return np.zeros((6, 6)), np.zeros(6)
+    e = aside[beyond] / out[beyond][:, None]
+    J = -np.concatenate([e, np.cross(x[beyond], e)], axis=1)
+    w = weight[beyond] / _SIDEWAYS_M**2
+    return J.T @ (w[:, None] * J), J.T @ (w * out[beyond])
+
+
+def read_stl(path: str | Path, unit_m: float = 1e-3) -> tuple[Array, NDArray[np.int64]]:
+    """Read a binary STL mesh: (V, 3) vertices, m, and (T, 3) triangles.
+
+    Args:
+        path: the file.
+        unit_m: metres a unit of the file; STL has none, and most programs mean mm.
+
+    Raises:
+        InputError: missing, unreadable, or no binary STL.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
+    if count == 0 or len(data) < 84 + 50 * count:
+        raise InputError(f"{path}: not a binary STL mesh (80 bytes of header, a count, 50 bytes a triangle)")
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    corners = np.frombuffer(data, kind, count, 84)["corners"].reshape(-1, 3).astype(np.float64) * unit_m
+    return corners, np.arange(3 * count).reshape(-1, 3)

@@ -1,0 +1,79 @@
+"""Pairs that are none: each is told from what it shows."""
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.vision.dense.method import Search
+from armsight.vision.dense.methods import METHODS, open_method
+from armsight.vision.dense.standard import match_pair
+from dense_scenes import layers
+
+SEARCH = Search(0, 32)
+
+
+def pair():
+    return layers(height=240, width=320, seed=4)[:2]
+
+
+def refused(left, right, *words, search=SEARCH):
+    with pytest.raises(InputError) as error:
+        match_pair(open_method("block"), left, right, search)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_a_good_pair_passes_without_a_remark():
+    said = []
+    assert match_pair(open_method("block"), *pair(), SEARCH, said.append).problem is None
+    assert said == []
+
+
+def test_rows_that_are_apart_are_told():
+    left, right = pair()
+    refused(left, np.roll(right, 5, axis=0), "not in standard form", "5.0 px")
+    turn = cv2.getRotationMatrix2D((160, 120), 3, 1)
+    refused(left, cv2.warpAffine(right, turn, (320, 240)), "not in standard form")
+
+
+def test_rows_that_are_a_little_apart_are_a_remark():
+    left, right = pair()
+    said = []
+    match_pair(open_method("block"), left, np.roll(right, 2, axis=0), SEARCH, said.append)
+    assert len(said) == 1
+    assert "2.0 px apart" in said[0]
+
+
+def test_exchanged_images_are_told():
+    left, right = pair()
+    refused(right, left, "exchanged")
+
+
+def test_sizes_and_searches_that_do_not_fit_are_told():
+    left, right = pair()
+    refused(left, right[:-1], "320x240", "320x239")
+    refused(left, right, "outside an image 320 px wide", search=Search(0, 321))
+    refused(left, right, "outside", search=Search(319, 2))
+
+
+def test_floats_are_taken_unless_they_are_none():
+    left, right = pair()
+    as_floats = match_pair(open_method("block"), left.astype(np.float32), right.astype(np.float64), SEARCH)
+    np.testing.assert_array_equal(as_floats.disparity, match_pair(open_method("block"), left, right, SEARCH).disparity)
+    bad = left.astype(np.float32)
+    bad[3, 4] = np.nan
+    refused(bad, right, "left image", "1 values are NaN")
+    refused(left, np.full(right.shape, np.inf), "right image", "NaN or infinite")
+    refused(left / 255.0 * 1000, right, "0 to 255")
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_an_image_without_texture_is_an_empty_result_with_the_reason(name, noise):
+    rng = np.random.default_rng(0)
+    left, right = (np.rint(90 + noise * rng.normal(size=(120, 200))).astype(np.uint8) for _ in "lr")
+    result = match_pair(open_method(name), left, right, SEARCH)
+    assert "no texture" in result.problem
+    assert not result.measured.any()
+    assert np.isnan(result.disparity).all()

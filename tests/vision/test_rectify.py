@@ -1,0 +1,74 @@
+"""Standard form against OpenCV's projections, for every camera model, and back."""
+
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.rig import StereoRig
+from strategies import CAMERAS, ordinary_rig
+from views import both_pixels
+
+
+def scene_points(count=200):
+    return np.array([0.1, 0.0, 0.7]) + np.random.default_rng(0).uniform(-1, 1, (count, 3)) * [0.2, 0.15, 0.2]
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_rows_are_common_and_disparity_is_depth(model):
+    rig, p_left = ordinary_rig(model), scene_points()
+    form = rig.rectify()
+    uv = both_pixels(rig, p_left)
+    left, right = form.to_rect(uv[:, 0], "left"), form.to_rect(uv[:, 1], "right")
+    np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-8)
+    d = left[:, 0] - right[:, 0]
+    assert (d > 0).all()
+    np.testing.assert_allclose(form.points(left, d), p_left, atol=1e-10)
+    np.testing.assert_allclose(form.depth(d), p_left @ form.T_left_rectleft[:3, 2], atol=1e-10)
+    for side, rect, raw in (("left", left, uv[:, 0]), ("right", right, uv[:, 1])):
+        np.testing.assert_allclose(form.to_raw(rect, side), raw, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", ["none", "brown5", "fisheye"])
+def test_images_show_at_each_pixel_what_the_map_says(model):
+    rig = ordinary_rig(model)
+    form = rig.rectify()
+    width, height = rig.left.image_size_px
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    ramp = (u / 8 + v / 16).astype(np.float32)
+    left, _ = form.images(ramp, ramp)
+    inside = form.seen("left")
+    inside[:, [0, -1]], inside[[0, -1]] = False, False
+    place = form.map_left
+    within = inside & (place > 2).all(axis=2) & (place < np.array([width, height]) - 3).all(axis=2)
+    # OpenCV's remap rounds places to 1/32 px, half a step along each axis, and its cubic kernel (a = -0.75) moves a ramp by
+    # up to 0.035 px more.
+    bound = (1 / 8 + 1 / 16) * (1 / 64 + 0.035)
+    assert np.abs(left - (place[..., 0] / 8 + place[..., 1] / 16))[within].max() <= bound
+    assert within.mean() > 0.5
+
+
+def test_a_pair_in_standard_form_stays_as_it_is():
+    camera = CAMERAS["none"].with_parameters(np.array([900.0, 900.0, 639.5, 359.5]))
+    rig = StereoRig(camera, camera, pose(np.eye(3), np.array([0.1, 0, 0])), np.zeros((14, 14)), 0.1)
+    form = rig.rectify()
+    assert form.focal_px == 900
+    assert form.principal_px == (639.5, 359.5)
+    u, v = np.meshgrid(np.arange(1280), np.arange(720))
+    np.testing.assert_allclose(form.map_left, np.stack([u, v], axis=2), atol=1e-3)
+    assert form.seen("left")[1:-1, 1:-1].all()
+
+
+def test_rigs_without_a_standard_form_are_refused():
+    camera = CAMERAS["none"]
+    for t, word in (([-0.1, 0, 0], "exchange"), ([0.001, 0, 0.3], "behind the other")):
+        with pytest.raises(InputError, match=word):
+            StereoRig(camera, camera, pose(exp_so3(np.zeros(3)), np.array(t)), np.zeros((14, 14)), 0.1).rectify()
+
+
+def test_images_of_another_size_are_refused():
+    form = ordinary_rig().rectify()
+    good = np.zeros((720, 1280), np.uint8)
+    with pytest.raises(InputError, match="right image: 640x480"):
+        form.images(good, np.zeros((480, 640), np.uint8))
