@@ -11,12 +11,15 @@ import click
 
 from armsight.app import identify_words
 from armsight.app.cli.progress import steps
+from armsight.app.identify_plan import plan_csv, plan_from, plan_text
 from armsight.app.identify_report import write_identify_report
 from armsight.app.identify_run import check_folder, run_identify, summary, write_results
 from armsight.app.report_draw import require_matplotlib
 from armsight.errors import InputError
+from armsight.files import check_writable, write_text
 from armsight.loop.identify.model_file import open_model
 from armsight.loop.identify.read import TURNS, read_poses
+from armsight.vision.rig import StereoRig
 
 
 @click.group(invoke_without_command=True)
@@ -89,6 +92,41 @@ def command(
         click.echo(
             f"\nwritten: {out}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"
         )
+
+
+@command.command()
+@click.option("--model", required=True, metavar="MODEL", help="The nominal arm: a name, a .toml or a .urdf file.")
+@click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="What was measured already.")
+@click.option(
+    "--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that shall see the poses."
+)
+@click.option("-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="How many poses.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the candidates.")
+@click.option("-o", "--out", metavar="PLAN.csv", type=click.Path(path_type=Path), help="Write the poses here.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+def plan(
+    model: str, data: Path | None, rig: Path | None, count: int, seed: int, out: Path | None, as_json: bool
+) -> None:
+    """Choose the poses that tell most about an arm, and say how many more buy how much.
+
+    With --data the poses measured already count, and place the arm; with --rig and --data only what both cameras see is
+    chosen, weighted by how well they see it. Check the poses against your cell before you move to them.
+    """
+    if rig is not None and data is None:
+        raise InputError("--rig needs --data: without any pose measured, where the arm is to the cameras is not known")
+    if out is not None:
+        check_writable(out, apart_from=(data, rig))
+    with steps() as progress:
+        progress("choosing poses")
+        done = None if data is None else read_poses(data).measured
+        chosen, _ = plan_from(open_model(model), done, None if rig is None else StereoRig.load(rig), count, seed)
+    if out is not None:
+        write_text(out, plan_csv(chosen))
+    if as_json:
+        facts = {"q_rad": chosen.q.tolist(), "approach": chosen.approach.tolist(), "sigma_m": chosen.sigma_m.tolist()}
+        click.echo(json.dumps({**facts, "random_sigma_m": chosen.random_sigma_m.tolist()}))
+    else:
+        click.echo(plan_text(chosen))
 
 
 def _priors(texts: tuple[str, ...]) -> dict[str, float]:

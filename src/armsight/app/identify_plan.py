@@ -1,0 +1,119 @@
+"""Where to look next, from files: what was measured already, and what the cameras can see and how well."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.geometry.pose import inverse, transform
+from armsight.loop.identify.features import approaches
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.place import placed
+from armsight.loop.identify.plan import Plan, plan_poses
+from armsight.loop.identify.priors import prior_sigma
+from armsight.robot.arm import Arm
+from armsight.vision.rig import StereoRig
+
+#: What is assumed of an instrument of which nothing is known: sigma of a place, m, and of a turn, rad.
+NOISE = (1e-4, 5e-4)
+#: A body's spread about its middle, m, and the sigma of a marker, px: they make a pose's covariance of a rig's geometry.
+SPREAD_M, SIGMA_PX = 0.04, 0.1
+#: Markers of a body.
+MARKERS = 6
+#: A pose is seen where its body is this far from the images' edges, px.
+MARGIN_PX = 60.0
+
+
+def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, seed: int) -> tuple[Plan, Model]:
+    """Choose poses.
+
+    Args:
+        arm: the nominal arm.
+        done: what was measured already, which places base and tool; None: all that can be reached counts as seen.
+        rig: the stereo rig; None: all that can be reached counts as seen, equally well.
+        n: how many.
+        seed: of the candidates.
+    """
+    if done is None:
+        T = arm.forward(arm.home[None])
+        model = Model.of(arm, Measured(arm.home[None], T[:, None, :3, 3], T[:, :3, :3]), backlash=True)
+        x = model.nominal()
+    else:
+        model, x = placed(Model.of(arm, done, backlash=approaches(done)), done)
+    prior = prior_sigma(model)
+    if rig is None or done is None:
+        return plan_poses(model, x, prior, NOISE, n, done=done, seed=seed), model
+    seen = rig
+
+    def visible(Ts: Array) -> NDArray[np.bool_]:
+        return _visible(seen, Ts)
+
+    def cov(Ts: Array) -> Array:
+        return _covariance(seen, Ts, model.full)
+
+    return plan_poses(model, x, prior, (1e-6, 1e-6), n, done=done, visible=visible, cov=cov, seed=seed), model
+
+
+def _visible(rig: StereoRig, Ts: Array) -> NDArray[np.bool_]:
+    """Say whether both cameras see a body's middle, away from their edges and in front."""
+    good = np.ones(len(Ts), bool)
+    for camera, p in zip(rig.cameras, _in_cameras(rig, Ts[:, :3, 3]), strict=True):
+        uv = camera.project(p)
+        w, h = camera.image_size_px
+        low, high = MARGIN_PX, np.array([w, h]) - MARGIN_PX
+        with np.errstate(invalid="ignore"):
+            good &= (p[:, 2] > 0) & ((uv > low) & (uv < high)).all(axis=1)
+    return good
+
+
+def _in_cameras(rig: StereoRig, p_rig: Array) -> tuple[Array, Array]:
+    return p_rig, transform(inverse(rig.T_left_right), p_rig)
+
+
+def _covariance(rig: StereoRig, Ts: Array, full: bool) -> Array:
+    """Return the covariance of bodies: of their middle from all markers, of their turn from the markers' spread."""
+    H = np.zeros((len(Ts), 3, 3))
+    R_right_left = inverse(rig.T_left_right)[:3, :3]
+    turns = (np.eye(3), R_right_left)
+    for camera, p, R in zip(rig.cameras, _in_cameras(rig, Ts[:, :3, 3]), turns, strict=True):
+        J = camera.project_jacobians(p)[1] @ R
+        H += J.swapaxes(1, 2) @ J / SIGMA_PX**2
+    C = np.linalg.inv(H) / MARKERS
+    if not full:
+        return C
+    back = Ts[:, :3, :3].swapaxes(1, 2)
+    out = np.zeros((len(Ts), 6, 6))
+    out[:, :3, :3] = back @ C @ Ts[:, :3, :3]
+    # A turn about one axis is told by what moves along the two others, so their mean stands for it.
+    out[:, 3:, 3:] = np.eye(3) * (np.einsum("nii->n", C) / 3 / SPREAD_M**2)[:, None, None]
+    return out
+
+
+def plan_text(plan: Plan) -> str:
+    """Return what a person reads: what so many poses buy."""
+    n = len(plan.q)
+    lines = ["predicted error of the arm over its workspace, RMS:"]
+    for k in sorted({0, n // 4, n // 2, 3 * n // 4, n}):
+        random = plan.random_for(k)
+        told = (
+            f"as good as {random} at random"
+            if random
+            else f"more than {len(plan.random_sigma_m) - 1} at random would do"
+        )
+        lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({told})" if k else ""))
+    return "\n".join(lines)
+
+
+def plan_csv(plan: Plan) -> str:
+    """Return the poses as CSV: joint angles, and from which side to come to each."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*(f"q{i}_rad" for i in range(1, 7)), *(f"approach{i}" for i in range(1, 7)), "sigma_after_mm"])
+    for q, side, sigma in zip(plan.q, plan.approach, plan.sigma_m[1:], strict=True):
+        writer.writerow([*(f"{v:.6f}" for v in q), *(f"{v:.0f}" for v in side), f"{1e3 * sigma:.4f}"])
+    return out.getvalue()
