@@ -34,7 +34,7 @@ def kalman(delay_s=0.0, sigma_s=2e-4, jitter_s=0.0):
 @pytest.mark.parametrize("world", [worn, drawn], ids=["worn", "drawn"])
 def test_in_motion_it_is_within_a_quarter_of_a_millimetre_and_through_half_a_second_without_vision_within_a_half(world):
     fused, blind, alone = [], [], []
-    for seed in (11, 12, 13):
+    for seed in (11, 12):
         rng = np.random.default_rng(seed)
         shaft = legs(rng, 10.0)
         track, Ts = run(rng, kalman(), world(rng), shaft, blind=[(8.0, 8.5), (9.3, 9.8)])
@@ -55,14 +55,14 @@ def nees(errors, covs):
 
 def test_it_is_consistent_in_motion_and_without_vision():
     errors, covs = {"seeing": [], "blind": []}, {"seeing": [], "blind": []}
-    for seed in range(24):
+    for seed in range(16):
         rng = np.random.default_rng(1000 + seed)
         late_s = rng.normal() * 1e-3
         estimator = kalman(0.03, 1e-3, 2e-4)
         track, Ts = run(
-            rng, estimator, drawn(rng), legs(rng, 4.0), late_s=0.03 + late_s, jitter_s=2e-4, blind=[(3.5, 9.0)]
+            rng, estimator, drawn(rng), legs(rng, 3.5), late_s=0.03 + late_s, jitter_s=2e-4, blind=[(3.0, 9.0)]
         )
-        for name, row in (("seeing", 3499), ("blind", 3999)):
+        for name, row in (("seeing", 2999), ("blind", 3499)):
             errors[name].append(off(track.Ts_base_tool[row], Ts[row]))
             covs[name].append(track.covs[row])
     for name in errors:

@@ -112,7 +112,7 @@ def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
     assert modes[-1] is Mode.POTENTIOMETERS
     assert "vision is lost" in modes[-1].value
     held = [step.correction for step in steps if step.mode is Mode.POTENTIOMETERS]
-    assert np.array_equal(held[0], held[-1])
+    assert np.allclose(held[0], held[-1], rtol=0, atol=1e-14)
     cell.blind = False
     seeing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
     assert steps[-1].mode is Mode.VISION

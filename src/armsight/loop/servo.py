@@ -30,6 +30,9 @@ MOST_SIGMA_M = 1e-3
 BRIDGE_S = 0.75
 #: The correction moves no faster than this share of each joint's speed limit, so that nothing jumps.
 RATE_SHARE = 0.1
+#: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
+#: which the joint would have to make up so much, m: less is vision's noise.
+CROSS_S, CROSS_M = 0.3, 3e-5
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
 MOST_RAD = np.deg2rad(5.0)
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and wanted slower than that, rad/s.
@@ -115,7 +118,7 @@ class PoseServo:
         self._arm, self._scale = arm, _scale(arm)
         self._correction = np.zeros(6)
         self._goal: Joints | None = None
-        self._rest_s = 0.0
+        self._rest_s, self._lasting = 0.0, np.zeros(6)
 
     def step(
         self, motion: Trajectory, t_s: float, estimator: Estimator, gravity_duty: ArrayLike = (0.0,) * 6
@@ -140,7 +143,9 @@ class PoseServo:
             push = following - last
             if mode is Mode.VISION:
                 push += self.timing.gain * (error if resting else last)
-            change = _speeds(self._arm.jacobian(goal.q), push, self._scale)[0]
+            change = self._joints(goal.q, push)
+        if mode is Mode.VISION and resting:
+            change += self._crossing(estimator, goal, error)
         return self._command(goal, ahead, change, duty, mode, error)
 
     def _mode(self, estimate: ArmEstimate) -> Mode:
@@ -156,11 +161,26 @@ class PoseServo:
         q, qd = np.stack([goal.q, ahead.q]), np.stack([goal.qd, ahead.qd])
         return behind(self._arm.forward(q), estimator.tool(q + self._correction, qd))
 
+    def _joints(self, q: Array, error: Array) -> Array:
+        """Return the joint angles (6,) that make up for an error of the tool (6,), damped near singularities."""
+        return _speeds(self._arm.jacobian(q), error, self._scale)[0]
+
+    def _crossing(self, estimator: Estimator, goal: Joints, error: Array) -> Array:
+        """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
+        self._lasting += self.timing.gain * (error - self._lasting)
+        wanted, J = self._joints(goal.q, self._lasting), self._arm.jacobian(goal.q)
+        worth = np.abs(wanted) * np.linalg.norm(J[:3], axis=0) > CROSS_M
+        sides = np.stack([np.zeros(6), np.where(worth, np.sign(wanted), 0.0)])
+        here, there = estimator.tool(np.stack([goal.q, goal.q]) + self._correction, sides)
+        return self._joints(goal.q, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
+
     def _resting(self, estimate: ArmEstimate, goal: Joints, ahead: Joints) -> bool:
         """Say whether the arm has been at rest for as long as the newest sighting is old."""
         wanted = max(np.abs(goal.qd).max(), np.abs(ahead.qd).max())
         still = bool(wanted < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
+        if not still:
+            self._lasting = np.zeros(6)
         return still and self._rest_s > estimate.vision_age_s
 
     def _command(self, goal: Joints, ahead: Joints, change: Array, duty: Array, mode: Mode, error: Array) -> ServoStep:
