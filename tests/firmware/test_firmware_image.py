@@ -1,5 +1,6 @@
 """Images: how they are built and read, what is said when that fails, and how much memory they need."""
 
+import numpy as np
 import pytest
 from firmware_build import FIRMWARE
 from firmware_layout import c
@@ -159,3 +160,38 @@ def test_a_dialect_that_is_wrong_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(build, "source_folder", lambda: tmp_path / "source")
     with pytest.raises(InputError, match=r"armsight\.xml"):
         build.generate("Python3", tmp_path / "dialect.py")
+
+
+@pytest.mark.parametrize("name", ["gcc", "zig"])
+def test_memory_is_copied_and_filled_at_any_place_and_length(tmp_path, name):
+    found = build.compilers()
+    if name not in found:
+        pytest.skip(f"needs {name} for a Cortex-M4F")
+    image = build.build_board("pil", tmp_path / "pil.elf", found[name])
+    try:
+        machine = open_machine("unicorn", image)
+    except InputError as missing:
+        pytest.skip(str(missing))
+    arm = pytest.importorskip("unicorn.arm_const")
+    symbols, uc = read_elf(image).symbols, machine.uc
+    memory, space, back = 0x20008000, 256, 0x3FFE0
+    rng = np.random.default_rng(3)
+
+    def call(function, *arguments):
+        for register, value in zip((arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R1, arm.UC_ARM_REG_R2), arguments, strict=True):
+            uc.reg_write(register, value)
+        uc.reg_write(arm.UC_ARM_REG_SP, symbols["stack_top"])
+        uc.reg_write(arm.UC_ARM_REG_LR, back | 1)
+        uc.emu_start(symbols[function] | 1, back)
+        return uc.reg_read(arm.UC_ARM_REG_R0)
+
+    for length in [*range(40), 63, 64, 65, 100]:
+        for to, source in ((0, 128), (4, 132), (1, 128), (0, 131), (3, 129)):
+            before = bytearray(rng.bytes(space))
+            uc.mem_write(memory, bytes(before))
+            assert call("memcpy", memory + to, memory + source, length) == memory + to
+            before[to : to + length] = before[source : source + length]
+            assert call("memset", memory + to + 104, 0x1A5, length % 20) == memory + to + 104
+            before[to + 104 : to + 104 + length % 20] = b"\xa5" * (length % 20)
+            assert bytes(uc.mem_read(memory, space)) == bytes(before), (length, to, source)
+    machine.close()

@@ -36,18 +36,14 @@ void *memcpy(void *to, const void *from, size_t length)
 {
     uint8_t *target = to;
     const uint8_t *source = from;
-    for (; length >= 16u; length -= 16u, target += 16, source += 16) {
-        const word *four = (const word *)(const void *)source;
-        const word a = four[0];
-        const word b = four[1];
-        const word c = four[2];
-        const word d = four[3];
-        word *place = (word *)(void *)target;
-        place[0] = a;
-        place[1] = b;
-        place[2] = c;
-        place[3] = d;
-        KEEP;
+    if ((((uintptr_t)to | (uintptr_t)from) & 3u) == 0u) { /* eight words at a time need aligned ones */
+        for (; length >= 32u; length -= 32u) {
+            __asm__ volatile("ldmia %1!, {r3-r6, r8-r10, r12}\n"
+                             "stmia %0!, {r3-r6, r8-r10, r12}"
+                             : "+r"(target), "+r"(source)
+                             :
+                             : "r3", "r4", "r5", "r6", "r8", "r9", "r10", "r12", "memory");
+        }
     }
     for (; length >= 4u; length -= 4u, target += 4, source += 4) {
         *(word *)(void *)target = *(const word *)(const void *)source;

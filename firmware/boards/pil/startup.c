@@ -44,8 +44,9 @@ __attribute__((section(".vectors"), used)) static const vector vectors[16] = {
     stray_interrupt,              NULL,            stray_interrupt, tick_interrupt,
 };
 
-/* Wait for the tick's interrupt with all floating-point registers in use; returns whether it left them as they were. It turns
- * round in place of sleeping: an emulated processor that sleeps costs its emulator more than one that counts. */
+/* Wait for the tick's interrupt with all floating-point registers in use; returns whether it left them as they were.
+ * It turns round in place of sleeping: an emulated processor that sleeps costs its emulator more than one that
+ * counts. */
 static bool wait_for_tick(uint32_t seed)
 {
     uint32_t before[FPU_REGISTERS];
