@@ -76,8 +76,8 @@ class Prior:
     harmonic_rad: float = float(np.deg2rad(0.2))
     backlash_rad: float = float(np.deg2rad(0.2))
     compliance: float = 5e-3
-    rest_rad: float = float(np.deg2rad(0.02))
-    rest_travel_rad: float = 0.5
+    rest_rad: float = float(np.deg2rad(0.1))
+    rest_travel_rad: float = 0.1
     flip_rad: float = float(np.deg2rad(0.03))
     pose_m: float = 1e-4
     pose_rad: float = float(np.deg2rad(0.01))

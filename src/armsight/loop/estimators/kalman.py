@@ -10,14 +10,14 @@ shared covariance is added to what comes out (Schmidt, 1966: considered, not est
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from armsight.data import Array, JointStates
-from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, POSE, REST, SIZE, ZEROS, Prior
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
@@ -38,6 +38,8 @@ OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
+#: Joints that came no further than this between two sightings stood still, rad.
+STILL_RAD = 1e-5
 _GATE = float(chi2.isf(CHANCE, 6))
 
 
@@ -147,6 +149,37 @@ class KalmanEstimator:
         own += (Hs * step.added[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._reading_noise(Hs, joints)
         age = t_s - state.t_s
         return Track(t_s, Ts, own + self._shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+
+    def smoothed(self, t_s: Array) -> Track:
+        """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
+
+        Between two sightings the model after each is carried to the time in between, the way to it by the joints; the two are
+        blended by how far the joints had come. Times newer than the newest sighting are as in :meth:`track`.
+        """
+        ends = [state for state in self._states if state.sighting is not None]
+        at = np.searchsorted([state.t_s for state in ends], t_s)
+        parts = [self._between(ends, int(k), t_s[at == k]) for k in np.unique(at)]
+        return Track(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Track)))
+
+    def _between(self, ends: list[_State], k: int, t_s: Array) -> Track:
+        """Return where the tool was between the sightings k - 1 and k."""
+        if k == len(ends) or k == 0:
+            return self.track(t_s)
+        joints, (before, after) = self._readings.at(t_s), ends[k - 1 : k + 1]
+        come = np.abs(joints.travel - before.travel).sum(axis=1)
+        whole = float(np.abs(after.travel - before.travel).sum())
+        times = (t_s - before.t_s) / max(after.t_s - before.t_s, 1e-9)
+        share = np.clip(come / whole if whole > STILL_RAD else times, 0.0, 1.0)
+        ahead = self._moved(before, joints)
+        back = self._moved(after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints)
+        Ts, Hs = self._model(before.x * ahead.kept, joints.q, joints.side)
+        Ts_after, _ = self._model(after.x * back.kept, joints.q, joints.side)
+        Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
+        P = before.P + share[:, None, None] * (after.P - before.P)
+        own = Hs @ P @ np.swapaxes(Hs, 1, 2)
+        bridge = ahead.added * back.added / np.maximum(ahead.added + back.added, 1e-30)
+        own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._reading_noise(Hs, joints)
+        return Track(t_s, Ts, own + self._shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""

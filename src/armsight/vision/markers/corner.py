@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.vision.markers.crossing import (
-    LANES,
     MOMENTS,
     PARAMETERS,
     WORK,
@@ -48,6 +47,8 @@ NEAR_SIGMAS, NEAR_PX, NEAR_ROUGH_PX = 3.5, 0.25, 0.75
 #: less than this; or that moves the edges and their blur by less than this share of the blur.
 STOP, STOP_ROUGH = 0.05, 20.0
 SLIGHT, SLIGHT_ROUGH = 0.1, 0.3
+#: Fewer pixels near the edges than this tell no corner.
+_FEWEST = 16
 #: A window whose opposite quadrants differ by less, grey levels, shows nothing.
 PLAIN = 1.0
 #: A start further off than this leaves the window off centre; it is drawn again about the corner.
@@ -133,7 +134,7 @@ def _place(
     if not known:  # a share of the pixels finds the corner faster, and all of them place it
         near[:] = NEAR_SIGMAS * np.sqrt(START_BLUR_PX**2 + 1.0 / 12.0) + NEAR_ROUGH_PX
         n = gather(image, start, square, bow, arm, WINDOW_ROUGH_PX, near, w, flat)
-        if n < LANES or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
+        if n < _FEWEST or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
             return -_BORDER
         n = thin(n, w, flat)
         fill_up(n, w)
@@ -152,7 +153,7 @@ def _place(
         for j in range(2):
             near[j] = NEAR_SIGMAS * np.sqrt(q[4 + j] + 1.0 / 12.0) + NEAR_PX
         n = gather(image, centre, square, bow, arm, WINDOW_MAX_PX, near, w, flat)
-        if n < LANES or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
+        if n < _FEWEST or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
             return -_DIVERGED
         fill_up(n, w)
         if not fit_crossing(n, w, flat, np.rint(centre[0]), np.rint(centre[1]), q, sides, bow, L, STOP, SLIGHT):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.vision.markers.edge import decay_single, edge_single
-from armsight.vision.markers.normal import factor, solve
+from armsight.vision.markers.normal import LANES, factor, products, solve
 
 Work = NDArray[np.float32]
 
@@ -23,8 +23,6 @@ ROOM = 1424
 #: Rows of the work space: x, y, grey, the derivatives by the parameters, the residual, one to fill the last tile.
 Y, GREY, JACOBIAN, _R = ROOM, 2 * ROOM, 3 * ROOM, (3 + PARAMETERS) * ROOM
 WORK = (5 + PARAMETERS) * ROOM
-#: Pixels are worked on by so many at once; rows are filled up to a multiple of it.
-LANES = 16
 #: Moments of the pixels of plain squares of one colour: n, x, y, xx, xy, yy, I, Ix, Iy, II.
 MOMENTS = 10
 _STEPS = 25
@@ -99,31 +97,10 @@ def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow:
         w[JACOBIAN + 9 * ROOM + i] = level * dy
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _products(n: int, w: Work, H: Array) -> None:
-    """Fill the lower half of H (12, 12) with the products of derivatives and residuals, summed over n pixels.
-
-    Two rows by four at a time, for eight sums under way keep the processor busy.
-    """
-    for i in range(0, PARAMETERS + 1, 2):
-        o = JACOBIAN + i * ROOM
-        a0, a1 = w[o : o + n], w[o + ROOM : o + ROOM + n]
-        for j in range(0, i + 2, 4):
-            o = JACOBIAN + j * ROOM
-            b0, b1 = w[o : o + n], w[o + ROOM : o + ROOM + n]
-            b2, b3 = w[o + 2 * ROOM : o + 2 * ROOM + n], w[o + 3 * ROOM : o + 3 * ROOM + n]
-            s0, s1, s2, s3, t0, t1, t2, t3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-            for m in range(n):
-                s0 += a0[m] * b0[m]
-                s1 += a0[m] * b1[m]
-                s2 += a0[m] * b2[m]
-                s3 += a0[m] * b3[m]
-                t0 += a1[m] * b0[m]
-                t1 += a1[m] * b1[m]
-                t2 += a1[m] * b2[m]
-                t3 += a1[m] * b3[m]
-            H[i, j], H[i, j + 1], H[i, j + 2], H[i, j + 3] = s0, s1, s2, s3
-            H[i + 1, j], H[i + 1, j + 1], H[i + 1, j + 2], H[i + 1, j + 3] = t0, t1, t2, t3
+@numba.njit(cache=True, error_model="numpy")
+def _rows(w: Work) -> Work:
+    """Return (12, ROOM) derivatives, residuals and an empty row of the work space."""
+    return w[JACOBIAN:].reshape(PARAMETERS + 2, ROOM)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
@@ -163,7 +140,7 @@ def _assemble(
     for i in range(PARAMETERS + 1):
         for m in range(JACOBIAN + i * ROOM + n, JACOBIAN + i * ROOM + full):
             w[m] = _ZERO
-    _products(full, w, H)
+    products(full, _rows(w), H)
     _add_plain(flat, x0, y0, q, H)
     mean, weight = _BLUR2_PRIOR[0], 1.0 / _BLUR2_PRIOR[1] ** 2
     cost = H[PARAMETERS, PARAMETERS]
@@ -308,7 +285,7 @@ def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
         row = w[o : o + n]
         for m in range(n):
             row[m] *= root[m]
-    _products(n, w, H)
+    products(n, _rows(w), H)
     leverage = 0.0
     for i in range(PARAMETERS):
         for j in range(i + 1):

@@ -1,6 +1,6 @@
 """The centre of one disc to the limit that the image's noise sets, and what is no disc.
 
-Gauss-Newton on :mod:`~armsight.vision.markers.disc_model`: a first step on a third of the rows, then on all until the
+Gauss-Newton on :mod:`~armsight.vision.markers.disc_model`: first steps on a third of the rows, then on all until the
 centre rests. Where the surround is not plain its own variance lowers the weight of what shows it; where the disc has a
 gradient (a score test), the kind of gradient that fits best is taken. What is left tells discs from what looks like one.
 """
@@ -27,7 +27,8 @@ from armsight.vision.markers.disc_model import (
     solve,
 )
 
-_STEPS = 8
+#: Steps on a third of the rows, and at most on all.
+_SAMPLE_STEPS, _STEPS = 2, 8
 #: A step of the centre after which the next one does not count: the next is a tenth of it at the most, px; and in
 #: standard deviations of the centre.
 _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
@@ -80,12 +81,12 @@ def _step(n: int, theta: Array, x0: float, y0: float, slope: int, texture: float
     Returns:
         How far the centre moved, px, -1 where no step is possible; the sum of the squared residuals after the step.
     """
-    J, residual, H, g, L, scale, x, at = work.J, work.residual, work.H, work.g, work.L, work.scale, work.x, work.at
+    H, g, L, scale, x, at = work.H, work.g, work.L, work.scale, work.x, work.at
     for a in range(UNKNOWNS):
         at[a] = theta[a]
     at[0], at[1] = theta[0] - x0, theta[1] - y0
     square = linearise(n, slope, texture, work)
-    normal_equations(n, J, residual, H, g)
+    normal_equations(n, work)
     if not factor(H, L, scale):
         return -1.0, square
     solve(L, scale, g, x)
@@ -131,23 +132,32 @@ def _clipped(n: int, work: Work) -> int:
     return int(count)
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def _stepped(n: int, work: Work) -> None:
+    """Fill ``work.left``, the residuals after the last step; ``work.residual`` is before it."""
+    residual, J, left = work.residual, work.J, work.left
+    x0, x1, x2, x3, x4, x5, x6, x7, x8, x9 = work.x.astype(np.float32)
+    for i in range(n):
+        shape = x2 * J[2, i] + x3 * J[3, i] + x4 * J[4, i] + x5 * J[5, i]
+        light = x6 * J[6, i] + x7 * J[7, i] + x8 * J[8, i] + x9 * J[9, i]
+        left[i] = residual[i] - x0 * J[0, i] - x1 * J[1, i] - shape - light
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) -> None:
     """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
-    px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
+    px, py, J, inside = work.px, work.py, work.J, work.inside
     sectors[:, :] = 0.0
-    x = work.x.astype(np.float32)  # the last step: the residuals are those before it
     cx, cy = F(theta[0] - x0), F(theta[1] - y0)
+    left = work.left
+    _stepped(n, work)
     for i in range(n):
         if F(0.03) < inside[i] < F(0.97):
             square = J[0, i] * J[0, i] + J[1, i] * J[1, i]
             u, v = px[i] - cx, py[i] - cy
             a, b = abs(u), abs(v)
             k = 8 * (u > F(0.0)) + 4 * (v > F(0.0)) + 2 * (a > b) + (min(a, b) > F(0.41421356) * max(a, b))
-            left = residual[i]
-            for m in range(UNKNOWNS):
-                left -= J[m, i] * x[m]
-            sectors[0, k] += np.sqrt(square) * left
+            sectors[0, k] += np.sqrt(square) * left[i]
             sectors[1, k] += square
     for k in range(_SECTORS):
         sectors[0, k] /= max(sectors[1, k], 1e-12)
@@ -316,8 +326,9 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if n < 4 * UNKNOWNS:
         return 7
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
-    if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
-        return 2
+    for _ in range(_SAMPLE_STEPS):
+        if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
+            return 2
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.vision.markers.normal import LANES, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
 MOST_PIXELS = 3072
@@ -29,6 +30,9 @@ MOST_PIXELS = 3072
 UNKNOWNS = 10
 #: How far from the rim pixels tell about it, in blurs; a ring beyond, px, tells the surround.
 _NEAR, _RING_PX = 3.4, 4.0
+
+#: Floats in a cache line.
+_LINE = 16
 
 #: What a gradient may be one of.
 LIGHT, SURROUND, STRAY = 0, 1, 2
@@ -50,8 +54,9 @@ class Work(NamedTuple):
         px: (MOST_PIXELS,) columns of the pixels, relative to the nearest pixel of the centre.
         py: (MOST_PIXELS,) their rows.
         level: (MOST_PIXELS,) their grey.
-        J: (10, MOST_PIXELS) whitened derivatives.
-        residual: (MOST_PIXELS,) whitened.
+        J: (12, MOST_PIXELS + LANES) whitened derivatives, residuals, an empty row.
+        residual: (MOST_PIXELS + LANES,) the row of J that holds the residuals, whitened.
+        left: (MOST_PIXELS,) what the last step leaves of the residuals.
         inside: (MOST_PIXELS,) share of disc.
         H: (10, 10) normal matrix.
         g: (10,) right side.
@@ -59,11 +64,12 @@ class Work(NamedTuple):
         scale: (10,) inverse square roots of its diagonal.
         x: (10,) solution.
         at: (10,) parameters, the centre relative to the pixels' origin.
-        shapes: (4, 3) ellipses.
+        shapes: (4, 5) ellipses.
         sectors: (2, 16) of the rim.
         trial: (10,) parameters tried.
         start: (10,) parameters begun with.
         products: (2, 13) of a gradient inside.
+        sums: (12, 12) products of the rows of J.
     """
 
     px: Floats
@@ -71,6 +77,7 @@ class Work(NamedTuple):
     level: Floats
     J: Floats
     residual: Floats
+    left: Floats
     inside: Floats
     H: Array
     g: Array
@@ -83,40 +90,47 @@ class Work(NamedTuple):
     trial: Array
     start: Array
     products: Array
+    sums: Array
+
+
+def _aligned(rows: int, columns: int) -> Floats:
+    """Return zeros (rows, columns) that begin with a cache line: vectors across two lines take half as long again."""
+    room = np.zeros(rows * columns + _LINE, np.float32)
+    first = -room.ctypes.data // 4 % _LINE
+    return room[first : first + rows * columns].reshape(rows, columns)
 
 
 def workspace() -> Work:
     """Return room for fits."""
-    px, py, level, residual, inside = (np.empty(MOST_PIXELS, np.float32) for _ in range(5))
     n = UNKNOWNS
+    px, py, level, left, inside = _aligned(5, MOST_PIXELS)
+    J = _aligned(n + 2, MOST_PIXELS + LANES)
     return Work(
-        px, py, level, np.empty((n, MOST_PIXELS), np.float32), residual, inside,
+        px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
-        np.empty((4, 3)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)),
+        np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
     )  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _chord(v: float, s: Array) -> tuple[float, float]:
-    """Return middle and half length of the chord at height v of the ellipse s = S11, S12, S22; half < 0 where none."""
+    """Return middle and half length of the chord at height v of an ellipse as :func:`_grown` fills it; half < 0 where none."""
     rest = s[2] - v * v
     if rest <= 0.0:
         return 0.0, -1.0
-    return s[1] / s[2] * v, np.sqrt(rest * (s[0] * s[2] - s[1] * s[1])) / s[2]
+    return s[3] * v, s[4] * np.sqrt(rest)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _grown(shape: Array, by: float, out: Array) -> None:
-    """Fill the ellipse whose half axes are longer by ``by``, not below zero."""
+    """Fill the ellipse whose half axes are longer by ``by``, not below zero: S11, S12, S22, its chords' lean and length."""
     mean, half = (shape[0] + shape[2]) / 2, (shape[0] - shape[2]) / 2
     root = np.sqrt(half * half + shape[1] * shape[1])
     major, minor = np.sqrt(mean + root), np.sqrt(max(mean - root, 1e-6))
     a, b = max(major + by, 0.01) ** 2, max(minor + by, 0.01) ** 2
-    if root < 1e-9 * mean:
-        out[0], out[1], out[2] = a, 0.0, a
-        return
-    c, s = half / root, shape[1] / root
+    c, s = (half / root, shape[1] / root) if root > 1e-9 * mean else (1.0, 0.0)
     out[0], out[1], out[2] = (a + b + (a - b) * c) / 2, (a - b) * s / 2, (a + b - (a - b) * c) / 2
+    out[3], out[4] = out[1] / out[2], np.sqrt(a * b) / out[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -246,20 +260,18 @@ def linearise(n: int, slope: int, texture: float, work: Work) -> float:
     return float(square)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def normal_equations(n: int, J: Floats, residual: Floats, H: Array, g: Array) -> None:
-    """Fill H = J J^T (10, 10) and g = J residual (10,)."""
+@numba.njit(cache=True, error_model="numpy")
+def normal_equations(n: int, work: Work) -> None:
+    """Fill H = J J^T (10, 10), its lower half, and g = J residual (10,), of the first n pixels."""
+    J, H, g, sums = work.J, work.H, work.g, work.sums
+    full = (n + LANES - 1) // LANES * LANES
+    for a in range(UNKNOWNS + 1):
+        J[a, n:full] = _ZERO
+    products(full, J, sums)
     for a in range(UNKNOWNS):
-        total = _ZERO
-        for i in range(n):
-            total += J[a, i] * residual[i]
-        g[a] = total
+        g[a] = sums[UNKNOWNS, a]
         for b in range(a + 1):
-            total = _ZERO
-            for i in range(n):
-                total += J[a, i] * J[b, i]
-            H[a, b] = total
-            H[b, a] = total
+            H[a, b] = sums[a, b]
 
 
 @numba.njit(cache=True, error_model="numpy")

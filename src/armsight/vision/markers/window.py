@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.crossing import GREY, LANES, ROOM, Work, Y
+from armsight.vision.markers.crossing import GREY, ROOM, Work, Y
+from armsight.vision.markers.normal import LANES
 
 #: How far the window reaches along each square's side, as a share of the side, and at most in px. The next corners
 #: stay out of it with their blur.
