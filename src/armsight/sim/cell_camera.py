@@ -8,7 +8,6 @@ from the seed and k alone.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +27,7 @@ _WIDTHS, _RATES = (320, 3840), (1.0, 500.0)
 #: Where the cameras' middle is, seen from where the body is at home: distance, m; to the side and up, degrees.
 DISTANCE_M, ASIDE_DEG, ABOVE_DEG = 0.85, 14.0, 12.0
 _AIM_M = 0.10  # they aim at a place so far behind the body, at home: the arm works there
-_BASELINE_M = 0.2
+BASELINE_M = 0.2
 
 
 @dataclass(frozen=True)
@@ -126,30 +125,31 @@ def open_timing(spec: str) -> Timing:
     )
 
 
-def _parallel(size: tuple[int, int]) -> StereoRig:
-    return bench_rig(size, _FOCAL * size[0], _BASELINE_M, 0.3)
+#: Name -> by how much the right camera turns to the left one's axis, as a share of what would make them look at one
+#: place DISTANCE_M away; parallel cameras are parallel to a fraction of a degree, as mounts are.
+RIGS = {"parallel": 0.02, "verging": 1.0}
 
 
-def _verging(size: tuple[int, int]) -> StereoRig:
-    return bench_rig(size, _FOCAL * size[0], _BASELINE_M, 13.0)
-
-
-#: Name -> two cameras for an image size; parallel ones are so to a fraction of a degree, as mounts are.
-RIGS: dict[str, Callable[[tuple[int, int]], StereoRig]] = {"parallel": _parallel, "verging": _verging}
-
-
-def open_rig(name: str, size: tuple[int, int]) -> StereoRig:
+def open_rig(name: str, size: tuple[int, int], baseline_m: float = BASELINE_M) -> StereoRig:
     """Return the true cameras of a preset.
 
+    Args:
+        name: a key of RIGS.
+        size: (width, height) of their images, px.
+        baseline_m: distance between them.
+
     Raises:
-        InputError: unknown.
+        InputError: unknown, or a distance that is none.
     """
     if name not in RIGS:
         raise InputError(f"rig {name!r} is unknown; known are {', '.join(RIGS)}")
-    return RIGS[name](size)
+    if not 0.02 <= baseline_m <= 1.0:
+        raise InputError(f"baseline_m is {baseline_m}; the cameras must be 0.02 to 1 m apart")
+    turn_deg = RIGS[name] * float(np.degrees(np.arctan2(baseline_m, DISTANCE_M)))
+    return bench_rig(size, _FOCAL * size[0], baseline_m, turn_deg)
 
 
-def placed_rig(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int) -> Array:
+def placed_rig(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance_m: float = DISTANCE_M) -> Array:
     """Return where the rig's left camera stands, T_base_rig (4, 4), m: it looks at the body of an arm at home.
 
     Args:
@@ -157,7 +157,13 @@ def placed_rig(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int) -> Arr
         rig: the cameras.
         T_tool_body: (4, 4) where the body is on the tool, m.
         seed: nobody mounts cameras to the millimetre.
+        distance_m: from the cameras to the body of an arm at home.
+
+    Raises:
+        InputError: the distance is no use.
     """
+    if not 0.3 <= distance_m <= 3.0:
+        raise InputError(f"distance_m is {distance_m}; the cameras must be 0.3 to 3 m from the body")
     T_base_tool = model.forward(model.home)
     p_body = (T_base_tool @ T_tool_body)[:3, 3]
     ahead = T_base_tool[:3, 2]
@@ -167,11 +173,11 @@ def placed_rig(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int) -> Arr
     aside, above = np.radians((ASIDE_DEG, ABOVE_DEG))
     level = np.cross(up, across) if ahead @ np.cross(up, across) > 0 else -np.cross(up, across)
     towards = np.cos(above) * (np.cos(aside) * level + np.sin(aside) * across) + np.sin(above) * up
-    z = p_body - _AIM_M * level - (p_body + DISTANCE_M * towards)
+    z = p_body - _AIM_M * level - (p_body + distance_m * towards)
     z /= np.linalg.norm(z)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
-    T_base_middle = pose(np.column_stack([x, np.cross(z, x), z]), p_body + DISTANCE_M * towards)
+    T_base_middle = pose(np.column_stack([x, np.cross(z, x), z]), p_body + distance_m * towards)
     T_middle_left = pose(np.eye(3), -0.5 * rig.T_left_right[:3, 3])
     off = np.random.default_rng([seed, 8]).normal(0, 1, 6) * np.repeat((0.004, np.radians(0.4)), 3)
     return np.asarray(T_base_middle @ T_middle_left @ exp_se3(off))

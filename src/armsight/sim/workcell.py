@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
@@ -29,11 +29,13 @@ from armsight.sim.bench import board_poses
 from armsight.sim.cell_arm import drawn, imperfections
 from armsight.sim.cell_board import configuration, gravity_duty
 from armsight.sim.cell_body import body_patterns, body_target, body_text
-from armsight.sim.cell_camera import open_rig, open_timing, placed_rig
+from armsight.sim.cell_camera import BASELINE_M, DISTANCE_M, open_rig, open_timing, placed_rig
+from armsight.sim.cell_motors import chosen
 from armsight.sim.cell_paint import CellCamera
 from armsight.sim.cell_picture import picture
 from armsight.sim.cell_solids import solids
 from armsight.sim.cell_source import CellSource
+from armsight.sim.optics import Sensor
 from armsight.sim.plant import TICK_S, ArmPlant
 from armsight.sim.scene import chessboard
 from armsight.vision.markers.targets import Composite
@@ -107,6 +109,9 @@ class Workcell:
         machine: str = "unicorn",
         rig: str = "parallel",
         model: Arm | None = None,
+        distance_m: float = DISTANCE_M,
+        baseline_m: float = BASELINE_M,
+        noise: float = 2.0,
     ) -> None:
         """Build a cell; a second or so.
 
@@ -117,6 +122,9 @@ class Workcell:
             machine: what runs the firmware: unicorn, qemu or host.
             rig: parallel or verging.
             model: the nominal table; the chapter's arm by default.
+            distance_m: from the cameras to the body of the arm at home.
+            baseline_m: between the cameras.
+            noise: of the sensors, grey levels.
 
         Raises:
             InputError: an unknown name or a bad file.
@@ -124,27 +132,34 @@ class Workcell:
         """
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise InputError(f"seed {seed!r}: must be a whole number from 0 to {2**32 - 1}")
-        timing, amounts = open_timing(cameras), imperfections(arm)
+        if not 0 <= noise <= 50:
+            raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
+        self.timing, amounts = open_timing(cameras), imperfections(arm)
         self.model = model if model is not None else open_arm("six_r")
-        self._rig, self._seed, self.timing = open_rig(rig, timing.image_size_px), seed, timing
-        true = drawn(self.model, amounts, seed)
+        self._rig, self._seed = open_rig(rig, self.timing.image_size_px, baseline_m), seed
         self._parts = solids(self.model)
-        self.plant = ArmPlant(self.model, true, seed)
-        mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
-        off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
-        self._T_tool_body = mount @ exp_se3(off)
-        self._T_base_rig = placed_rig(self.model, self._rig, mount, seed)
-        places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
-        with ThreadPoolExecutor(2) as pool:
-            left, right = pool.map(
-                lambda camera, place: CellCamera(camera, place, self.plant.parts, seed), self._rig.cameras, places
-            )
-        clock = (lambda: self.t_s, self.advance)
-        self.source = CellSource(self.plant, (left, right), timing, (body_patterns(), self._T_tool_body), clock, seed)
+        self._motors = chosen(self.model, self._parts)  # as the drawing has them: friction as usual
+        self.plant = ArmPlant(self.model, drawn(self.model, amounts, seed), seed)
+        self._stand(distance_m, noise)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD
         self.link = EmulatedLink(open_machine(machine), self.plant)
-        self.board = configured(self.link, configuration(self.model, self._parts, self.plant.motors))
+        self.board = configured(self.link, configuration(self.model, self._parts, self._motors))
+
+    def _stand(self, distance_m: float, noise: float) -> None:
+        """Screw the body to the tool and stand the cameras before it."""
+        seed = self._seed
+        mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
+        off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
+        self._T_tool_body = mount @ exp_se3(off)
+        self._T_base_rig = placed_rig(self.model, self._rig, mount, seed, distance_m)
+        places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
+        stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
+        with ThreadPoolExecutor(2) as pool:
+            left, right = pool.map(stand, self._rig.cameras, places)
+        clock = (lambda: self.t_s, self.advance)
+        body = (body_patterns(), self._T_tool_body)
+        self.source = CellSource(self.plant, (left, right), self.timing, body, clock, seed)
 
     @property
     def t_s(self) -> float:
@@ -161,7 +176,7 @@ class Workcell:
 
     def gravity_duty(self, q: Array) -> Array:
         """Return the duty (6,) that carries the nominal arm's weight at joint angles q (6,), rad."""
-        return gravity_duty(self.model, self._parts, self.plant.motors, q)
+        return gravity_duty(self.model, self._parts, self._motors, q)
 
     @cached_property
     def poses(self) -> Array:
