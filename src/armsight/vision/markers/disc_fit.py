@@ -1,6 +1,6 @@
 """The centre of one disc to the limit that the image's noise sets, and what is no disc.
 
-Gauss-Newton on :mod:`~armsight.vision.markers.disc_model`: first steps on a third of the rows, then on all until the
+Gauss-Newton on :mod:`~armsight.vision.markers.disc_model`: a first step on a third of the rows, then on all until the
 centre rests. Where the surround is not plain its own variance lowers the weight of what shows it; where the disc has a
 gradient (a score test), the kind of gradient that fits best is taken. What is left tells discs from what looks like one.
 """
@@ -27,8 +27,7 @@ from armsight.vision.markers.disc_model import (
     solve,
 )
 
-#: Steps on a third of the rows, and at most on all.
-_SAMPLE_STEPS, _STEPS = 2, 8
+_STEPS = 8
 #: A step of the centre after which the next one does not count: the next is a tenth of it at the most, px; and in
 #: standard deviations of the centre.
 _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
@@ -215,14 +214,14 @@ def _texture_factor(n: int, blur: float, texture: float, work: Work) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pair(first: int, work: Work, cov: Array) -> None:
-    """Fill the (2, 2) block of H^-1 of two neighbouring unknowns."""
+def _of_centre(work: Work, cov: Array) -> None:
+    """Fill the (2, 2) block of H^-1 that is the centre's."""
     g, L, scale, x = work.g, work.L, work.scale, work.x
     for a in range(2):
         g[:] = 0.0
-        g[first + a] = 1.0
+        g[a] = 1.0
         solve(L, scale, g, x)
-        cov[a, 0], cov[a, 1] = x[first], x[first + 1]
+        cov[a, 0], cov[a, 1] = x[0], x[1]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -254,11 +253,9 @@ def _slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> flo
 @numba.njit(cache=True, error_model="numpy")
 def _slope_outside(theta: Array, work: Work) -> float:
     """Return what chi-square would lose without the surround's gradient, in units of the noise's variance."""
-    cov = work.shapes
-    _pair(8, work, cov)
-    a, b = theta[8], theta[9]
-    det = cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
-    return float((cov[1, 1] * a * a - 2 * cov[0, 1] * a * b + cov[0, 0] * b * b) / det)
+    L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
+    # Of the last two unknowns the factor's last corner is that of their information, the others' share taken out.
+    return float((a / L[8, 8] + b * L[9, 8]) ** 2 + (b / L[9, 9]) ** 2)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -280,7 +277,7 @@ def _average(
         square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
         results[kind, 0] = np.inf
         if square >= 0.0:
-            _pair(0, work, block)
+            _of_centre(work, block)
             variance = square / (n - UNKNOWNS)
             results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
             results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
@@ -326,9 +323,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if n < 4 * UNKNOWNS:
         return 7
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
-    for _ in range(_SAMPLE_STEPS):
-        if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
-            return 2
+    if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
+        return 2
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2
@@ -364,7 +360,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         _slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
         or _slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
     )
-    _pair(0, work, cov)
+    _of_centre(work, cov)
     if texture > 0.0:
         variance *= _texture_factor(n, theta[5], texture, work)
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:

@@ -114,7 +114,7 @@ def workspace() -> Work:
 
 @numba.njit(cache=True, error_model="numpy")
 def _chord(v: float, s: Array) -> tuple[float, float]:
-    """Return middle and half length of the chord at height v of an ellipse as :func:`_grown` fills it; half < 0 where none."""
+    """Return middle and half length of the chord at height v of an ellipse that :func:`_grown` filled; half < 0: none."""
     rest = s[2] - v * v
     if rest <= 0.0:
         return 0.0, -1.0
@@ -133,7 +133,7 @@ def _grown(shape: Array, by: float, out: Array) -> None:
     out[3], out[4] = out[1] / out[2], np.sqrt(a * b) / out[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def _take(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: int, n: int, work: Work) -> int:
     """Append the pixels first <= x < end of a row; return the new count."""
     count = max(min(end - first, MOST_PIXELS - n), 0)
