@@ -42,8 +42,8 @@ def test_images_show_at_each_pixel_what_the_map_says(model):
     inside[:, [0, -1]], inside[[0, -1]] = False, False
     place = form.map_left
     within = inside & (place > 2).all(axis=2) & (place < np.array([width, height]) - 3).all(axis=2)
-    # OpenCV's remap rounds places to 1/32 px, half a step along each axis, and its cubic kernel (a = -0.75) moves a ramp by
-    # up to 0.035 px more.
+    # OpenCV's remap rounds places to 1/32 px, half a step along each axis, and its cubic kernel (a = -0.75) moves a
+    # ramp by up to 0.035 px more.
     bound = (1 / 8 + 1 / 16) * (1 / 64 + 0.035)
     assert np.abs(left - (place[..., 0] / 8 + place[..., 1] / 16))[within].max() <= bound
     assert within.mean() > 0.5

@@ -57,11 +57,13 @@ def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth
     """
     chosen = result.measured & np.isfinite(depth.depth_m)
     v, u = np.nonzero(chosen)
-    p_left = form.points(np.column_stack([u, v]).astype(np.float64), result.disparity[chosen])
+    p_left = form.points(np.column_stack([u, v]).astype(np.float64), result.disparity[chosen].astype(np.float64))
     colours = image[chosen] if image.ndim == 3 else np.repeat(image[chosen][:, None], 3, axis=1)
     if colours.dtype == np.uint16:
         colours = colours >> 8
-    fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
+    fields = (
+        [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
+    )
     rows = np.empty(len(u), np.dtype(fields))
     for k, name in enumerate("xyz"):
         rows[name] = p_left[:, k]

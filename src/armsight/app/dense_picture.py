@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.vision.dense.judge import Truth
-from armsight.vision.dense.method import MEASURED, NOTHING, Disparity
+from armsight.vision.dense.method import FILLED, MEASURED, NOTHING, OCCLUDED, Disparity
 
 _BAR_PX, _MARGIN_PX, _CAPTION_PX = 18, 62, 26
 _INK, _PAPER = (41, 31, 31), (255, 255, 255)
@@ -47,7 +47,8 @@ def paint_disparity(result: Disparity) -> Image:
     picture[~some] = (200, 200, 200)
     canvas[:height, :width] = picture
     _bar(canvas, height, width, low, high)
-    shares = [f"{100 * np.mean(result.state == k):.0f}% {name}" for k, name in enumerate(("", "measured", "hidden", "filled")) if k]
+    names = ((MEASURED, "measured"), (OCCLUDED, "hidden"), (FILLED, "filled"))
+    shares = [f"{100 * np.mean(result.state == state):.0f}% {name}" for state, name in names]
     _write(canvas, ", ".join(shares), (4, height + 17))
     return canvas
 
@@ -60,7 +61,9 @@ def _bar(canvas: Image, height: int, width: int, low: float, high: float) -> Non
     for k in range(5):
         y = round(k * (height - 1) / 4)
         value = high + (low - high) * k / 4
-        _write(canvas, f"{value:.3g}" + (" px" if k == 0 else ""), (left + _BAR_PX + 3, min(max(y + 4, 10), height - 2)))
+        _write(
+            canvas, f"{value:.3g}" + (" px" if k == 0 else ""), (left + _BAR_PX + 3, min(max(y + 4, 10), height - 2))
+        )
 
 
 def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
@@ -76,7 +79,13 @@ def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
     canvas = np.full((height + _CAPTION_PX, width, 3), _PAPER, np.uint8)
     canvas[:height] = picture
     x = 4
-    for name, colour in (("right", _RIGHT), ("> 1 px", _OFF_1), ("> 2", _OFF_2), ("> 4", _OFF_4), ("no truth", _UNKNOWN)):
+    for name, colour in (
+        ("right", _RIGHT),
+        ("> 1 px", _OFF_1),
+        ("> 2", _OFF_2),
+        ("> 4", _OFF_4),
+        ("no truth", _UNKNOWN),
+    ):
         cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), colour, -1)
         cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), _INK, 1)
         _write(canvas, name, (x + 14, height + 17))

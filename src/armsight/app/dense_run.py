@@ -45,7 +45,7 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
     count = int(np.ceil(form.disparity_of(nearest))) + 1
     if near is not None and count > width:
         raise InputError(
-            f"--near {near:g}: there the disparity is {count} px, outside an image {width} px wide; give a greater depth"
+            f"--near {near:g}: the disparity there is {count} px, outside an image {width} px wide; give more"
         )
     return Search(0, max(2, min(count, width)))
 
@@ -101,8 +101,9 @@ def result_line(record: dict[str, Any]) -> str:
     if record["problem"] is not None:
         return f"{record['shot']}: nothing measured: {record['problem']}"
     line = (
-        f"{record['shot']}: {record['measured_percent']:.1f}% measured (median sigma {record['median_sigma_px']:.2f} px), "
-        f"{record['hidden_percent']:.1f}% hidden from the right camera and {record['filled_percent']:.1f}% unsure, filled"
+        f"{record['shot']}: {record['measured_percent']:.1f}% measured (median sigma "
+        f"{record['median_sigma_px']:.2f} px), {record['hidden_percent']:.1f}% hidden from the right camera and "
+        f"{record['filled_percent']:.1f}% unsure, filled"
     )
     if record["not_in_view_percent"] > 0:
         line += f", {record['not_in_view_percent']:.1f}% not in view"

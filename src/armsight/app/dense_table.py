@@ -138,7 +138,9 @@ def table_text(lines: list[Line]) -> str:
         keys = [key.removeprefix("all_") for key in means if key.startswith("all_")]
         cells = "".join(f"{means['all_' + k]:>7.2f}/{means['nonocc_' + k]:<6.2f}" for k in keys)
         text.append(f"{'(average)':<12}{name:<12}{cells}")
-    text.append("All pixels with a truth / those both cameras see; gaps filled. within: measured ones inside 1.96 sigma.")
+    text.append(
+        "all pixels with a truth / those both cameras see, gaps filled; within: measured ones inside 1.96 sigma"
+    )
     return "\n".join(text)
 
 

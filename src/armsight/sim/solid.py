@@ -1,8 +1,8 @@
 """Images of solid bodies with exact depth: triangles whose material has a grain, seen through the full camera model.
 
-Meshes and a camera go in; an 8-bit image and the depth of every pixel's centre come out. The grain is a function of the place
-in the body (value noise in octaves), so that it needs no unfolding and moves with the body. Light is even; each pixel is the
-mean of a few samples, so that edges are soft as a sensor's are.
+Meshes and a camera go in; an 8-bit image and the depth of every pixel's centre come out. The grain is a function of the
+place in the body (value noise in octaves), so that it needs no unfolding and moves with the body. Light is even; each
+pixel is the mean of a few samples, so that edges are soft as a sensor's are.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Image, Record
-from armsight.geometry.pose import transform
+from armsight.geometry.pose import inverse, transform
 from armsight.vision.camera import Camera
 
 #: Samples along each side of a pixel; an odd number, so that one is the centre.
@@ -67,7 +67,9 @@ def moved(solid: Solid, T: Array) -> Solid:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cast(rays: Array, corners: Array, box: tuple[int, int, int, int], depth: Array, owner: NDArray[np.int32], k: int) -> None:
+def _cast(
+    rays: Array, corners: Array, box: tuple[int, int, int, int], depth: Array, owner: NDArray[np.int32], k: int
+) -> None:
     """Let the rays (H, W, 3) of a box meet a triangle (3, 3); the nearer keeps the sample (Moeller and Trumbore 1997)."""
     e1, e2, s = corners[1] - corners[0], corners[2] - corners[0], -corners[0]
     q = np.cross(s, e1)
@@ -133,8 +135,8 @@ def see(camera: Camera, solids: Sequence[tuple[Solid, Array]]) -> tuple[Image, A
         solids: meshes with their poses (4, 4) in the camera's frame.
 
     Returns:
-        (H, W) uint8; (H, W) depth along the camera's axis at pixel centres, m, NaN where there is nothing; (H, W) which of the
-        solids is seen there, -1 for none.
+        (H, W) uint8; (H, W) depth along the camera's axis at pixel centres, m, NaN where there is nothing; (H, W) which
+        of the solids is seen there, -1 for none.
     """
     rays = _sample_rays(camera)
     height, width = rays.shape[:2]
@@ -151,7 +153,7 @@ def see(camera: Camera, solids: Sequence[tuple[Solid, Array]]) -> tuple[Image, A
     light = np.full((height, width), 60.0)
     for k, (solid, T) in enumerate(solids):
         mine = owner == k
-        p_solid = transform(np.linalg.inv(T), rays[mine] * depth[mine][:, None])
+        p_solid = transform(inverse(T), rays[mine] * depth[mine][:, None])
         value = np.empty(len(p_solid))
         _grain(p_solid, solid.grain_m, solid.seed, value)
         light[mine] = 120 + solid.contrast * value

@@ -1,9 +1,9 @@
 """Where a body without markers is: its known surface is laid on a point cloud.
 
-A surface (a mesh's, or what a reference shot showed), a cloud with its uncertainty and a first pose, such as the arm's, go in;
-a pose with covariance comes out. Iterative closest points, from each measured point to the tangent plane of the surface there
-(Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a reach that shrinks to what the
-cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body.
+A surface (a mesh's, or what a reference shot showed), a cloud with its uncertainty and a first pose, such as the arm's,
+go in; a pose with covariance comes out. Iterative closest points, from each measured point to the tangent plane of the
+surface there (Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a reach that
+shrinks to what the cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from armsight.geometry.pose import exp_se3, inverse, transform
 
 #: Distance between the points a mesh is sampled at, m, and the neighbours that a normal of a cloud is fitted to.
 _SPACING_M, _NEIGHBOURS = 0.002, 24
-#: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the noise.
+#: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the
+#: noise.
 _SHRINK, _SIGMAS = 0.9, 10.0
 #: How well the edge of a body is seen in a disparity map, sideways, m: about a pixel and a half at arm's length.
 _SIDEWAYS_M = 0.002
@@ -124,13 +125,13 @@ def locate_cloud(
     """
     T: Array = checked(T_left_body, (4, 4), "T_left_body")
     p, sigma = checked(p_left, (None, 3), "p_left"), checked(sigma_m, (None,), "sigma_m")
-    tree = cKDTree(surface.points)
-    near = tree.query(transform(inverse(T), p), distance_upper_bound=2 * reach_m)[0] <= 2 * reach_m
+    tree: cKDTree = cKDTree(surface.points)
+    near = _nearest(tree, transform(inverse(T), p), 2 * reach_m)[0] <= 2 * reach_m
     p, sigma = p[near], sigma[near]
     if len(p) > _MOST:
         drawn = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
         p, sigma = p[drawn], sigma[drawn]
-    reach, shared = reach_m, max(1.0, _SHARED * len(p) / max(np.count_nonzero(near), 1))
+    reach, shared = reach_m, max(1.0, _SHARED * len(p) / max(int(np.count_nonzero(near)), 1))
     for _ in range(_STEPS):
         fit = _planes(surface, tree, p, sigma, T, reach)
         if fit is None:
@@ -139,7 +140,7 @@ def locate_cloud(
         if np.linalg.eigvalsh(H)[0] <= 1 / _OPEN**2:
             return Missed("the body's surface in view does not fix its pose: it can slide or turn along itself")
         step = -np.linalg.solve(H, g)
-        T = T @ exp_se3(step)
+        T = np.asarray(T @ exp_se3(np.asarray(step, np.float64)))
         settled = reach <= least_reach and np.abs(step).max() < _SETTLED_M
         reach = max(reach * _SHRINK, least_reach)
         if settled:
@@ -148,17 +149,23 @@ def locate_cloud(
     return CloudPose(T, np.asarray(cov), float(np.sqrt(np.mean(gaps[:, 0] ** 2))), len(gaps))
 
 
+def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.int64]]:
+    """Return how far (N,) the nearest point of the surface is, infinite beyond a reach, and its row."""
+    far, rows = tree.query(p, distance_upper_bound=reach)
+    return np.asarray(far, np.float64), np.asarray(rows, np.int64)
+
+
 def _planes(
     surface: Surface, tree: cKDTree, p: Array, sigma: Array, T: Array, reach: float
 ) -> tuple[Array, Array, Array, float] | None:
     """Linearise the distances of points to the planes of the surface near them.
 
     Returns:
-        (6, 6) information, (6,) gradient, (M, 2) distances of the points that count, m and in sigmas, and the reach that
-        their noise asks for; None where too few count.
+        (6, 6) information, (6,) gradient, (M, 2) distances of the points that count, m and in sigmas, and the reach
+        that their noise asks for; None where too few count.
     """
     p_body = transform(inverse(T), p)
-    far, rows = tree.query(p_body, distance_upper_bound=reach)
+    far, rows = _nearest(tree, p_body, reach)
     eye = inverse(T)[:3, 3]
     found = np.isfinite(far)
     found[found] = np.einsum("ni,ni->n", surface.normals[rows[found]], eye - p_body[found]) > 0  # the side in view

@@ -1,9 +1,10 @@
 """Standard form: a pair as two equal cameras side by side would have seen it, and back.
 
-Both cameras are turned about their own centres until the rows of both images are the same planes through the baseline (the
-chapter's "standard form"; Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA 12(1),
-2000). A scene point is then in one row, and its column in the left image less that in the right one, the disparity d, tells
-its depth: z = f b / d. Both images have one principal point, so that what is infinitely far has no disparity.
+Both cameras are turned about their own centres until the rows of both images are the same planes through the baseline
+(the chapter's "standard form"; Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA
+12(1), 2000). A scene point is then in one row, and its column in the left image less that in the right one, the
+disparity d, tells its depth: z = f b / d. Both images have one principal point, so that what is infinitely far has no
+disparity.
 """
 
 from __future__ import annotations
@@ -67,10 +68,14 @@ class Rectification(Record):
             if (image.shape[1], image.shape[0]) != tuple(camera.image_size_px):
                 width, height = camera.image_size_px
                 raise InputError(
-                    f"{side} image: {image.shape[1]}x{image.shape[0]} px, but the rig was calibrated at {width}x{height}"
+                    f"{side} image: {image.shape[1]}x{image.shape[0]} px, the rig was calibrated at {width}x{height}"
                 )
             place = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
-            out.append(np.asarray(cv2.remap(image, place, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)))
+            out.append(
+                np.asarray(
+                    cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+                )
+            )
         return out[0], out[1]
 
     def seen(self, side: Side) -> NDArray[np.bool_]:
@@ -122,8 +127,8 @@ def _rays(uv: Array, focal_px: float, principal: tuple[float, float]) -> Array:
 def rectify(rig: StereoRig) -> Rectification:
     """Put a rig's images into standard form.
 
-    The new axes: x along the baseline, z as near to both optical axes as can be. The images keep the left one's size and the
-    mean focal length; what the two cameras look at on average is in the middle.
+    The new axes: x along the baseline, z as near to both optical axes as can be. The images keep the left one's size
+    and the mean focal length; what the two cameras look at on average is in the middle.
 
     Raises:
         InputError: the baseline lies along the optical axes: there is no standard form.

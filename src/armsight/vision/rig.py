@@ -116,7 +116,7 @@ class StereoRig(Record):
         )
 
     def rectify(self) -> Rectification:
-        """Return how the rig's images become standard form, and points come back; see :func:`~armsight.vision.rectify.rectify`."""
+        """Return how the rig's images become standard form, and back; see :func:`~armsight.vision.rectify.rectify`."""
         from armsight.vision.rectify import rectify
 
         return rectify(self)

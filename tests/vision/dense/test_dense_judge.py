@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from dense_scenes import layers
 
 from armsight.errors import InputError
 from armsight.vision.dense.judge import Truth, judge, seen_by_right
 from armsight.vision.dense.middlebury import find_scenes, load_scene
 from armsight.vision.dense.pfm import read_pfm, write_pfm
-from dense_scenes import layers
 
 
 def test_figures_are_those_counted_by_hand():
@@ -52,7 +52,9 @@ def test_pfm_goes_round_and_opencv_reads_it(tmp_path):
     np.testing.assert_array_equal(read_pfm(tmp_path / "b.pfm"), [[1.5, 2.5]])
 
 
-@pytest.mark.parametrize("data", [b"", b"PF\n1 1\n-1\n" + bytes(12), b"Pf\n2 2\n-1\n" + bytes(8), b"Pf\nx y\n-1\n" + bytes(8)])
+@pytest.mark.parametrize(
+    "data", [b"", b"PF\n1 1\n-1\n" + bytes(12), b"Pf\n2 2\n-1\n" + bytes(8), b"Pf\nx y\n-1\n" + bytes(8)]
+)
 def test_what_is_no_pfm_is_refused_by_name(tmp_path, data):
     (tmp_path / "a.pfm").write_bytes(data)
     with pytest.raises(InputError, match=r"a\.pfm"):

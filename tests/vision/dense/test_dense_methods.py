@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 import pytest
+from dense_scenes import layers, rendered
 
 from armsight.errors import InputError
 from armsight.vision.dense.block import Block
@@ -11,7 +12,6 @@ from armsight.vision.dense.method import MEASURED, OCCLUDED, Search
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.opencv import OpenCV
 from armsight.vision.dense.semiglobal import Semiglobal
-from dense_scenes import layers, rendered
 
 SEARCH = Search(0, 32)
 VARIANTS = {

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from dense_scenes import layers
 
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.cost import COST_MAX
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.semiglobal import _EDGE, _P1, _P2, Semiglobal
-from dense_scenes import layers
 
 WAYS = {
     4: [(0, 1), (0, -1), (1, 0), (-1, 0)],
@@ -24,7 +24,9 @@ def raw_costs(left, right, count):
         return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
 
     def bits(image, y, x):
-        return [at(image, y + j, x + i) < at(image, y, x) for j in range(-2, 3) for i in range(-2, 3) if (i, j) != (0, 0)]
+        return [
+            at(image, y + j, x + i) < at(image, y, x) for j in range(-2, 3) for i in range(-2, 3) if (i, j) != (0, 0)
+        ]
 
     def span(image, y, x):
         c = at(image, y, x)
@@ -47,13 +49,16 @@ def smoothed(raw):
     height, width, _ = raw.shape
     rows = np.clip(np.arange(height)[:, None] + [-1, 0, 1], 0, height - 1)
     column = raw[rows].sum(axis=1)
-    before, after = column[:, np.clip(np.arange(width) - 1, 0, None)], column[:, np.clip(np.arange(width) + 1, None, width - 1)]
+    before, after = (
+        column[:, np.clip(np.arange(width) - 1, 0, None)],
+        column[:, np.clip(np.arange(width) + 1, None, width - 1)],
+    )
     return ((before + after + 1) // 2 + column + 1) // 2
 
 
 def totals(costs, image, ways):
     """Sum the paths, each by its definition."""
-    height, width, count = costs.shape
+    height, width, _ = costs.shape
     total = np.zeros(costs.shape, int)
     for dy, dx in ways:
         L = np.zeros(costs.shape, int)
@@ -104,7 +109,7 @@ def test_no_path_cost_leaves_a_byte():
 
 
 def test_strips_meet_without_a_seam(monkeypatch):
-    left, right, truth = layers(height=220)
+    left, right, _ = layers(height=220)
     whole = Semiglobal(8).match(left, right, Search(0, 32))
     monkeypatch.setattr("armsight.vision.dense.semiglobal._STRIP_ROWS_KEPT", 1000)
     one = Semiglobal(8).match(left, right, Search(0, 32))

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from dense_scenes import layers
 
 from armsight.errors import InputError
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.standard import match_pair
-from dense_scenes import layers
 
 SEARCH = Search(0, 32)
 

@@ -35,7 +35,7 @@ class _Dense(click.Group):
 
 @click.group(cls=_Dense)
 def command() -> None:
-    """Find a disparity for every pixel of a pair, or judge the methods by scenes with a truth.
+    r"""Find a disparity for every pixel of a pair, or judge the methods by scenes with a truth.
 
     \b
     armsight dense RIG.json LEFT RIGHT -o OUT        depth, point cloud
@@ -49,8 +49,12 @@ def command() -> None:
 
 @command.command("match")
 @click.argument("paths", nargs=-1, metavar="[RIG.json] [LEFT RIGHT]", type=click.Path(path_type=Path))
-@click.option("--method", "name", default="semiglobal", show_default=True, type=click.Choice(list(METHODS)), help="How.")
-@click.option("-o", "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files.")
+@click.option(
+    "--method", "name", default="semiglobal", show_default=True, type=click.Choice(list(METHODS)), help="How."
+)
+@click.option(
+    "-o", "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."
+)
 @click.option("--source", metavar="SOURCE", help="A sequence in place of LEFT RIGHT (see armsight record -h).")
 @click.option("--rectified", is_flag=True, help="The pair is in standard form already; no RIG.json.")
 @click.option("--max-disparity", type=int, metavar="N", help="Disparities below N px are tried.")
@@ -68,9 +72,10 @@ def match(
 ) -> None:
     """Match a pair, or every shot of a source, and write disparity, picture, and with a rig depth and point cloud.
 
-    In OUT: disparity.pfm (px, left image, filled), valid.png (255 where it was measured), disparity.png (16 bits, 64 steps
-    a px), state.png (1 measured, 2 hidden from the right camera, 3 filled), sigma.pfm (px), picture.png; with a rig
-    left.png and right.png in standard form, depth_mm.pfm, depth_sigma_mm.pfm and cloud.ply (m, left camera's frame).
+    In OUT: disparity.pfm (px, left image, filled), valid.png (255 where it was measured), disparity.png (16 bits, 64
+    steps a px), state.png (1 measured, 2 hidden from the right camera, 3 filled), sigma.pfm (px), picture.png; with a
+    rig left.png and right.png in standard form, depth_mm.pfm, depth_sigma_mm.pfm and cloud.ply (m, left camera's
+    frame).
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
     method, folder = open_method(name), make_folder(out)
@@ -123,15 +128,19 @@ def _arguments(
 
 @command.command("evaluate")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--method", "names", multiple=True, type=click.Choice(list(METHODS)), help="May be repeated; all by default.")
-@click.option("-o", "--out", metavar="OUT", type=click.Path(path_type=Path), help="Write the table and error maps there.")
+@click.option(
+    "--method", "names", multiple=True, type=click.Choice(list(METHODS)), help="May be repeated; all by default."
+)
+@click.option(
+    "-o", "--out", metavar="OUT", type=click.Path(path_type=Path), help="Write the table and error maps there."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def evaluate(folder: Path, names: tuple[str, ...], out: Path | None, as_json: bool) -> None:
     """Judge the methods by scenes with a truth, in the folder layouts of the Middlebury benchmark.
 
-    DIR is a scene or a folder of scenes. Figures: share of pixels off by more than 0.5, 1, 2 and 4 px, mean, RMS, and the
-    errors that 50, 90, 95 and 99% stay below, over all pixels and over those both cameras see. Gaps are filled. With OUT:
-    table.csv, and for each scene and method an error map and the disparities in colour.
+    DIR is a scene or a folder of scenes. Figures: share of pixels off by more than 0.5, 1, 2 and 4 px, mean, RMS, and
+    the errors that 50, 90, 95 and 99% stay below, over all pixels and over those both cameras see. Gaps are filled.
+    With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)
     target = None if out is None else make_folder(out)

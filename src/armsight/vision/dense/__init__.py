@@ -1,1 +1,1 @@
-"""Dense stereo: a pair in standard form goes in, a disparity for every pixel comes out. The contract is in ``method.py``."""
+"""Dense stereo: a pair in standard form goes in, a disparity for every pixel comes out; the contract is in method.py."""

@@ -2,8 +2,8 @@
 
 By default the cost is census with Birchfield and Tomasi's dissimilarity over a square window, which a running sum makes
 fast. The other costs and supports of the chapter's survey work on one disparity at a time (``support.py``): absolute
-differences, zero-mean normalised correlation, windows shaped by arms of alike pixels (Zhang, Lu and Lafruit 2009) and the
-guided filter (Hosni et al., PAMI 35(2), 2013).
+differences, zero-mean normalised correlation, windows shaped by arms of alike pixels (Zhang, Lu and Lafruit 2009) and
+the guided filter (Hosni et al., PAMI 35(2), 2013).
 """
 
 from __future__ import annotations
@@ -68,5 +68,3 @@ class Block:
 
         on_strips(left.shape[0], _STRIP_ROWS, work)
         return found
-
-

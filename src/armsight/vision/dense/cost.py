@@ -1,11 +1,11 @@
 """What it costs to match two pixels: census and Birchfield and Tomasi's dissimilarity, a row at a time.
 
-A pair goes in; one byte comes out for every pixel of a row and every disparity, the disparities of a pixel side by side.
-The right image's rows are kept mirrored: the pixels that a left pixel is compared with, one further left for each step in
-disparity, then follow one another in memory, and the compiler uses vectors.
+A pair goes in; one byte comes out for every pixel of a row and every disparity, the disparities of a pixel side by
+side. The right image's rows are kept mirrored: the pixels that a left pixel is compared with, one further left for each
+step in disparity, then follow one another in memory, and the compiler uses vectors.
 
-Zabih and Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994; Birchfield and Tomasi,
-"A pixel dissimilarity measure that is insensitive to image sampling", PAMI 20(4), 1998.
+Zabih and Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994; Birchfield and
+Tomasi, "A pixel dissimilarity measure that is insensitive to image sampling", PAMI 20(4), 1998.
 """
 
 from __future__ import annotations
@@ -59,14 +59,18 @@ class Pair(NamedTuple):
     right_census: Words
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def popcount(typing: Any, x: Any) -> Any:
+@intrinsic
+def _popcount(typing: Any, x: Any) -> Any:  # noqa: ANN401
     """Count the bits that are set: LLVM's ctpop, which numba does not offer by name."""
 
-    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         return builder.ctpop(arguments[0])
 
     return x(x), emit
+
+
+#: To numba an intrinsic takes what its signature says; its type says it is the function above.
+popcount: Any = _popcount
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -103,7 +107,11 @@ def _looks(image: Image) -> tuple[Bytes, Bytes, Bytes, Words]:
     """Return an image (H, W), its least and greatest levels half way to the neighbours, and its census words."""
     reach = _CENSUS_REACH
     padded = np.pad(image, reach, mode="edge")
-    low, high, words = np.empty(image.shape, np.uint8), np.empty(image.shape, np.uint8), np.zeros(image.shape, np.uint32)
+    low, high, words = (
+        np.empty(image.shape, np.uint8),
+        np.empty(image.shape, np.uint8),
+        np.zeros(image.shape, np.uint32),
+    )
     _half_way(padded, low, high)
     _census(padded, words)
     return np.ascontiguousarray(padded[reach:-reach, reach:-reach]), low, high, words
@@ -144,7 +152,8 @@ def _bt(g: np.uint8, g_low: np.uint8, g_high: np.uint8, r: np.uint8, r_low: np.u
 def raw_row(pair: Pair, y: int, first: int, count: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
     """Write the raw costs of one row into ``out`` from ``base`` on: W times ``size`` bytes.
 
-    Disparities beyond ``count`` cost the most there is. Census distance plus half of Birchfield and Tomasi's dissimilarity (their equation 3), cut off.
+    Census distance plus half of Birchfield and Tomasi's dissimilarity, cut off; disparities from ``count`` on cost the
+    most.
     """
     width = pair.left.shape[1]
     words, right, low, high = pair.right_census[y], pair.right[y], pair.right_low[y], pair.right_high[y]

@@ -1,8 +1,8 @@
 """From disparity to depth, with what matching and calibration leave uncertain.
 
-sigma_z^2 = (z^2 / (f b) sigma_d)^2 + what the rig's covariance does to the depth. The second is smooth over image and depth: it
-is worked out at a few places, by triangulating the same pixels with rigs that are off by one standard deviation along each
-principal axis of the covariance, and interpolated.
+sigma_z^2 = (z^2 / (f b) sigma_d)^2 + what the rig's covariance does to the depth. The second is smooth over image and
+depth: it is worked out at a few places, by triangulating the same pixels with rigs that are off by one standard
+deviation along each principal axis of the covariance, and interpolated.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What stands where nothing was measured, told apart by why.
 
-The right camera cannot see what lies behind a nearer surface or beyond its image; what it cannot see continues the farther
-of the surfaces beside it in its row. Where a pixel could have been seen and was not matched, the same is a guess.
+The right camera cannot see what lies behind a nearer surface or beyond its image; what it cannot see continues the
+farther of the surfaces beside it in its row. Where a pixel could have been seen and was not matched, the same is a
+guess.
 """
 
 from __future__ import annotations

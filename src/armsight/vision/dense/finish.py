@@ -29,9 +29,9 @@ _LEAST_SHARE = 0.005
 class Trust:
     """How sure a method is: sigma^2 = floor^2 + (gain * least / curvature)^2.
 
-    The second term is the noise of a minimum: what a match still costs is noise, and the bend of the costs turns it into
-    pixels. The first is what no cost tells: the pull towards whole disparities, slants, the smoothing. Both are set so that
-    1.96 sigma holds about 95% of the errors on four rendered scenes; others, and real ones, then check it.
+    The second term is the noise of a minimum: what a match still costs is noise, and the bend of the costs turns it
+    into pixels. The first is what no cost tells: the pull towards whole disparities, slants, the smoothing. Both are
+    set so that 1.96 sigma holds about 95% of the errors on four rendered scenes; others, and real ones, then check it.
 
     Attributes:
         floor_px: px.
@@ -62,8 +62,8 @@ def finished(found: Found, left: Image, search: Search, trust: Trust) -> Dispari
         return Disparity.none(
             (left.shape[0], left.shape[1]),
             search,
-            "nothing in the left image was found in the right one: too little texture, not the same scene, or disparities "
-            f"beyond {search.first} to {search.last} px",
+            "nothing in the left image was found in the right one: too little texture, not the same scene, or "
+            f"disparities beyond {search.first} to {search.last} px",
         )
     surface, share = smoothed(sure, left)
     full, state = filled(surface)

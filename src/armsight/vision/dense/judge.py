@@ -1,9 +1,10 @@
 """How good a disparity map is, in the Middlebury benchmark's figures.
 
-Scharstein and Szeliski, "A taxonomy and evaluation of dense two-frame stereo correspondence algorithms", IJCV 47, 2002, and the
-benchmark's third version (Scharstein et al., GCPR 2014): shares of pixels that are off by more than a threshold, mean, RMS and
-quantiles of the error, over all pixels with a truth and over those that both cameras see. A pixel without a disparity is bad
-at every threshold, and left out of mean, RMS and quantiles. Disparities are judged as they are, never rounded.
+Scharstein and Szeliski, "A taxonomy and evaluation of dense two-frame stereo correspondence algorithms", IJCV 47, 2002,
+and the benchmark's third version (Scharstein et al., GCPR 2014): shares of pixels that are off by more than a
+threshold, mean, RMS and quantiles of the error, over all pixels with a truth and over those that both cameras see. A
+pixel without a disparity is bad at every threshold, and left out of mean, RMS and quantiles. Disparities are judged as
+they are, never rounded.
 """
 
 from __future__ import annotations

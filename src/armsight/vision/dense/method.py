@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from armsight.data import Image, Record
 from armsight.errors import InputError
 
-#: What a pixel's disparity is: nothing, measured, filled because the right camera cannot see it, or filled because what was
-#: measured there cannot be believed.
+#: What a pixel's disparity is: nothing, measured, filled because the right camera cannot see it, or filled because what
+#: was measured there cannot be believed.
 NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
 
 

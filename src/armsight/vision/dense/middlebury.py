@@ -1,12 +1,13 @@
 """Scenes with a truth, in the folder layouts of the Middlebury benchmark.
 
-- 2001 and 2003: ``im2`` and ``im6`` with ``disp2``, or ``im3`` and ``im4`` with ``disp3`` (Tsukuba); 2005 and 2006: ``view1``
+- 2001 and 2003: ``im2`` and ``im6`` with ``disp2``, or ``im3`` and ``im4`` with ``disp3`` (Tsukuba); 2005 and 2006:
+``view1``
   and ``view5`` with ``disp1``. The truth is an 8-bit image of scaled disparities, 0 where unknown.
 - 2014: ``im0`` and ``im1`` with ``disp0.pfm`` or ``disp0GT.pfm`` and ``calib.txt``; infinity where unknown.
 - ``NAME_left`` and ``NAME_right`` with ``NAME_left_gt``, disparities as they are, 0 where unknown.
 
-A mask says which pixels both cameras see: ``mask0nocc``, ``nonocc``, ``nocc`` or ``occlusion_left``, 255 there. Without one
-it follows from the truth.
+A mask says which pixels both cameras see: ``mask0nocc``, ``nonocc``, ``nocc`` or ``occlusion_left``, 255 there. Without
+one it follows from the truth.
 """
 
 from __future__ import annotations
@@ -124,7 +125,9 @@ def _seen(folder: Path, truth: Array) -> NDArray[np.bool_]:
         if (path := _find(folder, stem)) is not None:
             mask = read_image(path)
             if mask.shape[:2] != truth.shape:
-                raise InputError(f"{path}: {mask.shape[1]}x{mask.shape[0]} px, the truth has {truth.shape[1]}x{truth.shape[0]}")
+                raise InputError(
+                    f"{path}: {mask.shape[1]}x{mask.shape[0]} px, the truth has {truth.shape[1]}x{truth.shape[0]}"
+                )
             return np.asarray((mask if mask.ndim == 2 else mask[:, :, 0]) == 255)
     return np.asarray(seen_by_right(truth))
 

@@ -1,9 +1,9 @@
 """Costs of the best paths that end in a pixel: the recurrence of semi-global matching, in bytes.
 
 L(p, d) = C(p, d) + min(L(q, d), L(q, d -+ 1) + P1, min L(q) + P2) - min L(q), with q the pixel before p on the path:
-equation 13 of Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008. With the
-least of q taken away no L is above C + P2, so a byte holds it as long as P1 + P2 plus the largest cost stays below 256; a
-vector then holds twice the disparities that it holds of two bytes each.
+equation 13 of Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008. With
+the least of q taken away no L is above C + P2, so a byte holds it as long as P1 + P2 plus the largest cost stays below
+256; a vector then holds twice the disparities that it holds of two bytes each.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from armsight.vision.dense.cost import BLOCK, ONE, TWO, Bytes
 from armsight.vision.dense.winner import Counts
 
-#: Bytes beyond the disparities in a slot of path costs: one before the first and one after the last are never the least.
+#: Bytes beyond the disparities in a slot of path costs: one before the first and one after the last are never the
+#: least.
 _GUARD = np.uintp(16)
 #: What becomes of a row's path costs.
 RUN_UP, WRITE, ADD = range(3)
@@ -96,7 +97,7 @@ def _step(
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _penalty(image: Bytes, y: int, x: int, from_y: int, from_x: int, p2: Bytes) -> np.uint8:
     """Return the penalty of a jump between two neighbouring pixels: less where the light jumps too."""
-    return p2[abs(np.int32(image[y, x]) - np.int32(image[from_y, from_x]))]
+    return np.uint8(p2[abs(np.int32(image[y, x]) - np.int32(image[from_y, from_x]))])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -126,7 +127,8 @@ def forward(
 ) -> None:
     """Go to row y on the paths from the row before, and along it to the right.
 
-    The paths take turns pixel by pixel: the one along the row waits for its own last step, and the others fill the time.
+    The paths take turns pixel by pixel: the one along the row waits for its own last step, and the others fill the
+    time.
 
     Args:
         work: the strip's room, the row's costs in it.

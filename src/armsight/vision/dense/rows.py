@@ -1,8 +1,9 @@
 """Rows that were matched by themselves vote.
 
-Birchfield and Tomasi, IJCV 35(3), 1999, section 4, let disparities that many rows agree on spread over those that few agree
-on, up to where the light changes. Here every pixel takes the disparity that most of its column near it holds, those that look
-like it counting more, and then the same along its row: no thresholds, and a streak is outvoted where it is thin.
+Birchfield and Tomasi, IJCV 35(3), 1999, section 4, let disparities that many rows agree on spread over those that few
+agree on, up to where the light changes. Here every pixel takes the disparity that most of its column near it holds,
+those that look like it counting more, and then the same along its row: no thresholds, and a streak is outvoted where it
+is thin.
 """
 
 from __future__ import annotations

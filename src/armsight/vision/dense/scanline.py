@@ -1,10 +1,10 @@
 """Dynamic programming along rows, and what rows tell their neighbours.
 
-Birchfield and Tomasi, "Depth discontinuities by pixel-to-pixel stereo", IJCV 35(3), 1999: along a row, matches keep their
-order, left pixels that the right camera cannot see are skipped, every break costs, and less where the light changes, for that
-is where depth breaks. A break to a lesser disparity starts from the best way up to there only: their pruning. Rows matched by
-themselves disagree in streaks, so that they then vote (``rows.py``). Where they forbid a break without an edge, it costs more
-here, and a slant of one disparity a pixel is allowed anywhere, for surfaces slant.
+Birchfield and Tomasi, "Depth discontinuities by pixel-to-pixel stereo", IJCV 35(3), 1999: along a row, matches keep
+their order, left pixels that the right camera cannot see are skipped, every break costs, and less where the light
+changes, for that is where depth breaks. A break to a lesser disparity starts from the best way up to there only: their
+pruning. Rows matched by themselves disagree in streaks, so that they then vote (``rows.py``). Where they forbid a break
+without an edge, it costs more here, and a slant of one disparity a pixel is allowed anywhere, for surfaces slant.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.winner import Found, make_found
 
 Whole = NDArray[np.int16]
-#: Penalties in thirds of a census bit. Of a slant; of a break at an edge in the image and without one, so high that noise in
-#: a window of 25 pixels does not pay for it; of a skipped pixel, what an undecided match costs. An edge is a step of so many
-#: grey levels within a pixel to either side, Birchfield and Tomasi's own threshold.
+#: Penalties in thirds of a census bit. Of a slant; of a break at an edge in the image and without one, so high that
+#: noise in a window of 25 pixels does not pay for it; of a skipped pixel, what an undecided match costs. An edge is a
+#: step of so many grey levels within a pixel to either side, Birchfield and Tomasi's own threshold.
 _SLANT, _BREAK_AT_EDGE, _BREAK, _SKIPPED = np.int16(16), np.int16(150), np.int16(250), np.int16(39)
 _EDGE = 5
 _STRIP_ROWS = 96
@@ -68,7 +68,14 @@ def _skip(table: Table, at: np.uintp, stride: np.uintp, size: np.uintp, taken: n
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ways(
-    table: Table, at: np.uintp, stride: np.uintp, size: np.uintp, stop: np.int16, best: np.int16, costs: Bytes, cost: np.uintp
+    table: Table,
+    at: np.uintp,
+    stride: np.uintp,
+    size: np.uintp,
+    stop: np.int16,
+    best: np.int16,
+    costs: Bytes,
+    cost: np.uintp,
 ) -> np.int16:
     """Write the costs of the best ways that end in a pixel, and return their least.
 

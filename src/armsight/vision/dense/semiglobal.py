@@ -1,9 +1,9 @@
 """Semi-global matching: the sum of the best paths from four, five or eight directions.
 
-Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008, with census and Birchfield
-and Tomasi's dissimilarity as the cost. The image is worked on in strips of rows, each by itself from some rows before it
-(with four or eight paths, behind it too): the memory is that of a strip, strips go to threads, and the result is the same
-for any number of them.
+Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008, with census and
+Birchfield and Tomasi's dissimilarity as the cost. The image is worked on in strips of rows, each by itself from some
+rows before it (with four or eight paths, behind it too): the memory is that of a strip, strips go to threads, and the
+result is the same for any number of them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,16 @@ def _costs(pair: Pair, y: int, direction: int, begun: bool, first: int, count: i
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _strip(
-    pair: Pair, begin: int, end: int, paths: int, first: int, count: int, size: np.uintp, p1: np.uint8, p2: Bytes, found: Found
+    pair: Pair,
+    begin: int,
+    end: int,
+    paths: int,
+    first: int,
+    count: int,
+    size: np.uintp,
+    p1: np.uint8,
+    p2: Bytes,
+    found: Found,
 ) -> None:
     """Match the rows from ``begin`` to ``end``."""
     height, width = pair.left.shape
@@ -101,9 +110,7 @@ class Semiglobal:
         p2 = np.maximum(_P2 * _EDGE // (_EDGE + steps), _P1 + 4).astype(np.uint8)
 
         def work(begin: int, end: int) -> None:
-            _strip(
-                pair, begin, end, self.paths, search.first, search.count, np.uintp(size), np.uint8(_P1), p2, found
-            )
+            _strip(pair, begin, end, self.paths, search.first, search.count, np.uintp(size), np.uint8(_P1), p2, found)
 
         on_strips(left.shape[0], _STRIP_ROWS if self.paths == 5 else _STRIP_ROWS_KEPT, work)
         return found

@@ -1,9 +1,9 @@
 """Disparities smoothed within their own surface.
 
-Winners come from whole disparities with a place between them, and that place is noisy where there is little texture. Every
-measured pixel becomes the mean of those near it that lie within a little of it in disparity, weighted by how alike they are
-in grey: along rows, then along columns, a bilateral filter taken apart (Pham and van Vliet 2005). Depth breaks stay, for what
-lies across them is too far off to count.
+Winners come from whole disparities with a place between them, and that place is noisy where there is little texture.
+Every measured pixel becomes the mean of those near it that lie within a little of it in disparity, weighted by how
+alike they are in grey: along rows, then along columns, a bilateral filter taken apart (Pham and van Vliet 2005). Depth
+breaks stay, for what lies across them is too far off to count.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ _STRIP_ROWS = 96
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add(d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles) -> None:
+def _add(
+    d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles
+) -> None:
     """Add neighbours to sums of weighted differences and of weights, a row at a time; NaN never counts."""
     for x in range(d.shape[0]):
         gap = other[x] - d[x]
@@ -36,7 +38,9 @@ def _add(d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rows(source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles) -> None:
+def _rows(
+    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
+) -> None:
     """Smooth along rows."""
     width = source.shape[1]
     up, down = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -76,18 +80,18 @@ def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.floa
         image: (H, W) uint8, the left image.
 
     Returns:
-        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on its
-        surface.
+        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on
+        its surface.
     """
     height = disparity.shape[0]
     share, half, out = np.empty_like(disparity), np.empty_like(disparity), disparity
-    for tolerance in _ROUNDS:
+    for tolerance in map(np.float32, _ROUNDS):
         source, out = out, np.empty_like(disparity)
 
-        def rows(begin: int, end: int, source: Singles = source, limit: np.float32 = np.float32(tolerance)) -> None:
+        def rows(begin: int, end: int, source: Singles = source, limit: np.float32 = tolerance) -> None:
             _rows(source, image, limit, begin, end, half, share)
 
-        def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = np.float32(tolerance)) -> None:
+        def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
             _columns(half, image, limit, begin, end, out, share)
 
         on_strips(height, _STRIP_ROWS, rows)

@@ -1,7 +1,8 @@
 """Is it a pair, and is it in standard form: checks before any matching, each with what to do about it.
 
-The two images must be of one size, their rows must show the same rows of the scene, and what is seen must lie further left
-in the right image than in the left one. The last two are told from a few hundred corners that look alike in both images.
+The two images must be of one size, their rows must show the same rows of the scene, and what is seen must lie further
+left in the right image than in the left one. The last two are told from a few hundred corners that look alike in both
+images.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from armsight.vision.image import grey
 _CORNERS = 1500
 #: A corner's match must be this much better than its next best, and there must be so many before anything is concluded.
 _RATIO, _ENOUGH = 0.75, 30
-#: Rows that the images may be apart, px: at the first the matching suffers, beyond the second it is no pair in standard form.
+#: Rows that the images may be apart, px: at the first the matching suffers, beyond the second it is no pair in standard
+#: form.
 _VERTICAL_NOTE_PX, VERTICAL_MAX_PX = 1.0, 2.5
 #: Share of corners that must lie on the wrong side before the images are taken for exchanged.
 _EXCHANGED = 0.8
-#: An image that, with its pixel noise smoothed away, stays within so many grey levels of its surroundings almost everywhere
-#: has no texture to match.
+#: An image that, with its pixel noise smoothed away, stays within so many grey levels of its surroundings almost
+#: everywhere has no texture to match.
 _TEXTURE, _TEXTURED_SHARE = 1.5, 0.002
 
 
@@ -90,12 +92,14 @@ def check_standard(left: Image, right: Image) -> str | None:
     size = float(np.sqrt((apart**2).mean()))
     if size > VERTICAL_MAX_PX:
         raise InputError(
-            f"the images are not in standard form: what is in one row of the left image is {size:.1f} px off that row in the "
-            f"right one (median {np.median(apart):+.1f}); rectify them first, or give the RIG.json they were taken with"
+            f"the images are not in standard form: what is in one row of the left image is {size:.1f} px off that row "
+            f"in the right one (median {np.median(apart):+.1f}); rectify them first, or give the rig they were taken with"
         )
     level = np.abs(corners[:, 3] - corners[:, 1] - apart) <= 3
     if level.sum() >= _ENOUGH and (corners[level, 2] > corners[level, 0] + 1).mean() > _EXCHANGED:
-        raise InputError("left and right image are exchanged: what is near lies further right in the right one; swap them")
+        raise InputError(
+            "left and right image are exchanged: what is near lies further right in the right one; swap them"
+        )
     if size > _VERTICAL_NOTE_PX:
         return f"the rows of the two images are {size:.1f} px apart: matching suffers; calibrate again"
     return None
@@ -154,13 +158,13 @@ def match_pair(
     Raises:
         InputError: not images, not of one size, exchanged, not in standard form, or a search that leaves the image.
     """
-    images = [plain_grey(image, side) for image, side in zip((left, right), SIDES, strict=True)]
-    check_sizes(*images)
-    check_search(search, images[0].shape[1])
-    for image, side in zip(images, SIDES, strict=True):
+    a, b = plain_grey(left, "left"), plain_grey(right, "right")
+    check_sizes(a, b)
+    check_search(search, a.shape[1])
+    for image, side in zip((a, b), SIDES, strict=True):
         if (problem := untextured(image, side)) is not None:
             return Disparity.none((image.shape[0], image.shape[1]), search, problem)
-    remark = check_standard(*images)
+    remark = check_standard(a, b)
     if remark is not None:
         note(remark)
-    return method.match(*images, search)
+    return method.match(a, b, search)

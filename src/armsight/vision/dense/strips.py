@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numba
 
@@ -20,7 +21,7 @@ def on_strips(height: int, rows: int, work: Callable[[int, int], None]) -> None:
     bounds = [height * k // count for k in range(count + 1)]
     threads = min(count, numba.get_num_threads())
     if threads == 1:
-        for begin, end in zip(bounds, bounds[1:], strict=False):
+        for begin, end in pairwise(bounds):
             work(begin, end)
         return
     with ThreadPoolExecutor(threads) as pool:

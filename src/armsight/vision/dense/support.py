@@ -1,7 +1,7 @@
 """Matching costs and supports that work on one disparity at a time.
 
-A strip of rows and a disparity go in, a plane of costs comes out; a support then gathers each pixel's neighbours. Planes are
-rounded to whole numbers and judged as the totals of the other methods are.
+A strip of rows and a disparity go in, a plane of costs comes out; a support then gathers each pixel's neighbours.
+Planes are rounded to whole numbers and judged as the totals of the other methods are.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from armsight.vision.dense.winner import Counts, Found, Singles, choose_row, mak
 _FINE = 32.0
 #: Grey levels beyond which absolute differences are just different.
 _SAD_CUT = 40.0
-#: The guided filter's regularisation: variance of grey levels that still counts as flat (Hosni et al. use 0.01^2 of full
-#: scale), and the step in grey that ends an arm of a shaped window, with the shorter one it keeps anyway.
+#: The guided filter's regularisation: variance of grey levels that still counts as flat (Hosni et al. use 0.01^2 of
+#: full scale), and the step in grey that ends an arm of a shaped window, with the shorter one it keeps anyway.
 _FLAT_VARIANCE = (0.01 * 255) ** 2
 _ARM_STEP = 15
 _STRIP_ROWS = 64

@@ -97,7 +97,9 @@ def choose_row(
     """
     width = found.disparity.shape[1]
     best_right[:] = NOWHERE
-    for phase in range(count):  # pixels that share no right pixel follow one another: none waits for what the last wrote
+    for phase in range(
+        count
+    ):  # pixels that share no right pixel follow one another: none waits for what the last wrote
         for x in range(phase, width, count):
             n, right = _tried(x, first, count), np.uintp(width - 1 - x + first)
             found.disparity[y, x] = _least_of(total, at + np.uintp(x) * size, n, best_right, right)
@@ -106,7 +108,10 @@ def choose_row(
         o, d = at + np.uintp(x) * size, np.uintp(found.disparity[y, x])
         least, offset, curvature = np.float32(total[o + d]), np.float32(0), np.float32(0)
         if np.uintp(0) < d < n - np.uintp(1):
-            below, above = np.float32(total[o + d - np.uintp(1)]) - least, np.float32(total[o + d + np.uintp(1)]) - least
+            below, above = (
+                np.float32(total[o + d - np.uintp(1)]) - least,
+                np.float32(total[o + d + np.uintp(1)]) - least,
+            )
             curvature = below + above
             if curvature > 0:  # two lines of equal slope, not a parabola: the totals are sums of absolute differences
                 offset = np.float32(0.5) * (below - above) / max(below, above)
