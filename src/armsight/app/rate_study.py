@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.app.experiment import Outcome, Progress, timing
+from armsight.app.experiment import PRIOR, Outcome, Progress, timing
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_data import RunData, assembled
 from armsight.app.run_loop import Log, Loop
@@ -68,7 +68,9 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     assert outcome.handeye is not None
     station.board.enable()
     log = Log()
-    loop = Loop(station, Follower(rig, station.target), log, KalmanEstimator(station.arm, delay=outcome.delay))
+    loop = Loop(
+        station, Follower(rig, station.target), log, KalmanEstimator(station.arm, prior=PRIOR, delay=outcome.delay)
+    )
     loop.mounting = outcome.handeye.mounting
     servo = PoseServo(station.arm, timing(station, outcome.delay))
     kinds = [motion.kind for motion in plan.motions]

@@ -164,7 +164,7 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     way = point_to_point(arm, q_start, q_middle)
     there = Segment("calibration", "sweep's start", "joints", False, trajectory=way)
     loop.run(Planned(way, loop.t_s, gravity), way.duration_s + DELAY_REST_S, there, watch=False)
-    sweep = Sweep(q_middle)
+    sweep = Sweep(arm, q_middle)
     looked = len(loop.log.poses)
     controller = Planned(sweep, loop.t_s, gravity)
     loop.run(controller, sweep.duration_s, Segment("calibration", "sweep", "joints", False, trajectory=sweep))

@@ -24,7 +24,8 @@ class RunData(Record):
         q_wanted: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
         potentiometers: where the table of the arm has the tool with them.
         vision: where each used shot saw it.
-        fused: where the estimator had it, when it was asked.
+        fused: where the estimator has it, a little later, with vision on both sides of each time.
+        live: where the estimator had it at once: what the loop goes by.
         wanted: where it was to be, at the times something was planned.
         truth: where it was; None for a real arm.
         segments: what happened when.
@@ -40,6 +41,7 @@ class RunData(Record):
     potentiometers: ToolTrack
     vision: ToolTrack
     fused: ToolTrack
+    live: ToolTrack
     wanted: ToolTrack
     truth: ToolTrack | None
     segments: tuple[Segment, ...]
@@ -90,6 +92,11 @@ def assembled(
             np.concatenate([part.Ts_base_tool for part in fused]),
             np.concatenate([part.covs for part in fused if part.covs is not None]),
         ),
+        named.track(
+            np.array([e.t_s for e in log.live]),
+            np.array([e.T_base_tool for e in log.live]),
+            np.array([e.cov for e in log.live]),
+        ),
         named.track(t_s[planned], arm.forward(q_wanted[planned])),
         None if truth is None else named.track(*truth),
         tuple(log.segments),
@@ -134,6 +141,7 @@ def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
         potentiometers=within(run.potentiometers),
         vision=within(run.vision),
         fused=within(run.fused),
+        live=within(run.live),
         wanted=within(run.wanted),
         segments=tuple(s for s in run.segments if s.begin_s >= begin_s - 1e-9 and s.end_s <= end_s + 1e-9),
     )

@@ -91,7 +91,13 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
 
 def _tracks(run: RunData) -> dict[str, ToolTrack]:
     """Return the tracks that are written, by the name of their file."""
-    named = {"potentiometers": run.potentiometers, "vision": run.vision, "fused": run.fused, "wanted": run.wanted}
+    named = {
+        "potentiometers": run.potentiometers,
+        "vision": run.vision,
+        "fused": run.fused,
+        "live": run.live,
+        "wanted": run.wanted,
+    }
     return named if run.truth is None else {**named, "truth": run.truth}
 
 
@@ -133,7 +139,7 @@ def _summary(finished: Finished, run: RunData, before: RunData | None, after: Ru
     assert outcome.handeye is not None
     summary: dict[str, Any] = {}
     if run.truth is not None and before is not None:
-        for name in ("vision", "potentiometers", "fused"):
+        for name in ("vision", "potentiometers", "fused", "live"):
             track: ToolTrack = getattr(before, name)
             moving = (track.phase == "open_loop") & ~_hidden(track, outcome.covered_s)
             resting = (track.phase == "rest") & ~_hidden(track, outcome.covered_s)
@@ -144,8 +150,12 @@ def _summary(finished: Finished, run: RunData, before: RunData | None, after: Ru
                 }
         hidden = _hidden(before.fused, outcome.covered_s)
         if outcome.covered_s is not None and hidden.any():
-            worst = track_figures(before.fused[hidden], run.truth)["position_max_m"]
-            summary["occlusion"] = {"duration_s": float(np.ptp(outcome.covered_s)), "fused_position_max_m": worst}
+            found = track_figures(before.fused[hidden], run.truth)
+            summary["occlusion"] = {
+                "duration_s": float(np.ptp(outcome.covered_s)),
+                "fused_position_rms_m": found["position_rms_m"],
+                "fused_position_max_m": found["position_max_m"],
+            }
     if before is not None and after is not None:
         summary["closed_loop"] = _closed(before, after)
     if len(run.latency_s):

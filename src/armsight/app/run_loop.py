@@ -17,7 +17,7 @@ from armsight.app.run_station import Station
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
-from armsight.loop.estimators import Estimator, Mounting, Verdict
+from armsight.loop.estimators import ArmEstimate, Estimator, KalmanEstimator, Mounting, Verdict
 from armsight.robot.boards.codes import State
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.follow import Follower
@@ -26,6 +26,10 @@ from armsight.vision.follow import Follower
 PERIOD_S = 0.004
 #: Without a shot for so long the cameras have stalled, s.
 STALLED_S = 0.5
+#: The fused track is written down so late, s: the sightings on both sides of a time have come by then. The loop does not
+#: wait for that.
+RECORD_LAG_S = 0.04
+_LAST_BATCHES = 32  # of readings that hold all within that lag
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 
 
@@ -66,7 +70,8 @@ class Log:
 
     Attributes:
         joints: the potentiometers, batch by batch.
-        fused: where the estimator had the tool at each reading, batch by batch.
+        fused: where the estimator has the tool at each reading, RECORD_LAG_S later, batch by batch.
+        live: where it had the tool at the newest reading, turn by turn: what the loop goes by.
         poses: each shot's name, stamp and pose (the cameras' skew in its covariance), or why there is none.
         verdicts: what the estimator made of those it was given.
         commands: when each was sent, and what.
@@ -77,6 +82,7 @@ class Log:
 
     joints: list[JointStates] = field(default_factory=list)
     fused: list[ToolTrack] = field(default_factory=list)
+    live: list[ArmEstimate] = field(default_factory=list)
     poses: list[tuple[str, float, PoseEstimate | Missed]] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[tuple[float, JointCommand]] = field(default_factory=list)
@@ -100,7 +106,7 @@ class Loop:
         t_s: time of the newest reading, board's clock.
     """
 
-    def __init__(self, station: Station, follower: Follower, log: Log, estimator: Estimator) -> None:
+    def __init__(self, station: Station, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
         self.board, self.station, self.follower = station.board, station, follower
         self.estimator, self.log = estimator, log
         self.mounting: Mounting | None = None
@@ -108,13 +114,21 @@ class Loop:
         self.t_s = 0.0
         self._shot_s: float | None = None
         self._last: tuple[float, Array] | None = None
+        self._written_s = -np.inf
         while not log.joints:
             self.pass_time(PERIOD_S)
 
-    def begin(self, estimator: Estimator) -> None:
-        """Take another estimator from here on; it hears the last readings first."""
-        self.estimator = estimator
-        estimator.joints(self.log.joints[-1])
+    def begin(self, estimator: KalmanEstimator) -> None:
+        """Take another estimator from here on, after it has learned from everything measured so far."""
+        assert self.mounting is not None
+        seen = [(t_s, pose) for _, t_s, pose in self.log.poses if isinstance(pose, PoseEstimate)]
+        at = 0
+        for states in self.log.joints:
+            estimator.joints(states)
+            while at < len(seen) and seen[at][0] <= states.t_s[-1]:
+                estimator.vision(self.mounting.sighting(seen[at][1], seen[at][0]))
+                at += 1
+        self.estimator, self._written_s = estimator, self.t_s
 
     def pass_time(self, wait_s: float) -> None:
         """Let time pass and hear the joints."""
@@ -124,9 +138,19 @@ class Loop:
         self.t_s = float(states.t_s[-1])
         self.log.joints.append(states)
         self.estimator.joints(states)
-        track = self.estimator.track(states.t_s)
-        none = np.full(len(states.t_s), "")
-        self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
+        self.log.live.append(self.estimator.estimate())
+        self._record()
+
+    def _record(self) -> None:
+        """Write down where the tool was, as late as RECORD_LAG_S: with the sightings on both sides of a time."""
+        wanted = [s.t_s for s in self.log.joints[-_LAST_BATCHES:]]
+        t_s = np.concatenate(wanted)
+        t_s = t_s[(t_s > self._written_s) & (t_s <= self.t_s - RECORD_LAG_S)]
+        if len(t_s):
+            track = self.estimator.smoothed(t_s)
+            none = np.full(len(t_s), "")
+            self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
+            self._written_s = float(t_s[-1])
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""

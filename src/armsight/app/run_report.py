@@ -41,6 +41,7 @@ for (const box of document.querySelectorAll(".zoom")) {
   box.addEventListener("dblclick", () => { k = 1; x = y = 0; show(); });
 }
 """
+_NAMES = {"fused": "fused, 40 ms later", "live": "fused, at once"}
 _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{}</div>'
 _IMG = '<img src="data:image/{};base64,{}" alt="{}" style="transform-origin:0 0" draggable="false">'
 
@@ -162,7 +163,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
 def _tracks(s: Mapping[str, Any]) -> str:
     """Return the table of the three tracks."""
     rows = []
-    for name in ("potentiometers", "vision", "fused"):
+    for name in ("potentiometers", "vision", "fused", "live"):
         t = s.get(name)
         if t is None or "position_rms_m" not in t:
             continue
@@ -174,7 +175,7 @@ def _tracks(s: Mapping[str, Any]) -> str:
         inside = f"{100 * t['inside_95_share']:.0f}%" if "inside_95_share" in t else "–"
         rows.append(
             (
-                name,
+                _NAMES.get(name, name),
                 f"<b>{1e3 * t['position_rms_m']:.3f}</b>",
                 f"{1e3 * t['position_max_m']:.3f}",
                 f"<b>{_DEG * t['orientation_rms_rad']:.3f}</b>",

@@ -10,6 +10,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+_TRACKS = {
+    "potentiometers": "potentiometers",
+    "vision": "vision",
+    "fused": "fused, 40 ms later",
+    "live": "fused, at once",
+}
 _DEG = float(np.degrees(1.0))
 
 
@@ -45,11 +51,11 @@ def _tracks(summary: Mapping[str, Any]) -> Table:
     table = Table(title="The tool in motion, against the truth")
     for column in ("", "position RMS", "max", "at rest RMS", "turn RMS", "sigma claimed"):
         table.add_column(column, justify="right" if column else "left")
-    for name in ("potentiometers", "vision", "fused"):
+    for name, shown in _TRACKS.items():
         t = summary[name]
         sigma = f"{1e3 * t['position_sigma_rms_m']:.3f} mm" if "position_sigma_rms_m" in t else "none"
         table.add_row(
-            name,
+            shown,
             f"{1e3 * t['position_rms_m']:.3f} mm",
             f"{1e3 * t['position_max_m']:.3f} mm",
             f"{1e3 * t['rest_position_rms_m']:.3f} mm",
