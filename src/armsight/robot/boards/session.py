@@ -20,6 +20,7 @@ SILENT_S = 1.0
 STEP_S = 0.01
 _HELLOS = 20
 _STEPS = 5  # between one hello and the next
+_TELEMETRY_STEPS = 300  # the rarest message comes once a second at 9600 baud
 _WRAP = 1 << 32
 
 
@@ -154,7 +155,7 @@ class Session:
         self.ticks_per_s, self._tick = welcome.ticks_per_s, message.tick
 
     def _first_telemetry(self) -> None:
-        for _ in range(_HELLOS * _STEPS):
+        for _ in range(_TELEMETRY_STEPS):
             self.pump(STEP_S)
             if hasattr(self, "status") and hasattr(self, "joints"):
                 self.angles.clear()
