@@ -48,7 +48,7 @@ class EmulatedLink:
     Args:
         machine: runs the firmware; closed with the link.
         plant: the arm at the board's motors.
-        baud: bits a second towards the board.
+        baud: bits a second towards the board, as its own wire has: it gives a message up that comes much slower.
         faults: what goes wrong on the wire.
         advance: lets a number of seconds pass in place of this link, whose ``step`` it must call once a millisecond:
             for a world that owns the time.
