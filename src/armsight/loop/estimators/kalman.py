@@ -171,7 +171,9 @@ class KalmanEstimator:
         times = (t_s - before.t_s) / max(after.t_s - before.t_s, 1e-9)
         share = np.clip(come / whole if whole > STILL_RAD else times, 0.0, 1.0)
         ahead = self._moved(before, joints)
-        back = self._moved(after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints)
+        back = self._moved(
+            after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints
+        )
         Ts, Hs = self._model(before.x * ahead.kept, joints.q, joints.side)
         Ts_after, _ = self._model(after.x * back.kept, joints.q, joints.side)
         Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
