@@ -103,14 +103,12 @@ def open_timing(spec: str) -> Timing:
     Raises:
         InputError: of another form, or out of range.
     """
-    kind, _, rest = (
-        spec.rpartition(":") if ":" in spec else ("webcams", "", "") if spec == "webcams" else ("", "", spec)
-    )
-    base = WEBCAMS if kind == "webcams" else Timing()
-    if kind == "webcams" and not rest:
+    text = spec.strip()
+    base = WEBCAMS if text.startswith("webcams") else Timing()
+    if text == "webcams":
         return base
-    match = re.fullmatch(r"(\d+)x(\d+)@(\d+(?:\.\d+)?)", rest)
-    if kind not in ("", "webcams") or not match:
+    match = re.fullmatch(r"(?:webcams:)?(\d+)x(\d+)@(\d+(?:\.\d+)?)", text)
+    if not match:
         raise InputError(f"cameras {spec!r}: expected {_FORM}")
     width, height, rate = int(match[1]), int(match[2]), float(match[3])
     if not _WIDTHS[0] <= width <= _WIDTHS[1] or not 240 <= height <= width:

@@ -23,14 +23,27 @@ Counts = NDArray[np.uint32]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _converted(share: Array, noise: NDArray[np.float32], steps: float, counts: Counts) -> None:
-    """Convert wiper voltages (6,), shares of the supply, with noise (6, n) in steps; averages into counts (6,)."""
+def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, out: Array) -> None:
+    """Write what potentiometers say too much at shaft angles (N, 6) into out (N, 6)."""
+    for n in range(shaft.shape[0]):
+        for i in range(6):
+            along = (shaft[n, i] - low[i]) / span[i]
+            total = offset[i]
+            for k in range(sines.shape[1]):
+                total += sines[i, k, 0] * np.sin(2 * np.pi * sines[i, k, 1] * along + sines[i, k, 2])
+            out[n, i] = total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _converted(said: Array, low: Array, span: Array, noise: NDArray[np.float32], steps: float, counts: Counts) -> None:
+    """Convert what wipers say (6,), rad, with noise (6, n) in steps; averages into counts (6,)."""
     n = noise.shape[1]
     for i in range(6):
+        share = LOW_SHARE + (HIGH_SHARE - LOW_SHARE) * (said[i] - low[i]) / span[i]
         total = 0.0
         for k in range(n):
-            total += min(max(np.floor(share[i] * steps + noise[i, k] + 0.5), 0.0), steps - 1.0)
-        counts[i] = np.uint32(min(np.floor(total / n * (65536.0 / steps) + 0.5), 65535.0))
+            total += min(max(np.floor(share * steps + noise[i, k] + 0.5), 0.0), steps - 1.0)
+        counts[i] = np.uint32(min(np.floor(total / n * (COUNTS / steps) + 0.5), COUNTS - 1.0))
 
 
 class Potentiometers:
@@ -44,20 +57,19 @@ class Potentiometers:
             travel: (6, 2) joint angles at the ends of their travel, rad.
             seed: of the noise.
         """
-        self._true, self._travel = true, travel
-        self._span = np.ptp(travel, axis=1)
+        self._given = true.imperfections
+        self._low, self._span = travel[:, 0].copy(), np.ptp(travel, axis=1)
+        self._offset, self._sines = true.pot_offset_rad.copy(), true.pot_sines.copy()
         self._rng = np.random.default_rng([seed, 2])
         self._noise = np.zeros((0, 6, 0), np.float32)
         self._next = 0
-        self._steps = float(1 << true.imperfections.adc_bits)
+        self._steps = float(1 << self._given.adc_bits)
 
     def error(self, shaft: Array) -> Array:
-        """Return what they say too much at shaft angles (..., 6), rad."""
-        amplitude, cycles, phase = np.moveaxis(self._true.pot_sines, 2, 0)
-        along = (shaft - self._travel[:, 0]) / self._span
-        return np.asarray(
-            self._true.pot_offset_rad + (amplitude * np.sin(2 * np.pi * cycles * along[..., None] + phase)).sum(axis=-1)
-        )
+        """Return what they say too much at shaft angles (N, 6), rad."""
+        out = np.empty(shaft.shape)
+        _errors(np.ascontiguousarray(shaft), self._offset, self._sines, self._low, self._span, out)
+        return out
 
     def read(self, shaft: Array) -> Counts:
         """Read them once.
@@ -69,12 +81,10 @@ class Potentiometers:
             (6,) counts, uint32, 0 to 65535.
         """
         if self._next == len(self._noise):
-            given = self._true.imperfections
-            block = self._rng.standard_normal((_BLOCK, 6, given.oversampling), dtype=np.float32)
-            self._noise, self._next = block * np.float32(given.pot_noise_lsb), 0
-        said = shaft + self.error(shaft)
-        share = LOW_SHARE + (HIGH_SHARE - LOW_SHARE) * (said - self._travel[:, 0]) / self._span
+            block = self._rng.standard_normal((_BLOCK, 6, self._given.oversampling), dtype=np.float32)
+            self._noise, self._next = block * np.float32(self._given.pot_noise_lsb), 0
         counts = np.empty(6, np.uint32)
-        _converted(share, self._noise[self._next], self._steps, counts)
+        said = shaft + self.error(shaft[None])[0]
+        _converted(said, self._low, self._span, self._noise[self._next], self._steps, counts)
         self._next += 1
         return counts
