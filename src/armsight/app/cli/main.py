@@ -21,6 +21,7 @@ COMMANDS = {
     "body": "body",
     "calibrate": "calibrate",
     "cameras": "cameras",
+    "check": "check",
     "demo": "demo",
     "dense": "dense",
     "identify": "identify",

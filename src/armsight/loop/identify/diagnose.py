@@ -18,6 +18,7 @@ from armsight.errors import InputError
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.place import linear_placement
 from armsight.robot.arm import Arm
+from armsight.robot.kinematics import chain
 
 #: Worse than this part of the space that the points span (RMS about their middle), and this many m, is another arm.
 BAD_SHARE, BAD_M = 0.08, 0.015
@@ -43,17 +44,24 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     Raises:
         InputError: with the unit, the order or the signs that fit, or that none does.
     """
+    if np.abs(measured.q).max() > chain.MOST_RADIANS:
+        row, joint = divmod(int(np.argmax(np.abs(measured.q))), 6)
+        raise InputError(
+            f"joint {joint + 1} of row {row + 1} is at {measured.q[row, joint]:g} rad, further than any joint turns: are "
+            "the angles in degrees? name the columns q1_deg .. q6_deg"
+        )
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
     q, p = measured.q[rows], measured.p_rig[rows]
     off, scale = misfit(arm, q, p)
     span = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=2))))
-    if span < 1e-9:
-        raise InputError("the tool was seen at one place only; move every joint between poses")
-    if abs(np.log(scale)) > np.log1p(SCALE_OFF) and off < max(BAD_SHARE * span, BAD_M * scale):
-        raise InputError(_unit(scale))
-    if off < max(BAD_SHARE * span, BAD_M):
+    scaled = abs(np.log(scale)) > np.log1p(SCALE_OFF)
+    good = off < max(BAD_SHARE * span, BAD_M * (scale if scaled else 1.0))
+    if good and not scaled:
         return
-    raise InputError(_proposal(arm, q, p, off) or _no_arm(off))
+    told = _angles(arm, q, p, off)
+    if told is None:
+        told = _unit(scale) if good else _proposal(arm, q, p, off, max(BAD_SHARE * span, BAD_M))
+    raise InputError(told or _no_arm(off))
 
 
 def misfit(arm: Arm, q: Array, p_rig: Array) -> tuple[float, float]:
@@ -81,13 +89,22 @@ def _unit(scale: float) -> str:
     return f"the points are {scale:.3g} times as large as this arm's motions: is it the right model, in the right unit?"
 
 
-def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str | None:
-    """Return what makes the data fit, or None."""
+def _angles(arm: Arm, q: Array, p: Array, off: float) -> str | None:
+    """Return the unit of the joint angles that makes the data fit, scale and all, or None."""
     for factor, what in _ANGLES:
-        if np.abs(q * factor).max() < 20 and misfit(arm, q * factor, p)[0] < off / BETTER:
-            return f"the arm's motions fit if the joint angles are in {what} (off by {1e3 * off:.0f} mm as they are)"
+        if np.abs(q * factor).max() < chain.MOST_RADIANS:
+            better, scale = misfit(arm, q * factor, p)
+            if abs(np.log(scale)) < np.log1p(SCALE_OFF) and better < off / BETTER:
+                return (
+                    f"the arm's motions fit if the joint angles are in {what} (off by {1e3 * off:.0f} mm as they are)"
+                )
+    return None
+
+
+def _proposal(arm: Arm, q: Array, p: Array, off: float, bad: float) -> str | None:
+    """Return the order and the signs that make the data fit, or None."""
     order, signs, best = _search(arm, q, p)
-    if best > off / BETTER:
+    if best > min(off / BETTER, bad):
         return None
     told = []
     if order != tuple(range(6)):

@@ -28,6 +28,8 @@ from armsight.robot.arm import Arm
 
 #: Fewest poses: what places base and tool, with some to spare.
 LEAST_POINTS, LEAST_FULL = 6, 4
+#: Joints that move less than this, rad, do not move.
+ALIKE = 0.02
 #: Correlations larger than this are told.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")
@@ -172,6 +174,8 @@ def _require_enough(measured: Measured) -> None:
         raise InputError(
             f"{len(measured)} poses are fewer than {least}, which base and tool alone need; 50 and more are advised"
         )
+    if np.ptp(measured.q, axis=0).max() < ALIKE:
+        raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
 
 
 def _require_placed(

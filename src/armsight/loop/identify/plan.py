@@ -92,7 +92,7 @@ def plan_poses(
     P = _prior_covariance(model, prior, free)
     if done is not None:
         Jd = _whitened(model, x, done, noise)[:, :, free].reshape(-1, int(free.sum()))
-        P = np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd)
+        P = np.asarray(np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd))
     J = J[:, :, free]
     wanted = _wanted(model, x, seen, free, rng)
     chosen, sigma = _greedy(J, P, wanted, n)

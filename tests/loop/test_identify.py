@@ -1,0 +1,244 @@
+"""Identification of a worn arm whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worn_arm import distance_m, poses, worn
+
+from armsight.errors import CalibrationError, InputError
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.identify.corrected import Corrected
+from armsight.loop.identify.fit import fit
+from armsight.loop.identify.growth import PLACEMENT
+from armsight.loop.identify.identify import contributions, identify
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.observable import observed
+from armsight.loop.identify.place import placed
+from armsight.loop.identify.plan import plan_poses
+from armsight.loop.identify.priors import prior_sigma
+from armsight.loop.identify.validate import validate
+from armsight.robot.models import open_arm
+
+
+def points_of(measured, w, body_points):
+    """What a tracker sees of points on the body, with 0.05 mm of noise."""
+    rng = np.random.default_rng(9)
+    T = w.T_rig_body(measured.q, measured.approach)
+    p = np.stack([T[:, :3, :3] @ b + T[:, :3, 3] for b in body_points], axis=1)
+    return Measured(measured.q, p + rng.normal(0, 5e-5, p.shape), None, None, measured.approach)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    w, rng = worn(1), np.random.default_rng(101)
+    measured = w.seen(*poses(w.nominal, 60, rng), rng)
+    return w, measured, identify(w.nominal, measured), rng
+
+
+def truth_of(w):
+    out = {}
+    for i in range(6):
+        n = i + 1
+        out |= {
+            f"a{n}": w.true.a[i],
+            f"d{n}": w.true.d[i],
+            f"alpha{n}": w.true.alpha[i],
+            f"offset{n}": w.true.offset[i],
+        }
+        out |= {f"backlash{n}": w.backlash[i], f"gain{n}": w.gain[i]}
+    return out
+
+
+def test_a_worn_arm_is_found_out(scene):
+    w, _, found, _ = scene
+    rng = np.random.default_rng(3)
+    q, approach = poses(w.nominal, 200, rng)
+    truth = w.T_rig_body(q, approach)
+    before, after = (distance_m(found.model, x, truth, q, approach).mean() for x in (found.nominal, found.solution.x))
+    assert after < before / 8  # the figure asked for
+    assert after < 0.25e-3
+    for i in range(6):
+        assert found.value(f"backlash{i + 1}")[0] == pytest.approx(w.backlash[i], abs=np.deg2rad(0.02))
+
+
+def test_what_is_told_alone_is_within_its_sigma(scene):
+    w, _, found, _ = scene
+    told = {name: true for name, true in truth_of(w).items() if name not in found.reasons and found.value(name)[1] > 0}
+    assert len(told) > 15
+    off = np.array([(found.value(name)[0] - true) / found.value(name)[1] for name, true in told.items()])
+    assert np.abs(off).max() < 4  # of 20 numbers: 0.1 % by chance
+    assert np.sqrt(np.mean(off**2)) < 1.5
+
+
+def test_hayatis_angle_stands_where_axes_are_parallel_and_nowhere_else(scene):
+    _, _, found, _ = scene
+    assert "not needed" in found.reasons["beta1"]
+    assert "not needed" in found.reasons["beta4"]
+    assert "not needed" not in found.reasons.get("beta2", "")
+    assert "not needed" not in found.reasons.get("beta3", "")
+    for name in ("d3", "d4"):  # axes 2, 3 and 4 are parallel: only the sum of their offsets is told
+        assert found.reasons[name] == "kept at its nominal value: no pose can tell it from d2"
+    assert found.reasons["d2"] == "tied: its value also holds what is off in d3, d4"
+
+
+def test_the_gauge_is_told():
+    arm, rng = open_arm("puma560"), np.random.default_rng(0)
+    q = rng.uniform(-1, 1, (60, 6))
+    measured = Measured(q, (arm.forward(q) @ [0.05, 0.03, 0.1, 1.0])[:, None, :3])
+    model, x = placed(Model.of(arm, measured, backlash=False), measured)
+    seen = observed(model, x, measured, prior_sigma(model), (1e-5, 0.0))
+    table = [p.name for p, f in zip(model.parameters, seen.free, strict=True) if f and p.kind not in PLACEMENT]
+    geometric = [name for name in table if name.rstrip("123456") in ("a", "d", "alpha", "offset", "beta")]
+    # A complete model of six turning joints and one point has 4 x 6 + 6 - 3 numbers, nine of them base and tool.
+    assert len(geometric) == 4 * 6 + 6 - 3 - 9
+    assert "base_z" in seen.reasons["d1"]
+    assert "base_rz" in seen.reasons["offset1"]
+
+
+def test_the_fit_is_least_squares(scene):
+    from scipy.optimize import least_squares
+
+    w, _, _, rng = scene
+    measured = replace(w.seen(*poses(w.nominal, 40, rng), rng), cov=None)
+    model, x = placed(Model.of(w.nominal, measured, backlash=False).with_features(()), measured)
+    prior = prior_sigma(model)
+    free = np.array([p.kind in PLACEMENT or p.name in ("a2", "a3", "offset2", "alpha3") for p in model.parameters])
+    s = fit(model, x, measured, free, prior, used=np.ones(len(measured), bool))
+    phi, nominal = model.feature_values(measured.q, None), model.nominal()
+    weight = np.repeat([1 / s.noise[0], 1 / s.noise[1]], 3)
+
+    def cost(v):
+        y = s.x.copy()
+        y[free] = v
+        pull = ((y - nominal) / prior)[free & np.isfinite(prior)]
+        return np.concatenate([(model.residuals(y, measured, phi) * weight).ravel(), pull])
+
+    best = least_squares(cost, s.x[free], x_scale=np.diag(s.cov)[free] ** 0.5, xtol=1e-12, ftol=1e-12)
+    assert np.abs((best.x - s.x[free]) / np.sqrt(np.diag(s.cov)[free])).max() < 0.01
+    assert np.mean((cost(s.x[free])[: 6 * len(measured)]) ** 2) == pytest.approx(1 - free.sum() / (6 * 40), rel=0.1)
+
+
+def test_gross_errors_are_left_out_and_do_no_harm(scene):
+    w, measured, found, _ = scene
+    rng = np.random.default_rng(8)
+    bad = rng.choice(60, 3, replace=False)
+    p = measured.p_rig.copy()
+    p[bad, 0] += rng.normal(0, 1, (3, 3)) * 0.01 / np.sqrt(3)
+    spoilt = identify(w.nominal, replace(measured, p_rig=p))
+    assert set(bad) <= set(spoilt.left_out)
+    assert len(spoilt.left_out) <= 5
+    for name in ("a2", "offset4", "backlash2"):
+        assert abs(spoilt.value(name)[0] - truth_of(w)[name]) < 4 * spoilt.value(name)[1]
+    assert found.left_out.size == 0
+
+
+def test_several_points_do_as_poses_do(scene):
+    w, measured, _, _ = scene
+    body = np.array([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [-0.05, 0.02, 0.0]])
+    seen = points_of(measured, w, body)
+    found = identify(w.nominal, seen)
+    rng = np.random.default_rng(3)
+    q, approach = poses(w.nominal, 100, rng)
+    v = validate(found, points_of(Measured(q, np.zeros((100, 1, 3)), None, None, approach), w, body))
+    assert not v.placed_anew
+    assert v.identified.summary()["mean_m"] < v.nominal.summary()["mean_m"] / 8
+    assert 0.7 < v.residual_over_predicted < 1.5
+
+
+def test_another_set_up_is_placed_anew(scene):
+    w, _, found, rng = scene
+    q, approach = poses(w.nominal, 40, rng)
+    moved = replace(w, T_rig_base=w.T_rig_base @ inverse(w.T_flange_body))
+    v = validate(found, moved.seen(q, approach, rng))
+    assert v.placed_anew
+    assert v.identified.summary()["mean_m"] < 0.3e-3
+
+
+def test_a_perfect_arm_is_left_as_it_is():
+    arm, rng = open_arm("six_r"), np.random.default_rng(4)
+    none = np.zeros(6)
+    w = replace(worn(0), true=arm, backlash=none, compliance=none, gain=none, waves=np.zeros((6, 0, 2)))
+    measured = w.seen(*poses(arm, 60, rng), rng)
+    found = identify(arm, measured)
+    kept = [n for n, f in zip(found.model.names, found.solution.free, strict=True) if f]
+    beyond = [n for n in kept if not n.startswith(("base", "tool"))]
+    assert len(beyond) <= 12  # what pays by chance
+    assert sum(contributions(found, measured).values()) < 2e-4
+    q, approach = poses(arm, 100, rng)
+    assert distance_m(found.model, found.solution.x, w.T_rig_body(q, approach), q, approach).mean() < 1e-4
+
+
+def test_readings_bring_the_tool_there(scene):
+    w, _, found, rng = scene
+    corrected = Corrected.of(found)
+    q, approach = poses(w.nominal, 5, rng)
+    for T, angles, side in zip(corrected.forward(q, approach), q, approach, strict=True):
+        back = corrected.readings(T, angles + 0.05, side)
+        assert np.abs(log_se3(inverse(T) @ corrected.forward(back[None], side[None])[0])).max() < 1e-8
+    assert corrected.readings(np.diag([1, 1, 1, 1.0]) + 5 * np.eye(4, k=3), q[0]) is None
+
+
+def test_planned_poses_tell_more_than_random_ones(scene):
+    w, measured, _, _ = scene
+    few = measured.rows(np.arange(15))
+    model, x = placed(Model.of(w.nominal, few, backlash=True), few)
+    plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), 12, done=few)
+    assert (np.diff(plan.sigma_m) < 0).all()
+    assert plan.sigma_m[12] < plan.random_sigma_m[12]
+    assert plan.random_for(12) >= 15
+    assert w.nominal.within_limits(plan.q).all()
+
+
+def test_poses_all_alike_are_refused(scene):
+    w, _, _, rng = scene
+    q = np.repeat(w.nominal.home[None], 30, axis=0)
+    with pytest.raises(CalibrationError, match="too alike"):
+        identify(w.nominal, w.seen(q, np.ones((30, 6)), rng))
+
+
+def test_too_few_poses_are_refused_and_few_are_enough_for_little(scene):
+    w, measured, _, _ = scene
+    with pytest.raises(InputError, match="fewer than 4"):
+        identify(w.nominal, measured.rows(np.arange(3)))
+    found = identify(w.nominal, measured.rows(np.arange(10)))
+    assert found.solution.free.sum() < 60
+    q, approach = poses(w.nominal, 100, np.random.default_rng(5))
+    truth = w.T_rig_body(q, approach)
+    before, after = (distance_m(found.model, x, truth, q, approach).mean() for x in (found.nominal, found.solution.x))
+    assert after < before  # more parameters than numbers do no harm
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: replace(m, p_rig=m.p_rig / 1e3), "are they in m, not mm"),
+        (lambda m: replace(m, p_rig=m.p_rig * 1e3), "are they in mm, not m"),
+        (lambda m: replace(m, q=np.degrees(m.q) / 10), "not of this arm|fit"),
+        (lambda m: replace(m, q=np.radians(m.q)), "radians; name the columns q1_rad"),
+        (lambda m: replace(m, q=m.q * [1, -1, 1, 1, 1, 1]), "sign is turned of joint 2"),
+        (lambda m: replace(m, q=m.q * [1, 1, -1, 1, -1, 1]), "sign is turned of joint 3, 5"),
+        (lambda m: replace(m, q=m.q[:, [0, 2, 1, 3, 4, 5]]), "order is q1, q3, q2, q4, q5, q6"),
+        (lambda m: replace(m, q=m.q[:, ::-1]), "order is q6, q5, q4, q3, q2, q1"),
+    ],
+)
+def test_wrong_units_order_and_signs_are_told(scene, change, said):
+    w, measured, _, _ = scene
+    with pytest.raises(InputError, match=said):
+        identify(w.nominal, change(replace(measured, cov=None)))
+
+
+def test_another_arm_is_told(scene):
+    _, measured, _, _ = scene
+    with pytest.raises(InputError, match="not of this arm"):
+        identify(open_arm("ur10"), measured)
+
+
+def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_refused(scene):
+    w, measured, _, _ = scene
+    found = identify(w.nominal, measured, priors={"a2": 0.0, "wave": 0.0})
+    assert found.value("a2")[0] == w.nominal.a[1]
+    assert "prior of zero" in found.reasons["wave1_sin1"]
+    with pytest.raises(InputError, match="'a9'"):
+        identify(w.nominal, measured, priors={"a9": 1.0})
