@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
+from armsight.vision.dense.edges import redrawn
 from armsight.vision.dense.fill import filled
 from armsight.vision.dense.method import MEASURED, Disparity, Search
 from armsight.vision.dense.smooth import smoothed
@@ -54,8 +55,16 @@ def without_speckles(disparity: Singles) -> Singles:
     return np.where(coarse == -_FINE, np.float32(np.nan), disparity)
 
 
-def finished(found: Found, left: Image, search: Search, trust: Trust) -> Disparity:
-    """Turn what was found into a result."""
+def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: bool = False) -> Disparity:
+    """Turn what was found into a result.
+
+    Args:
+        found: what a method found.
+        left: (H, W) uint8, the left image.
+        search: which disparities were tried.
+        trust: how sure the method is.
+        edges: whether depth breaks are drawn again where the image has its edges.
+    """
     good = found.agreed & (found.curvature > 0)
     sure = without_speckles(np.where(good, found.disparity, np.float32(np.nan)))
     if np.count_nonzero(np.isfinite(sure)) < _LEAST_SHARE * sure.size:
@@ -67,6 +76,8 @@ def finished(found: Found, left: Image, search: Search, trust: Trust) -> Dispari
         )
     surface, share = smoothed(sure, left)
     full, state = filled(surface)
+    if edges:
+        full, state = redrawn(full, state, left)
     measured = state == MEASURED
     sigma = np.where(measured, trust.sigma_px(found), np.float32(np.nan))
     return Disparity(full, state, sigma, np.where(measured, share, np.float32(0)), search)

@@ -89,9 +89,11 @@ class Semiglobal:
 
     Attributes:
         paths: 4, 5 or 8. Five are fastest and need the least memory, for all come from above or along the row.
+        edges: whether depth breaks are drawn again where the image has its edges (``edges.py``).
     """
 
     paths: int = 8
+    edges: bool = True
 
     def __post_init__(self) -> None:
         """Check the number of paths."""
@@ -100,7 +102,7 @@ class Semiglobal:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search, _TRUST)
+        return finished(self.search(left, right, search), left, search, _TRUST, edges=self.edges)
 
     def search(self, left: Image, right: Image, search: Search) -> Found:
         """Find disparities, without judging, smoothing or filling them."""
