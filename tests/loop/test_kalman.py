@@ -1,5 +1,7 @@
 """The filter against a world with known errors: how near it comes, whether it knows, and what it does with the odd."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from arm_bench import (
@@ -198,3 +200,19 @@ def test_the_bench_wanders_as_it_says():
     at = np.arange(0, 70, 3.0)
     values = np.array([Wander(rng, 2.0, 0.5, 4).pose(at) for _ in range(20)])
     assert values.std() == pytest.approx(2.0, rel=5 / np.sqrt(2 * values.size))
+
+
+def test_for_the_record_the_sightings_that_follow_are_heard_too():
+    rng = np.random.default_rng(14)
+    shaft, seen_all, Ts = sightings(rng, seconds=1.9)
+    estimator, now, later = fed(shaft), [], []
+    estimator.vision(seen_all[0])
+    for a, b in pairwise(seen_all):
+        t_s = np.arange(round(a.t_s / TICK_S) + 1, round(b.t_s / TICK_S)) * TICK_S
+        now.append(estimator.track(t_s))
+        estimator.vision(b)
+        later.append(estimator.smoothed(t_s))
+    rows = np.rint(np.concatenate([track.t_s for track in now]) / TICK_S).astype(int)
+    apart = [distance_mm(np.concatenate([track.Ts_base_tool for track in way]), Ts[rows]) for way in (now, later)]
+    assert rms(apart[1][300:]) < rms(apart[0][300:])
+    assert np.linalg.eigvalsh(later[-1].covs_own).min() > 0
