@@ -1,6 +1,7 @@
 """The fault campaign: seeded faults on an emulated board whose arm is in motion, each held against what must come of it.
 
-A host of 250 Hz swings all joints; once they move, one fault strikes, most of them for a time drawn log-uniformly:
+A host of 250 Hz, or of 62.5 Hz, swings all joints; once they move, one fault strikes, most of them for a time drawn
+log-uniformly (bytes are spoiled with the faster host only, so that it can see how soon the link is usable again):
 
     flip, drop, burst    bytes to the board or to the host: one bit changed; 1 to 20 bytes missing; noise for 1 to 30 ms
     stall                the host sends nothing for 1 ms to 5 s
@@ -13,9 +14,10 @@ A host of 250 Hz swings all joints; once they move, one fault strikes, most of t
 
 What must hold, with the configuration's own times (no figure of this file's):
 
-    speed      no joint is ever faster than its speed limit (the true speed, not the measured one)
+    speed      no reference is ever faster than its speed limit, and no joint (its true speed, not the measured one)
+               faster than that by more than a tenth: a joint that is told to move at its limit catches up with it
     stop       a fault that releases switches the drives off; one that holds brings the reference to rest within
-               speed limit / deceleration; half a second later nothing moves
+               speed limit / deceleration; half a second later nothing moves at a twentieth of its limit
     code       a fault that lasts long enough is told by its own code and joint, a shorter one is not told at all
     link       a command sent after the last bad byte is obeyed, and telemetry read, within 20 ms of it
     known      afterwards the host's last obeyed and refused numbers are the board's
@@ -37,7 +39,8 @@ from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.sim.joints import JointPlant, PotFault
 
-PERIOD_TICKS, PERIOD_S = 4, 0.004
+PERIODS = (4, 16)  # ticks
+CATCHING_UP, STANDING = 1.1, 0.05  # of the speed limit
 LINK_TICKS = 20
 KINDS = ("flip", "drop", "burst", "stall", "pot", "dip", "cut", "tick", "jump")
 POT_CODES = {
@@ -117,6 +120,7 @@ class Campaign:
         self.rest_tick = None
         self.obeyed_after = None  # (sequence that counts, tick in which one was obeyed)
         self.outputs = None
+        self.period_ticks = PERIODS[0]
         self.sent = 0  # number of the last motion command
         self.config = lab_configuration()
         board = Board(self.link)
@@ -136,8 +140,12 @@ class Campaign:
         fastest = float(np.abs(self.plant.qd).max()) / self.limits.speed_rad_s
         if fastest > self.out.fastest.get(self.kind, 0.0):
             self.out.fastest[self.kind] = fastest
-            if fastest > 1.0:
+            if fastest > CATCHING_UP:
                 self.violate(f"a joint moves at {fastest:.3f} of its limit")
+        told = float(np.abs(outputs["reference_rad_s"]).max()) / self.limits.speed_rad_s
+        self.out.fastest["reference"] = max(told, self.out.fastest.get("reference", 0.0))
+        if told > 1.0 + 1e-6:
+            self.violate(f"a reference moves at {told:.3f} of its limit")
         tick = int(outputs["tick"])
         if outputs["faults"] and not self.fault_was:
             self.fault_tick, self.rest_tick = tick, None
@@ -152,12 +160,16 @@ class Campaign:
 
     def command(self):
         """Return the next command on the way to a swing of all joints, 1.5 rad/s at most, without a jolt."""
-        self.phase_s += PERIOD_S
+        self.phase_s += self.period_s
         target = 0.6 * np.sin(2 * math.pi * (0.4 * self.phase_s + np.arange(6) / 6))
         wanted = np.clip((target - self.reference) / 0.1, -1.5, 1.5)
-        self.rate = self.rate + np.clip(wanted - self.rate, -10.0 * PERIOD_S, 10.0 * PERIOD_S)
-        self.reference = self.reference + self.rate * PERIOD_S
-        return JointCommand(self.reference, self.rate, np.zeros(6), PERIOD_S)
+        self.rate = self.rate + np.clip(wanted - self.rate, -10.0 * self.period_s, 10.0 * self.period_s)
+        self.reference = self.reference + self.rate * self.period_s
+        return JointCommand(self.reference, self.rate, np.zeros(6), self.period_s)
+
+    @property
+    def period_s(self):
+        return self.period_ticks * 1e-3
 
     def take_up(self):
         """Go on from where the board has its references."""
@@ -165,13 +177,13 @@ class Campaign:
         self.rate = np.array(self.board.joints.reference_rad_s)
 
     def period(self, send=True):
-        """One period of the host: a command, then 4 ms; returns what came."""
+        """One period of the host: a command, and what it takes; returns what came."""
         if send:
             self.sent = self.board.send(self.command())
-        return self.board.receive(PERIOD_S)
+        return self.board.receive(self.period_s)
 
     def periods(self, ticks, send=True):
-        for _ in range(math.ceil(ticks / PERIOD_TICKS)):
+        for _ in range(math.ceil(ticks / self.period_ticks)):
             self.period(send)
 
     def ready(self):
@@ -199,9 +211,11 @@ class Campaign:
 
     def run(self, faults):
         for _ in range(faults):
+            kind = str(self.rng.choice(KINDS))
+            self.period_ticks = PERIODS[0] if kind in ("flip", "drop", "burst") else int(self.rng.choice(PERIODS))
             self.kind = "between"
             self.ready()
-            self.kind = str(self.rng.choice(KINDS))
+            self.kind = kind
             self.out.faults[self.kind] += 1
             getattr(self, f"do_{self.kind}")()
             self.kind = "after"
@@ -260,11 +274,11 @@ class Campaign:
         self.board.receive(ticks * 1e-3)
         silence = int(self.config["silence_ticks"])
         # The last command arrives up to a period after it was sent.
-        if ticks > silence + PERIOD_TICKS:
+        if ticks > silence + self.period_ticks:
             self.expect_fault(Fault.HOST_SILENT, None)
             self.periods(500, send=False)
             self.expect_rest()
-        elif ticks < silence - PERIOD_TICKS:
+        elif ticks < silence - self.period_ticks:
             self.periods(20)
             self.expect_no_fault()
 
@@ -301,7 +315,7 @@ class Campaign:
 
     def one_tick(self):
         """One tick, in the middle of the host's own beat."""
-        if int(self.outputs["tick"]) % PERIOD_TICKS == 0:
+        if int(self.outputs["tick"]) % self.period_ticks == 0:
             self.sent = self.board.send(self.command())
         self.board.receive(1e-3)
 
@@ -333,7 +347,7 @@ class Campaign:
             self.violate("a board that started anew is not noticed")
         on = bool(self.outputs["drives_on"])
         self.link.step(500)
-        if on or self.outputs["drives_on"] or np.abs(self.plant.qd).max() > 0.05:
+        if on or self.outputs["drives_on"] or np.abs(self.plant.qd).max() > STANDING * self.limits.speed_rad_s:
             self.violate("the arm is driven by a board that started anew")
         self.board = Board(self.link)
         self.take_up()
@@ -354,7 +368,7 @@ class Campaign:
             far, fast = self.rng.uniform(-3, 3, 6), self.rng.uniform(-5, 5, 6)
             command = JointCommand(far, fast, np.zeros(6), int(self.rng.integers(1, 51)) * 1e-3)
             self.board.send(command)
-            self.board.receive(PERIOD_S)
+            self.board.receive(self.period_s)
         self.board.receive(0.012)
         self.take_up()
         self.periods(200)
@@ -384,7 +398,7 @@ class Campaign:
         self.out.slowest_stop_s = max(self.out.slowest_stop_s, took_s)
         if took_s > self.limits.stop_s:
             self.violate(f"the reference comes to rest after {took_s} s")
-        if np.abs(self.plant.qd).max() > 0.05:
+        if np.abs(self.plant.qd).max() > STANDING * self.limits.speed_rad_s:
             self.violate(
                 f"a joint still moves at {np.abs(self.plant.qd).max():.2f} rad/s half a second after the fault"
             )
