@@ -22,7 +22,7 @@ from armsight.vision.disc_size import wrong_size
 from armsight.vision.disc_view import DiscView
 from armsight.vision.expected import centred
 from armsight.vision.hypothesis import Hypothesis, hypothesis
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc import MOST_TOLD, DiscTarget
 from armsight.vision.pairing import MOST_PAIRS, Pairs, pair
 from armsight.vision.rig import StereoRig
 from armsight.vision.triples import Triples, spread, triples
@@ -196,6 +196,7 @@ def _too_few(target: DiscTarget, discs: tuple[Discs, Discs]) -> str:
         text = f"{side}: {len(seen.uv)} disc{'' if len(seen.uv) == 1 else 's'} found"
         if seen.rejected:
             many, first = len(seen.rejected), seen.rejected[0].reason  # the one that looks most like a disc
-            text += f" ({many} other place{'' if many == 1 else 's'} looked at; the most likely: {first})"
+            count = f"{many} or more" if many >= MOST_TOLD else f"{many}"
+            text += f" ({count} other place{'' if many == 1 else 's'} looked at; the most likely: {first})"
         parts.append(text)
     return f"{'; '.join(parts)}; {target.body.name} has {len(target.radii_m)}"

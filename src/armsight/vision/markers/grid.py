@@ -47,22 +47,23 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
         lines, 1/px: a point t px along a line lies ``t^2 * bow`` off its tangent; zero where it is not known.
     """
     squares, bows = np.empty((*uv.shape, 2)), np.empty((*uv.shape, 2))
-    _read_squares(np.ascontiguousarray(uv, dtype=np.float64), squares, bows)
-    missing = np.isnan(squares.sum(axis=(2, 3))) & np.isfinite(uv[..., 0])
-    if missing.any():
+    if _read_squares(np.ascontiguousarray(uv, dtype=np.float64), squares, bows):
+        missing = np.isnan(squares.sum(axis=(2, 3))) & np.isfinite(uv[..., 0])
         squares[missing] = _homography_squares(uv, missing)
     return squares, bows
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _read_squares(uv: Array, squares: Array, bows: Array) -> None:
-    """Fill what :func:`local_squares` returns; squares without a neighbour are NaN."""
+def _read_squares(uv: Array, squares: Array, bows: Array) -> bool:
+    """Fill what :func:`local_squares` returns; tell whether a known point has a side without a neighbour, NaN."""
     rows, columns = uv.shape[:2]
+    missing = False
     bow = np.empty((2, rows, columns, 2))
     for y in range(rows):
         for x in range(columns):
             _read_side(uv, y, x, 0, 1, squares[y, x, 0], bow[0, y, x])
             _read_side(uv, y, x, 1, 0, squares[y, x, 1], bow[1, y, x])
+            missing |= np.isfinite(uv[y, x, 0]) and np.isnan(squares[y, x, 0, 0] + squares[y, x, 1, 0])
     if columns >= 3:  # the ends of a line have the bow of the point beside them
         bow[0, :, 0], bow[0, :, -1] = bow[0, :, 1], bow[0, :, -2]
     if rows >= 3:
@@ -71,6 +72,7 @@ def _read_squares(uv: Array, squares: Array, bows: Array) -> None:
         for x in range(columns):
             for side in range(2):
                 _mean_about(bow[side], y, x, bows[y, x, side])
+    return missing
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -97,15 +99,12 @@ def _read_side(uv: Array, y: int, x: int, down: int, right: int, side: Array, bo
 @numba.njit(cache=True, error_model="numpy")
 def _mean_about(bow: Array, y: int, x: int, mean: Array) -> None:
     """Average bow (rows, columns, 2) over a point and its known neighbours: lenses bow lines slowly over the image."""
-    count = 0
-    mean[:] = 0.0
+    count, across, down = 0, 0.0, 0.0
     for i in range(max(y - 1, 0), min(y + 2, bow.shape[0])):
         for j in range(max(x - 1, 0), min(x + 2, bow.shape[1])):
             if np.isfinite(bow[i, j, 0]):
-                count += 1
-                mean += bow[i, j]
-    if count:
-        mean /= count
+                count, across, down = count + 1, across + bow[i, j, 0], down + bow[i, j, 1]
+    mean[0], mean[1] = across / max(count, 1), down / max(count, 1)
 
 
 def completed(uv: Array) -> Array:
