@@ -123,6 +123,15 @@ def test_a_disc_behind_a_link_is_not_found(camera):
     assert not left[hidden].any()
 
 
+def test_a_face_that_turns_away_during_the_exposure(camera):
+    """It is in some parts of the exposure and not in others."""
+    T = pose(exp_so3(np.array([0.0, np.pi / 2 - 1e-4, 0.0])), np.array([0.0, 0.0, 0.8]))
+    twist = np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
+    for way in (-1.0, 1.0):
+        image = camera.image(None, [Placed(body_patterns(), T, way * twist)], Shutter(0.004), QUIET, 0)
+        assert (image != camera.image(None, [], STILL, QUIET, 0)).any()
+
+
 def test_noise_is_as_strong_as_asked_and_another_in_every_image():
     rig = open_rig("parallel", (320, 240))
     T = placed_rig(MODEL, rig, pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.03])), 0)

@@ -33,6 +33,7 @@ from armsight.vision.camera import Camera
 LENS = Optics(0.7, vignetting=0.25, light_gradient=(0.1, -0.1))
 #: Points around a pattern or a disc that bound it in the image.
 EDGE = 4 * OUTLINE
+_STILL_PX = 0.05  # what moves less is painted once
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -69,7 +70,7 @@ class ArmSeen(Record):
 
     Attributes:
         parts: what it is made of.
-        Ts_base_link: (7, 4, 4) its row frames.
+        Ts_base_link: (7, 4, 4) row frames.
     """
 
     parts: Solids
@@ -83,25 +84,26 @@ class _Face(NamedTuple):
         pattern: what it is.
         Ts: (1 or H, 4, 4) its pose, or its pose as each row sees it.
         boxes: (1 + K, 4) the pixels of its cells and of each disc.
-        uv: (N, 2) its edges in pixels.
     """
 
     pattern: Pattern
     Ts: Array
     boxes: Ids
-    uv: Array
 
 
-_Step = tuple[float, float, list[_Face]]
+_Step = tuple[float, list[_Face]]
 
 
 @lru_cache(maxsize=64)
-def _edges(pattern: Pattern) -> Array:
-    """Return points ((1 + K) * EDGE, 3) around a pattern's cells and around each of its discs, m, pattern frame."""
+def _edges(patterns: tuple[Pattern, ...]) -> Array:
+    """Return points (N, EDGE, 3) around each pattern's cells, and then each of its discs, m, body frame."""
     angle = np.arange(EDGE) * (math.tau / EDGE)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    around = [outline(pattern), *(disc[:2] + 1.01 * disc[2] * circle for disc in pattern.discs)]
-    return np.column_stack([np.concatenate(around), np.zeros(len(around) * EDGE)])
+    around = []
+    for pattern in patterns:
+        for line in (outline(pattern), *(disc[:2] + 1.01 * disc[2] * circle for disc in pattern.discs)):
+            around.append(transform(pattern.T_body_pattern, np.column_stack([line, np.zeros(EDGE)])))
+    return np.array(around)
 
 
 @lru_cache(maxsize=64)
@@ -179,7 +181,7 @@ class CellCamera:
         steps = self._steps(bodies, shutter)
         margin = _reach(LENS.psf_sigma_px)
         crop = self._around(
-            [tuple(face.boxes[0].tolist()) for step in (steps[0], steps[-1]) for face in step[2]], 2 * margin
+            [tuple(face.boxes[0].tolist()) for _, faces in (steps[0], steps[-1]) for face in faces], 2 * margin
         )
         window = self._around([crop, *(tuple(box) for box in boxes.tolist())], 2 * margin)
         u0, v0, u1, v1 = window
@@ -210,28 +212,32 @@ class CellCamera:
 
     def _around(self, boxes: Sequence[tuple[int, ...]], margin: int) -> Window:
         """Return what holds all boxes that are not empty, with a margin, within the image."""
-        width, height = self.camera.image_size_px
         full = np.array([box for box in boxes if box[0] < box[2] and box[1] < box[3]])
         if not len(full):
             return 0, 0, 0, 0
         u0, v0 = np.maximum(full[:, :2].min(axis=0) - margin, 0)
-        u1, v1 = np.minimum(full[:, 2:].max(axis=0) + margin, (width, height))
+        u1, v1 = np.minimum(full[:, 2:].max(axis=0) + margin, self.camera.image_size_px)
         return int(u0), int(v0), int(u1), int(v1)
 
     def _steps(self, bodies: Sequence[Placed], shutter: Shutter) -> list[_Step]:
-        """Return the parts of the exposure: time, s; weight; faces, farthest first."""
-        ways = [0.0]
-        first, last = ([self._seen(b, sign * shutter.exposure_s / 2, shutter) for b in bodies] for sign in (-1.0, 1.0))
-        for before, after in zip(first, last, strict=True):
-            ways += [float(np.abs(a.uv - b.uv).max()) for a, b in zip(before, after, strict=True)]
-        nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(max(ways)))
+        """Return the parts of the exposure: weight; faces, farthest first."""
+        way_px = 0.0
+        for body in bodies if shutter.exposure_s else ():
+            ends = body.T_camera_body @ exp_se3(np.outer((-0.5, 0.5), shutter.exposure_s * body.twist))
+            before, after = (self._outlines(T[None], body.patterns) for T in ends)
+            way_px = max(way_px, float(np.nan_to_num(np.abs(after - before)).max()))
+        nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
         steps = []
         for x, w in zip(nodes, weights, strict=True):
-            t = 0.5 * shutter.exposure_s * float(x)
-            faces = [face for body in bodies for face in self._seen(body, t, shutter)]
+            faces = [face for body in bodies for face in self._seen(body, 0.5 * shutter.exposure_s * float(x), shutter)]
             faces.sort(key=lambda face: -float(np.linalg.norm(face.Ts[0, :3, 3])))
-            steps.append((t, 0.5 * float(w), faces))
+            steps.append((0.5 * float(w), faces))
         return steps
+
+    def _outlines(self, Ts_camera_body: Array, patterns: tuple[Pattern, ...]) -> Array:
+        """Return the edges of a body's patterns in pixels, (R, N, EDGE, 2), at poses (R, 4, 4)."""
+        p = transform(Ts_camera_body[:, None, None], _edges(patterns))
+        return self.camera.project(p.reshape(-1, 3)).reshape(*p.shape[:3], 2)
 
     def _seen(self, body: Placed, t_s: float, shutter: Shutter) -> list[_Face]:
         """Return what of a body faces the camera at a time."""
@@ -239,16 +245,17 @@ class CellCamera:
         moving = shutter.row_s > 0 and body.twist.any()
         rows = (np.arange(height) - (height - 1) / 2) * shutter.row_s if moving else np.zeros(1)
         Ts_camera_body = body.T_camera_body @ exp_se3(np.outer(rows + t_s, body.twist))
-        found = []
+        uv = self._outlines(Ts_camera_body[[0, -1]] if moving else Ts_camera_body, body.patterns)
+        low = np.clip(np.floor(uv.min(axis=(0, 2))) - 1, 0, (width, height))
+        high = np.clip(np.ceil(uv.max(axis=(0, 2))) + 2, 0, (width, height))
+        boxes = np.nan_to_num(np.concatenate([low, high], axis=1)).astype(np.int64)
+        found, next_box = [], 0
         for pattern in body.patterns:
+            first, next_box = next_box, next_box + 1 + len(pattern.discs)
             Ts = Ts_camera_body @ pattern.T_body_pattern
-            if not (np.linalg.det(Ts[:, :3, [0, 1, 3]]) > 0).all():
-                continue
-            uv = self.camera.project(transform(Ts[[0, -1]][:, None] if moving else Ts, _edges(pattern)).reshape(-1, 3))
-            parts = uv.reshape(-1, 1 + len(pattern.discs), EDGE, 2)
-            low = np.clip(np.floor(parts.min(axis=(0, 2))) - 1, 0, (width, height))
-            high = np.clip(np.ceil(parts.max(axis=(0, 2))) + 2, 0, (width, height))
-            found.append(_Face(pattern, Ts, np.concatenate([low, high], axis=1).astype(np.int64), uv))
+            # Its face is on the side that z points away from; what is behind the camera is not seen.
+            if ((Ts[:, :3, 2] * Ts[:, :3, 3]).sum(axis=1) > 0).all() and (Ts[:, 2, 3] > 0).all():
+                found.append(_Face(pattern, Ts, boxes[first:next_box]))
         return found
 
     def _painted(
@@ -264,9 +271,9 @@ class CellCamera:
         rays = np.ascontiguousarray(self._corners[v0 : v1 + 1, u0 : u1 + 1])
         fine = np.empty((1 << 13, SUB, SUB))
         total = np.zeros(light.shape, np.float32)
-        for _, weight, faces in steps:
+        for weight, faces in steps:
             coarse, slot, count = light.copy(), np.full(light.shape, -1, np.int32), 0
-            for pattern, Ts, boxes, _ in faces:
+            for pattern, Ts, boxes in faces:
                 rows = Ts[v0:v1] if len(Ts) > 1 else Ts
                 Ms = np.ascontiguousarray(np.linalg.inv(rows[:, :3, [0, 1, 3]]))
                 inner = np.clip(boxes - (u0, v0, u0, v0), 0, (u1 - u0, v1 - v0) * 2).tolist()
@@ -278,8 +285,7 @@ class CellCamera:
 
     def _core(self, window: Window, margin: int) -> Window:
         """Return a window but for a margin where its blur did not know what is around; none at the image's border."""
-        width, height = self.camera.image_size_px
-        u0, v0, u1, v1 = window
+        (width, height), (u0, v0, u1, v1) = self.camera.image_size_px, window
         return u0 + margin * (u0 > 0), v0 + margin * (v0 > 0), u1 - margin * (u1 < width), v1 - margin * (v1 < height)
 
 
