@@ -1,75 +1,151 @@
+"""The whole experiment, made small: the firmware's host build, few calibration shots, a short motion."""
+
+import csv
 import json
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from armsight.app import demo
 from armsight.app.cli import demo as command
-from armsight.sim.bench import demo_recording
-from armsight.vision.rig import StereoRig
+from armsight.app.demo import Demo, run_demo
+from armsight.app.motion_file import read_motions
+from armsight.errors import ArmsightError
+from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
+from armsight.sim.workcell import Workcell
+
+SHORT = """
+[[motion]]
+kind = "joints"
+name = "there"
+q_deg = [34.0, -46.6, 74.2, -14.7, -134.4, 20.2]
+rest_s = 1.5
+
+[[motion]]
+kind = "line"
+name = "line"
+by_mm = [20.0, -150.0, -10.0]
+duration_s = 0.9
+rest_s = 1.5
+"""
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """Make the demo's recording small: eight pairs of the board and six shots."""
-
-    def recording(folder, *, seed=0):
-        return demo_recording(folder, seed=seed, image_size_px=(640, 360), boards=8, shots=6, rate_hz=2.0)
-
-    monkeypatch.setattr(demo, "demo_recording", recording)
-
-
-def test_the_demo_does_the_main_job_and_tells_the_error(small, armsight, tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "write_report", lambda calibration, folder: folder.mkdir())  # it has its own tests
-    said = armsight("demo", "-o", tmp_path / "demo", "--json")
-    assert said.code == 0, said.err
-    (s,) = said.lines
-    assert s["measured"] == s["shots"] == 6
-    # Each squared error in sigmas is chi-square of three degrees of freedom, the calibration's share common to all.
-    for kind in ("position", "orientation"):
-        unit = "m" if kind == "position" else "rad"
-        rms, sigma, worst = (s[f"{kind}_{what}_{unit}"] for what in ("rms", "sigma_rms", "max"))
-        assert rms <= worst
-        assert rms < np.sqrt(chi2.ppf(0.9999, 3) / 3) * sigma
-    assert 0 < s["heldout_epipolar_rms_px"] < 0.05
-    true, rig = (StereoRig.load(tmp_path / "demo" / name) for name in ("board/truth_rig.json", "rig.json"))
-    assert s["baseline_error_m"] == pytest.approx(rig.baseline_m - true.baseline_m, abs=1e-15)
-    assert s["focal_error_px"] == pytest.approx(rig.left.intrinsics[0] - true.left.intrinsics[0], abs=1e-12)
-    for name in ("demo.png", "pose.png", "poses.csv", "plate.toml", "arm/shots.csv"):
-        assert (tmp_path / "demo" / name).stat().st_size > 0
-    assert len((tmp_path / "demo" / "poses.csv").read_text().splitlines()) == 7
-    # What it wrote is a recording: the commands a user would type next run on it.
-    again = armsight(
-        "measure", tmp_path / "demo" / "rig.json", "--target", tmp_path / "demo" / "plate.toml", "--source",
-        tmp_path / "demo" / "arm", "--json",
-    )  # fmt: skip
-    assert [json.dumps(line["position_m"]) for line in again.lines]
-    assert all(line["status"] == "ok" for line in again.lines)
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """Run the experiment on a short motion; returns the folder and the summary."""
+    folder = tmp_path_factory.mktemp("run")
+    motion = folder / "short.toml"
+    motion.write_text(SHORT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "_AMOUNTS", {True: (10, 14, 0)})
+        patch.setattr(demo, "CHAPTER", motion)
+        patch.setattr(demo, "read_motions", lambda arm: read_motions(arm, motion))
+        summary = run_demo(Demo(folder, machine="host", quick=True, seed=4))
+    return folder, summary
 
 
-def test_people_read_millimetres(armsight, tmp_path, monkeypatch):
-    summary = {
-        "shots": 4, "measured": 4, "inside_95_share": 1.0, "heldout_epipolar_rms_px": 0.01, "heldout_rigid_rms_m": 2e-5,
-        "baseline_error_m": -1e-5, "focal_error_px": 0.1,
-        **{f"position_{k}_m": 1.25e-4 for k in ("rms", "max", "sigma_rms")},
-        **{f"orientation_{k}_rad": np.pi / 180 for k in ("rms", "max", "sigma_rms")},
-    }  # fmt: skip
+def rows(folder, name):
+    found = list(csv.DictReader((folder / f"{name}.csv").read_text().splitlines()))
+    p = np.array([[float(r[f"{a}_m"]) for a in "xyz"] for r in found])
+    q = np.array([[float(r[f"q{a}"]) for a in "wxyz"] for r in found])
+    return np.array([float(r["t_s"]) for r in found]), p, q, np.array([r["phase"] for r in found])
 
-    class Result:
-        calibration = None
 
-        def summary(self):
-            return summary
+@pytest.mark.parametrize("name", ["vision", "potentiometers", "fused", "live"])
+def test_anyone_can_recompute_the_figures_from_the_files(short, name):
+    folder, summary = short
+    t, p, q, phase = rows(folder, name)
+    t_true, p_true, q_true, _ = rows(folder, "truth")
+    moving = phase == "open_loop"
+    at = np.stack([np.interp(t, t_true, p_true[:, i]) for i in range(3)], axis=1)
+    off = np.linalg.norm(p - at, axis=1)[moving]
+    assert np.sqrt((off**2).mean()) == pytest.approx(summary[name]["position_rms_m"], rel=1e-3)
+    assert off.max() == pytest.approx(summary[name]["position_max_m"], rel=1e-2)
+    nearest = np.clip(np.searchsorted(t_true, t), 0, len(t_true) - 1)
+    turns = [
+        np.linalg.norm(log_so3(from_quaternion_wxyz(q[k]).T @ from_quaternion_wxyz(q_true[nearest[k]])))
+        for k in np.flatnonzero(moving)[::7]
+    ]
+    # The nearest millisecond in place of interpolation: at 2 rad/s half a milliradian.
+    assert np.sqrt(np.square(turns).mean()) == pytest.approx(summary[name]["orientation_rms_rad"], abs=1e-3)
 
-    monkeypatch.setattr(command, "run_demo", lambda folder, **options: Result())
-    monkeypatch.setattr(command, "write_report", lambda *arguments: None)
-    monkeypatch.setattr(command, "write_figure", lambda *arguments: None)
-    said = armsight("demo", "-o", tmp_path)
-    assert said.code == 0
-    assert "0.1250 mm" in said.out
-    assert "1.0000 deg" in said.out
-    assert "baseline off by -0.0100 mm" in said.out
+
+def test_vision_is_right_and_potentiometers_are_not(short):
+    _, summary = short
+    assert summary["ended_by"] is None
+    assert summary["vision"]["position_rms_m"] < 0.2e-3
+    assert summary["vision"]["orientation_rms_rad"] < np.radians(0.15)
+    assert summary["potentiometers"]["position_rms_m"] > 5 * summary["vision"]["position_rms_m"]
+    assert summary["fused"]["position_rms_m"] < 0.25e-3
+    assert summary["shots"]["missed"] <= 0.05 * summary["shots"]["measured"]
+    # The delay the workcell has: half an exposure of 2 ms, and 12 ms.
+    assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=0.4e-3)
+
+
+def test_closing_the_loop_pays(short):
+    _, summary = short
+    c = summary["closed_loop"]
+    assert c["rest_error_after_m"] < c["rest_error_before_m"] / 5
+    assert c["path_error_after_m"] < c["path_error_before_m"] / 2
+
+
+def test_the_folder_holds_what_its_page_says(short):
+    folder, summary = short
+    assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary))
+    for name in ("truth", "vision", "potentiometers", "fused", "live", "wanted", "joints"):
+        assert (folder / f"{name}.csv").stat().st_size > 1000
+        assert (folder / f"{name}.parquet").stat().st_size > 1000
+    for name in ("joints", "path", "errors", "loop", "latency", "pose", "cell"):
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    page = (folder / "report.html").read_text()
+    assert "http" not in page.replace("http://www.w3.org", "")  # needs no network
+    assert set(rows(folder, "vision")[3]) == {"calibration", "open_loop", "closed_loop", "rest"}
+    log = (folder / "run.log").read_text()
+    assert "shots measured" in log
+    assert "line" in log
+
+
+def broken(tmp_path, monkeypatch, mend):
+    """Run with a cell that ``mend`` has done something to; returns what was said."""
+
+    class Cell(Workcell):
+        def __init__(self, **options):
+            super().__init__(**options)
+            mend(self)
+
+    monkeypatch.setattr(demo, "Workcell", Cell)
+    monkeypatch.setattr(demo, "_AMOUNTS", {True: (6, 12, 0)})
+    with pytest.raises(ArmsightError) as caught:
+        run_demo(Demo(tmp_path, machine="host", quick=True, seed=1))
+    assert json.loads((tmp_path / "summary.json").read_text())["ended_by"] in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_body_out_of_view_at_the_start(tmp_path, monkeypatch):
+    said = broken(tmp_path, monkeypatch, lambda cell: cell.cover(0.0, 100.0))
+    assert "is not seen where the arm stands" in said
+    assert "bring it into the view" in said
+
+
+def test_a_camera_that_is_gone(tmp_path, monkeypatch):
+    said = broken(tmp_path, monkeypatch, lambda cell: cell.source.unplug(3.0, "left camera: unplugged"))
+    assert said.startswith("left camera: unplugged")
+
+
+def test_a_board_that_faults(tmp_path, monkeypatch):
+    def fails(cell):
+        step = cell.plant.step
+
+        def stepped(duty, drives_on):
+            if cell.t_s > 2.0:
+                cell.plant.supply_mv = 3000
+            step(duty, drives_on)
+
+        monkeypatch.setattr(cell.plant, "step", stepped)
+
+    said = broken(tmp_path, monkeypatch, fails)
+    assert "the board went over to FAULTED" in said
+    assert "supply too low" in said
 
 
 def test_a_demo_where_a_file_stands(armsight, tmp_path):
@@ -81,6 +157,35 @@ def test_a_demo_where_a_file_stands(armsight, tmp_path):
     assert (tmp_path / "demo").read_text() == "mine"
 
 
-@pytest.mark.parametrize("options", [("--seed", "-1"), ("--seed", "many"), ("--speed", "9")])
+@pytest.mark.parametrize(
+    "options",
+    [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--rig", "round")],
+)
 def test_options_typed_wrong(armsight, options):
     assert armsight("demo", *options).code == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--arm", "rusty"), "arm 'rusty' is unknown"),
+        (("--cameras", "big"), "cameras 'big'"),
+        (("--board", "emulated:cray"), "cray"),
+    ],
+)
+def test_names_that_are_not_known(armsight, tmp_path, options, said):
+    got = armsight("demo", "-o", tmp_path, *options)
+    assert got.code == 2
+    assert said in got.err
+    assert len(got.err.splitlines()) == 1
+
+
+def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):
+    _, summary = short
+    monkeypatch.setattr(command, "run_demo", lambda demo, **options: summary)
+    said = armsight("demo", "-o", tmp_path)
+    assert said.code == 0
+    assert f"{1e3 * summary['vision']['position_rms_m']:.3f} mm" in said.out
+    assert "times smaller" in said.out
+    again = armsight("demo", "-o", tmp_path, "--json")
+    assert again.lines[0]["seed"] == 4

@@ -14,7 +14,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import estimate_delay
-from armsight.loop.estimators import Delay, Mounting
+from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye import HandEye, calibrate_handeye
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
@@ -27,6 +27,8 @@ Progress = Callable[[str], None]
 #: How long the arm stands before it is measured, and for how long, s.
 SETTLE_S, LOOK_S = 0.25, 0.1
 DELAY_REST_S = 1.0  # before and after the sweep
+#: In the sweep joints keep their side of the backlash: what they are off beside what can be learned changes little.
+STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5)
 _NEAR = np.radians(70.0)  # a joint that turned further has gone over to another configuration
 
 
@@ -175,4 +177,4 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
         np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])
     )
     newest = states.t_s > states.t_s[-1] - sweep.duration_s - 2 * DELAY_REST_S
-    return estimate_delay(arm, JointStates(states.t_s[newest], states.q[newest]), seen)
+    return estimate_delay(arm, JointStates(states.t_s[newest], states.q[newest]), seen, prior=STEADY)
