@@ -18,8 +18,8 @@ from armsight.robot.arm import Arm
 
 #: Harmonics of one turn of a joint's sensor.
 WAVES = (1, 2)
-#: A joint whose weight never changes by more than this lever, m, cannot show sag.
-LEAST_LEVER_M = 1e-3
+#: A joint whose links' weight pulls with less than this lever, m, rests where friction leaves it.
+LEAST_LEVER_M = 5e-3
 
 
 class Feature(NamedTuple):
@@ -90,6 +90,24 @@ def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
     z, at = m.axis[:, chain.OFFSET], np.concatenate([m.through[:, chain.OFFSET], m.o[None]])
     pull = np.cross(at[1:] - at[:-1], -up_base)  # link j goes from axis j to axis j + 1
     return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
+
+
+def resting_sides(arm: Arm, q: Array, approach: Array, up_base: Array) -> Array:
+    """Return the directions of approach (N, 6) that tell on which side of its play each joint rests.
+
+    Play between a joint's sensor and its link is closed by weight, whichever way the joint came, wherever weight pulls on
+    it harder than friction holds; there the side is the weight's. Links weigh by their length.
+
+    Args:
+        arm: the nominal arm.
+        q: (N, 6) joint angles, rad.
+        approach: (N, 6) directions of approach, kept for joints on which no weight pulls.
+        up_base: (3,) unit vector against gravity, base.
+    """
+    lengths = np.hypot(arm.a, arm.d)
+    levers = np.einsum("nij,j->ni", _levers(arm, q, up_base), lengths) / max(float(lengths.sum()), 1e-9)
+    # A link that its weight turns forward leads its sensor, as one does that was come to from above.
+    return np.where(np.abs(levers) > LEAST_LEVER_M, -np.sign(levers), approach)
 
 
 def approaches(measured: Measured) -> bool:

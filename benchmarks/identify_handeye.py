@@ -1,0 +1,74 @@
+"""Hand-eye calibration on real recordings: a camera in a KUKA's hand, and pairs of streams with an unknown time offset."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armsight.geometry.pose import inverse, pose, transform
+from armsight.loop.handeye import calibrate_handeye
+from armsight.loop.handeye_streams import PoseStream, calibrate_streams
+from armsight.vision.image import grey, read_image
+from armsight.vision.markers.board import open_board
+
+#: Archive -> the ends of the names of the hand's and the eye's stream.
+PAIRS = {
+    "robot_arm_w_color_camera_sim": ("sim_hand.csv", "sim_camera.csv"),
+    "robot_arm_w_color_camera_real": ("sr300_hinge.csv", "target_ir.csv"),
+    "prime_sense_color_w_vicon_1": ("vicon_prime_sense.csv", "rgb_image_raw.csv"),
+}
+
+
+def kuka2(folder: Path, told) -> None:
+    """Fit on even poses, the camera's own numbers too; the board's middle in the base on odd ones."""
+    if not folder.is_dir():
+        return
+    board = open_board("chessboard:24x17:15mm")
+    A = np.loadtxt(folder / "RobotPosesVec.txt").reshape(-1, 4, 4)
+    seen = [board.detect(grey(read_image(folder / f"im_{i + 1:02d}.png"))) for i in range(len(A))]
+    p, middle = board.body.points, board.body.points.mean(axis=0)
+    even, odd = np.arange(0, len(A), 2), np.arange(1, len(A), 2)
+    points = [p[seen[i].ids].astype(np.float32) for i in even]
+    places = [seen[i].uv.astype(np.float32) for i in even]
+    _, K, k, _, _ = cv2.calibrateCamera(points, places, (1920, 1200), None, None)
+    B = []
+    for d in seen:
+        _, r, t = cv2.solvePnP(p[d.ids], d.uv, K, k)
+        B.append(pose(cv2.Rodrigues(r)[0], t.ravel()))
+    B = np.array(B)
+    h = calibrate_handeye(A[even], B[even], eye="in_hand", centre=middle)
+    off = transform(A[odd] @ h.T_flange_rig @ B[odd], middle) - transform(h.T_base_body, middle)
+    told(
+        "kuka2, board's middle, even to odd", 1e3 * float(np.linalg.norm(off, axis=1).mean()), 0.55, more=f", {h.share}"
+    )
+
+
+def stream(archive: zipfile.ZipFile, end: str) -> tuple[np.ndarray, np.ndarray]:
+    name = next(name for name in archive.namelist() if name.endswith(end))
+    D = np.loadtxt(io.BytesIO(archive.read(name)), delimiter=",")
+    T = np.tile(np.eye(4), (len(D), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(D[:, 4:8]).as_matrix(), D[:, 1:4]
+    return D[:, 0], T
+
+
+def eth_pairs(folder: Path, told) -> None:
+    """The time offset of both halves of each recording."""
+    if not folder.is_dir():
+        return
+    for name, (hand_end, eye_end) in PAIRS.items():
+        with zipfile.ZipFile(folder / f"{name}.zip") as archive:
+            hand = PoseStream.of(*stream(archive, hand_end), "hand")
+            t, T = stream(archive, eye_end)
+        late = t > np.median(t)
+        found = [
+            calibrate_streams(hand, PoseStream.of(t[r], inverse(T[r]), "eye"), eye="in_hand") for r in (~late, late)
+        ]
+        a, b = (f.offset_s for f in found)
+        sigma = float(np.hypot(*(f.sigma_offset_s for f in found)))
+        more = f": {1e3 * a:.2f} and {1e3 * b:.2f} ms, sigma of the difference {1e3 * sigma:.2f}"
+        told(f"{name}, halves apart", 1e3 * abs(a - b), 2.0, "ms", more)

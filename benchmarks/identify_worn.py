@@ -1,0 +1,83 @@
+"""Worn arms that are made up, seen by a made-up rig: what identification finds of a truth that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from worn_arm import distance_m, poses, worn
+
+from armsight.loop.identify.identify import identify
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.place import placed
+from armsight.loop.identify.plan import free_of_collision, plan_poses
+from armsight.loop.identify.priors import prior_sigma
+
+POSES, UNSEEN, FIRST = 60, 200, 15
+
+
+def truth_of(w) -> dict[str, float]:
+    out = {}
+    for i in range(6):
+        n = i + 1
+        out |= {
+            f"a{n}": w.true.a[i],
+            f"d{n}": w.true.d[i],
+            f"alpha{n}": w.true.alpha[i],
+            f"offset{n}": w.true.offset[i],
+        }
+        out |= {f"backlash{n}": w.backlash[i], f"gain{n}": w.gain[i]}
+    return out
+
+
+def worn_arms(told, seeds: int) -> None:
+    """Figure 3, on a stand-in for the workcell."""
+    after, fall, off, play = [], [], [], []
+    for seed in range(seeds):
+        rng, w = np.random.default_rng(100 + seed), worn(seed)
+        found = identify(w.nominal, w.seen(*poses(w.nominal, POSES, rng), rng))
+        q, side = poses(w.nominal, UNSEEN, rng)
+        truth = w.T_rig_body(q, side)
+        d = [distance_m(found.model, x, truth, q, side).mean() for x in (found.nominal, found.solution.x)]
+        after.append(1e3 * d[1])
+        fall.append(d[0] / d[1])
+        for name, true in truth_of(w).items():
+            value, sigma = found.value(name)
+            if sigma > 0 and name not in found.reasons:
+                off.append(abs(value - true) / sigma)
+            if name.startswith("backlash"):
+                play.append(abs(np.degrees(value - true)))
+    told(f"worn arm, {POSES} poses: mean on {UNSEEN} unseen, worst of {seeds}", max(after), 0.25)
+    told("  one over the times that it falls, least", 1 / min(fall), 1 / 8, "")
+    told(f"  furthest of {len(off)} parameters from the truth", max(off), 3.0, "sigma")
+    told(f"  share of them over 3 sigma: {sum(o > 3 for o in off)} of {len(off)}", np.mean(np.array(off) > 3), 0.01, "")
+    told("  backlash, furthest", max(play), 0.02, "deg")
+    planned(told, min(seeds, 3))
+
+
+def planned(told, seeds: int) -> None:
+    """Poses that random choice needs for what planned ones reach, after a first few."""
+    shares = []
+    for seed in range(seeds):
+        rng, w = np.random.default_rng(200 + seed), worn(seed)
+        first = w.seen(*poses(w.nominal, FIRST, rng), rng)
+        model, x = placed(Model.of(w.nominal, first, backlash=True), first)
+        plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), 15, done=first, seed=seed)
+        q = rng.uniform(np.maximum(w.nominal.q_min, -np.pi), np.minimum(w.nominal.q_max, np.pi), (4000, 6))
+        q = q[free_of_collision(model, q)]
+        side = rng.choice([-1.0, 1.0], q.shape)
+        truth = w.T_rig_body(q[:UNSEEN], side[:UNSEEN])
+
+        def error(more, sides, w=w, first=first, rng=rng, q=q, side=side, truth=truth):
+            both = np.concatenate([first.q, more]), np.concatenate([first.approach, sides])
+            found = identify(w.nominal, w.seen(*both, rng))
+            return distance_m(found.model, found.solution.x, truth, q[:UNSEEN], side[:UNSEEN]).mean()
+
+        reached = error(plan.q, plan.approach)
+        needed = next(
+            (n for n in (10, 15, 20, 25, 30, 40, 60) if error(q[300 : 300 + n], side[300 : 300 + n]) <= reached), 80
+        )
+        shares.append(len(plan.q) / needed)
+        print(
+            f"     planned 15: {1e3 * reached:.3f} mm; random needs {needed} (predicted {plan.random_for(15)})",
+            flush=True,
+        )
+    told("  planned poses, of the random ones needed", float(np.mean(shares)), 0.5, "")
