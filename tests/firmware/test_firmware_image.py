@@ -1,5 +1,7 @@
 """Images: how they are built and read, what is said when that fails, and how much memory they need."""
 
+import sys
+
 import numpy as np
 import pytest
 from firmware_build import FIRMWARE
@@ -81,7 +83,9 @@ def test_an_unknown_board_is_named_with_those_there_are(tmp_path, compiler):
 
 
 def test_an_unknown_compiler_is_named_with_those_there_are(monkeypatch):
-    with pytest.raises(InputError, match=r"no firmware compiler 'tcc' \(.*\); zig needs pip install ziglang"):
+    with pytest.raises(
+        InputError, match=r"no firmware compiler 'tcc' \(.*\); zig needs pip install 'armsight\[build\]'"
+    ):
         build.open_compiler("tcc")
     monkeypatch.setenv(build.COMPILER_VARIABLE, "tcc")
     with pytest.raises(InputError, match="no firmware compiler 'tcc'"):
@@ -149,6 +153,12 @@ def test_a_board_is_built_from_the_command_line(tmp_path, capsys):
     assert read_elf(tmp_path / "pil.elf").hard_float
     assert build.main(["--board", "nano"]) == 2
     assert capsys.readouterr().err.startswith("error: no board 'nano'")
+
+
+def test_without_pymavlink_it_is_said_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymavlink.generator", None)
+    with pytest.raises(InputError, match=r"needs pymavlink: pip install 'armsight\[build\]'"):
+        build.generate("Python3", tmp_path / "dialect.py")
 
 
 def test_a_dialect_that_is_wrong_is_refused(tmp_path, monkeypatch):

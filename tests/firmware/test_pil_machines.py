@@ -1,15 +1,16 @@
 """The same trace, bit for bit, from every compiler on every machine; what the image needs, and its size."""
 
 import json
+import shutil
 
 import pytest
-from firmware_build import build_host, compilers
+from firmware_build import FIRMWARE, build_host, compilers
 from firmware_layout import c
 
 from armsight import firmware
 from armsight.app.board_scenarios import DRIVEN
 from armsight.app.board_selftest import run_scenario
-from armsight.errors import InputError
+from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.machines import open_machine
@@ -155,3 +156,22 @@ def test_an_image_told_nonsense_says_so_on_every_machine(images, library_files):
         assert (refused.magic, refused.version) == (c.FRAME_REFUSED, c.FRAME_VERSION), name
         assert c.pil_answer.from_buffer_copy(machine.tick(bytes(good))).magic == c.FRAME_ANSWER, name
         machine.close()
+
+
+@pytest.mark.parametrize("compiler", IMAGES)
+def test_a_floating_point_register_lost_in_the_interrupt_ends_the_emulation(compiler, tmp_path, monkeypatch):
+    """The main loop's registers are compared after each tick: here the interrupt is made to spoil one."""
+    found = build.compilers()
+    if compiler not in found:
+        pytest.skip(f"needs {compiler} for a Cortex-M4F")
+    sources = tmp_path / "firmware"
+    shutil.copytree(FIRMWARE, sources)
+    startup, call = sources / "boards" / "pil" / "startup.c", "        pil_control();\n"
+    text = startup.read_text(encoding="utf-8")
+    assert call in text
+    startup.write_text(text.replace(call, call + '        __asm__ volatile("vmov s20, r0");\n'), encoding="utf-8")
+    monkeypatch.setattr(build, "source_folder", lambda: sources)
+    machine = machine_of("qemu", build.build_board("pil", tmp_path / "pil.elf", found[compiler]))
+    with pytest.raises(DeviceError, match="broke down"):
+        machine.tick(bytes(c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION)))
+    machine.close()

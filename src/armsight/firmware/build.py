@@ -73,7 +73,7 @@ def open_compiler(name: str | None = None) -> Compiler:
         return found[name]
     wanted = f"no firmware compiler {name!r}" if name else "no firmware compiler"
     have = f"found: {', '.join(found)}" if found else "none found"
-    raise InputError(f"{wanted} ({have}); zig needs pip install ziglang, gcc needs {_ARM_GCC} and gcc")
+    raise InputError(f"{wanted} ({have}); zig needs pip install 'armsight[build]', gcc needs {_ARM_GCC} and gcc")
 
 
 def source_folder() -> Path:
@@ -94,8 +94,10 @@ def boards() -> list[str]:
 
 def generate(language: str, target: Path) -> None:
     """Generate the dialect from its XML: ``C`` headers into a folder, or the ``Python3`` module into a file."""
-    from pymavlink.generator import mavgen, mavparse
-
+    try:
+        from pymavlink.generator import mavgen, mavparse
+    except ImportError:
+        raise InputError("building firmware needs pymavlink: pip install 'armsight[build]'") from None
     options = mavgen.Opts(str(target), wire_protocol="2.0", language=language, validate=True)
     said = io.StringIO()
     try:
