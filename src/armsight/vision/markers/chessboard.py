@@ -141,7 +141,7 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     if not found:
         return None
     uv = (corners.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
-    across, down = (uv[:, -1] - uv[:, 0]).sum(axis=0), (uv[-1] - uv[0]).sum(axis=0)
+    across, down = (uv[0, -1] - uv[0, 0]).tolist(), (uv[-1, 0] - uv[0, 0]).tolist()
     return uv if across[0] * down[1] - across[1] * down[0] > 0 else np.ascontiguousarray(uv[:, ::-1])
 
 
