@@ -30,7 +30,8 @@ from armsight.sim.render import OUTLINE, Shutter, outline
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
-LENS = Optics(0.7, vignetting=0.25, light_gradient=(0.1, -0.1))
+#: The lens and the light, after the shading correction that cameras do themselves.
+LENS = Optics(0.7, vignetting=0.08, light_gradient=(0.04, -0.04))
 #: Points around a pattern or a disc that bound it in the image.
 EDGE = 4 * OUTLINE
 _STILL_PX = 0.05  # what moves less is painted once
@@ -173,7 +174,6 @@ class CellCamera:
         Returns:
             (H, W) uint8.
         """
-        width, height = self.camera.image_size_px
         ends, radius, albedo = (np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
         if arm is not None:
             ends, radius, albedo = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
@@ -193,7 +193,7 @@ class CellCamera:
             core = self._core(crop, margin)
             painted = self._painted(steps, crop, window, (light, depth, ids))
             seen[_part(core, window)] = painted[_part(core, crop)]
-        out: Image = np.empty((height, width), np.uint8)
+        out: Image = np.empty(self._still_grey.shape, np.uint8)
         s = self._sensor
         core = self._core(window, margin)
         light_core = np.ascontiguousarray(seen[_part(core, window)])
@@ -205,9 +205,9 @@ class CellCamera:
         """Return (H, W) which of the arm's moving solids each pixel sees, counted from 1; 0 where it sees none."""
         width, height = self.camera.image_size_px
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
-        boxes = capsule_boxes(self.camera, *capsules[:2])
+        boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
         light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
-        cell_rays.moving(self._rays, (0, 0, width, height), boxes, capsules, self._lamp, light, depth, ids)
+        cell_rays.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
         return ids
 
     def _around(self, boxes: Sequence[tuple[int, ...]], margin: int) -> Window:
