@@ -28,12 +28,14 @@ _STRIP_ROWS = 64
 
 
 def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return where (H, W) a pixel is drawn again: gaps, and near breaks."""
+    """Return where (H, W) a pixel is drawn again: near breaks, and in gaps that a window bridges."""
     three = np.ones((3, 3), np.uint8)
     broken = cv2.dilate(disparity, three) - cv2.erode(disparity, three) > _BREAK
     size = 2 * _BESIDE + 1
-    near = cv2.dilate(broken.astype(np.uint8), np.ones((size, size), np.uint8))
-    return np.asarray(near | (state != MEASURED)).astype(np.uint8)
+    near = cv2.dilate(broken.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    measured = (state == MEASURED).astype(np.uint8)
+    bridged = cv2.dilate(measured, np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)) > measured
+    return np.asarray(near | bridged).astype(np.uint8)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

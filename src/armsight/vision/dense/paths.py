@@ -69,7 +69,7 @@ def cost_base(width: int, size: np.uintp) -> np.uintp:
     return np.uintp(6 * width + 3) * (size + _GUARD)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _step(
     arena: Bytes,
     before: np.uintp,
@@ -100,7 +100,7 @@ def _penalty(image: Bytes, y: int, x: int, from_y: int, from_x: int, p2: Bytes) 
     return np.uint8(p2[abs(np.int32(image[y, x]) - np.int32(image[from_y, from_x]))])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _sum(arena: Bytes, slots: Starts, total: Counts, at: np.uintp, size: np.uintp, add: bool) -> None:
     """Sum four slots into a pixel's totals, or add them to what is there."""
     a, b, c, e = slots[0] + ONE, slots[1] + ONE, slots[2] + ONE, slots[3] + ONE

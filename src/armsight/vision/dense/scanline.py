@@ -54,7 +54,7 @@ class Table(NamedTuple):
     best: Whole
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _skip(table: Table, at: np.uintp, stride: np.uintp, size: np.uintp, taken: np.int16) -> None:
     """Write what it costs to have skipped the pixel before: one more skipped, or the first; disparity grows by one each."""
     matched, skipping = table.matched, table.skipping
@@ -66,7 +66,7 @@ def _skip(table: Table, at: np.uintp, stride: np.uintp, size: np.uintp, taken: n
             skipping[at + d] = min(max(value, _LOW), _HIGH)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _ways(
     table: Table,
     at: np.uintp,
@@ -103,7 +103,7 @@ def _ways(
     return least
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _take_off(matched: Whole, at: np.uintp, size: np.uintp, least: np.int16) -> np.int16:
     """Take the least off a pixel's ways, and return the last disparity that has it."""
     best = np.int16(0)

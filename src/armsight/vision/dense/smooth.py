@@ -23,7 +23,7 @@ _ROUNDS = (1.5, 1.0)
 _STRIP_ROWS = 96
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _add(
     d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles
 ) -> None:

@@ -23,7 +23,7 @@ def _start(columns: Counts, raw: Bytes, row: np.uintp) -> None:
         columns[i] += np.uint16(raw[row + i])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _along(columns: Counts, add: np.uintp, take: np.uintp, total: Counts, at: np.uintp, size: np.uintp) -> None:
     """Let the sum over a window move right by one pixel."""
     for d in range(size):

@@ -47,7 +47,7 @@ def _tried(x: int, first: int, count: int) -> np.uintp:
     return np.uintp(min(max(x - first + 1, 1), count))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, right: np.uintp) -> np.uint16:
     """Return the first disparity of least total, and let every right pixel, from ``right`` on, keep its own least."""
     least, whole = NOWHERE, count - count % BLOCK
