@@ -22,7 +22,7 @@ from armsight.vision.expected import bias_normals
 from armsight.vision.follow_kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
 from armsight.vision.likeness import misfit_limit
-from armsight.vision.markers import disc_search
+from armsight.vision.markers import disc_outline, disc_search
 from armsight.vision.markers.disc_fit import REASONS
 from armsight.vision.markers.disc_model import workspace
 from armsight.vision.markers.marker import Target
@@ -133,7 +133,7 @@ class Follower:
         self._found = _room(len(discs.radii_m), rig.parameter_count)
         self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
-        self._work, self._outline = workspace(), disc_search.workspace()
+        self._work, self._outline = workspace(), disc_outline.workspace()
         # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
         rehearse(rig, target, discs)
         black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]

@@ -25,7 +25,7 @@ from armsight.vision.disc_pose import (
 )
 from armsight.vision.markers.disc_fit import fit, shape_of
 from armsight.vision.markers.disc_model import Work
-from armsight.vision.markers.disc_search import Room, outline
+from armsight.vision.markers.disc_outline import Room, outline
 from armsight.vision.posefit import moved
 
 #: What came of one disc in one image, beside SEEN and the codes of disc_fit.REASONS.

@@ -29,11 +29,10 @@ from armsight.vision.markers.crossing import (
     PARAMETERS,
     WORK,
     Work,
-    edge_noise,
     first_guess,
     fit_crossing,
-    rough_noise,
 )
+from armsight.vision.markers.crossing_noise import edge_noise, rough_noise
 from armsight.vision.markers.window import WINDOW_MAX_PX, WINDOW_SHARE, fill_up, gather, reach_px, thin
 
 #: How far the window of a first fit reaches at most, px.

@@ -21,7 +21,7 @@ PARAMETERS = 10  # c (2), edge angles (2), squared blurs (2), a, b, k (2)
 #: Length of a row of the work space: the most pixels a window has near its edges, and some to fill the last vector.
 ROOM = 1424
 #: Rows of the work space: x, y, grey, the derivatives by the parameters, the residual, one to fill the last tile.
-Y, GREY, JACOBIAN, _R = ROOM, 2 * ROOM, 3 * ROOM, (3 + PARAMETERS) * ROOM
+Y, GREY, JACOBIAN, RESIDUAL = ROOM, 2 * ROOM, 3 * ROOM, (3 + PARAMETERS) * ROOM
 WORK = (5 + PARAMETERS) * ROOM
 #: Moments of the pixels of plain squares of one colour: n, x, y, xx, xy, yy, I, Ix, Iy, II.
 MOMENTS = 10
@@ -84,7 +84,7 @@ def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow:
         g1, g2 = scale * (d1 * e2 + c1), scale * (d2 * e1 + c2)
         h = ff * (_ONE + rho * z1 * z2 + rho2 * w1 * w2) * drho * scale
         level = middle + half * M
-        w[_R + i] = w[GREY + i] - light * level
+        w[RESIDUAL + i] = w[GREY + i] - light * level
         w[JACOBIAN + i] = -g1 * (n1x - bow1 * t1 * s1x) - g2 * (n2x - bow2 * t2 * s2x) - kx * level
         w[JACOBIAN + ROOM + i] = -g1 * (n1y - bow1 * t1 * s1y) - g2 * (n2y - bow2 * t2 * s2y) - ky * level
         w[JACOBIAN + 2 * ROOM + i] = g1 * (n1x * y1 - n1y * x1) + h
@@ -98,7 +98,7 @@ def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _rows(w: Work) -> Work:
+def rows(w: Work) -> Work:
     """Return (12, ROOM) derivatives, residuals and an empty row of the work space."""
     return w[JACOBIAN:].reshape(PARAMETERS + 2, ROOM)
 
@@ -140,7 +140,7 @@ def _assemble(
     for i in range(PARAMETERS + 1):
         for m in range(JACOBIAN + i * ROOM + n, JACOBIAN + i * ROOM + full):
             w[m] = _ZERO
-    products(full, _rows(w), H)
+    products(full, rows(w), H)
     _add_plain(flat, x0, y0, q, H)
     mean, weight = _BLUR2_PRIOR[0], 1.0 / _BLUR2_PRIOR[1] ** 2
     cost = H[PARAMETERS, PARAMETERS]
@@ -185,7 +185,7 @@ def _slight(x: Array, q: Array, share: float) -> bool:
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _carry(n: int, w: Work, x: Array) -> None:
     """Take the residuals along a step x, linearly."""
-    left = w[_R : _R + n]
+    left = w[RESIDUAL : RESIDUAL + n]
     for i in range(PARAMETERS):
         share, o = _f(x[i]), JACOBIAN + i * ROOM
         row = w[o : o + n]
@@ -247,57 +247,3 @@ def fit_crossing(
         if done:
             return factor(H, 0.0, L)
     return False
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def rough_noise(n: int, w: Work) -> float:
-    """Return the variance of what a fit leaves of the n pixels near the edges."""
-    r, power = w[_R : _R + n], _ZERO
-    for m in range(n):
-        power += r[m] * r[m]
-    return float(power / (n - PARAMETERS))
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
-    """Return the variance of the noise and fill cov (2, 2), the covariance of the place; derivatives are used up.
-
-    The noise is that of the pixels that tell the place, as in ``normal.edge_noise``. Leverage is the squared length of
-    L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
-    """
-    H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
-    for j in range(PARAMETERS):
-        inverse[j, j] = L[j, j]
-        for i in range(j + 1, PARAMETERS):
-            s = 0.0
-            for m in range(j, i):
-                s -= L[i, m] * inverse[m, j]
-            inverse[i, j] = s * L[i, i]
-    n = (n + LANES - 1) // LANES * LANES  # derivatives and residuals are zero to the end of a vector
-    jx, jy, root = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[:n]
-    weight = _ZERO
-    for m in range(n):
-        v = jx[m] * jx[m] + jy[m] * jy[m]
-        weight += v
-        root[m] = np.sqrt(v)  # where the columns were: the pixels have done their work
-    for i in range(PARAMETERS + 1):
-        o = JACOBIAN + i * ROOM
-        row = w[o : o + n]
-        for m in range(n):
-            row[m] *= root[m]
-    products(n, _rows(w), H)
-    leverage = 0.0
-    for i in range(PARAMETERS):
-        for j in range(i + 1):
-            s = 0.5 * inverse[i, j] * H[j, j]
-            for k in range(j):
-                s += inverse[i, k] * H[j, k]
-            leverage += 2.0 * inverse[i, j] * s
-    variance = max(H[PARAMETERS, PARAMETERS] / (float(weight) - leverage), 1.0 / 12.0)
-    for i in range(2):
-        for j in range(2):
-            s = 0.0
-            for m in range(PARAMETERS):
-                s += inverse[m, i] * inverse[m, j]
-            cov[i, j] = variance * s
-    return float(variance)

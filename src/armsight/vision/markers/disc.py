@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Discs, Record, Rejected
-from armsight.vision.markers import disc_fit, disc_model, disc_search
+from armsight.vision.markers import disc_fit, disc_model, disc_outline, disc_search
 from armsight.vision.markers.body_check import check_discs
 from armsight.vision.markers.body_file import Marker
 
@@ -86,7 +86,7 @@ class DiscTarget(Record):
         return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
 
 
-def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, disc_search.Room, disc_model.Work]:
+def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, disc_outline.Room, disc_model.Work]:
     """Return the arrays that this thread finds discs in; kept, for new memory each time costs as much as the search."""
     if not hasattr(_KEPT, "room"):
         _KEPT.room = (
@@ -95,7 +95,7 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, 
             np.empty(_MOST_PLACES, np.int64),
             np.empty((_MOST_PLACES, 2, 2)),
             np.empty((_MOST_PLACES, 3)),
-            disc_search.workspace(),
+            disc_outline.workspace(),
             disc_model.workspace(),
         )
     room: tuple[Any, ...] = _KEPT.room

@@ -17,14 +17,22 @@ from armsight.vision.markers.disc_model import (
     STRAY,
     SURROUND,
     UNKNOWNS,
-    F,
     Work,
     factor,
-    gather,
-    inside_products,
     linearise,
     normal_equations,
     solve,
+)
+from armsight.vision.markers.disc_pixels import gather
+from armsight.vision.markers.disc_residuals import (
+    SECTORS,
+    clipped,
+    of_centre,
+    rim,
+    slope_inside,
+    slope_outside,
+    spread,
+    texture_factor,
 )
 
 _STEPS = 8
@@ -70,7 +78,6 @@ _MOST_SIGMA_PX = 0.08
 #: How uneven the inside may be beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
-_SECTORS = 16
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -105,63 +112,6 @@ def _step(n: int, theta: Array, x0: float, y0: float, slope: int, texture: float
     return (shift if shrink == 1.0 else max(shift, 1.0)), square
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _spread(n: int, work: Work, flat: Array) -> None:
-    """Fill the mean squares of the residuals inside and outside, away from the rim, and their counts (4,)."""
-    residual, inside = work.residual, work.inside
-    square_in, square_out, count_in, count_out = F(0.0), F(0.0), F(0.0), F(0.0)
-    for i in range(n):
-        square = residual[i] * residual[i]
-        disc = F(1.0) if inside[i] > F(0.995) else F(0.0)
-        surround = F(1.0) if inside[i] < F(0.005) else F(0.0)
-        square_in += disc * square
-        square_out += surround * square
-        count_in += disc
-        count_out += surround
-    flat[0], flat[1] = square_in / max(count_in, F(1.0)), square_out / max(count_out, F(1.0))
-    flat[2], flat[3] = count_in, count_out
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _clipped(n: int, work: Work) -> int:
-    """Count the pixels that are black or white to the last level."""
-    level, count = work.level, np.int32(0)
-    for i in range(n):
-        count += np.int32(1) if level[i] <= F(0.0) or level[i] >= F(255.0) else np.int32(0)
-    return int(count)
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _stepped(n: int, work: Work) -> None:
-    """Fill ``work.left``, the residuals after the last step; ``work.residual`` is before it."""
-    residual, J, left = work.residual, work.J, work.left
-    x0, x1, x2, x3, x4, x5, x6, x7, x8, x9 = work.x.astype(np.float32)
-    for i in range(n):
-        shape = x2 * J[2, i] + x3 * J[3, i] + x4 * J[4, i] + x5 * J[5, i]
-        light = x6 * J[6, i] + x7 * J[7, i] + x8 * J[8, i] + x9 * J[9, i]
-        left[i] = residual[i] - x0 * J[0, i] - x1 * J[1, i] - shape - light
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) -> None:
-    """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
-    px, py, J, inside = work.px, work.py, work.J, work.inside
-    sectors[:, :] = 0.0
-    cx, cy = F(theta[0] - x0), F(theta[1] - y0)
-    left = work.left
-    _stepped(n, work)
-    for i in range(n):
-        if F(0.03) < inside[i] < F(0.97):
-            square = J[0, i] * J[0, i] + J[1, i] * J[1, i]
-            u, v = px[i] - cx, py[i] - cy
-            a, b = abs(u), abs(v)
-            k = 8 * (u > F(0.0)) + 4 * (v > F(0.0)) + 2 * (a > b) + (min(a, b) > F(0.41421356) * max(a, b))
-            sectors[0, k] += np.sqrt(square) * left[i]
-            sectors[1, k] += square
-    for k in range(_SECTORS):
-        sectors[0, k] /= max(sectors[1, k], 1e-12)
-
-
 @numba.njit(cache=True, error_model="numpy")
 def _minimise(
     n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: Work
@@ -178,7 +128,7 @@ def _minimise(
             return -1.0, 0.0
         if shift < _WEIGH_PX and not weighed:
             weighed = True
-            _spread(n, work, flat)
+            spread(n, work, flat)
             v_in = flat[0] if flat[2] >= 30.0 else noise_sigma * noise_sigma
             v_in = max(v_in, 0.05, 1e-4 * theta[6] * theta[6])
             if flat[1] > (2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))) * v_in:
@@ -187,75 +137,6 @@ def _minimise(
         if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
             return square, texture
     return -1.0, 0.0
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _texture_factor(n: int, blur: float, texture: float, work: Work) -> float:
-    """Return how many times larger the centre's variance is because neighbouring pixels of a texture are alike.
-
-    The correlation of neighbours, k, gives (1 + k) / (1 - k) pixels that vary as one along the rim, and at most the width
-    of the edge across it; it counts by the share that the texture has in what tells the centre.
-    """
-    px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
-    square, product = 0.0, 0.0
-    by_texture, by_all = 0.0, 1e-12
-    for i in range(n):
-        if inside[i] < F(0.005):
-            square += residual[i] * residual[i]
-            if i + 1 < n and py[i + 1] == py[i] and px[i + 1] == px[i] + F(1.0):
-                product += residual[i] * residual[i + 1]
-        tells = J[0, i] * J[0, i] + J[1, i] * J[1, i]
-        rest = 1.0 - inside[i]
-        by_texture += tells * texture * rest * rest / (1.0 + texture * rest * rest)
-        by_all += tells
-    k = min(max(product / max(square, 1e-12), 0.0), 0.95)
-    along = (1.0 + k) / (1.0 - k)
-    return 1.0 + (along * min(along, 1.0 + 2.0 * blur) - 1.0) * by_texture / by_all
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _of_centre(work: Work, cov: Array) -> None:
-    """Fill the (2, 2) block of H^-1 that is the centre's."""
-    g, L, scale, x = work.g, work.L, work.scale, work.x
-    for a in range(2):
-        g[:] = 0.0
-        g[a] = 1.0
-        solve(L, scale, g, x)
-        cov[a, 0], cov[a, 1] = x[0], x[1]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> float:
-    """Return what chi-square would gain from a gradient of the disc's own, in units of the noise's variance."""
-    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
-    inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
-    s0, s1 = out[0, 10], out[1, 10]
-    k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
-    # The residual is the one before the last step x = H^-1 g; then the columns as far as J does not explain them.
-    for a in range(UNKNOWNS):
-        s0 -= out[0, a] * x[a]
-        s1 -= out[1, a] * x[a]
-    g[:] = out[0, :UNKNOWNS]
-    solve(L, scale, g, x)
-    for a in range(UNKNOWNS):
-        k00 -= out[0, a] * x[a]
-        k01 -= out[1, a] * x[a]
-    g[:] = out[1, :UNKNOWNS]
-    solve(L, scale, g, x)
-    for a in range(UNKNOWNS):
-        k11 -= out[1, a] * x[a]
-    det = k00 * k11 - k01 * k01
-    if not det > 0.0:
-        return 0.0
-    return float((k11 * s0 * s0 - 2 * k01 * s0 * s1 + k00 * s1 * s1) / det)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _slope_outside(theta: Array, work: Work) -> float:
-    """Return what chi-square would lose without the surround's gradient, in units of the noise's variance."""
-    L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
-    # Of the last two unknowns the factor's last corner is that of their information, the others' share taken out.
-    return float((a / L[8, 8] + b * L[9, 8]) ** 2 + (b / L[9, 9]) ** 2)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -277,7 +158,7 @@ def _average(
         square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
         results[kind, 0] = np.inf
         if square >= 0.0:
-            _of_centre(work, block)
+            of_centre(work, block)
             variance = square / (n - UNKNOWNS)
             results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
             results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
@@ -329,7 +210,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if square < 0.0:
         return 2
     # Clipped pixels have no noise and say nothing of it.
-    variance = square / max(n - _clipped(n, work) - UNKNOWNS, UNKNOWNS)
+    variance = square / max(n - clipped(n, work) - UNKNOWNS, UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
     half = (theta[2] + theta[4]) / 2
     root = np.sqrt(max(half * half - det, 0.0))
@@ -343,9 +224,9 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     excess = np.sqrt(max(variance - noise_sigma * noise_sigma, 0.0)) / abs(theta[6])
     if excess > _MOST_RESIDUAL:
         return 10
-    _rim(n, theta, x0, y0, work, sectors)
+    rim(n, theta, x0, y0, work, sectors)
     off, chance, count = 0.0, 0.0, 0
-    for k in range(_SECTORS):
+    for k in range(SECTORS):
         if sectors[1, k] > 0.0:
             off += sectors[0, k] ** 2 - variance / sectors[1, k]
             chance += 2.0 * (variance / sectors[1, k]) ** 2
@@ -353,16 +234,16 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
         return 5
-    _spread(n, work, sectors[0])
+    spread(n, work, sectors[0])
     if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
     uneven = texture == 0.0 and (
-        _slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
-        or _slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
+        slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
+        or slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
     )
-    _of_centre(work, cov)
+    of_centre(work, cov)
     if texture > 0.0:
-        variance *= _texture_factor(n, theta[5], texture, work)
+        variance *= texture_factor(n, theta[5], texture, work)
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
             return 10
     for a in range(2):
