@@ -12,7 +12,7 @@ from armsight.data import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.bench import bench_rig
-from armsight.sim.solid import box, joined, moved, see, with_noise
+from armsight.sim.solid import Solid, box, joined, moved, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.depth import depth_of
@@ -140,15 +140,13 @@ def coverage(folder: Path) -> dict[str, Any]:
             inside[label] = 100 * float(np.mean(off <= 1.96 * result.sigma_px[sure]))
         rendered = [v for k, v in inside.items() if k != "cones"]
         cones = f"cones {inside['cones']:.1f}%, " if "cones" in inside else ""
-        print(
-            f"  {name:<14}{cones}rendered {np.mean(rendered):.1f}% ({min(rendered):.1f} to {max(rendered):.1f}); wanted 90 to 97",
-            flush=True,
-        )
+        spread = f"({min(rendered):.1f} to {max(rendered):.1f})"
+        print(f"  {name:<14}{cones}rendered {np.mean(rendered):.1f}% {spread}; wanted 90 to 97", flush=True)
         found[name] = inside
     return found
 
 
-def a_tool() -> Any:  # noqa: ANN401
+def a_tool() -> Solid:
     grain = {"grain_m": 0.012, "contrast": 30.0, "seed": 3}
     arm = pose(exp_so3(np.array([0, 0, 0.4])), np.array([-0.07, -0.03, -0.03]))
     return joined(

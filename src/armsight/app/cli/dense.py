@@ -35,7 +35,7 @@ class _Dense(click.Group):
 
 @click.group(cls=_Dense)
 def command() -> None:
-    r"""Find a disparity for every pixel of a pair, or judge the methods by scenes with a truth.
+    """Find a disparity for every pixel of a pair, or judge the methods by scenes with a truth.
 
     \b
     armsight dense RIG.json LEFT RIGHT -o OUT        depth, point cloud
@@ -44,7 +44,7 @@ def command() -> None:
     armsight dense evaluate DIR                      the Middlebury benchmark's figures
 
     More: armsight dense match -h, armsight dense evaluate -h.
-    """
+    """  # noqa: D301 - click keeps the lines of a paragraph that begins so
 
 
 @command.command("match")

@@ -1,9 +1,10 @@
 """Depth breaks drawn where the image has its edges.
 
-A window that matches sees both sides of a break, so that the nearer surface comes out a few pixels too wide, and what is filled
-beside it is a guess. Near breaks and gaps every pixel takes the weighted median of its neighbourhood, neighbours that look like
-it and are near counting more: the surface that its looks belong to (Ma, He, Wei, Sun and Wu, "Constant time weighted median
-filtering for stereo matching and beyond", ICCV 2013). A measured pixel that finds itself on another surface is measured no more.
+A window that matches sees both sides of a break, so that the nearer surface comes out a few pixels too wide, and what
+is filled beside it is a guess. Near breaks and gaps every pixel takes the weighted median of its neighbourhood,
+neighbours that look like it and are near counting more: the surface that its looks belong to (Ma, He, Wei, Sun and Wu,
+"Constant time weighted median filtering for stereo matching and beyond", ICCV 2013). A measured pixel that finds itself
+on another surface is measured no more.
 """
 
 from __future__ import annotations

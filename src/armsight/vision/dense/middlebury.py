@@ -98,7 +98,9 @@ def _read_truth(path: Path, name: str) -> Array:
         raw = read_pfm(path).astype(np.float64)
         return np.where(np.isfinite(raw) & (raw > 0), raw, np.nan)
     if path.suffix in (".tif", ".tiff"):
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # or it warns of tags it does not know
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.utils.logging.setLogLevel(level)
         if image is None or image.ndim != 2:
             raise InputError(f"{path}: not a grey TIFF that can be read")
         values: Array = np.asarray(image, np.float64)

@@ -22,8 +22,9 @@ from armsight.vision.dense.paths import ADD, RUN_UP, WRITE, Work, cost_base, for
 from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.winner import Found, choose_row, make_found
 
-#: Rows of a strip where all paths come from above, and where they come from below too and a strip's totals are kept.
-_STRIP_ROWS, _STRIP_ROWS_KEPT = 384, 96
+#: Rows of a strip where all paths come from above; where they come from below too and a strip's totals are kept, rows
+#: at most and bytes about.
+_STRIP_ROWS, _STRIP_ROWS_KEPT, _STRIP_BYTES = 384, 96, 32e6
 #: Rows that the paths run before they count: by then what lies further back is forgotten.
 _RUN_UP = 24
 #: Penalties in thirds of a census bit. P1, of a disparity that changes by one, is four bits: what noise changes in a
@@ -114,5 +115,6 @@ class Semiglobal:
         def work(begin: int, end: int) -> None:
             _strip(pair, begin, end, self.paths, search.first, search.count, np.uintp(size), np.uint8(_P1), p2, found)
 
-        on_strips(left.shape[0], _STRIP_ROWS if self.paths == 5 else _STRIP_ROWS_KEPT, work)
+        kept = int(np.clip(_STRIP_BYTES / (2 * left.shape[1] * size), _RUN_UP, _STRIP_ROWS_KEPT))
+        on_strips(left.shape[0], _STRIP_ROWS if self.paths == 5 else kept, work)
         return found
