@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_calibrate import HandEyeRun, find_delay, find_mounting
 from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
@@ -17,7 +19,7 @@ from armsight.app.run_passes import closed_on, drive, planned
 from armsight.app.run_station import Station
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError
-from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.servo import PoseServo, Timing
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.follow import Follower
@@ -26,6 +28,8 @@ from armsight.vision.rig import StereoRig
 Progress = Callable[[str], None]
 #: Sigma of the delay before it is measured, s.
 _UNKNOWN_DELAY = Delay(0.02, 0.02)
+#: Links of an arm that stands creep in their backlash, unseen by the potentiometers: half a gap of 0.2 degree in seconds.
+PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
 #: From an image's arrival to its command: our own time, and the wait for the loop's next turn, s.
 _OWN_S = 0.002 + PERIOD_S / 2
 
@@ -89,7 +93,7 @@ def run_experiment(
         progress("making ready to follow the body")
         follower = Follower(rig, station.target)
         station.board.enable()
-        loop = Loop(station, follower, outcome.log, KalmanEstimator(station.arm, delay=_UNKNOWN_DELAY))
+        loop = Loop(station, follower, outcome.log, KalmanEstimator(station.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
         _require_seen(loop, station, plan)
         _prepare(loop, station, plan, targets, outcome, progress)
         _passes(loop, station, plan, outcome, progress, cover, close_loop)
@@ -138,7 +142,7 @@ def _prepare(
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
     back = point_to_point(arm, middle, plan.start)
     there = Segment("calibration", "to the start", "joints", False, trajectory=back)
-    loop.begin(KalmanEstimator(arm, delay=outcome.delay))
+    loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay))
     loop.run(Planned(back, loop.t_s, gravity), back.duration_s + 0.5, there)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.app.experiment import Outcome, Progress, timing
+from armsight.app.experiment import PRIOR, Outcome, Progress, timing
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_data import RunData, assembled
 from armsight.app.run_loop import Log, Loop
@@ -69,7 +69,7 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     station.board.enable()
     log = Log()
     loop = Loop(
-        station, Follower(rig, station.target), log, KalmanEstimator(station.arm, delay=outcome.delay)
+        station, Follower(rig, station.target), log, KalmanEstimator(station.arm, prior=PRIOR, delay=outcome.delay)
     )
     loop.mounting = outcome.handeye.mounting
     servo = PoseServo(station.arm, timing(station, outcome.delay))

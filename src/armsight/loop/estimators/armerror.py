@@ -60,6 +60,7 @@ class Prior:
         compliance: sag per gravity torque of a unit load, rad/m.
         rest_rad: what else a joint is off, rad.
         rest_travel_rad: travel in which it forgets that, rad.
+        creep_rad: how far a link creeps in its backlash in a second while its potentiometer stands, rad.
         flip_rad: how uncertain a joint is after a change of side, beyond the width, rad.
         pose_m: what no joint explains, m.
         pose_rad: the same of the turn, rad.
@@ -78,6 +79,7 @@ class Prior:
     compliance: float = 5e-3
     rest_rad: float = float(np.deg2rad(0.1))
     rest_travel_rad: float = 0.1
+    creep_rad: float = 0.0
     flip_rad: float = float(np.deg2rad(0.03))
     pose_m: float = 1e-4
     pose_rad: float = float(np.deg2rad(0.01))

@@ -38,6 +38,8 @@ OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
+#: After so long a joint has crept wherever it could, s.
+LONGEST_CREEP_S = 4.0
 #: Joints that came no further than this between two sightings stood still, rad.
 STILL_RAD = 1e-5
 _GATE = float(chi2.isf(CHANCE, 6))
@@ -142,7 +144,7 @@ class KalmanEstimator:
         """Return where the tool is at (N,) times."""
         joints = self._readings.at(np.asarray(t_s, dtype=float))
         state = self._states[-1]
-        step = self._moved(state, joints)
+        step = self._moved(state, joints, t_s)
         Ts, Hs = self._model(state.x * step.kept, joints.q, joints.side)
         by_state = Hs * step.kept[:, None, :]
         own = (by_state.reshape(-1, SIZE) @ state.P).reshape(Hs.shape) @ np.swapaxes(by_state, 1, 2)
@@ -153,8 +155,8 @@ class KalmanEstimator:
     def smoothed(self, t_s: Array) -> Track:
         """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
 
-        Between two sightings the model after each is carried to the time in between, the way to it by the joints; the two are
-        blended by how far the joints had come. Times newer than the newest sighting are as in :meth:`track`.
+        Between two sightings the model after each is carried to the time in between; the two are blended by how far the
+        joints had come. Times newer than the newest sighting are as in :meth:`track`.
         """
         ends = [state for state in self._states if state.sighting is not None]
         at = np.searchsorted([state.t_s for state in ends], t_s)
@@ -170,9 +172,9 @@ class KalmanEstimator:
         whole = float(np.abs(after.travel - before.travel).sum())
         times = (t_s - before.t_s) / max(after.t_s - before.t_s, 1e-9)
         share = np.clip(come / whole if whole > STILL_RAD else times, 0.0, 1.0)
-        ahead = self._moved(before, joints)
+        ahead = self._moved(before, joints, t_s)
         back = self._moved(
-            after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints
+            after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints, t_s
         )
         Ts, Hs = self._model(before.x * ahead.kept, joints.q, joints.side)
         Ts_after, _ = self._model(after.x * back.kept, joints.q, joints.side)
@@ -185,16 +187,16 @@ class KalmanEstimator:
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
-        now = self._readings.at(np.array([self.span_s[1]]))
-        state = self._states[-1]
+        newest = np.array([self.span_s[1]])
+        now, state = self._readings.at(newest), self._states[-1]
         side = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.side)
-        return self._model(state.x * self._moved(state, now).kept, q, side)[0]
+        return self._model(state.x * self._moved(state, now, newest).kept, q, side)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
-        now = self._readings.at(np.array([self.span_s[1]]))
-        state = self._states[-1]
-        step = self._moved(state, now)
+        newest = np.array([self.span_s[1]])
+        now, state = self._readings.at(newest), self._states[-1]
+        step = self._moved(state, now, newest)
         x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
         by = np.empty((6, SIZE))
         armerror.offsets_by(self._arm.table, now.q[0], now.side[0], by)
@@ -230,8 +232,8 @@ class KalmanEstimator:
         armerror.poses_and_derivatives(self._arm.table, np.broadcast_to(x, (len(q), SIZE)).copy(), q, side, Ts, Hs)
         return Ts, Hs
 
-    def _moved(self, state: _State, joints: Smoothed) -> _Step:
-        """Return what the motion since a state does to it: factors and variances (N, SIZE)."""
+    def _moved(self, state: _State, joints: Smoothed, t_s: Array) -> _Step:
+        """Return what motion and time (N,) since a state, or before it, do to it: factors and variances (N, SIZE)."""
         prior = self._prior
         travel = np.maximum(joints.travel - state.travel, 0.0)
         flips = np.maximum(joints.flips - state.flips, 0.0)
@@ -241,13 +243,14 @@ class KalmanEstimator:
         kept[:, free] = np.exp(-travel.sum(axis=1, keepdims=True) / prior.pose_travel_rad)
         for part in (rest, free):
             added[:, part] = self._sigmas[part] ** 2 * (1 - kept[:, part] ** 2)
+        added[:, rest] += prior.creep_rad**2 * np.minimum(np.abs(t_s - state.t_s), LONGEST_CREEP_S)[:, None]
         added[:, rest] += 0.5 * prior.flip_rad**2 * flips  # a whole change of side moves it from -1 to 1
         return _Step(kept, added)
 
     def _reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
         """Return the covariances (N, 6, 6) of poses from the readings' noise."""
         J = Hs[:, :, ZEROS]
-        return np.asarray(J @ np.swapaxes(J, 1, 2) * (self._prior.reading_rad**2 * joints.variance[:, None, None]))
+        return np.asarray(self._prior.reading_rad**2 * (J * joints.variance[:, None, :]) @ np.swapaxes(J, 1, 2))
 
     @staticmethod
     def _shared(sighting: Sighting | None, Ts: Array) -> Array:
@@ -262,7 +265,7 @@ class KalmanEstimator:
         """Return the state after a sighting, None where it is an outlier."""
         t_s = max(self._seen_s(sighting, before), before.t_s)
         joints = self._readings.at(np.array([t_s]))
-        step = self._moved(before, joints)
+        step = self._moved(before, joints, np.array([t_s]))
         kept = step.kept[0]
         x, P = before.x * kept, before.P * np.outer(kept, kept)
         P[np.diag_indices(SIZE)] += step.added[0]

@@ -9,6 +9,7 @@ hysteresis", 1989), behind a dead zone that the readings' noise does not cross.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -21,6 +22,11 @@ from armsight.geometry.check import checked
 #: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
 #: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
 SPAN_S = 0.049
+#: A joint that shows no motion within this time around (or, where it is the newest, before) a time stands still there, s,
+#: and is averaged over it: the parabola's noise at its end is eight times the mean's.
+STILL_SPAN_S = 0.3
+#: What counts as motion, in standard deviations: of the two halves' means, and of parabola and mean.
+_MOTION = 3.0
 #: Readings kept, s.
 KEPT_S = 2.0
 #: Fewest readings for a parabola; fewer are averaged.
@@ -46,7 +52,7 @@ class Smoothed(NamedTuple):
     Attributes:
         q: (N, 6) angles, rad.
         qd: (N, 6) speeds, rad/s.
-        variance: (N,) what is left of a reading's variance.
+        variance: (N, 6) what is left of a reading's variance.
         side: (N, 6) where the joint should be in its backlash, -1 to 1: 1 when it came up from below.
         travel: (N, 6) how far the joint has moved in all, rad.
         flips: (N, 6) how far ``side`` has moved in all.
@@ -86,11 +92,11 @@ def _fit(t: Array, q: Array, low: int, high: int, at: float, angles: Array, spee
 
 
 @_kernel
-def _window(t: Array, first: int, count: int, at: float) -> tuple[int, int]:
-    """Return the rows around a time: SPAN_S of them, around it as far as there are any, else before or after."""
+def _window(t: Array, first: int, count: int, at: float, span: float) -> tuple[int, int]:
+    """Return the rows of a span of time around a time, s: around it as far as there are any, else before or after."""
     last = first + count - 1
-    late = min(max(at + 0.5 * SPAN_S, t[first] + SPAN_S), t[last])
-    low = first + np.searchsorted(t[first : last + 1], late - SPAN_S)
+    late = min(max(at + 0.5 * span, t[first] + span), t[last])
+    low = first + np.searchsorted(t[first : last + 1], late - span)
     high = first + np.searchsorted(t[first : last + 1], late, side="right") - 1
     return min(low, high), high
 
@@ -100,7 +106,7 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
     """Write travel, flips, side, and the place behind the dead zone, of rows begin to end into memory (N, 4, 6)."""
     angles, speeds = np.empty(6), np.empty(6)
     for k in range(begin, end):
-        low, high = _window(t, first, k - first + 1, t[k])
+        low, high = _window(t, first, k - first + 1, t[k], SPAN_S)
         _fit(t, q, low, high, t[k], angles, speeds)
         for i in range(6):
             if k == first:
@@ -117,14 +123,41 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 
 
 @_kernel
+def _rest(q: Array, low: int, high: int, sigma: float, angles: Array, speeds: Array, variance: Array) -> None:
+    """Put the means of rows low to high in the place of fitted angles (6,) of joints that stand still meanwhile."""
+    half, n = (high - low + 1) // 2, high - low + 1
+    for i in range(6):
+        early = late = 0.0
+        for k in range(half):
+            early += q[low + k, i]
+            late += q[high - k, i]
+        mean, drift = (early + late) / (2 * half), abs(late - early) / half
+        moves = drift > _MOTION * sigma * math.sqrt(2.0 / half)
+        if not moves and abs(angles[i] - mean) < _MOTION * sigma * math.sqrt(variance[i]):
+            angles[i], speeds[i], variance[i] = mean, 0.0, 1.0 / n
+
+
+@_kernel
 def _smooth(
-    t: Array, q: Array, memory: Array, first: int, count: int, at: Array, qs: Array, qds: Array, hysteresis: Array
+    t: Array,
+    q: Array,
+    memory: Array,
+    first: int,
+    count: int,
+    at: Array,
+    sigma: float,
+    qs: Array,
+    qds: Array,
+    hysteresis: Array,
 ) -> Array:
-    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 3, 6); return the variances (N,)."""
-    variance = np.empty(len(at))
+    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 3, 6); return the variances (N, 6)."""
+    variance = np.empty((len(at), 6))
     for n in range(len(at)):
-        low, high = _window(t, first, count, at[n])
+        low, high = _window(t, first, count, at[n], SPAN_S)
         variance[n] = _fit(t, q, low, high, at[n], qs[n], qds[n])
+        low, high = _window(t, first, count, at[n], STILL_SPAN_S)
+        if high - low > 4 * _PARABOLA:
+            _rest(q, low, high, sigma, qs[n], qds[n], variance[n])
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
         hysteresis[n] = memory[k, :3]
     return variance
@@ -140,7 +173,7 @@ class Readings:
     def __init__(self, sigma_rad: float) -> None:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
-        self._gap = np.full(6, GAP_RAD)
+        self._gap, self._sigma = np.full(6, GAP_RAD), sigma_rad
         self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 4, 6))
         self._first = self._count = 0
 
@@ -199,5 +232,6 @@ class Readings:
                 f"{newest:.4f} s"
             )
         qs, qds, hysteresis = np.empty((len(t_s), 6)), np.empty((len(t_s), 6)), np.empty((len(t_s), 3, 6))
-        variance = _smooth(self._t, self._q, self._memory, self._first, self._count, t_s, qs, qds, hysteresis)
+        kept = (self._t, self._q, self._memory, self._first, self._count)
+        variance = _smooth(*kept, t_s, self._sigma, qs, qds, hysteresis)
         return Smoothed(qs, qds, variance, hysteresis[:, 2], hysteresis[:, 0], hysteresis[:, 1])
