@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test lint bench clean
 
-demo: $(VENV)/.armsight  ## calibrate and measure a rendered recording, and print the error against its truth
+demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held against its truth
 	$(BIN)/armsight demo -o demo
 
 test: $(VENV)/.armsight-test lint  ## everything that must hold
@@ -18,7 +18,7 @@ lint: $(VENV)/.armsight-test
 
 bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA; about an hour
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
-	cd benchmarks && for each in calibration markers kinematics motions; do ../$(BIN)/python $$each.py || exit 1; done
+	cd benchmarks && for each in calibration markers kinematics motions board dense identify experiment; do ../$(BIN)/python $$each.py || exit 1; done
 
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)

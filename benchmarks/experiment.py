@@ -1,0 +1,60 @@
+"""The experiment's figures over seeds: every one of them, none hidden.
+
+python experiment.py            ten seeds, worn arm, the ARM binary under Unicorn: about ten minutes idle
+python experiment.py 3          three of them
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from armsight.app.demo import Demo, run_demo
+
+#: Figure -> where it stands in the summary, its factor and unit, and what it must be at most (None: told only).
+FIGURES = {
+    "vision, moving, RMS": ("vision", "position_rms_m", 1e3, "mm", 0.20),
+    "vision, turn RMS": ("vision", "orientation_rms_rad", float(np.degrees(1)), "deg", 0.15),
+    "vision, at rest, RMS": ("vision", "rest_position_rms_m", 1e3, "mm", None),
+    "potentiometers, moving, RMS": ("potentiometers", "position_rms_m", 1e3, "mm", None),
+    "fused (40 ms later), moving, RMS": ("fused", "position_rms_m", 1e3, "mm", 0.25),
+    "fused, at rest, RMS": ("fused", "rest_position_rms_m", 1e3, "mm", None),
+    "fused, NEES (6 is honest)": ("fused", "nees_mean", 1.0, "", None),
+    "fused at once, moving, RMS": ("live", "position_rms_m", 1e3, "mm", None),
+    "hidden for 0.5 s, fused, max": ("occlusion", "fused_position_max_m", 1e3, "mm", 0.5),
+    "loop open, rest error RMS": ("closed_loop", "rest_error_before_m", 1e3, "mm", None),
+    "loop closed, rest error RMS": ("closed_loop", "rest_error_after_m", 1e3, "mm", 0.15),
+    "loop open, path error RMS": ("closed_loop", "path_error_before_m", 1e3, "mm", None),
+    "loop closed, path error RMS": ("closed_loop", "path_error_after_m", 1e3, "mm", None),
+    "image to command, p50": ("latency_s", "p50", 1e3, "ms", None),
+    "image to command, p99": ("latency_s", "p99", 1e3, "ms", 2.0),
+}
+
+
+def main(seeds: int) -> None:
+    """Run and print."""
+    found: dict[str, list[float]] = {
+        name: [] for name in (*FIGURES, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
+    }
+    for seed in range(seeds):
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            s = run_demo(Demo(Path(folder), seed=seed, quick=True))
+        for name, (part, key, factor, _, _) in FIGURES.items():
+            found[name].append(factor * s[part][key])
+        c = s["closed_loop"]
+        found["vision, RMS over sigma"].append(s["vision"]["position_rms_m"] / s["vision"]["position_sigma_rms_m"])
+        found["rest, times smaller"].append(c["rest_error_before_m"] / c["rest_error_after_m"])
+        found["path, times smaller"].append(c["path_error_before_m"] / c["path_error_after_m"])
+        print(f"seed {seed}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+    print(f"{'':34s} {'median':>8s} {'least':>8s} {'most':>8s}  wanted at most")
+    for name, values in found.items():
+        unit, most = FIGURES[name][3:] if name in FIGURES else ("", None)
+        bar = "" if most is None else f"{most:g} {unit}: {sum(v <= most for v in values)} of {len(values)}"
+        print(f"{name:34s} {np.median(values):8.3f} {min(values):8.3f} {max(values):8.3f}  {bar}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10)
