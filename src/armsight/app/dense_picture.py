@@ -21,8 +21,8 @@ _RIGHT, _OFF_1, _OFF_2, _OFF_4, _UNKNOWN = (225, 225, 225), (120, 200, 250), (40
 
 def _colours(values: NDArray[np.floating[Any]], low: float, high: float) -> Image:
     """Return colours (..., 3) BGR for values between low and high."""
-    share = np.clip(np.nan_to_num((values - low) / max(high - low, 1e-9)), 0, 1)
-    return np.asarray(cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO))
+    share = np.nan_to_num((values.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1e-9)))
+    return np.asarray(cv2.applyColorMap(np.clip(share, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO))
 
 
 def _write(canvas: Image, text: str, place: tuple[int, int]) -> None:
@@ -41,8 +41,8 @@ def paint_disparity(result: Disparity) -> Image:
         return canvas
     low, high = (float(q) for q in np.percentile(result.disparity[some], (0.5, 99.5)))
     picture = _colours(result.disparity, low, high)
-    v, u = np.mgrid[:height, :width]
-    pale = some & (result.state != MEASURED) & ((u + v) % 6 < 3)
+    diagonal = np.add.outer(np.arange(height, dtype=np.int16), np.arange(width, dtype=np.int16))
+    pale = some & (result.state != MEASURED) & (diagonal % 6 < 3)
     picture[pale] = (0.35 * picture[pale] + 0.65 * 255).astype(np.uint8)
     picture[~some] = (200, 200, 200)
     canvas[:height, :width] = picture

@@ -24,7 +24,7 @@ from armsight.vision.dense.winner import Found, choose_row, make_found
 
 #: Rows of a strip where all paths come from above; where they come from below too and a strip's totals are kept, rows
 #: at most and bytes about.
-_STRIP_ROWS, _STRIP_ROWS_KEPT, _STRIP_BYTES = 384, 96, 32e6
+_STRIP_ROWS, _STRIP_ROWS_KEPT, _STRIP_BYTES = 384, 96, 14e6
 #: Rows that the paths run before they count: by then what lies further back is forgotten.
 _RUN_UP = 24
 #: Penalties in thirds of a census bit. P1, of a disparity that changes by one, is four bits: what noise changes in a
