@@ -67,3 +67,12 @@ def test_render_a_recording(tmp_path, capsys):
     sigma = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along))
     assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5 * sigma)
     assert f"baseline {1e3 * rig.baseline_m:.3f} mm" in capsys.readouterr().out
+
+
+def test_dense(capsys):
+    (path,) = [path for path in EXAMPLES if path.name.startswith("04")]  # run("04") but for its main, which takes no folder
+    runpy.run_path(str(path))["main"]()
+    found = re.search(r"error ([\d.]+) mm, ([\d.]+) deg", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) < 1.0  # what docs/dense.md says of 0.8 m
+    assert float(found[2]) < 0.5
