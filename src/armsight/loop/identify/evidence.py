@@ -17,7 +17,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
 #: The kinds whose priors are scaled: what is known of them before differs most from arm to arm.
-SCALED = ("gain", "wave", "backlash", "sag")
+SCALED = ("gain", "wave", "ripple", "backlash", "slack", "sag")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
 LEAST, MOST = 0.01, 1.0
 #: The factor is itself told by a handful of numbers, to some 40 %; it is taken at its upper end.

@@ -1,8 +1,10 @@
 """What a joint's true angle may differ by from what its sensor reads: linear in the unknown coefficients.
 
-gain: the sensor's scale. wave: linearity error of a sensor of one turn, sin and cos of its angle and of twice that.
-backlash: half of it to either side, by the direction of approach. sag: a compliant gear under the links' weight; the torque
-about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j link j's own vector.
+gain: the sensor's scale. wave, ripple: linearity error of a sensor, sin and cos of its angle and of multiples of it.
+backlash: half of it to either side, by the direction of approach: play that friction holds where the joint left it. slack:
+the same for play that the weight beyond the joint closes, whichever way it came. sag: a compliant gear under the links'
+weight; the torque about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j
+link j's own vector.
 """
 
 from __future__ import annotations
@@ -16,10 +18,12 @@ from armsight.loop.identify import chain
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
-#: Harmonics of one turn of a joint's sensor.
-WAVES = (1, 2)
-#: A joint whose links' weight pulls with less than this lever, m, rests where friction leaves it.
-LEAST_LEVER_M = 5e-3
+#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, and those of its track and gears.
+WAVES, RIPPLES = (1, 2), (3, 4, 5, 6, 7, 8)
+#: Fewer numbers measured than this cannot choose among the ripples' 72 coefficients without taking chance for a cause.
+ENOUGH = 350
+#: Weight closes a joint's play where it pulls with more than about this lever, m.
+LEAST_LEVER_M = 1e-2
 
 
 class Feature(NamedTuple):
@@ -27,7 +31,7 @@ class Feature(NamedTuple):
 
     Attributes:
         name: of the coefficient.
-        kind: "gain", "wave", "backlash" or "sag".
+        kind: "gain", "wave", "ripple", "backlash", "slack" or "sag".
         joint: 0 to 5.
         unit: of the coefficient.
         detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose weight sags; (0, 0) elsewhere.
@@ -40,15 +44,17 @@ class Feature(NamedTuple):
     detail: tuple[int, int] = (0, 0)
 
 
-def all_features(backlash: bool) -> tuple[Feature, ...]:
-    """Return every cause there is; ``backlash`` where directions of approach are known."""
+def all_features(backlash: bool, ripple: bool) -> tuple[Feature, ...]:
+    """Return every cause there is; ``backlash`` where directions of approach are known, ``ripple`` with many poses."""
     found = []
     for i in range(6):
         found.append(Feature(f"gain{i + 1}", "gain", i, "1"))
-        for n in WAVES:
-            found += [Feature(f"wave{i + 1}_{w}{n}", "wave", i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
+        for n in (*WAVES, *RIPPLES) if ripple else WAVES:
+            kind = "wave" if n in WAVES else "ripple"
+            found += [Feature(f"{kind}{i + 1}_{w}{n}", kind, i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
         if backlash:
             found.append(Feature(f"backlash{i + 1}", "backlash", i, "rad"))
+        found.append(Feature(f"slack{i + 1}", "slack", i, "rad"))
         found += [Feature(f"sag{i + 1}_{j + 1}", "sag", i, "rad/m", (j, 0)) for j in range(i, 6)]
     return tuple(found)
 
@@ -67,16 +73,20 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
         (N, F).
     """
     out = np.zeros((len(q), len(features)))
-    levers = _levers(arm, q, up_base) if any(f.kind == "sag" for f in features) else np.zeros((0, 6, 6))
+    weighty = any(f.kind in ("sag", "slack") for f in features)
+    levers = _levers(arm, q, up_base) if weighty else np.zeros((len(q), 6, 6))
     for k, f in enumerate(features):
         angle = q[:, f.joint]
         if f.kind == "gain":
             out[:, k] = angle
-        elif f.kind == "wave":
+        elif f.kind in ("wave", "ripple"):
             n, phase = f.detail
             out[:, k] = np.cos(n * angle) if phase else np.sin(n * angle)
         elif f.kind == "backlash" and approach is not None:
             out[:, k] = -0.5 * approach[:, f.joint]
+        elif f.kind == "slack":
+            lever = levers[:, f.joint, f.joint :].sum(axis=1)  # of the flange: where the weight is, is not known
+            out[:, k] = 0.5 * lever / np.hypot(lever, LEAST_LEVER_M)
         elif f.kind == "sag":
             out[:, k] = levers[:, f.joint, f.detail[0]]
     return out
@@ -90,24 +100,6 @@ def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
     z, at = m.axis[:, chain.OFFSET], np.concatenate([m.through[:, chain.OFFSET], m.o[None]])
     pull = np.cross(at[1:] - at[:-1], -up_base)  # link j goes from axis j to axis j + 1
     return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
-
-
-def resting_sides(arm: Arm, q: Array, approach: Array, up_base: Array) -> Array:
-    """Return the directions of approach (N, 6) that tell on which side of its play each joint rests.
-
-    Play between a joint's sensor and its link is closed by weight, whichever way the joint came, wherever weight pulls on
-    it harder than friction holds; there the side is the weight's. Links weigh by their length.
-
-    Args:
-        arm: the nominal arm.
-        q: (N, 6) joint angles, rad.
-        approach: (N, 6) directions of approach, kept for joints on which no weight pulls.
-        up_base: (3,) unit vector against gravity, base.
-    """
-    lengths = np.hypot(arm.a, arm.d)
-    levers = np.einsum("nij,j->ni", _levers(arm, q, up_base), lengths) / max(float(lengths.sum()), 1e-9)
-    # A link that its weight turns forward leads its sensor, as one does that was come to from above.
-    return np.where(np.abs(levers) > LEAST_LEVER_M, -np.sign(levers), approach)
 
 
 def approaches(measured: Measured) -> bool:

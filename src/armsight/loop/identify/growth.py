@@ -173,7 +173,7 @@ def _groups(model: Model, free: Mask) -> dict[str, Mask]:
         if not free[k] or p.kind in PLACEMENT:
             continue
         name = _GROUPS.get(p.kind, f"{p.kind} of joint {p.joint + 1}")
-        if p.kind == "wave":
+        if p.kind in ("wave", "ripple"):
             name += f", {p.name[-1]} a turn"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups

@@ -30,6 +30,8 @@ from armsight.robot.arm import Arm
 LEAST_POINTS, LEAST_FULL = 6, 4
 #: Joints that move less than this, rad, do not move.
 ALIKE = 0.02
+#: Poses that tell which causes there are; the final fit is to all of them.
+MOST = 4000
 #: Correlations larger than this are told.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")
@@ -119,13 +121,15 @@ def _identified(
     model: Model, start: Solution, measured: Measured, prior: Array, placement: Mask, progress: Callable[[str], None]
 ) -> Identified:
     """Go from base and tool to the whole."""
+    rows = np.linspace(0, len(measured) - 1, min(MOST, len(measured))).astype(np.int64)
+    part = measured.rows(rows)
     progress("lengths, angles and zeros")
-    table = observed(model, start.x, measured, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
-    geometric = fit(model, start.x, measured, table, prior)
+    table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
+    geometric = fit(model, start.x, part, table, prior)
     progress("every cause at once")
-    whole, prior, tellable = _everything(model, start, geometric, measured, prior)
+    whole, prior, tellable = _everything(model, start, geometric, part, prior)
     progress("which causes pay")
-    growth = grown(model, whole, measured, tellable.free, prior, progress)
+    growth = grown(model, whole, part, tellable.free, prior, progress)
     x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
     progress("the fit")
     solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)

@@ -32,7 +32,7 @@ PROBES = 300
 #: Poses looked at; more change nothing.
 MOST_POSES = 3000
 #: Kinds that belong to no row of the table.
-CAUSES = ("gain", "wave", "backlash", "sag")
+CAUSES = ("gain", "wave", "ripple", "backlash", "slack", "sag")
 _ORDER = ("base", "tool", "offset", "a", "alpha", "d", "beta", *CAUSES)
 
 

@@ -28,7 +28,9 @@ SIGMA: dict[str, float] = {
     "beta": np.deg2rad(2.0),
     "gain": 0.01,
     "wave": np.deg2rad(0.5),
+    "ripple": np.deg2rad(0.1),
     "backlash": np.deg2rad(1.0),
+    "slack": np.deg2rad(1.0),
     "sag": np.deg2rad(0.5) / 0.25,
 }
 

@@ -60,7 +60,7 @@ def zeros_text(found: Identified) -> str:
         ]
         lines.append(f"sigma_zero_rad = {sigma!r}")
         for f in model.features:
-            if f.joint == i and f.kind in ("gain", "wave") and found.value(f.name)[0] != 0.0:
+            if f.joint == i and f.kind in ("gain", "wave", "ripple") and found.value(f.name)[0] != 0.0:
                 key = "gain" if f.kind == "gain" else f"{f.name.split('_')[1]}_rad"
                 lines.append(f"{key} = {found.value(f.name)[0]!r}")
     return "\n".join(lines) + "\n"
