@@ -137,7 +137,7 @@ def _identified(
     reasons = {**tellable.reasons, **growth.reasons}
     cov = _whole(model, solution, measured, tellable.possible, prior)
     between = np.where(growth.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
-    cov = np.where(growth.free[:, None] & growth.free, cov + np.outer(between, between), 0.0)
+    cov = np.where(growth.free[:, None] & growth.free, cov + np.diag(between**2), 0.0)
     return Identified(model, nominal.x, solution, reasons, growth.steps, tellable.singular_values, prior, cov)
 
 
