@@ -1,6 +1,6 @@
 """Render a recording with truth, and calibrate the pair on its board: what docs/walkthrough.md goes through.
 
-    python examples/05_render_a_recording.py demo_recording
+python examples/05_render_a_recording.py demo_recording
 """
 
 import sys

@@ -70,7 +70,8 @@ def test_render_a_recording(tmp_path, capsys):
 
 
 def test_dense(capsys):
-    (path,) = [path for path in EXAMPLES if path.name.startswith("04")]  # run("04") but for its main, which takes no folder
+    # run("04") but for its main, which takes no folder
+    (path,) = [path for path in EXAMPLES if path.name.startswith("04")]
     runpy.run_path(str(path))["main"]()
     found = re.search(r"error ([\d.]+) mm, ([\d.]+) deg", capsys.readouterr().out)
     assert found is not None

@@ -38,7 +38,8 @@ def write(tmp_path, text):
 def test_a_line_goes_by_a_step_and_turns(tmp_path):
     path = write(
         tmp_path,
-        'start_deg = [10, -60, 80, 5, -80, 20]\n[[motion]]\nkind = "line"\nby_mm = [30, -40, 10]\nturn_deg = [0, 0, 15]\nrest_s = 0\n',
+        'start_deg = [10, -60, 80, 5, -80, 20]\n[[motion]]\nkind = "line"\nby_mm = [30, -40, 10]\n'
+        "turn_deg = [0, 0, 15]\nrest_s = 0\n",
     )
     plan = read_motions(ARM, path)
     T0 = ARM.forward(plan.start)

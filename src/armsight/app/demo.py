@@ -24,7 +24,7 @@ from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
 
 #: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
-_AMOUNTS = {False: (24, 30, 12), True: (14, 14, 0)}
+_AMOUNTS = {False: (40, 30, 8), True: (24, 14, 0)}
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from armsight.app.poses import csv_text, pose_record
 from armsight.app.run_calibrate import HandEyeRun
 from armsight.app.run_data import RunData, assembled, cut
 from armsight.app.run_report import RunReport, write_run_report
-from armsight.app.run_summary import judge, path_errors, rest_errors, rms, spread, track_figures
+from armsight.app.run_summary import judge, path_errors, rest_errors, rms, singular, spread, track_figures
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
 from armsight.app.studies import Study
 from armsight.data import Array, Image, Missed, PoseEstimate
@@ -157,7 +157,8 @@ def _summary(finished: Finished, run: RunData, before: RunData | None, after: Ru
                 "fused_position_max_m": found["position_max_m"],
             }
     if before is not None and after is not None:
-        summary["closed_loop"] = _closed(before, after)
+        goals = {m.name: m.trajectory.at(m.trajectory.duration_s).q for m in finished.plan.motions}
+        summary["closed_loop"] = _closed(before, after, [n for n, q in goals.items() if singular(finished.arm, q)])
     if len(run.latency_s):
         summary["latency_s"] = spread(run.latency_s)
     position, angle = outcome.handeye.found.held_out.rms()
@@ -189,15 +190,21 @@ def _summary(finished: Finished, run: RunData, before: RunData | None, after: Ru
     return summary
 
 
-def _closed(before: RunData, after: RunData) -> dict[str, float]:
-    """Return the error of the tool against where it was to be, with potentiometers alone and with the loop closed."""
-    found = {}
-    for name, run in (("before", before), ("after", after)):
-        rests = list(rest_errors(run, judge(run)).values())
+def _closed(before: RunData, after: RunData, singular_at: list[str]) -> dict[str, Any]:
+    """Return the error of the tool against where it was to be, with potentiometers alone and with the loop closed.
+
+    Rests at which the arm is singular stand apart: there it cannot be moved to where it should be.
+    """
+    found: dict[str, Any] = {"singular_rests": {name: {} for name in singular_at}}
+    for when, run in (("before", before), ("after", after)):
+        rests = rest_errors(run, judge(run))
+        for name in singular_at:
+            if name in rests:
+                found["singular_rests"][name][f"rest_error_{when}_m"] = rests.pop(name)
         paths = [away for _, away in path_errors(run, judge(run)).values()]
-        found[f"rest_error_{name}_m"] = rms(np.array(rests))
-        found[f"rest_error_{name}_max_m"] = max(rests, default=float("nan"))
-        found[f"path_error_{name}_m"] = rms(np.concatenate(paths)) if paths else float("nan")
+        found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
+        found[f"rest_error_{when}_max_m"] = max(rests.values(), default=float("nan"))
+        found[f"path_error_{when}_m"] = rms(np.concatenate(paths)) if paths else float("nan")
     return found
 
 

@@ -16,6 +16,7 @@ from armsight.app.report_draw import drawing, png, svg
 from armsight.app.report_tables import bullets, table, text
 from armsight.app.run_data import RunData
 from armsight.app.run_figures import errors_figure, joints_figure, latency_figure, loop_figure, path_figure
+from armsight.app.run_overview import overview_figure
 from armsight.app.studies import Study
 from armsight.app.study_figure import studies_figure
 from armsight.data import Image
@@ -87,7 +88,7 @@ def write_run_report(report: RunReport, folder: Path) -> Path:
         for name, figure in _figures(report).items():
             if figure is not None:
                 files[f"{name}.png"] = png(figure)
-                embedded[name] = _box("svg+xml", svg(figure), name)
+                embedded[name] = _box("svg+xml", svg(figure), name) if name != "overview" else ""
     put_files(folder, {**files, PAGE: _page(report, embedded).encode()})
     return folder / PAGE
 
@@ -102,6 +103,9 @@ def _figures(report: RunReport) -> dict[str, Figure | None]:
         "loop": loop_figure(report.before, report.after) if both else None,  # type: ignore[arg-type]
         "latency": latency_figure(report.run),
         "studies": studies_figure(report.studies) if report.studies else None,
+        "overview": overview_figure(report.picture, report.before, report.after)
+        if report.picture is not None and report.before is not None and report.after is not None
+        else None,
     }
 
 

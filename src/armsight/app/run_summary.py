@@ -15,6 +15,8 @@ from scipy.stats import chi2
 from armsight.app.run_data import RunData
 from armsight.app.run_tracks import ToolTrack, errors
 from armsight.data import Array
+from armsight.loop.servo import EASY
+from armsight.robot.arm import Arm
 
 #: Kinds of motion whose path in space is what counts.
 PATHS = ("line", "circle")
@@ -77,6 +79,13 @@ def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]
             away = path_distances(was, run.wanted.Ts_base_tool[rows, :3, 3])
             found[segment.motion] = (run.wanted.t_s[rows] - segment.begin_s, away)
     return found
+
+
+def singular(arm: Arm, q: Array) -> bool:
+    """Say whether an arm at joint angles (6,) cannot move its tool in some direction, as far as the loop corrects it."""
+    size_m = float(np.hypot(arm.a, arm.d).sum())
+    J = arm.jacobian(q) / np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])[:, None]
+    return bool(np.linalg.svd(J, compute_uv=False)[-1] < EASY)
 
 
 def judge(run: RunData) -> ToolTrack:

@@ -3,8 +3,8 @@
 In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
 The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
 is what the estimator says the potentiometers must be off for the tool to be right at the place to be reached next; at rest,
-c integrates the tool's error itself. Tool errors become joint errors through the damped Jacobian. Gain, its margin, and
-what happens when vision is lost: docs/loop.md.
+c integrates the tool's error itself. Tool errors become joint errors through the Jacobian, but for directions in which the
+arm is singular. Gain, its margin, and what happens when vision is lost: docs/loop.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from armsight.geometry.check import checked
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
-from armsight.robot.trajectories.resolved_rate import _scale, _speeds
 from armsight.robot.trajectories.walk import behind
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
@@ -33,6 +32,8 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
+#: Singular values (linear rows over the arm's size) from which on a direction is corrected, and fully corrected.
+SINGULAR, EASY = 0.02, 0.04
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
 MOST_RAD = np.deg2rad(5.0)
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and wanted slower than that, rad/s.
@@ -115,7 +116,8 @@ class PoseServo:
 
     def __init__(self, arm: Arm, timing: Timing) -> None:
         self.timing = timing
-        self._arm, self._scale = arm, _scale(arm)
+        size_m = float(np.hypot(arm.a, arm.d).sum())
+        self._arm, self._scale = arm, np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])
         self._correction = np.zeros(6)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
@@ -162,8 +164,13 @@ class PoseServo:
         return behind(self._arm.forward(q), estimator.tool(q + self._correction, qd))
 
     def _joints(self, q: Array, error: Array) -> Array:
-        """Return the joint angles (6,) that make up for an error of the tool (6,), damped near singularities."""
-        return _speeds(self._arm.jacobian(q), error, self._scale)[0]
+        """Return the joint angles (6,) that make up for an error of the tool (6,).
+
+        What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
+        """
+        U, s, Vt = np.linalg.svd(self._arm.jacobian(q) / self._scale[:, None])
+        able = np.clip((s - SINGULAR) / (EASY - SINGULAR), 0.0, 1.0)
+        return np.asarray((able / np.maximum(s, SINGULAR) * ((error / self._scale) @ U)) @ Vt)
 
     def _crossing(self, estimator: Estimator, goal: Joints, error: Array) -> Array:
         """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""

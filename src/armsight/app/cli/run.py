@@ -109,8 +109,8 @@ def _require_start(station: Station, plan: MotionPlan) -> None:
         joint = int(off.argmax())
         raise InputError(
             f"joint {joint + 1} reads {np.degrees(q[joint]):.1f} deg, the motion starts at "
-            f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, --model {station.arm.name} does not match the "
-            "board's potentiometers (armsight board monitor)"
+            f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
+            f"--model {station.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
 
 
