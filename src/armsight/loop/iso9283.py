@@ -97,7 +97,7 @@ def _accuracy(off: Array, p: Array, cov: Array) -> Figure:
     variance = np.atleast_2d(np.cov(p.T)) / len(p)  # scatter of arm and instrument together, in the barycentre
     floor = float(np.sqrt(np.trace(variance)))
     along = off / raw if raw > 0 else np.array([1.0, 0.0, 0.0])
-    sigma = float(np.sqrt(max(along @ variance @ along, 0.0)))
+    sigma = float(np.sqrt(max(float(along @ variance @ along), 0.0)))
     clean = float(np.sqrt(max(raw**2 - floor**2, 0.0)))
     resolvable = RESOLVED * floor
     return Figure(raw, clean if raw > resolvable else None, sigma, resolvable)
