@@ -1,6 +1,6 @@
 """The experiment's figures over seeds: every one of them, none hidden.
 
-python experiment.py            ten seeds, worn arm, the ARM binary under Unicorn: about ten minutes idle
+python experiment.py            ten seeds, worn arm, the ARM binary under Unicorn: about half an hour idle
 python experiment.py 3          three of them
 """
 
@@ -33,7 +33,7 @@ FIGURES = {
 }
 
 
-def main(seeds: int) -> None:
+def main(seeds: int, quick: bool) -> None:
     """Run and print."""
     found: dict[str, list[float]] = {
         name: [] for name in (*FIGURES, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
@@ -41,7 +41,7 @@ def main(seeds: int) -> None:
     for seed in range(seeds):
         began = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            s = run_demo(Demo(Path(folder), seed=seed, quick=True))
+            s = run_demo(Demo(Path(folder), seed=seed, quick=quick))
         for name, (part, key, factor, _, _) in FIGURES.items():
             found[name].append(factor * s[part][key])
         c = s["closed_loop"]
@@ -57,4 +57,4 @@ def main(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, "quick" in sys.argv)

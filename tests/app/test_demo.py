@@ -9,7 +9,6 @@ import pytest
 from armsight.app import demo
 from armsight.app.cli import demo as command
 from armsight.app.demo import Demo, run_demo
-from armsight.app.motion_file import read_motions
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.sim.workcell import Workcell
@@ -38,8 +37,7 @@ def short(tmp_path_factory):
     motion.write_text(SHORT)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "_AMOUNTS", {True: (10, 14, 0)})
-        patch.setattr(demo, "CHAPTER", motion)
-        patch.setattr(demo, "read_motions", lambda arm: read_motions(arm, motion))
+        patch.setattr(demo, "_MOTIONS", {True: motion})
         summary = run_demo(Demo(folder, machine="host", quick=True, seed=4))
     return folder, summary
 

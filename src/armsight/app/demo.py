@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.experiment import Outcome, Progress, run_experiment
-from armsight.app.motion_file import CHAPTER, MotionPlan, read_motions
+from armsight.app.motion_file import CHAPTER, QUICK, MotionPlan, read_motions
 from armsight.app.rate_study import rate_study
 from armsight.app.run_calibrate import calibrated, handeye_poses
 from armsight.app.run_folder import Finished, write_run
@@ -24,7 +24,8 @@ from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
 
 #: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
-_AMOUNTS = {False: (40, 30, 8), True: (24, 14, 0)}
+_AMOUNTS = {False: (40, 30, 8), True: (20, 12, 0)}
+_MOTIONS = {False: CHAPTER, True: QUICK}
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Demo:
         seed: of everything.
         machine: what runs the firmware.
         rig: parallel or verging.
-        quick: fewer calibration shots and no studies.
+        quick: fewer calibration shots and motions, and no studies.
     """
 
     folder: Path
@@ -68,8 +69,8 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         calibration = calibrated(cell.board_spec, cell.board_shots(boards), progress)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", cell.body_text)
-        plan = read_motions(cell.model)
-        write_text(demo.folder / "motion.toml", CHAPTER.read_text(encoding="utf-8"))
+        plan = read_motions(cell.model, _MOTIONS[demo.quick])
+        write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))
         targets = handeye_poses(cell.model, np.vstack([cell.model.home, cell.poses]), handeyes, demo.seed)
         outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
         studies = _studies(demo, calibration, outcome, plan, study_shots, progress)

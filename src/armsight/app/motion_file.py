@@ -19,7 +19,9 @@ from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
 
 #: The chapter's motion: home to five poses and back, a line, a circle.
 CHAPTER = Path(__file__).with_name("chapter_motion.toml")
-_REST_S = 1.5
+#: Less of it.
+QUICK = Path(__file__).with_name("quick_motion.toml")
+_REST_S = 2.5
 #: Kind -> its own keys and how many numbers each has; those in the second place must be there.
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "joints": ({"q_deg": 6}, ("q_deg",)),

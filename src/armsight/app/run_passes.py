@@ -11,6 +11,8 @@ from armsight.data import Array
 from armsight.loop.servo import PoseServo
 from armsight.robot.trajectories import Trajectory
 
+#: Without a loop to settle the arm need not stand longer, s.
+OPEN_REST_S = 0.5
 #: Makes a controller of a trajectory that begins at a time of the board's clock.
 Control = Callable[[Trajectory, float], Controller]
 
@@ -46,7 +48,7 @@ def drive(
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)
         rest = Segment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
-        loop.run(controller, motion.rest_s, rest)
+        loop.run(controller, motion.rest_s if closed else min(motion.rest_s, OPEN_REST_S), rest)
 
 
 def planned(gravity: Callable[[Array], Array]) -> Control:

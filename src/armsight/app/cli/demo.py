@@ -26,7 +26,7 @@ from armsight.app.run_tracks import require_pyarrow
     "--board", default="emulated:unicorn", show_default=True, help="emulated:unicorn, emulated:qemu or emulated:host."
 )
 @click.option("--rig", default="parallel", show_default=True, type=click.Choice(["parallel", "verging"]))
-@click.option("--quick", is_flag=True, help="Fewer calibration shots, and no studies.")
+@click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
 def command(out: Path, seed: int, arm: str, cameras: str, board: str, rig: str, quick: bool, as_json: bool) -> None:
     """Calibrate, measure the moving arm, show who is right, and close the loop, in a simulated workcell.
