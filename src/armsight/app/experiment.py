@@ -28,6 +28,8 @@ from armsight.vision.rig import StereoRig
 Progress = Callable[[str], None]
 #: Sigma of the delay before it is measured, s.
 _UNKNOWN_DELAY = Delay(0.02, 0.02)
+#: So many shots are kept as images: a recording for whoever wants to try the stages on them.
+KEPT_SHOTS = 12
 #: Links of an arm that stands creep in their backlash, unseen by the potentiometers: half a gap of 0.2 degree in seconds.
 PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
 #: From an image's arrival to its command: our own time, and the wait for the loop's next turn, s.
@@ -46,6 +48,7 @@ class Outcome:
         open_s: when the pass with potentiometers alone began and ended, board's clock; None before.
         closed_s: the same of the pass with the loop closed.
         covered_s: when the body was hidden on purpose, from and to; None where it was not.
+        kept: the first shots of the motions.
         picture: the first image with the body found in motion, and the pose.
         ended_by: what ended the run early; None where it ran to its end.
         interrupted: whether that was the keyboard.
@@ -58,6 +61,7 @@ class Outcome:
     open_s: tuple[float, float] | None = None
     closed_s: tuple[float, float] | None = None
     covered_s: tuple[float, float] | None = None
+    kept: list[Shot] = field(default_factory=list)
     picture: tuple[Shot, PoseEstimate] | None = None
     ended_by: ArmsightError | None = None
     interrupted: bool = False
@@ -164,8 +168,10 @@ def _passes(
             cover(*outcome.covered_s)
 
     def seen(shot: Shot, result: PoseEstimate | Missed) -> None:
-        if isinstance(result, PoseEstimate):
+        outcome.kept.append(shot)
+        if isinstance(result, PoseEstimate) and outcome.picture is None:
             outcome.picture = (shot, result)
+        if len(outcome.kept) >= KEPT_SHOTS:
             loop.on_shot = lambda shot, result: None
 
     loop.on_shot = seen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 from armsight.app.experiment import Outcome
 from armsight.app.motion_file import MotionPlan
 from armsight.app.poses import csv_text, pose_record
+from armsight.app.recording import record
 from armsight.app.run_calibrate import HandEyeRun
 from armsight.app.run_data import RunData, assembled, cut
 from armsight.app.run_report import RunReport, write_run_report
 from armsight.app.run_summary import judge, path_errors, rest_errors, rms, singular, spread, track_figures
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
 from armsight.app.studies import Study
-from armsight.data import Array, Image, Missed, PoseEstimate
+from armsight.data import Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import write_text
 from armsight.robot.arm import Arm
@@ -78,6 +80,7 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
         write_track(folder, name, track)
     write_columns(folder, "joints", _joint_columns(run))
     write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
+    _write_shots(folder / "shots", outcome.kept)
     before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
     summary = _summary(finished, run, before, after)
     write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
@@ -131,6 +134,22 @@ def _write_handeye(folder: Path, run: HandEyeRun) -> None:
         "missed": list(run.missed),
     }
     write_text(folder / "handeye.json", json.dumps(told, indent=1) + "\n")
+
+
+def _write_shots(folder: Path, shots: Sequence[Shot]) -> None:
+    """Write the kept shots as a recording; one of an earlier run makes room."""
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    left = iter(shots)
+
+    class Kept:
+        def read(self) -> Shot | None:
+            return next(left, None)
+
+        def close(self) -> None:
+            pass
+
+    record(Kept(), folder)
 
 
 def _summary(finished: Finished, run: RunData, before: RunData | None, after: RunData | None) -> dict[str, Any]:
