@@ -15,7 +15,7 @@ SANITIZE = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=
 BOARD = [*CORE, *WIRE, "boards/loop.c", "boards/pil/pil.c"]
 #: Programs that run the firmware on what they draw: sources, and how many rounds. A few million ticks each.
 SHAKES = {"core": [HERE / "shake.c", *CORE], "wire": [HERE / "fuzz_wire.c", *BOARD]}
-FUZZ_RUNS = 6000
+FUZZ_RUNS = 12000
 #: Python tests of the core; what they reach is counted.
 CORE_TESTS = ("pid", "setpoint", "pot", "states", "faults", "commands", "config", "random")
 BRANCHES_PERCENT = 95.0
