@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from armsight.app.cli import demo as command
 from armsight.app.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
+from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
 
 SHORT = """
@@ -176,6 +178,13 @@ def test_names_that_are_not_known(armsight, tmp_path, options, said):
     assert got.code == 2
     assert said in got.err
     assert len(got.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("cameras", ["webcams", "webcams:640x480@15", "1280x720@60"])
+def test_the_study_of_rates_takes_the_same_cameras(cameras):
+    told, at = open_timing(cameras), open_timing(demo.cameras_at(cameras, 4.0))
+    assert at.rate_hz == 4.0
+    assert replace(at, rate_hz=told.rate_hz) == told
 
 
 def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):

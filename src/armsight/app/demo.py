@@ -20,6 +20,7 @@ from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
+from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
 
@@ -73,7 +74,12 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))
         targets = handeye_poses(cell.model, np.vstack([cell.model.home, cell.poses]), handeyes, demo.seed)
         outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
-        studies = _studies(demo, calibration, outcome, plan, study_shots, progress)
+        studies: list[Study] = []
+        try:
+            studies = _studies(demo, calibration, outcome, plan, study_shots, progress)
+        except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is whole, and is written
+            outcome.interrupted = isinstance(error, KeyboardInterrupt)
+            outcome.ended_by = error if isinstance(error, ArmsightError) else None
         progress("drawing")
         facts = {
             "seed": demo.seed,
@@ -113,6 +119,13 @@ def _truth(cell: Workcell, outcome: Outcome) -> tuple[Array, Array] | None:
     return truth.t_s, mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
 
 
+def cameras_at(cameras: str, rate_hz: float) -> str:
+    """Return the name of the same cameras at another rate."""
+    width, height = open_timing(cameras).image_size_px
+    kind = "webcams:" if cameras.strip().startswith("webcams") else ""
+    return f"{kind}{width}x{height}@{rate_hz:g}"
+
+
 def _studies(
     demo: Demo, calibration: Calibration, outcome: Outcome, plan: MotionPlan, shots: int, progress: Progress
 ) -> list[Study]:
@@ -121,8 +134,9 @@ def _studies(
         return []
 
     def at_rate(rate_hz: float) -> Workcell:
-        cameras = f"{demo.cameras.partition('@')[0]}@{rate_hz:g}"
-        return Workcell(arm=demo.arm, cameras=cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig)
+        return Workcell(
+            arm=demo.arm, cameras=cameras_at(demo.cameras, rate_hz), seed=demo.seed, machine=demo.machine, rig=demo.rig
+        )
 
     found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
     return [*found, rate_study(at_rate, station_of, calibration.rig, outcome, plan, progress)]

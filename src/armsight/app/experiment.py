@@ -96,17 +96,17 @@ def run_experiment(
     try:
         progress("making ready to follow the body")
         follower = Follower(rig, station.target)
-        station.board.enable()
         loop = Loop(station, follower, outcome.log, KalmanEstimator(station.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        station.board.enable()
         _require_seen(loop, station, plan)
         _prepare(loop, station, plan, targets, outcome, progress)
         _passes(loop, station, plan, outcome, progress, cover, close_loop)
-        loop.stop()
     except (ArmsightError, KeyboardInterrupt) as error:
-        if loop is not None:
-            _stopped(loop)
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
+    finally:  # whatever it was, a mistake of ours among it: the arm stops
+        if loop is not None:
+            _stopped(loop)
     return outcome
 
 
@@ -114,19 +114,23 @@ def _stopped(loop: Loop) -> None:
     """Bring the arm to rest, whatever else does not answer any more."""
     try:
         loop.stop()
-    except DeviceError:
-        return  # the board is gone: its own silence reaction holds or releases the arm
+    except ArmsightError:
+        return  # told what it must, or gone: then its own silence reaction holds or releases the arm
 
 
 def _require_seen(loop: Loop, station: Station, plan: MotionPlan) -> None:
     """Raise where the body is not in view at the start: everything after would be for nothing."""
     still = point_to_point(station.arm, plan.start, plan.start)
-    loop.run(Planned(still, loop.t_s, station.gravity), 0.3, Segment("calibration", "", "", False))
+    loop.run(
+        Planned(still, loop.t_s, station.gravity),
+        max(0.3, 3.0 / station.rate_hz),
+        Segment("calibration", "", "", False),
+    )
     results = [result for _, _, result in loop.log.poses]
     if any(isinstance(result, PoseEstimate) for result in results):
         return
     if not results:
-        raise DeviceError("no shot came within 0.3 s: are the cameras running?")
+        raise DeviceError("no shot came while the arm stood: are the cameras running?")
     missed = next(result for result in results if isinstance(result, Missed))
     raise ArmsightError(
         f"the body {station.target.body.name} is not seen where the arm stands ({missed.reason}): bring it into the view "

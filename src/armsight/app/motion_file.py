@@ -22,6 +22,7 @@ CHAPTER = Path(__file__).with_name("chapter_motion.toml")
 #: Less of it.
 QUICK = Path(__file__).with_name("quick_motion.toml")
 _REST_S = 2.5
+_MOST = 1e9  # of any number; NaN is not below it
 #: Kind -> its own keys and how many numbers each has; those in the second place must be there.
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "joints": ({"q_deg": 6}, ("q_deg",)),
@@ -95,7 +96,7 @@ def read_motions(arm: Arm, path: str | Path = CHAPTER) -> MotionPlan:
 def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> Motion:
     """Plan one motion."""
     kind = entry.get("kind")
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise InputError(f"{where}: kind is {kind!r}; known are {', '.join(_KINDS)}")
     keys, needed = _KINDS[kind]
     known = {**_COMMON, **keys}
@@ -149,7 +150,7 @@ def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Arra
 def _numbers(where: str, value: object, key: str, size: int) -> Array:
     """Return the numbers of a key."""
     listed = value if isinstance(value, list) else [value]
-    good = all(isinstance(n, int | float) and not isinstance(n, bool) and np.isfinite(n) for n in listed)
+    good = all(isinstance(n, int | float) and not isinstance(n, bool) and abs(n) < _MOST for n in listed)
     if not good or len(listed) != size or isinstance(value, list) != (size > 1):
         raise InputError(f"{where}: {key} must be {f'{size} numbers' if size > 1 else 'a number'}, got {value!r}")
     return np.array(listed, dtype=float)

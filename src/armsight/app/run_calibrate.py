@@ -24,7 +24,7 @@ from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
 
 Progress = Callable[[str], None]
-#: How long the arm stands before it is measured, and for how long, s.
+#: How long the arm stands before it is measured, and for how long at least, s.
 SETTLE_S, LOOK_S = 0.25, 0.1
 DELAY_REST_S = 1.0  # before and after the sweep
 #: In the sweep joints keep their side of the backlash: what they are off beside what can be learned changes little.
@@ -113,7 +113,7 @@ def find_mounting(
         DeviceError: the board or a camera failed.
     """
     q_seen, Ts, covs, approach, missed = [], [], [], [], []
-    q_from = q_start
+    q_from, look_s = q_start, max(LOOK_S, 3.0 / loop.station.rate_hz)
     for n, q_to in enumerate(targets):
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
         way = point_to_point(arm, q_from, q_to)
@@ -121,7 +121,7 @@ def find_mounting(
         loop.run(Planned(way, loop.t_s, gravity), way.duration_s + SETTLE_S, segment, watch=False)
         looked = len(loop.log.poses)
         heard = len(loop.log.joints)
-        loop.run(Planned(way, loop.t_s - way.duration_s, gravity), LOOK_S, Segment("calibration", "", "", False))
+        loop.run(Planned(way, loop.t_s - way.duration_s, gravity), look_s, Segment("calibration", "", "", False))
         results = [result for _, _, result in loop.log.poses[looked:]]
         good = [r for r in results if isinstance(r, PoseEstimate)]
         if good:

@@ -63,16 +63,7 @@ def assembled(
         delay_s: how late the camera's stamps are.
         truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
     """
-    t_s = np.concatenate([s.t_s for s in log.joints])
-    q = np.concatenate([s.q for s in log.joints])
-    q_wanted = np.full_like(q, np.nan)
-    for segment in log.segments:
-        if segment.trajectory is not None:
-            rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
-            since = t_s[rows] - segment.begin_s
-            q_wanted[rows] = segment.trajectory.at(
-                since + (segment.trajectory.duration_s if _rests(segment) else 0.0)
-            ).q
+    t_s, q, q_wanted = joints_of(log)
     planned = np.isfinite(q_wanted).all(axis=1)
     named = _Named(log.segments)
     seen = [mounting.sighting(p, t - delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
@@ -105,6 +96,21 @@ def assembled(
         len(log.poses) - len(seen),
         sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
     )
+
+
+def joints_of(log: Log) -> tuple[Array, Array, Array]:
+    """Return a log's times (N,) of readings, the joints (N, 6) then, and as planned, rad; NaN where nothing was."""
+    t_s = np.concatenate([s.t_s for s in log.joints])
+    q = np.concatenate([s.q for s in log.joints])
+    q_wanted = np.full_like(q, np.nan)
+    for segment in log.segments:
+        if segment.trajectory is not None:
+            rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
+            since = t_s[rows] - segment.begin_s
+            q_wanted[rows] = segment.trajectory.at(
+                since + (segment.trajectory.duration_s if _rests(segment) else 0.0)
+            ).q
+    return t_s, q, q_wanted
 
 
 def _rests(segment: Segment) -> bool:

@@ -20,7 +20,7 @@ from armsight.app.motion_file import MotionPlan
 from armsight.app.poses import csv_text, pose_record
 from armsight.app.recording import record
 from armsight.app.run_calibrate import HandEyeRun
-from armsight.app.run_data import RunData, assembled, cut
+from armsight.app.run_data import RunData, assembled, cut, joints_of
 from armsight.app.run_report import RunReport, write_run_report
 from armsight.app.run_summary import judge, path_errors, rest_errors, rms, singular, spread, track_figures
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
@@ -68,6 +68,9 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
         InputError: a file cannot be written; those that were stay whole.
     """
     outcome = finished.outcome
+    if outcome.log.joints:
+        write_columns(folder, "joints", _joint_columns(*joints_of(outcome.log)))
+    write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
     if outcome.handeye is not None:
         _write_handeye(folder, outcome.handeye)
     if outcome.handeye is None or not outcome.log.segments:
@@ -78,8 +81,6 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
     run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
     for name, track in _tracks(run).items():
         write_track(folder, name, track)
-    write_columns(folder, "joints", _joint_columns(run))
-    write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
     _write_shots(folder / "shots", outcome.kept)
     before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
     summary = _summary(finished, run, before, after)
@@ -104,12 +105,12 @@ def _tracks(run: RunData) -> dict[str, ToolTrack]:
     return named if run.truth is None else {**named, "truth": run.truth}
 
 
-def _joint_columns(run: RunData) -> dict[str, Any]:
+def _joint_columns(t_s: Array, q: Array, q_wanted: Array) -> dict[str, Any]:
     """Return the joints' columns: measured and wanted angles."""
-    named: dict[str, Any] = {"t_s": np.round(run.t_s, 6)}
+    named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
     for joint in range(6):
-        named[f"q{joint + 1}_rad"] = np.round(run.q[:, joint], 9)
-        named[f"q{joint + 1}_wanted_rad"] = np.round(run.q_wanted[:, joint], 9)
+        named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
+        named[f"q{joint + 1}_wanted_rad"] = np.round(q_wanted[:, joint], 9)
     return named
 
 
@@ -295,8 +296,10 @@ def open_folder(folder: Path) -> None:
     """Make a run's folder, before the long work begins.
 
     Raises:
-        InputError: it cannot be made or written to.
+        InputError: it cannot be made or written to, or holds shots that are of no run and would be written over.
     """
+    if (folder / "shots").exists() and not (folder / "summary.json").exists():
+        raise InputError(f"{folder}: holds shots that are of no earlier run; choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -112,7 +112,7 @@ class Loop:
         self.mounting: Mounting | None = None
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.t_s = 0.0
-        self._shot_s: float | None = None
+        self._shot_s = -np.inf
         self._last: tuple[float, Array] | None = None
         self._written_s = -np.inf
         while not log.joints:
@@ -196,7 +196,7 @@ class Loop:
             watch: whether shots are measured.
 
         Raises:
-            DeviceError: the board left the enabled state (its faults are told), or a device is gone.
+            DeviceError: the board left the enabled state (its faults are told), the cameras stalled, or a device is gone.
         """
         begin_s = self.t_s
         try:
@@ -204,6 +204,8 @@ class Loop:
                 self.pass_time(PERIOD_S)
                 self._check_board()
                 looked = self.look() if watch else None
+                if watch:
+                    self._check_cameras(begin_s)
                 command, mode = controller.command(self.t_s, self.estimator)
                 self.board.send(command)
                 self.log.commands.append((self.t_s, command))
@@ -217,12 +219,10 @@ class Loop:
 
     def stop(self) -> None:
         """Bring the arm to rest where it is, and leave it held there."""
-        self.pass_time(0.0)
         if self.board.status.state is not State.ENABLED or not self.log.commands:
             return
         newest = self.log.commands[-1][1]
-        reference = self.board.joints.reference_rad if self.board.joints is not None else newest.q_ref
-        self.board.send(JointCommand(reference, np.zeros(6), newest.gravity_duty, _STOP_S))
+        self.board.send(JointCommand(self.board.joints.reference_rad, np.zeros(6), newest.gravity_duty, _STOP_S))
         self.pass_time(_STOP_S)
 
     def _check_board(self) -> None:
@@ -233,7 +233,8 @@ class Loop:
         causes = "; ".join(str(fault) for fault in status.faults) or "no fault is latched"
         raise DeviceError(f"the board went over to {status.state.name} at {status.t_s:.3f} s: {causes}")
 
-    @property
-    def stalled(self) -> bool:
-        """Whether the cameras have been silent for too long."""
-        return self._shot_s is not None and self.t_s - self._shot_s > STALLED_S
+    def _check_cameras(self, since_s: float) -> None:
+        """Raise where the cameras have been silent for too long."""
+        silent_s = self.t_s - max(self._shot_s, since_s)
+        if silent_s > STALLED_S + 2.0 / self.station.rate_hz:
+            raise DeviceError(f"no shot has come for {silent_s:.1f} s: the cameras have stalled")

@@ -25,16 +25,13 @@ _SETTLED_S = 0.2  # at the end of a rest
 _PATH_STEP_M = 2e-5
 
 
-def track_figures(track: ToolTrack, truth: ToolTrack, floor: Array | None = None) -> dict[str, Any]:
+def track_figures(track: ToolTrack, truth: ToolTrack) -> dict[str, Any]:
     """Return how far a track is from the truth.
 
     Args:
         track: what was measured.
         truth: what was.
-        floor: unused rows are left out with it: (N,) bool of those that count; None is all.
     """
-    if floor is not None:
-        track = track[np.asarray(floor, bool)]
     error = errors(track, truth)
     position, angle = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
     found: dict[str, Any] = {

@@ -48,9 +48,19 @@ _HANDEYE_POSES = 30
 @click.option(
     "--motion", type=click.Path(path_type=Path), default=CHAPTER, help="What to do (TOML); the chapter's motion."
 )
-@click.option("--rate", default=60.0, show_default=True, help="Of the cameras, Hz.")
 @click.option(
-    "--sync-ms", default=0.1, show_default=True, help="How far apart both exposures of a shot may be, sigma, ms."
+    "--rate",
+    type=click.FloatRange(min=0.1, max=10_000.0),
+    default=60.0,
+    show_default=True,
+    help="Of the cameras, Hz.",
+)
+@click.option(
+    "--sync-ms",
+    type=click.FloatRange(min=0.0, max=1_000.0),
+    default=0.1,
+    show_default=True,
+    help="How far apart both exposures of a shot may be, sigma, ms.",
 )
 @click.option("--open-loop", is_flag=True, help="Only with potentiometers; do not close the loop.")
 @click.option("-o", "--out", default="run", show_default=True, metavar="DIR", type=click.Path(path_type=Path))

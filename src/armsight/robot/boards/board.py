@@ -91,7 +91,7 @@ class Board:
 
     def stop(self) -> None:
         """Stop in an emergency: the drives go off until ``Order.CLEAR_STOP``."""
-        self._sequence += 1
+        self._sequence = (self._sequence + 1) % _WRAP
         for _ in range(_STOPS):
             self._session.transmit("stop", self._sequence)
 

@@ -56,6 +56,11 @@ def configured(link: EmulatedLink, config: Configuration | None = None) -> Board
     Raises:
         InputError: a value of the configuration is outside its range.
     """
-    Board(link, name="the emulated board").store(lab_configuration() if config is None else config)
+    board = Board(link, name="the emulated board")
+    try:
+        board.store(lab_configuration() if config is None else config)
+    except BaseException:
+        board.close()
+        raise
     link.restart()
     return Board(link, name="the emulated board")

@@ -1,0 +1,109 @@
+"""The loop of a run on a board and cameras that are made up: how it ends when something goes wrong."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from armsight.app import experiment
+from armsight.app.experiment import run_experiment
+from armsight.app.motion_file import read_motions
+from armsight.app.run_loop import Log, Loop, Segment
+from armsight.app.run_motions import Planned
+from armsight.app.run_station import Station
+from armsight.data import JointStates, Missed, Shot
+from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.robot.boards.codes import State
+from armsight.robot.models import open_arm
+from armsight.robot.trajectories import point_to_point
+
+ARM = open_arm("six_r")
+
+
+class Standing:
+    """A board whose arm stands at home whatever it is told."""
+
+    def __init__(self):
+        self.t_s, self.sent = 0.0, []
+        self.status = SimpleNamespace(state=State.DISABLED, faults=(), t_s=0.0)
+        self.joints = SimpleNamespace(reference_rad=ARM.home)
+
+    def enable(self):
+        self.status.state = State.ENABLED
+
+    def receive(self, wait_s=0.0):
+        count = round(wait_s * 1000)
+        t_s = self.t_s + np.arange(1, count + 1) * 1e-3
+        self.t_s += count * 1e-3
+        return JointStates(t_s, np.tile(ARM.home, (count, 1)))
+
+    def send(self, command):
+        self.sent.append(command)
+
+
+class Blind:
+    """A follower that sees nothing."""
+
+    rig = None
+
+    def measure(self, shot):
+        return Missed("nothing is seen")
+
+
+def station(board, last_shot_s=np.inf):
+    """Cameras at 60 Hz that send nothing more from a time on."""
+    newest = [0]
+
+    def poll():
+        number = int(board.t_s * 60)
+        if number == newest[0] or board.t_s > last_shot_s:
+            return None
+        newest[0] = number
+        return Shot(str(number), None, None, board.t_s)
+
+    target = SimpleNamespace(body=SimpleNamespace(name="the body"))
+    return Station(ARM, board, poll, target, lambda q: np.zeros(6), 60.0, 0.0)
+
+
+def looped(board, **given):
+    loop = Loop(station(board, **given), Blind(), Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    return loop
+
+
+def stand(loop, seconds):
+    still = point_to_point(ARM, ARM.home, ARM.home)
+    loop.run(Planned(still, loop.t_s, lambda q: np.zeros(6)), seconds, Segment("open_loop", "", "", False))
+
+
+def test_cameras_that_stall_end_a_run_and_a_body_that_is_hidden_does_not():
+    board = Standing()
+    loop = looped(board, last_shot_s=2.0)
+    stand(loop, 1.9)
+    with pytest.raises(DeviceError, match=r"no shot has come for 0\.5 s: the cameras have stalled"):
+        stand(loop, 3.0)
+    assert 2.5 < board.t_s < 2.6
+    assert loop.log.segments[-1].end_s == pytest.approx(board.t_s)
+
+
+@pytest.mark.parametrize("error", [InputError("a camera"), KeyboardInterrupt(), ZeroDivisionError("a mistake of ours")])
+def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
+    board = Standing()
+
+    def fails(loop, *_):
+        stand(loop, 0.1)
+        raise error
+
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "_require_seen", fails)
+    plan = read_motions(ARM)
+    if isinstance(error, ArmsightError | KeyboardInterrupt):
+        outcome = run_experiment(station(board), None, plan, ARM.home[None], progress=lambda line: None)
+        assert outcome.interrupted == isinstance(error, KeyboardInterrupt)
+        assert outcome.ended_by is (error if isinstance(error, ArmsightError) else None)
+    else:
+        with pytest.raises(ZeroDivisionError):
+            run_experiment(station(board), None, plan, ARM.home[None], progress=lambda line: None)
+    assert (board.sent[-1].qd_ref == 0).all()
+    assert board.sent[-1].duration_s == pytest.approx(0.3)
