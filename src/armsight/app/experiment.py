@@ -145,7 +145,7 @@ def _prepare(
     arm, gravity = station.arm, station.gravity
     outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
     loop.mounting = outcome.handeye.mounting
-    progress("how late the images come: a sweep of all joints")
+    progress("how late the images come: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
     back = point_to_point(arm, middle, plan.start)
