@@ -7,8 +7,8 @@ import pytest
 
 from armsight.app import experiment
 from armsight.app.experiment import run_experiment
-from armsight.app.motion_file import read_motions
-from armsight.app.run_loop import Log, Loop, Segment
+from armsight.app.motion_file import QUICK, read_motions
+from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
 from armsight.app.run_motions import Planned
 from armsight.app.run_station import Station
 from armsight.data import JointStates, Missed, Shot
@@ -107,3 +107,15 @@ def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
             run_experiment(station(board), None, plan, ARM.home[None], progress=lambda line: None)
     assert (board.sent[-1].qd_ref == 0).all()
     assert board.sent[-1].duration_s == pytest.approx(0.3)
+
+
+def test_between_the_passes_the_arm_goes_back_to_the_start_by_a_way_of_its_own():
+    board = Standing()
+    loop = looped(board)
+    plan = read_motions(ARM, QUICK)
+    way = plan.motions[-1].trajectory
+    end = way.at(way.duration_s).q
+    assert np.abs(end - plan.start).max() > 0.5  # these motions do not end where they began
+    experiment._to_start(loop, station(board), plan)
+    q = np.array([end] + [command.q_ref for command in board.sent] + [plan.start])
+    assert (np.abs(np.diff(q, axis=0)) <= ARM.qd_max * PERIOD_S + 1e-6).all()

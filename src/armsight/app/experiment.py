@@ -187,12 +187,24 @@ def _passes(
         outcome.open_s = (begin, loop.t_s)
     if not close_loop:
         return
+    _to_start(loop, station, plan)
     servo = PoseServo(station.arm, timing(station, outcome.delay))
     begin = loop.t_s
     try:
         drive(loop, plan, closed_on(servo, station.gravity), closed=True, progress=progress)
     finally:
         outcome.closed_s = (begin, loop.t_s)
+
+
+def _to_start(loop: Loop, station: Station, plan: MotionPlan) -> None:
+    """Take the arm from the end of the motions to their start: they need not end where they began."""
+    last = plan.motions[-1].trajectory
+    end = last.at(last.duration_s).q
+    if np.allclose(end, plan.start, rtol=0.0, atol=1e-6):
+        return
+    back = point_to_point(station.arm, end, plan.start)
+    there = Segment("calibration", "back to the start", "joints", False, trajectory=back)
+    loop.run(Planned(back, loop.t_s + PERIOD_S, station.gravity), back.duration_s + 0.5, there)
 
 
 def timing(station: Station, delay: Delay) -> Timing:
