@@ -49,7 +49,8 @@ def map_figure(run: Run) -> Figure:
             ax.set_aspect("equal", adjustable="box")
             ax.set_xlabel(f"{labels[0]}, m")
             ax.set_ylabel(f"{labels[1]}, m")
-            ax.set_title(f"{name}, {'from above' if row == 0 else 'from the side'}: mean {1e3 * error.mean():.3f} mm")
+            # No longer title: where a view is narrow it would run into the scale.
+            ax.set_title(f"{name}, {'from above' if row == 0 else 'from the side'}")
     figure.colorbar(drawn, ax=axes, label="held-out error, mm", shrink=0.7)
     return figure
 
