@@ -257,7 +257,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         *outcome.handeye.missed,
         f"images come {1e3 * outcome.delay.delay_s:.2f} ms late (sigma {1e3 * outcome.delay.sigma_s:.2f} ms), by a sweep",
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.outliers} not believed by the estimator",
-        *(f"missed {count} times: {reason}" for reason, count in reasons.most_common(5)),
+        *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} on {mode}" for mode, count in modes.most_common()),
         *([f"ended early: {outcome.ended_by}"] if outcome.ended_by is not None else []),
         *(["ended early: interrupted"] if outcome.interrupted else []),
