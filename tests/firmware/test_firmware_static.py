@@ -69,7 +69,7 @@ def test_a_fuzzer_finds_nothing_in_the_wire(tmp_path, mavlink):
     assert done.returncode == 0, done.stderr
     (tmp_path / "corpus").mkdir()
     wanted = int(os.environ.get("ARMSIGHT_FUZZ_RUNS", str(FUZZ_RUNS)))
-    given = [program, f"-runs={wanted}", "-max_len=2048", "-seed=1", "-close_fd_mask=0", "corpus"]
+    given = [program, f"-runs={wanted}", "-rss_limit_mb=0", "-max_len=2048", "-seed=1", "-close_fd_mask=0", "corpus"]
     ran = subprocess.run([*map(str, given)], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr[-3000:]
     runs = re.search(r"Done (\d+) runs", ran.stderr)

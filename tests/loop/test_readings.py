@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from arm_bench import states
 
-from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, SPAN_S, Readings
+from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, SPAN_S, STILL_SPAN_S, Readings
 
 SIGMA = 3e-4
 
@@ -25,18 +25,35 @@ def test_parabolas_pass_unharmed_with_their_slope():
     assert np.allclose(out.qd[:, 3], -0.7 + 4.0 * at, atol=1e-9)
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.5])
 @pytest.mark.parametrize("back_s", [0.0, 0.01, 0.1])
-def test_the_variance_left_is_what_is_left(back_s):
+def test_the_variance_left_is_what_is_left(back_s, speed):
     rng = np.random.default_rng(1)
-    left = []
+    off, said = [], []
     for _ in range(300):
-        readings, t = filled(lambda t: 0.0 * t, 0.2, SIGMA, SIGMA * rng.normal(size=(200, 6)))
-        out = readings.at(np.array([t[-1] - back_s]))
-        left.append(out.q[0])
+        readings, t = filled(lambda t: speed * t, 0.4, SIGMA, SIGMA * rng.normal(size=(400, 6)))
+        at = t[-1] - back_s
+        out = readings.at(np.array([at]))
+        off.append(out.q[0] - speed * at)
+        said.append(out.variance[0])
+    off, said = np.array(off), np.array(said)
+    # A joint that stands is averaged but for noise that looks like motion: less than 1% by three sigma of two tests.
+    still = said < 2 / (STILL_SPAN_S * 1000)
+    assert still.mean() == 0 if speed else still.mean() > 0.99 - 3 * np.sqrt(0.01 / 1800)
+    counted = still if speed == 0 else ~still
     # The variance of 1800 draws is within 5 sqrt(2 / 1800) of itself.
-    assert np.var(left) == pytest.approx(SIGMA**2 * out.variance[0], rel=5 * np.sqrt(2 / 1800))
-    # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2).
-    assert out.variance[0] < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
+    assert np.var(off[counted]) == pytest.approx(SIGMA**2 * said[counted].mean(), rel=5 * np.sqrt(2 / 1800))
+    # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2); a mean of M has 1/M.
+    assert said.max() < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
+    assert said[still] == pytest.approx(1 / (STILL_SPAN_S * 1000), rel=0.02)
+
+
+def test_a_joint_that_begins_to_move_is_not_averaged_over_its_rest():
+    readings, t = filled(lambda t: np.where(t > 0.3, 0.5 * (t - 0.3), 0.0), 0.36, SIGMA, 0.0 * np.zeros((360, 6)))
+    out = readings.at(t[-1:])
+    # Where the window of the parabola lies wholly in the motion, the joint is where it is.
+    assert out.q[0] == pytest.approx(np.full(6, 0.5 * (t[-1] - 0.3)), abs=1e-9)
+    assert out.qd[0] == pytest.approx(np.full(6, 0.5), abs=1e-6)
 
 
 def test_the_side_is_the_play_operators():
@@ -94,4 +111,4 @@ def test_few_readings_are_averaged_and_one_is_itself():
     readings.add(states([1.0], np.full((1, 6), 0.2)))
     out = readings.at(np.array([1.0]))
     assert (out.q == 0.2).all()
-    assert out.variance[0] == 1
+    assert (out.variance[0] == 1).all()
