@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import norm
 
-from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure
+from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log
 from armsight.app.run_data import RunData
 from armsight.app.run_summary import judge, path_errors, rest_errors
 from armsight.app.run_tracks import ToolTrack, errors
@@ -126,6 +126,7 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
     rests.set_xticks(range(len(found)), list(found), rotation=30, ha="right", fontsize=7)
     for plot, title in ((rests, "error at rest, mm"), (paths, "distance from the path, mm")):
         plot.set_yscale("log")
+        plain_log(plot.yaxis)
         plot.set_title(title)
         plot.grid(axis="y", color="#e4e7eb", lw=0.6)
         plot.legend(fontsize=7)

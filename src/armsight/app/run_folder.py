@@ -222,9 +222,11 @@ def _closed(before: RunData, after: RunData, singular_at: list[str]) -> dict[str
             if name in rests:
                 found["singular_rests"][name][f"rest_error_{when}_m"] = rests.pop(name)
         paths = [away for _, away in path_errors(run, judge(run)).values()]
-        found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
-        found[f"rest_error_{when}_max_m"] = max(rests.values(), default=float("nan"))
-        found[f"path_error_{when}_m"] = rms(np.concatenate(paths)) if paths else float("nan")
+        if rests:
+            found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
+            found[f"rest_error_{when}_max_m"] = max(rests.values())
+        if paths:
+            found[f"path_error_{when}_m"] = rms(np.concatenate(paths))
     return found
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.report_draw import BLUE, ORANGE, new_figure
+from armsight.app.report_draw import BLUE, ORANGE, new_figure, plain_log
 from armsight.app.run_data import RunData
 from armsight.app.run_figures import GREEN
 from armsight.app.run_summary import judge, rest_errors
@@ -53,9 +53,11 @@ def _over_time(plot: Axes, run: RunData) -> None:
     ):
         shown = track[np.arange(0, len(track), every)]
         off = _MM * np.linalg.norm(errors(shown, run.truth)[:, :3], axis=1)
+        off[1:][np.diff(shown.t_s) > 0.2] = np.nan  # no line where nothing was seen
         plot.plot(shown.t_s - start, off, color=colour, lw=0.8, label=name)
     plot.set_yscale("log")
     plot.set_ylim(bottom=5e-3)
+    plain_log(plot.yaxis)
     plot.set_title("error of the measured position against the truth, mm")
     plot.set_xlabel("time, s", fontsize=7)
     plot.legend(fontsize=6.5, ncols=3, loc="lower right")
@@ -71,5 +73,8 @@ def _at_rest(plot: Axes, before: RunData, after: RunData) -> None:
         plot.bar(np.arange(len(found)) + shift, _MM * np.array(list(found.values())), 0.38, color=colour, label=name)
     plot.set_xticks(range(len(found)), list(found), rotation=30, ha="right", fontsize=6)
     plot.set_yscale("log")
+    plain_log(plot.yaxis)
+    low, high = plot.get_ylim()
+    plot.set_ylim(low, 3 * high)  # room for the legend
     plot.set_title("distance of the arm at rest from where it was sent, mm")
-    plot.legend(fontsize=6.5, loc="lower right")
+    plot.legend(fontsize=6.5, loc="upper right", ncols=2)

@@ -42,7 +42,7 @@ for (const box of document.querySelectorAll(".zoom")) {
   box.addEventListener("dblclick", () => { k = 1; x = y = 0; show(); });
 }
 """
-_NAMES = {"fused": "fused, 40 ms later", "live": "fused, at once"}
+_NAMES = {"fused": "fused, smoothed (40 ms later)", "live": "fused, live"}
 _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{}</div>'
 _IMG = '<img src="data:image/{};base64,{}" alt="{}" style="transform-origin:0 0" draggable="false">'
 
@@ -213,6 +213,7 @@ def _loop(s: Mapping[str, Any]) -> str:
             f"{c[f'{key}_error_before_m'] / c[f'{key}_error_after_m']:.1f}",
         )
         for what, key in (("at rest", "rest"), ("along the path", "path"))
+        if f"{key}_error_after_m" in c
     ]
     return table(
         ("error of the tool, RMS", "potentiometers alone, mm", "loop closed, mm", "times smaller"), rows, "numbers"

@@ -42,8 +42,12 @@ def command(out: Path, seed: int, arm: str, cameras: str, board: str, rig: str, 
             f"--board {board}: the workcell's board is emulated:unicorn, emulated:qemu or emulated:host"
         )
     open_folder(out)
-    with steps() as progress:
-        summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick), progress=progress)
+    try:
+        with steps() as progress:
+            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick), progress=progress)
+    except KeyboardInterrupt:
+        click.echo(f"the arm was stopped; what was measured until then is in {out}", err=True)
+        raise
     if as_json:
         click.echo(json.dumps(summary))
     else:

@@ -13,8 +13,8 @@ from rich.table import Table
 _TRACKS = {
     "potentiometers": "potentiometers",
     "vision": "vision",
-    "fused": "fused, 40 ms later",
-    "live": "fused, at once",
+    "fused": "fused, smoothed",
+    "live": "fused, live",
 }
 _DEG = float(np.degrees(1.0))
 
@@ -50,7 +50,7 @@ def _tracks(summary: Mapping[str, Any]) -> Table:
     """Return the table of the three tracks."""
     table = Table(title="The tool in motion, against the truth")
     for column in ("", "position RMS", "max", "at rest RMS", "turn RMS", "sigma claimed"):
-        table.add_column(column, justify="right" if column else "left")
+        table.add_column(column, justify="right" if column else "left", no_wrap=not column)
     for name, shown in _TRACKS.items():
         t = summary[name]
         sigma = f"{1e3 * t['position_sigma_rms_m']:.3f} mm" if "position_sigma_rms_m" in t else "none"
@@ -71,6 +71,8 @@ def _closed(c: Mapping[str, float]) -> Table:
     for column in ("", "potentiometers alone", "loop closed", "times smaller"):
         table.add_column(column, justify="right" if column else "left")
     for what, key in (("at rest, RMS", "rest"), ("from the path, RMS", "path")):
+        if f"{key}_error_after_m" not in c:
+            continue
         before, after = c[f"{key}_error_before_m"], c[f"{key}_error_after_m"]
         table.add_row(what, f"{1e3 * before:.3f} mm", f"{1e3 * after:.3f} mm", f"{before / after:.1f}")
     return table
