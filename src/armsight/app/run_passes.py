@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from armsight.app.motion_file import MotionPlan
-from armsight.app.run_loop import PERIOD_S, Controller, Loop, Segment
+from armsight.app.run_loop import Controller, Loop, Segment
 from armsight.app.run_motions import Closed, Planned
 from armsight.data import Array
 from armsight.loop.servo import PoseServo
@@ -42,8 +42,7 @@ def drive(
     phase = "closed_loop" if closed else "open_loop"
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
-        # The controller begins a period from now: its first command is for the first step of the way.
-        controller = control(motion.trajectory, loop.t_s + PERIOD_S)
+        controller = control(motion.trajectory, loop.t_s)
         segment = Segment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)

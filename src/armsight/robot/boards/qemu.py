@@ -43,6 +43,7 @@ class QemuMachine:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             bufsize=0,
+            start_new_session=True,  # an interrupt from the keyboard is for us: the arm is to be stopped through the board
         )
         self._in, self._out, self._said = _pipes(self._process)
 
