@@ -245,7 +245,7 @@ with mock.patch("{module}.{name}", told):
 @pytest.mark.parametrize(
     ("module", "name", "wait"),
     [
-        # Asleep, too: an interrupt that falls into numba's loading of compiled code ends the process there (docs/limits.md).
+        # Asleep, too: an interrupt that falls into numba's loading of compiled code ends the process (docs/limits.md).
         ("armsight.app.cli.calibrate", "calibrate_boards", "time.sleep(60)"),
         ("armsight.vision.sources.pairs", "read_image", "time.sleep(60)"),
         ("armsight.files", "os.replace", "time.sleep(60)"),
