@@ -12,6 +12,7 @@ from armsight.app.cli import demo as command
 from armsight.app.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
+from armsight.loop.identify.read import read_poses
 from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
 
@@ -100,6 +101,10 @@ def test_the_folder_holds_what_its_page_says(short):
     page = (folder / "report.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "")  # needs no network
     assert set(rows(folder, "vision")[3]) == {"calibration", "open_loop", "closed_loop", "rest"}
+    hands = read_poses(folder / "handeye_poses.csv").measured
+    assert len(hands) == summary["handeye"]["poses"]
+    assert set(np.unique(hands.approach)) == {-1, 0, 1} or set(np.unique(hands.approach)) == {-1, 1}
+    assert np.linalg.eigvalsh(hands.cov).min() > 0
     log = (folder / "run.log").read_text()
     assert "shots measured" in log
     assert "line" in log
@@ -128,8 +133,14 @@ def test_a_body_out_of_view_at_the_start(tmp_path, monkeypatch):
 
 
 def test_a_camera_that_is_gone(tmp_path, monkeypatch):
+    for stale in ("report.html", "truth.csv", "errors.png", "summary.json"):  # of an earlier run
+        (tmp_path / stale).write_text("{}")
+    (tmp_path / "mine.txt").write_text("mine")
     said = broken(tmp_path, monkeypatch, lambda cell: cell.source.unplug(3.0, "left camera: unplugged"))
     assert said.startswith("left camera: unplugged")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert not left & {"report.html", "truth.csv", "errors.png"}
+    assert {"mine.txt", "summary.json", "joints.csv", "poses.csv"} <= left
 
 
 def test_a_board_that_faults(tmp_path, monkeypatch):

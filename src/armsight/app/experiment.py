@@ -66,6 +66,16 @@ class Outcome:
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
+    @property
+    def delay_found(self) -> bool:
+        """Whether the delay was measured."""
+        return self.delay is not _UNKNOWN_DELAY
+
+    @property
+    def said(self) -> str | None:
+        """What ended the run early, in words; None where it ran to its end."""
+        return "interrupted" if self.interrupted else None if self.ended_by is None else str(self.ended_by)
+
 
 def run_experiment(
     station: Station,

@@ -18,7 +18,8 @@ from scipy.linalg import block_diag
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.geometry.rotation import quaternion_wxyz, roll_pitch_yaw
 
-_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+#: Elements of a 6x6 covariance that are written.
+UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 CSV_COLUMNS = (
     "shot",
     "status",
@@ -34,7 +35,7 @@ CSV_COLUMNS = (
     "misfit",
     "points",
     "dropped",
-    *(f"cov_{i}{j}" for i, j in _UPPER),
+    *(f"cov_{i}{j}" for i, j in UPPER),
 )
 
 
@@ -54,7 +55,7 @@ def pose_record(name: str, t_s: float | None, body: Body, result: PoseEstimate |
         "quaternion_wxyz": quaternion_wxyz(T[:3, :3]).tolist(),
         "roll_pitch_yaw_deg": np.degrees(angles).tolist(),
         "pitch_singular": singular,
-        "covariance": _left_axes(T, result.cov).tolist(),
+        "covariance": left_axes(T, result.cov).tolist(),
         "covariance_body": result.cov.tolist(),
         "residual_rms_m": _finite(result.residual_rms_m),
         "reprojection_rms_px": result.reprojection_rms_px,
@@ -64,7 +65,7 @@ def pose_record(name: str, t_s: float | None, body: Body, result: PoseEstimate |
     }
 
 
-def _left_axes(T_left_body: np.ndarray, cov: np.ndarray) -> np.ndarray:
+def left_axes(T_left_body: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """Turn a covariance of the right tangent into one along the left camera's axes."""
     turn = block_diag(T_left_body[:3, :3], T_left_body[:3, :3])
     return np.asarray(turn @ cov @ turn.T)
@@ -86,6 +87,6 @@ def csv_text(records: list[dict[str, Any]]) -> str:
             cov = np.array(r["covariance"])
             row += [*r["position_m"], *r["quaternion_wxyz"], *r["roll_pitch_yaw_deg"], *np.sqrt(np.diag(cov))]
             row += [r["residual_rms_m"], r["reprojection_rms_px"], r["misfit"], len(r["points_m"]), len(r["dropped"])]
-            row += [cov[i, j] for i, j in _UPPER]
+            row += [cov[i, j] for i, j in UPPER]
         writer.writerow(["" if cell is None else cell for cell in row] + [""] * (len(CSV_COLUMNS) - len(row)))
     return out.getvalue()

@@ -10,10 +10,10 @@ import numpy as np
 from armsight.app.experiment import PRIOR, Outcome, Progress, timing
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_data import RunData, assembled
+from armsight.app.run_judge import track_figures
 from armsight.app.run_loop import Log, Loop
 from armsight.app.run_passes import closed_on, drive
 from armsight.app.run_station import Station
-from armsight.app.run_summary import track_figures
 from armsight.app.studies import Study
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import KalmanEstimator

@@ -10,7 +10,7 @@ import numpy as np
 from armsight.app.run_loop import Loop, Segment
 from armsight.app.run_motions import Planned, Sweep
 from armsight.data import Array, JointStates, PoseEstimate, Record, Shot
-from armsight.errors import CalibrationError
+from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import estimate_delay
@@ -29,6 +29,7 @@ SETTLE_S, LOOK_S = 0.25, 0.1
 DELAY_REST_S = 1.0  # before and after the sweep
 #: In the sweep joints keep their side of the backlash: what they are off beside what can be learned changes little.
 STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5)
+_DRAWS = 50  # for each pose wanted
 _NEAR = np.radians(70.0)  # a joint that turned further has gone over to another configuration
 
 
@@ -56,10 +57,15 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
         around: (M, 6) joint angles at which the body is in view.
         count: how many.
         seed: of the draws.
+
+    Raises:
+        InputError: the arm hardly reaches such poses.
     """
     rng = np.random.default_rng([seed, 20])
     found: list[Array] = []
-    while len(found) < count:
+    for _ in range(_DRAWS * count):
+        if len(found) == count:
+            break
         weights = rng.dirichlet(np.full(len(around), 0.7))
         T = arm.forward(weights @ around)
         turn = np.radians(20.0) * rng.uniform(-1, 1, 3)
@@ -68,6 +74,11 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
         ).best
         if q is not None and np.abs(q - weights @ around).max() < _NEAR:
             found.append(q)
+    if len(found) < count:
+        raise InputError(
+            f"{arm.name} reaches {len(found)} of {_DRAWS * count} poses drawn around those of the motion, {count} are "
+            "needed: choose poses further from the limits of its joints"
+        )
     return np.array(found)
 
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log
 from armsight.app.run_data import RunData
-from armsight.app.run_summary import judge, path_errors, rest_errors
+from armsight.app.run_judge import judge, path_errors, rest_errors
 from armsight.app.run_tracks import ToolTrack, errors
 from armsight.data import Array
 
@@ -85,7 +85,9 @@ def errors_figure(run: RunData) -> Figure | None:
         plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
     for plot in plots:
         _shade(plot, run)
-    plots[1].set_title("vision and fused; shaded: 95% of the fused estimate's errors are to lie below", fontsize=9)
+    plots[1].set_title(
+        "vision and fused; shaded: at least 95% of the fused estimate's errors are to lie below", fontsize=9
+    )
     plots[1].legend(fontsize=7, ncols=3, loc="upper right")
     plots[3].set_xlabel("time, s")
     return figure

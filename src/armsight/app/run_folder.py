@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import shutil
 import tempfile
@@ -13,24 +15,28 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.app.experiment import Outcome
 from armsight.app.motion_file import MotionPlan
-from armsight.app.poses import csv_text, pose_record
+from armsight.app.poses import UPPER, csv_text, left_axes, pose_record
 from armsight.app.recording import record
 from armsight.app.run_calibrate import HandEyeRun
 from armsight.app.run_data import RunData, assembled, cut, joints_of
-from armsight.app.run_report import RunReport, write_run_report
-from armsight.app.run_summary import judge, path_errors, rest_errors, rms, singular, spread, track_figures
+from armsight.app.run_report import FIGURES, PAGE, RunReport, write_run_report
+from armsight.app.run_summary import summary_of
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
 from armsight.app.studies import Study
 from armsight.data import Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import write_text
+from armsight.geometry.rotation import quaternion_wxyz
 from armsight.robot.arm import Arm
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
+
+#: Files of tracks, and the fields of RunData they hold.
+_TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "wanted")
+_SHOTS = "shots"
 
 
 @dataclass(frozen=True)
@@ -68,22 +74,23 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
         InputError: a file cannot be written; those that were stay whole.
     """
     outcome = finished.outcome
+    _make_room(folder)
     if outcome.log.joints:
         write_columns(folder, "joints", _joint_columns(*joints_of(outcome.log)))
     write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
     if outcome.handeye is not None:
         _write_handeye(folder, outcome.handeye)
     if outcome.handeye is None or not outcome.log.segments:
-        summary = {**finished.facts, "ended_by": str(outcome.ended_by or "interrupted")}
+        summary = {**finished.facts, "ended_by": outcome.said}
         write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
         return summary
     mounting = outcome.handeye.mounting
     run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
     for name, track in _tracks(run).items():
         write_track(folder, name, track)
-    _write_shots(folder / "shots", outcome.kept)
+    _write_shots(folder / _SHOTS, outcome.kept)
     before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
-    summary = _summary(finished, run, before, after)
+    summary = summary_of(finished.arm, outcome, finished.plan, run, before, after, finished.studies, finished.facts)
     write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     notes = _notes(finished, run)
     write_text(folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
@@ -93,16 +100,23 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
     return summary
 
 
+def _make_room(folder: Path) -> None:
+    """Take away what an earlier run left here: none of it is to lie beside this one's."""
+    for name in (*FIGURES, "pose", "cell"):
+        (folder / f"{name}.png").unlink(missing_ok=True)
+    for name in (*_TRACKS, "joints"):
+        (folder / f"{name}.csv").unlink(missing_ok=True)
+        (folder / f"{name}.parquet").unlink(missing_ok=True)
+    for name in (PAGE, "summary.json", "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"):
+        (folder / name).unlink(missing_ok=True)
+    if (folder / _SHOTS).is_dir():
+        shutil.rmtree(folder / _SHOTS)
+
+
 def _tracks(run: RunData) -> dict[str, ToolTrack]:
     """Return the tracks that are written, by the name of their file."""
-    named = {
-        "potentiometers": run.potentiometers,
-        "vision": run.vision,
-        "fused": run.fused,
-        "live": run.live,
-        "wanted": run.wanted,
-    }
-    return named if run.truth is None else {**named, "truth": run.truth}
+    tracks = {name: getattr(run, name) for name in _TRACKS}
+    return {name: track for name, track in tracks.items() if track is not None}
 
 
 def _joint_columns(t_s: Array, q: Array, q_wanted: Array) -> dict[str, Any]:
@@ -135,12 +149,23 @@ def _write_handeye(folder: Path, run: HandEyeRun) -> None:
         "missed": list(run.missed),
     }
     write_text(folder / "handeye.json", json.dumps(told, indent=1) + "\n")
+    T = run.Ts_left_body
+    covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
+    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
+    named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
+    turns = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
+    named |= {f"q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
+    named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
+    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(named)
+    writer.writerows(zip(*named.values(), strict=True))
+    write_text(folder / "handeye_poses.csv", out.getvalue())
 
 
 def _write_shots(folder: Path, shots: Sequence[Shot]) -> None:
-    """Write the kept shots as a recording; one of an earlier run makes room."""
-    if folder.is_dir():
-        shutil.rmtree(folder)
+    """Write the kept shots as a recording."""
     left = iter(shots)
 
     class Kept:
@@ -151,90 +176,6 @@ def _write_shots(folder: Path, shots: Sequence[Shot]) -> None:
             pass
 
     record(Kept(), folder)
-
-
-def _summary(finished: Finished, run: RunData, before: RunData | None, after: RunData | None) -> dict[str, Any]:
-    """Return the figures, SI units in the keys."""
-    outcome = finished.outcome
-    assert outcome.handeye is not None
-    summary: dict[str, Any] = {}
-    if run.truth is not None and before is not None:
-        for name in ("vision", "potentiometers", "fused", "live"):
-            track: ToolTrack = getattr(before, name)
-            moving = (track.phase == "open_loop") & ~_hidden(track, outcome.covered_s)
-            resting = (track.phase == "rest") & ~_hidden(track, outcome.covered_s)
-            if moving.any() and resting.any():
-                summary[name] = {
-                    **track_figures(track[moving], run.truth),
-                    "rest_position_rms_m": track_figures(track[resting], run.truth)["position_rms_m"],
-                }
-        hidden = _hidden(before.fused, outcome.covered_s)
-        if outcome.covered_s is not None and hidden.any():
-            found = track_figures(before.fused[hidden], run.truth)
-            summary["occlusion"] = {
-                "duration_s": float(np.ptp(outcome.covered_s)),
-                "fused_position_rms_m": found["position_rms_m"],
-                "fused_position_max_m": found["position_max_m"],
-            }
-    if before is not None and after is not None:
-        goals = {m.name: m.trajectory.at(m.trajectory.duration_s).q for m in finished.plan.motions}
-        summary["closed_loop"] = _closed(before, after, [n for n, q in goals.items() if singular(finished.arm, q)])
-    if len(run.latency_s):
-        summary["latency_s"] = spread(run.latency_s)
-    position, angle = outcome.handeye.found.held_out.rms()
-    summary |= {
-        "handeye": {
-            "held_out_position_rms_m": position,
-            "held_out_angle_rms_rad": angle,
-            "poses": len(outcome.handeye.q),
-        },
-        "camera_delay_s": {"value": outcome.delay.delay_s, "sigma": outcome.delay.sigma_s},
-        "shots": {"measured": len(run.vision), "missed": run.missed, "not_believed": run.outliers},
-        "studies": [
-            {
-                "name": s.name,
-                "unit": s.unit,
-                "values": s.values.tolist(),
-                "position_rms_m": s.position_rms_m.tolist(),
-                "predicted_m": s.predicted_m.tolist(),
-            }
-            for s in finished.studies
-        ],
-        **finished.facts,
-        "ended_by": "interrupted"
-        if outcome.interrupted
-        else None
-        if outcome.ended_by is None
-        else str(outcome.ended_by),
-    }
-    return summary
-
-
-def _closed(before: RunData, after: RunData, singular_at: list[str]) -> dict[str, Any]:
-    """Return the error of the tool against where it was to be, with potentiometers alone and with the loop closed.
-
-    Rests at which the arm is singular stand apart: there it cannot be moved to where it should be.
-    """
-    found: dict[str, Any] = {"singular_rests": {name: {} for name in singular_at}}
-    for when, run in (("before", before), ("after", after)):
-        rests = rest_errors(run, judge(run))
-        for name in singular_at:
-            if name in rests:
-                found["singular_rests"][name][f"rest_error_{when}_m"] = rests.pop(name)
-        paths = [away for _, away in path_errors(run, judge(run)).values()]
-        if rests:
-            found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
-            found[f"rest_error_{when}_max_m"] = max(rests.values())
-        if paths:
-            found[f"path_error_{when}_m"] = rms(np.concatenate(paths))
-    return found
-
-
-def _hidden(track: ToolTrack, covered_s: tuple[float, float] | None) -> NDArray[np.bool_]:
-    """Return (N,) which rows lie where the body was hidden on purpose, or just after."""
-    if covered_s is None:
-        return np.zeros(len(track), bool)
-    return (track.t_s > covered_s[0] - 0.01) & (track.t_s < covered_s[1] + 0.05)
 
 
 def _picture(finished: Finished) -> Image | None:
@@ -257,12 +198,13 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: that is how far the arm is from its table",
         *outcome.handeye.missed,
-        f"images come {1e3 * outcome.delay.delay_s:.2f} ms late (sigma {1e3 * outcome.delay.sigma_s:.2f} ms), by a sweep",
+        f"images come {1e3 * outcome.delay.delay_s:.2f} ms late (sigma {1e3 * outcome.delay.sigma_s:.2f} ms), by a sweep"
+        if outcome.delay_found
+        else f"how late the images come was not found: {1e3 * outcome.delay.delay_s:g} ms taken",
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.outliers} not believed by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} on {mode}" for mode, count in modes.most_common()),
-        *([f"ended early: {outcome.ended_by}"] if outcome.ended_by is not None else []),
-        *(["ended early: interrupted"] if outcome.interrupted else []),
+        *([] if outcome.said is None else [f"ended early: {outcome.said}"]),
     ]
 
 
@@ -300,7 +242,7 @@ def open_folder(folder: Path) -> None:
     Raises:
         InputError: it cannot be made or written to, or holds shots that are of no run and would be written over.
     """
-    if (folder / "shots").exists() and not (folder / "summary.json").exists():
+    if (folder / _SHOTS).exists() and not (folder / "summary.json").exists():
         raise InputError(f"{folder}: holds shots that are of no earlier run; choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)

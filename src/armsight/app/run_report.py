@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "report.html"
+#: Names of the figures; each is a PNG beside the page.
+FIGURES = ("joints", "path", "errors", "loop", "latency", "studies", "overview")
 _DEG = float(np.degrees(1.0))
 #: Wheel zooms about the pointer, dragging moves, a double click shows the whole again.
 _ZOOM = """
@@ -140,7 +142,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
             "What the chapter left out",
             shown(
                 "errors",
-                "Errors against the truth. Potentiometers repeat themselves and are wrong; vision stays in its band.",
+                "Errors against the truth, and the band that the fused estimate claims for its own.",
             ),
         ),
         "loop": (

@@ -1,111 +1,123 @@
-"""The figures of a run: how far each track is from the truth, and what closing the loop gained. SI units.
-
-Distances are of the tool's origin, angles of the whole turn. Without a truth (a real arm) the fused track stands in for
-it where motions are judged, and nothing is said about the error of the tracks themselves.
-"""
+"""The summary of a run: what summary.json holds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from numpy.typing import NDArray
 
+from armsight.app.experiment import Outcome
+from armsight.app.motion_file import MotionPlan
 from armsight.app.run_data import RunData
-from armsight.app.run_tracks import ToolTrack, errors
-from armsight.data import Array
-from armsight.loop.servo import EASY
+from armsight.app.run_judge import judge, path_errors, rest_errors, rms, singular, spread, track_figures
+from armsight.app.run_tracks import ToolTrack
+from armsight.app.studies import Study
 from armsight.robot.arm import Arm
 
-#: Kinds of motion whose path in space is what counts.
-PATHS = ("line", "circle")
-_SETTLED_S = 0.2  # at the end of a rest
-#: A path's points are taken so close that the distance to the nearest is the distance to the path.
-_PATH_STEP_M = 2e-5
 
-
-def track_figures(track: ToolTrack, truth: ToolTrack) -> dict[str, Any]:
-    """Return how far a track is from the truth.
+def summary_of(
+    arm: Arm,
+    outcome: Outcome,
+    plan: MotionPlan,
+    run: RunData,
+    before: RunData | None,
+    after: RunData | None,
+    studies: Sequence[Study],
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the figures of a run, SI units in the keys.
 
     Args:
-        track: what was measured.
-        truth: what was.
+        arm: the nominal arm.
+        outcome: what was measured; its hand-eye calibration is there.
+        plan: what was to be done.
+        run: all of it.
+        before: the motions with potentiometers alone; None where they were not made.
+        after: the same with the loop closed; None likewise.
+        studies: made after it.
+        facts: what else to say.
     """
-    error = errors(track, truth)
-    position, angle = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
-    found: dict[str, Any] = {
-        "position_rms_m": rms(position),
-        "position_max_m": float(position.max()),
-        "orientation_rms_rad": rms(angle),
-        "orientation_max_rad": float(angle.max()),
-        "rows": len(track),
+    assert outcome.handeye is not None
+    position, angle = outcome.handeye.found.held_out.rms()
+    summary: dict[str, Any] = {} if before is None else _against_truth(before, outcome.covered_s)
+    if before is not None and after is not None:
+        goals = {m.name: m.trajectory.at(m.trajectory.duration_s).q for m in plan.motions}
+        summary["closed_loop"] = _closed(before, after, [n for n, q in goals.items() if singular(arm, q)])
+    if len(run.latency_s):
+        summary["latency_s"] = spread(run.latency_s)
+    return summary | {
+        "handeye": {
+            "held_out_position_rms_m": position,
+            "held_out_angle_rms_rad": angle,
+            "poses": len(outcome.handeye.q),
+        },
+        "camera_delay_s": {"value": outcome.delay.delay_s, "sigma": outcome.delay.sigma_s},
+        "shots": {"measured": len(run.vision), "missed": run.missed, "not_believed": run.outliers},
+        "studies": [_study(study) for study in studies],
+        **facts,
+        "ended_by": outcome.said,
     }
-    if track.covs is not None:
-        nees = np.einsum("ni,ni->n", error, np.linalg.solve(track.covs, error[..., None])[..., 0])
-        variance = np.einsum("nii->ni", track.covs)
-        found |= {
-            "position_sigma_rms_m": rms(np.sqrt(variance[:, :3].sum(axis=1))),
-            "orientation_sigma_rms_rad": rms(np.sqrt(variance[:, 3:].sum(axis=1))),
-            "nees_mean": float(nees.mean()),
-            "inside_95_share": float((nees <= chi2.ppf(0.95, 6)).mean()),
-        }
+
+
+def _study(study: Study) -> dict[str, Any]:
+    """Return a study's figures."""
+    return {
+        "name": study.name,
+        "unit": study.unit,
+        "values": study.values.tolist(),
+        "position_rms_m": study.position_rms_m.tolist(),
+        "predicted_m": study.predicted_m.tolist(),
+    }
+
+
+def _against_truth(before: RunData, covered_s: tuple[float, float] | None) -> dict[str, Any]:
+    """Return how far each track of the motions is from the truth, with the body in view and hidden; empty without one."""
+    found: dict[str, Any] = {}
+    if before.truth is None:
+        return found
+    for name in ("vision", "potentiometers", "fused", "live"):
+        track: ToolTrack = getattr(before, name)
+        seen = ~_hidden(track, covered_s)
+        moving, resting = (track.phase == "open_loop") & seen, (track.phase == "rest") & seen
+        if moving.any() and resting.any():
+            at_rest = track_figures(track[resting], before.truth)["position_rms_m"]
+            found[name] = {**track_figures(track[moving], before.truth), "rest_position_rms_m": at_rest}
+    if covered_s is not None and (before.t_s > covered_s[0]).any():
+        found["occlusion"] = {"duration_s": float(np.ptp(covered_s))}
+        for name in ("fused", "live"):
+            track = getattr(before, name)
+            figures = track_figures(track[_hidden(track, covered_s)], before.truth)
+            found["occlusion"] |= {
+                f"{name}_position_rms_m": figures["position_rms_m"],
+                f"{name}_position_max_m": figures["position_max_m"],
+            }
     return found
 
 
-def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
-    """Return how far from its goal the tool stood in the last fifth of a second of each rest, RMS, m."""
-    found = {}
-    for segment in run.segments:
-        rows = (run.wanted.t_s > segment.end_s - _SETTLED_S) & (run.wanted.t_s <= segment.end_s)
-        if segment.phase == "rest" and segment.motion and rows.any():
-            off = truth.at(run.wanted.t_s[rows])[:, :3, 3] - run.wanted.Ts_base_tool[rows, :3, 3]
-            found[segment.motion] = float(np.sqrt((off**2).sum(axis=1).mean()))
+def _closed(before: RunData, after: RunData, singular_at: list[str]) -> dict[str, Any]:
+    """Return the error of the tool against where it was to be, with potentiometers alone and with the loop closed.
+
+    Rests at which the arm is singular stand apart: there it cannot be moved to where it should be.
+    """
+    found: dict[str, Any] = {"singular_rests": {name: {} for name in singular_at}}
+    for when, run in (("before", before), ("after", after)):
+        rests = rest_errors(run, judge(run))
+        for name in singular_at:
+            if name in rests:
+                found["singular_rests"][name][f"rest_error_{when}_m"] = rests.pop(name)
+        paths = [away for _, away in path_errors(run, judge(run)).values()]
+        if rests:
+            found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
+            found[f"rest_error_{when}_max_m"] = max(rests.values())
+        if paths:
+            found[f"path_error_{when}_m"] = rms(np.concatenate(paths))
     return found
 
 
-def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]]:
-    """Return for each motion along a path (line, circle) times since its start and distances from the path, m."""
-    found = {}
-    for segment in run.segments:
-        if segment.phase == "rest" or segment.kind not in PATHS:
-            continue
-        rows = (run.wanted.t_s > segment.begin_s) & (run.wanted.t_s <= segment.end_s)
-        if rows.any():
-            was = truth.at(run.wanted.t_s[rows])[:, :3, 3]
-            away = path_distances(was, run.wanted.Ts_base_tool[rows, :3, 3])
-            found[segment.motion] = (run.wanted.t_s[rows] - segment.begin_s, away)
-    return found
-
-
-def singular(arm: Arm, q: Array) -> bool:
-    """Say whether an arm at joint angles (6,) cannot move its tool in some direction, as far as the loop corrects it."""
-    size_m = float(np.hypot(arm.a, arm.d).sum())
-    J = arm.jacobian(q) / np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])[:, None]
-    return bool(np.linalg.svd(J, compute_uv=False)[-1] < EASY)
-
-
-def judge(run: RunData) -> ToolTrack:
-    """Return what the run is judged by: the truth, or on a real arm the fused estimate."""
-    return run.fused if run.truth is None else run.truth
-
-
-def path_distances(was: Array, wanted: Array) -> Array:
-    """Return (N,) how far points (N, 3) are from a path through points (M, 3), m: time along it does not count."""
-    steps = np.linalg.norm(np.diff(wanted, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    keep = np.concatenate([[True], steps > 0])
-    fine = np.linspace(0.0, along[-1], max(2, int(along[-1] / _PATH_STEP_M) + 1))
-    path = np.stack([np.interp(fine, along[keep], wanted[keep, i]) for i in range(3)], axis=1)
-    return np.asarray(cKDTree(path).query(was)[0])
-
-
-def rms(values: Array) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def spread(values: Array) -> dict[str, float]:
-    """Return p50, p99 and max."""
-    p50, p99 = np.percentile(values, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(np.max(values))}
+def _hidden(track: ToolTrack, covered_s: tuple[float, float] | None) -> NDArray[np.bool_]:
+    """Return (N,) which rows lie where the body was hidden on purpose, or just after."""
+    if covered_s is None:
+        return np.zeros(len(track), bool)
+    return (track.t_s > covered_s[0] - 0.01) & (track.t_s < covered_s[1] + 0.05)

@@ -56,7 +56,7 @@ class Timing:
         period_s: between two commands, s.
         vision_period_s: between two sightings, s.
         latency_s: from the middle of an exposure to the command that knows of it, s, as measured.
-        response_s: from a command to the joints being there, s: the time constant of their own loop, as measured.
+        response_s: from a command to the joints being there, s: the time constant of their own loop.
     """
 
     period_s: float

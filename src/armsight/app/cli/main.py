@@ -71,7 +71,7 @@ def main() -> None:
         sys.exit(130)
     except click.ClickException as error:
         error.show()
-        if "extra argument" in error.format_message():
+        if "extra argument" in error.format_message() and {"--left", "--right"} & set(sys.argv):
             click.echo(
                 "A glob must be quoted: --left 'DIR/left*.png', or the shell puts every file name there.", err=True
             )

@@ -128,11 +128,18 @@ def covariance(
     noise: tuple[float, float],
 ) -> Array:
     """Return the covariance (P, P) of the free parameters at a vector; zero for the others."""
-    _, J = weighted(model, x, measured, phi, noise)
-    J = J[:, :, free].reshape(-1, int(free.sum()))
+    _, J = _free(model, x, measured, phi, free, noise)
     cov = np.zeros((len(x), len(x)))
     cov[np.ix_(free, free)] = np.linalg.inv(J.T @ J + np.diag(_pull(prior, free)))
     return cov
+
+
+def _free(
+    model: Model, x: Array, measured: Measured, phi: Array, free: Mask, noise: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Return whitened residuals (N M,) and their derivative (N M, F) by the free parameters."""
+    e, J = weighted(model, x, measured, phi, noise)
+    return e.ravel(), J[:, :, free].reshape(-1, int(free.sum()))
 
 
 def _pull(prior: Array, free: Mask) -> Array:
@@ -153,9 +160,8 @@ def _newton(
     """Return the best vector, and the information (F, F) about its free parameters."""
     nominal, pull = _nominal(model, x, prior), _pull(prior, free)
     for _ in range(STEPS):
-        e, J = weighted(model, x, measured, phi, noise)
-        J = J[:, :, free].reshape(-1, int(free.sum()))
-        H, g = J.T @ J + np.diag(pull), J.T @ e.ravel() + pull * (x - nominal)[free]
+        e, J = _free(model, x, measured, phi, free, noise)
+        H, g = J.T @ J + np.diag(pull), J.T @ e + pull * (x - nominal)[free]
         scale = 1 / np.sqrt(np.diag(H))
         factor = cho_factor(scale[:, None] * H * scale)
         step = scale * cho_solve(factor, scale * g)
