@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense.block import Block
 from armsight.vision.dense.cost import COST_MAX
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.semiglobal import _EDGE, _P1, _P2, Semiglobal
@@ -88,20 +87,6 @@ def test_semiglobal_totals_are_those_of_the_definition(paths):
     np.testing.assert_array_equal(found.least, masked.min(axis=2))
     whole = masked.argmin(axis=2)
     assert (np.abs(found.disparity - whole) <= 0.5).all()
-
-
-def test_block_totals_are_those_of_the_definition():
-    left, right, _ = layers(noise=3.0)
-    left, right = np.ascontiguousarray(left[30:54, 60:100]), np.ascontiguousarray(right[30:54, 60:100])
-    count, reach = 10, 2
-    raw = raw_costs(left, right, count)
-    height, width, _ = raw.shape
-    rows = np.clip(np.arange(height)[:, None] + np.arange(-reach, reach + 1), 0, height - 1)
-    columns = np.clip(np.arange(width)[:, None] + np.arange(-reach, reach + 1), 0, width - 1)
-    total = raw[rows].sum(axis=1)[:, columns].sum(axis=2)
-    allowed = np.arange(count)[None, :] <= np.arange(width)[:, None]
-    found = Block(reach=reach).search(left, right, Search(0, count))
-    np.testing.assert_array_equal(found.least, np.where(allowed, total, 10**6).min(axis=2))
 
 
 def test_no_path_cost_leaves_a_byte():

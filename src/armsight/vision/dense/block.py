@@ -1,32 +1,29 @@
 """Local matching: the least cost summed over a window, winner takes all.
 
-By default the cost is census with Birchfield and Tomasi's dissimilarity over a square window, which a running sum makes
-fast. The other costs and supports of the chapter's survey work on one disparity at a time (``support.py``): absolute
-differences, zero-mean normalised correlation, windows shaped by arms of alike pixels (Zhang, Lu and Lafruit 2009) and
-the guided filter (Hosni et al., PAMI 35(2), 2013).
+By default the cost is census with absolute differences over a square window, which a running sum and vectors make fast
+(``window.py``). The other costs and supports of the chapter's survey work on one disparity at a time (``support.py``):
+absolute differences, zero-mean normalised correlation, windows shaped by arms of alike pixels (Zhang, Lu and Lafruit
+2009) and the guided filter (Hosni et al., PAMI 35(2), 2013).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.cost import BLOCK, prepare
 from armsight.vision.dense.finish import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.support import COSTS, SUPPORTS, match_planes
-from armsight.vision.dense.window import match_windows
+from armsight.vision.dense.window import look, make_room, match_windows
 from armsight.vision.dense.winner import Found, make_found
 
-_STRIP_ROWS = 192
+_STRIP_ROWS = 384
 #: The largest window whose sum of raw costs still fits two bytes.
-_REACH_MAX = 21
+_REACH_MAX = 24
 #: See finish.py.
-_TRUST = Trust(0.15, 0.13)
+_TRUST = Trust(0.17, 0.09)
 
 
 @dataclass(frozen=True)
@@ -60,11 +57,12 @@ class Block:
         """Find disparities, without judging, smoothing or filling them."""
         if self.cost != "census" or self.support != "box":
             return match_planes(left, right, search, self.cost, self.support, self.reach)
-        size = -(-search.count // int(BLOCK)) * int(BLOCK)
-        pair, found = prepare(left, right, search.first + size), make_found(*left.shape)
+        pad = search.last + 1
+        looks, found = look(left, right, self.reach, pad), make_found(*left.shape)
 
         def work(begin: int, end: int) -> None:
-            match_windows(pair, begin, end, self.reach, search.first, search.count, np.uintp(size), found)
+            room = make_room(left.shape[1], self.reach, pad, search.count)
+            match_windows(looks, begin, end, self.reach, search.first, search.count, pad, room, found)
 
         on_strips(left.shape[0], _STRIP_ROWS, work)
         return found

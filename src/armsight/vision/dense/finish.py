@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from armsight.vision.dense.edges import redrawn
 from armsight.vision.dense.fill import filled
 from armsight.vision.dense.method import MEASURED, Disparity, Search
 from armsight.vision.dense.smooth import smoothed
+from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.winner import Found, Singles
 
 #: A patch of one disparity that is not larger than the pixels one match looks at (7 x 7) is one mistake, not a surface.
@@ -24,6 +26,7 @@ _SPECKLE_PX = 50
 _FINE = 16
 #: With less than this share of the image measured, there is no result: chance alone gives some.
 _LEAST_SHARE = 0.005
+_STRIP_ROWS = 192
 
 
 @dataclass(frozen=True)
@@ -42,17 +45,53 @@ class Trust:
     floor_px: float
     gain: float = 0.0
 
-    def sigma_px(self, found: Found) -> NDArray[np.float32]:
-        """Return the standard deviation (H, W) of what was found, px."""
-        noise = self.gain * found.least / np.maximum(found.curvature, 1)
-        return np.hypot(np.float32(self.floor_px), noise).astype(np.float32)
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _coarse(found: Found, begin: int, end: int, out: NDArray[np.int16]) -> None:
+    """Write disparities in steps of a pixel's sixteenth, below zero where the two images do not agree."""
+    for y in range(begin, end):
+        for x in range(out.shape[1]):
+            good = found.agreed[y, x] and found.curvature[y, x] > 0
+            out[y, x] = np.int16(found.disparity[y, x] * np.float32(_FINE)) if good else np.int16(-_FINE)
 
 
-def without_speckles(disparity: Singles) -> Singles:
-    """Return disparities (H, W) with NaN where a patch is too small to be believed."""
-    coarse = np.where(np.isnan(disparity), -_FINE, disparity * _FINE).astype(np.int16)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sure(found: Found, kept: NDArray[np.int16], begin: int, end: int, out: Singles) -> None:
+    """Write the disparities that are kept, NaN elsewhere."""
+    for y in range(begin, end):
+        for x in range(kept.shape[1]):
+            out[y, x] = found.disparity[y, x] if kept[y, x] >= 0 else np.float32(np.nan)
+
+
+def without_speckles(found: Found) -> Singles:
+    """Return the disparities (H, W) that the images agree on, NaN where a patch is too small to be believed."""
+    height, width = found.disparity.shape
+    coarse, out = np.empty((height, width), np.int16), np.empty((height, width), np.float32)
+    on_strips(height, _STRIP_ROWS, lambda begin, end: _coarse(found, begin, end, coarse))
     cv2.filterSpeckles(coarse, -_FINE, _SPECKLE_PX, _FINE)
-    return np.where(coarse == -_FINE, np.float32(np.nan), disparity)
+    on_strips(height, _STRIP_ROWS, lambda begin, end: _sure(found, coarse, begin, end, out))
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _judge(
+    found: Found,
+    state: NDArray[np.uint8],
+    floor: float,
+    gain: float,
+    begin: int,
+    end: int,
+    sigma: Singles,
+    share: Singles,
+) -> None:
+    """Write sigmas; what was not measured has neither sigma nor confidence."""
+    low, slope = np.float32(floor), np.float32(gain)
+    for y in range(begin, end):
+        for x in range(state.shape[1]):
+            noise = slope * found.least[y, x] / max(found.curvature[y, x], np.float32(1))
+            measured = state[y, x] == MEASURED
+            sigma[y, x] = np.sqrt(low * low + noise * noise) if measured else np.float32(np.nan)
+            share[y, x] = share[y, x] if measured else np.float32(0)
 
 
 def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: bool = False) -> Disparity:
@@ -65,9 +104,8 @@ def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: 
         trust: how sure the method is.
         edges: whether depth breaks are drawn again where the image has its edges.
     """
-    good = found.agreed & (found.curvature > 0)
-    sure = without_speckles(np.where(good, found.disparity, np.float32(np.nan)))
-    if np.count_nonzero(np.isfinite(sure)) < _LEAST_SHARE * sure.size:
+    sure = without_speckles(found)
+    if np.count_nonzero(sure == sure) < _LEAST_SHARE * sure.size:  # NaN is not even itself
         return Disparity.none(
             (left.shape[0], left.shape[1]),
             search,
@@ -78,6 +116,10 @@ def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: 
     full, state = filled(surface)
     if edges:
         full, state = redrawn(full, state, left)
-    measured = state == MEASURED
-    sigma = np.where(measured, trust.sigma_px(found), np.float32(np.nan))
-    return Disparity(full, state, sigma, np.where(measured, share, np.float32(0)), search)
+    sigma = np.empty_like(full)
+    on_strips(
+        left.shape[0],
+        _STRIP_ROWS,
+        lambda begin, end: _judge(found, state, trust.floor_px, trust.gain, begin, end, sigma, share),
+    )
+    return Disparity(full, state, sigma, share, search)

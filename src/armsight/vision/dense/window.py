@@ -1,70 +1,266 @@
-"""Costs summed over square windows, by running sums: the work for a pixel does not grow with the window."""
+"""Local matching over square windows: a pair's looks go in, a strip's winners come out.
+
+A byte a pixel and disparity says what a match costs: twice the bits in which two census words of eight neighbours
+differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute difference of the
+grey levels, cut off: order holds where the light differs, levels tell where order does not (Mei et al., "On building an
+accurate stereo matching system on graphics hardware", 2011). Costs are summed along the row, and then by a running sum
+down the columns, so that the work for a pixel does not grow with the window's height. Pixels of a row lie side by side
+and take turns with the disparities: the least so far, of the left pixel and of the right one, needs no search across a
+vector. No cost volume is kept, but the sums of as many rows as the window is high.
+"""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import cv2
 import numba
 import numpy as np
 
-from armsight.vision.dense.cost import Bytes, Pair, raw_row
-from armsight.vision.dense.winner import Counts, Found, choose_row
+from armsight.data import Image
+from armsight.vision.dense.cost import Bytes
+from armsight.vision.dense.lanes import (
+    LANES,
+    above,
+    as_in,
+    bits_set,
+    count_up,
+    differing,
+    half,
+    least,
+    load,
+    minus,
+    plus,
+    spread,
+    start,
+    store,
+    where_less,
+)
+from armsight.vision.dense.winner import NOWHERE, Counts, Found
+
+ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(LANES)
+#: Neighbours in a census word lie so far from the middle, px, along rows, columns and diagonals.
+_CENSUS_REACH = 2
+#: Beyond this many grey levels two pixels are just different; what a match beyond the right image's edge costs: about
+#: that of an undecided pixel; the most that a match can cost.
+_CUT, _OUTSIDE, RAW_MAX = np.uint8(20), np.uint8(10), 2 * 8 + 20 // 2
+#: The reach whose sum is written out.
+_USUAL = 4
+#: Up to this reach the sum along a row fits a byte.
+BYTE_REACH = (255 // RAW_MAX - 1) // 2
+
+
+class Looks(NamedTuple):
+    """A pair as the costs need it: rows of bytes, one after another, widened so that every window lies inside.
+
+    Attributes:
+        left: grey levels.
+        left_census: census words.
+        right: grey levels; one place further left for each disparity.
+        right_census: census words.
+        left_stride: places in a row of the left image's.
+        right_stride: places in a row of the right image's.
+    """
+
+    left: Bytes
+    left_census: Bytes
+    right: Bytes
+    right_census: Bytes
+    left_stride: np.uintp
+    right_stride: np.uintp
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _slide(columns: Counts, raw: Bytes, new: np.uintp, old: np.uintp) -> None:
-    """Let the sums over columns move down by one row."""
-    for i in range(np.uintp(columns.shape[0])):
-        columns[i] += np.uint16(raw[new + i]) - np.uint16(raw[old + i])
+def _census(padded: Bytes, out: Bytes) -> None:
+    """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
+    height, width = out.shape
+    for y in range(height):
+        row, middle = out[y], padded[y + _CENSUS_REACH]
+        for j in range(0, 5, 2):
+            other = padded[y + j]
+            for i in range(0, 5, 2):
+                if i == _CENSUS_REACH and j == _CENSUS_REACH:
+                    continue
+                for x in range(width):
+                    row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + i] < middle[x + _CENSUS_REACH])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _start(columns: Counts, raw: Bytes, row: np.uintp) -> None:
-    """Add one row to the sums over columns."""
-    for i in range(np.uintp(columns.shape[0])):
-        columns[i] += np.uint16(raw[row + i])
+def look(left: Image, right: Image, reach: int, further: int) -> Looks:
+    """Look at both images of a pair.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        reach: of the windows, px.
+        further: how far to the left of the right image a match may lie: the search's last disparity and one.
+    """
+
+    def widened(image: Image, before: int) -> Bytes:
+        return np.asarray(
+            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * LANES, cv2.BORDER_REPLICATE)
+        )
+
+    def census(image: Image) -> Bytes:
+        out = np.zeros(image.shape, np.uint8)
+        around = (_CENSUS_REACH,) * 4
+        _census(np.asarray(cv2.copyMakeBorder(image, *around, cv2.BORDER_REPLICATE), np.uint8), out)
+        return out
+
+    planes = (widened(left, 0), widened(census(left), 0), widened(right, further), widened(census(right), further))
+    a, b, c, d = (plane.reshape(-1) for plane in planes)
+    return Looks(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _along(columns: Counts, add: np.uintp, take: np.uintp, total: Counts, at: np.uintp, size: np.uintp) -> None:
-    """Let the sum over a window move right by one pixel."""
-    for d in range(size):
-        total[at + d] = np.uint16(total[at - size + d] + np.uint16(columns[add + d] - columns[take + d]))
+def _costs(g: Any, word: Any, r: Any, other: Any) -> Any:  # noqa: ANN401
+    """Return what it costs to match grey levels and census words."""
+    apart = least(plus(above(g, r), above(r, g)), spread(_CUT))
+    bits = bits_set(differing(word, other))
+    return plus(plus(bits, bits), half(apart))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _over(raw: Bytes, threes: Bytes, at: np.uintp, reach: int, kept: Bytes) -> Any:  # noqa: ANN401
+    """Return costs summed over 2 ``reach`` + 1 pixels, in as many bits as ``kept`` has; all are where arrays start."""
+    if reach == _USUAL:
+        a, b = load(threes, at), load(threes, at + np.uintp(3))
+        return as_in(plus(plus(a, b), load(threes, at + np.uintp(6))), kept)
+    total, size = as_in(load(threes, at), kept), np.uintp(2 * reach + 1)
+    for k in range(THREE, size - size % THREE, THREE):
+        total = plus(total, as_in(load(threes, at + k), kept))
+    for k in range(size - size % THREE, size):
+        total = plus(total, as_in(load(raw, at + k), kept))
+    return total
+
+
+class Room(NamedTuple):
+    """What a strip needs to be worked on.
+
+    Attributes:
+        raw: one row's costs at one disparity, with the windows' reach to either side.
+        threes: sums of three of them, from each on: windows are made of these.
+        kept: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest.
+        total: (count, T) sums over windows.
+        least: (T,) least total of each left pixel so far.
+        where: (T,) and at which disparity, from the search's first on.
+        right: (T + pad,) least total of each right pixel so far; pixel u is at u + pad.
+    """
+
+    raw: Bytes
+    threes: Bytes
+    kept: Bytes
+    total: Counts
+    least: Counts
+    where: Counts
+    right: Counts
+
+
+def make_room(width: int, reach: int, further: int, count: int) -> Room:
+    """Return room for strips of images of a width."""
+    wide = -(-width // LANES) * LANES
+    kind = np.uint8 if reach <= BYTE_REACH else np.uint16
+    return Room(
+        np.zeros(wide + 2 * reach + 2 * LANES, np.uint8),
+        np.zeros(wide + 2 * reach + 2 * LANES, np.uint8),
+        np.zeros((2 * reach + 1) * count * wide, kind),
+        np.zeros(count * wide, np.uint16),
+        np.zeros(wide, np.uint16),
+        np.zeros(wide, np.uint16),
+        np.zeros(wide + further, np.uint16),
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sum_row(columns: Counts, reach: int, size: np.uintp, total: Counts) -> None:
-    """Sum the columns (W * size,) over 2 ``reach`` + 1 pixels; beyond the image's edge it is its last column."""
-    width = columns.shape[0] // int(size)
-    total[: int(size)] = 0
-    for i in range(-reach, reach + 1):
-        c = np.uintp(min(max(i, 0), width - 1)) * size
-        for d in range(size):
-            total[d] += columns[c + d]
-    for x in range(1, width):
-        add, take = min(x + reach, width - 1), max(x - reach - 1, 0)
-        _along(columns, np.uintp(add) * size, np.uintp(take) * size, total, np.uintp(x) * size, size)
+def _cost_row(looks: Looks, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
+    """Write the costs of a row at disparity d, from ``reach`` pixels before it to ``reach`` after it."""
+    grey, word, r_grey, r_word = (
+        start(looks.left),
+        start(looks.left_census),
+        start(looks.right),
+        start(looks.right_census),
+    )
+    left = np.uintp(row) * looks.left_stride
+    right, out = np.uintp(row) * looks.right_stride + np.uintp(pad - d), start(raw)
+    for j in range(np.uintp(0), np.uintp(width + 2 * reach), BLOCK):
+        costs = _costs(load(grey, left + j), load(word, left + j), load(r_grey, right + j), load(r_word, right + j))
+        store(out, j, costs)
+    raw[: min(d, width) + reach] = _OUTSIDE if d > 0 else raw[reach]
+    raw[width + reach : width + 2 * reach] = raw[width + reach - 1]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_row(
+    looks: Looks, row: int, choose: bool, reach: int, first: int, count: int, width: int, pad: int, room: Room
+) -> None:
+    """Let the windows move down by a row of the widened images; with ``choose`` find the least totals.
+
+    Pixels from which a disparity leads out of the right image do not choose it, nor do places beyond the left one's end.
+    """
+    stride, end = np.uintp(room.least.shape[0]), np.uintp(width)
+    slot = np.uintp(row % (2 * reach + 1)) * np.uintp(count) * stride
+    raw, threes, kept, total = start(room.raw), start(room.threes), start(room.kept), start(room.total)
+    lowest, where, right = start(room.least), start(room.where), start(room.right)
+    for k in range(count):
+        d = first + k
+        _cost_row(looks, row, d, pad, width, reach, room.raw)
+        for x in range(np.uintp(0), stride + np.uintp(2 * reach), BLOCK):
+            store(threes, x, plus(plus(load(raw, x), load(raw, x + ONE)), load(raw, x + np.uintp(2))))
+        at, here, begin = np.uintp(k) * stride, spread(np.uint16(k)), np.uintp(d)
+        for x in range(begin // BLOCK * BLOCK, stride, BLOCK):
+            h = _over(raw, threes, np.uintp(x), reach, kept)
+            t = plus(load(total, at + x), as_in(h, total))
+            t = minus(t, as_in(load(kept, slot + at + x), total))
+            store(kept, slot + at + x, h)
+            store(total, at + x, t)
+            if choose:
+                if x < begin:
+                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(begin)), spread(NOWHERE), t)
+                if x + BLOCK > end:
+                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(end)), t, spread(NOWHERE))
+                before, u = load(lowest, x), x + np.uintp(pad - d)
+                store(where, x, where_less(t, before, here, load(where, x)))
+                store(lowest, x, least(t, before))
+                store(right, u, least(t, load(right, u)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place_row(y: int, first: int, count: int, pad: int, room: Room, found: Found) -> None:
+    """Write what row y found: places between disparities, curvatures, and whether the right image agrees."""
+    stride, total = np.uintp(room.least.shape[0]), room.total
+    width = found.disparity.shape[1]
+    for x in range(min(first, width)):  # nothing of the search lies in the right image
+        found.disparity[y, x], found.agreed[y, x], found.curvature[y, x] = first, False, 0
+    for x in range(first, width):
+        k, reached = np.uintp(room.where[x]), np.uintp(min(x - first + 1, count))
+        at = k * stride + np.uintp(x)
+        around = total[at]
+        low, offset, curvature = np.float32(around), np.float32(0), np.float32(0)
+        if k > 0:
+            around = min(around, total[at - stride - ONE])
+            if k + ONE < reached:
+                below, beyond = np.float32(total[at - stride]) - low, np.float32(total[at + stride]) - low
+                curvature = below + beyond
+                if curvature > 0:  # two lines of equal slope, not a parabola: these are sums of absolute differences
+                    offset = np.float32(0.5) * (below - beyond) / max(below, beyond)
+        if k + ONE < np.uintp(count) and x + 1 < width:
+            around = min(around, total[at + stride + ONE])
+        found.disparity[y, x] = np.float32(first) + np.float32(k) + offset
+        found.least[y, x], found.curvature[y, x] = low, curvature
+        found.agreed[y, x] = around <= room.right[np.uintp(x - first + pad) - k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def match_windows(
-    pair: Pair, begin: int, end: int, reach: int, first: int, count: int, size: np.uintp, found: Found
+    looks: Looks, begin: int, end: int, reach: int, first: int, count: int, pad: int, room: Room, found: Found
 ) -> None:
     """Choose the disparities of the rows from ``begin`` to ``end`` by the least sum over a window."""
-    height, width = pair.left.shape
-    n = np.uintp(width) * size
-    held = 2 * reach + 2  # rows of raw costs, each at its number modulo this
-    raw = np.empty(held * int(n), np.uint8)
-    columns, total = np.zeros(int(n), np.uint16), np.empty(int(n), np.uint16)
-    best_right = np.empty(width + first + int(size), np.uint16)
-    known = max(begin - reach, 0)
-    for row in range(known, min(begin + reach, height - 1) + 1):
-        raw_row(pair, row, first, count, size, raw, np.uintp(row % held) * n)
-    for y in range(begin - reach, begin + reach + 1):
-        _start(columns, raw, np.uintp(min(max(y, 0), height - 1) % held) * n)
-    for y in range(begin, end):
-        if y > begin:
-            new, old = min(y + reach, height - 1), max(y - reach - 1, 0)
-            if new == y + reach:
-                raw_row(pair, new, first, count, size, raw, np.uintp(new % held) * n)
-            _slide(columns, raw, np.uintp(new % held) * n, np.uintp(old % held) * n)
-        _sum_row(columns, reach, size, total)
-        choose_row(total, np.uintp(0), best_right, y, first, count, size, found)
+    width = found.disparity.shape[1]
+    room.kept[:] = 0
+    room.total[:] = 0
+    for row in range(begin, end + 2 * reach):
+        y = row - 2 * reach  # the row whose window this one completes
+        room.least[:] = NOWHERE
+        room.right[:] = NOWHERE
+        _add_row(looks, row, y >= begin, reach, first, count, width, pad, room)
+        if y >= begin:
+            _place_row(y, first, count, pad, room, found)

@@ -1,0 +1,112 @@
+"""Windows' totals and winners against their definitions, and vectors against plain numbers."""
+
+import numba
+import numpy as np
+import pytest
+from dense_scenes import layers
+
+from armsight.vision.dense import lanes
+from armsight.vision.dense.block import Block
+from armsight.vision.dense.method import Search
+from armsight.vision.dense.window import RAW_MAX
+
+
+def raw_costs(left, right, first, count):
+    """Twice the census bits that differ and half of the absolute difference, pixel by pixel."""
+    height, width = left.shape
+
+    def at(image, y, x):
+        return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
+
+    def bits(image, y, x):
+        around = [(j, i) for j in (-2, 0, 2) for i in (-2, 0, 2) if (i, j) != (0, 0)]
+        return [at(image, y + j, x + i) < at(image, y, x) for j, i in around]
+
+    out = np.full((height, width, count), 10)
+    for y in range(height):
+        for x in range(width):
+            for d in range(first, min(first + count, x + 1)):
+                differ = sum(a != b for a, b in zip(bits(left, y, x), bits(right, y, x - d), strict=True))
+                apart = abs(at(left, y, x) - at(right, y, x - d))
+                out[y, x, d - first] = 2 * differ + min(apart, 20) // 2
+    return out
+
+
+def totals(raw, reach):
+    height, width, _ = raw.shape
+    rows = np.clip(np.arange(height)[:, None] + np.arange(-reach, reach + 1), 0, height - 1)
+    columns = np.clip(np.arange(width)[:, None] + np.arange(-reach, reach + 1), 0, width - 1)
+    return raw[rows].sum(axis=1)[:, columns].sum(axis=2)
+
+
+@pytest.mark.parametrize(("reach", "first"), [(1, 0), (2, 3), (4, 0), (6, 0)])  # 6: sums of two bytes
+def test_totals_winners_and_agreement_are_those_of_the_definition(reach, first):
+    left, right, _ = layers(noise=3.0)
+    left, right = np.ascontiguousarray(left[30:54, 60:110]), np.ascontiguousarray(right[30:54, 60:110])
+    count = 10
+    total = totals(raw_costs(left, right, first, count), reach)
+    height, width, _ = total.shape
+    d = first + np.arange(count)
+    total[:, d[None, :] > np.arange(width)[:, None]] = 10**6
+    found = Block(reach=reach).search(left, right, Search(first, count))
+    inside = np.arange(width) >= first
+    winner = total.argmin(axis=2)
+    np.testing.assert_array_equal(found.least[:, inside], total.min(axis=2)[:, inside])
+    assert (np.abs(found.disparity - first - winner) <= 0.5)[:, inside].all()
+    assert not found.agreed[:, ~inside].any()
+    best_right = np.full((height, width), 10**6)
+    for k in range(count):
+        u = np.arange(first + k, width)
+        best_right[:, u - first - k] = np.minimum(best_right[:, u - first - k], total[:, u, k])
+    for y in range(height):
+        for x in range(first, width):
+            k = winner[y, x]
+            near = [(x + s, k + s) for s in (-1, 0, 1) if 0 <= x + s < width and 0 <= k + s < count]
+            agreed = min(total[y, u, j] for u, j in near) <= best_right[y, x - first - k]
+            assert found.agreed[y, x] == agreed
+
+
+def test_no_sum_leaves_its_type():
+    for reach in (4, 5, 24):
+        black, white = np.zeros((60, 80), np.uint8), np.full((60, 80), 255, np.uint8)
+        checks = np.where(np.indices((60, 80)).sum(axis=0) % 4 < 2, black, white)
+        found = Block(reach=reach).search(checks, np.roll(checks, 2, axis=1).copy(), Search(0, 2))
+        assert found.least.max() <= RAW_MAX * (2 * reach + 1) ** 2 < 65536
+
+
+@numba.njit
+def worked(a, b, out):
+    """Write what each operation makes of 32 bytes, one row after another."""
+    p, q, o, n = lanes.start(a), lanes.start(b), lanes.start(out), np.uintp(lanes.LANES)
+    x, y = lanes.load(p, np.uintp(0)), lanes.load(q, np.uintp(3))
+    lanes.store(o, np.uintp(0), lanes.plus(x, y))
+    lanes.store(o, n, lanes.minus(x, y))
+    lanes.store(o, np.uintp(2) * n, lanes.least(x, y))
+    lanes.store(o, np.uintp(3) * n, lanes.above(x, y))
+    lanes.store(o, np.uintp(4) * n, lanes.differing(x, y))
+    lanes.store(o, np.uintp(5) * n, lanes.bits_set(x))
+    lanes.store(o, np.uintp(6) * n, lanes.half(x))
+    lanes.store(o, np.uintp(7) * n, lanes.where_less(x, y, lanes.spread(np.uint8(1)), lanes.count_up(np.uint8(250))))
+
+
+@numba.njit
+def widened(a, out):
+    p, o = lanes.start(a), lanes.start(out)
+    lanes.store(o, np.uintp(0), lanes.plus(lanes.as_in(lanes.load(p, np.uintp(0)), o), lanes.spread(np.uint16(1000))))
+
+
+def test_vectors_work_as_numbers_do():
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 256, lanes.LANES + 3).astype(np.uint8) for _ in range(2))
+    x, y = a[: lanes.LANES], b[3:]
+    out = np.zeros(8 * lanes.LANES, np.uint8)
+    worked(a, b, out)
+    counted = (250 + np.arange(lanes.LANES)).astype(np.uint8)
+    wanted = [
+        x + y, x - y, np.minimum(x, y), np.where(x > y, x - y, 0), x ^ y, np.bitwise_count(x), x // 2,
+        np.where(x < y, 1, counted),
+    ]  # fmt: skip
+    np.testing.assert_array_equal(out.reshape(8, -1), np.array(wanted))
+    wide = np.zeros(lanes.LANES, np.uint16)
+    widened(a, wide)
+    np.testing.assert_array_equal(wide, x.astype(np.uint16) + 1000)
