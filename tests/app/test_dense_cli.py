@@ -69,6 +69,15 @@ def test_a_pair_in_standard_form(dense, flat, tmp_path, method):
     }  # fmt: skip
 
 
+def test_floats_are_read_as_grey_levels(dense, flat, tmp_path):
+    left, right, truth = flat
+    cv2.imwrite(str(tmp_path / "left.tiff"), cv2.imread(str(left), cv2.IMREAD_UNCHANGED).astype(np.float32))
+    out = tmp_path / "out"
+    said = dense("--rectified", "--max-disparity", 32, tmp_path / "left.tiff", right, "--method", "block", "-o", out)
+    assert said.code == 0, said.err
+    assert np.median(np.abs(read_pfm(out / "disparity.pfm") - truth)) < 0.1
+
+
 def test_people_are_told_how_much_is_measured(dense, flat, tmp_path):
     said = dense(*flat[:2], "--rectified", "--max-disparity", 32, "-o", tmp_path / "out")
     assert said.code == 0
@@ -83,9 +92,14 @@ def test_every_mistake_is_one_line(dense, flat, tmp_path):
     image = cv2.imread(str(right), cv2.IMREAD_UNCHANGED)
     for name, changed in {"shifted": np.roll(image, 6, axis=0), "small": image[:-2]}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), changed)
-    refused(dense(*ready, right, left, *out), "exchanged")
-    refused(dense(*ready, left, tmp_path / "shifted.png", *out), "not in standard form", "px")
-    refused(dense(*ready, left, tmp_path / "small.png", *out), "320x200", "320x198")
+    floats = image.astype(np.float32)
+    floats[3, 4] = np.nan
+    cv2.imwrite(str(tmp_path / "nan.tiff"), floats)
+    refused(dense(*ready, right, left, *out), "exchanged", "right.png, ", "left.png")
+    refused(dense(*ready, left, tmp_path / "shifted.png", *out), "not in standard form", "px", "shifted.png")
+    refused(dense(*ready, left, tmp_path / "small.png", *out), "320x200", "320x198", "small.png")
+    refused(dense(*ready, left, tmp_path / "nan.tiff", *out), "nan.tiff", "1 values are NaN")
+    refused(dense(*ready, "--source", tmp_path / "nowhere", *out), "nowhere", "not a source")
     refused(dense("--rectified", "--max-disparity", 321, left, right, *out), "outside the image")
     refused(dense("--rectified", "--max-disparity", 0, left, right, *out), "outside the image")
     refused(dense("--rectified", left, right, *out), "--max-disparity")
@@ -95,6 +109,9 @@ def test_every_mistake_is_one_line(dense, flat, tmp_path):
     refused(dense(left, left, right, *out), "left.png")
     refused(dense(*ready, "--near", 0.5, left, right, *out), "--near")
     refused(dense(*ready, left, right, "-o", left), "folder")
+    refused(dense(*ready, left, right, "-o", left / "in"), "folder")
+    refused(dense("evaluate", tmp_path, *out), "neither a scene nor a folder of scenes")
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_texture_is_an_empty_result_with_the_reason(dense, tmp_path):

@@ -36,6 +36,17 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+def check_folder(path: Path) -> None:
+    """Refuse what cannot become a folder, without making it: a result that is none must leave nothing behind.
+
+    Raises:
+        InputError: something that is no folder stands there, or in the way.
+    """
+    there = next(p for p in (path, *path.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise InputError(f"{path}: cannot be made a folder: {there} is a file")
+
+
 def write_png(path: Path, image: Image) -> None:
     """Write an image as PNG; errors as :func:`armsight.files.replacing`."""
     good, data = cv2.imencode(".png", image)

@@ -8,16 +8,44 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from armsight.app.dense_files import write_png, write_result
-from armsight.data import Shot
+from armsight.app.dense_files import make_folder, write_png, write_result
+from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
-from armsight.vision.dense.standard import match_pair
+from armsight.vision.dense.pfm import read_pfm
+from armsight.vision.dense.standard import match_pair, plain_grey
+from armsight.vision.dense.tiff import read_tiff
+from armsight.vision.image import read_image
 from armsight.vision.rectify import Rectification
 
 #: Without a nearest depth or a greatest disparity: the nearest depth, in baselines.
 _NEAREST_BASELINES = 3.0
+
+
+def read_pair(left: Path, right: Path) -> Shot:
+    """Read the two images of a pair; PFM and TIFF files may hold floats of 0 to 255.
+
+    Raises:
+        InputError: a file is missing, no image, or holds numbers that are no grey levels.
+    """
+    return Shot(f"{left}, {right}", _read_pixels(left), _read_pixels(right))
+
+
+def _read_pixels(path: Path) -> Image:
+    """Read an image; floats become 8-bit grey."""
+    floats: NDArray[np.generic] | None = None
+    if path.suffix.lower() == ".pfm":
+        floats = read_pfm(path)
+    elif path.suffix.lower() in (".tif", ".tiff"):
+        floats = read_tiff(path)
+    if floats is None or floats.dtype.kind != "f":
+        return read_image(path)
+    try:
+        return plain_grey(floats, "the")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def search_of(form: Rectification | None, max_disparity: int | None, near: float | None, shot: Shot) -> Search:
@@ -72,7 +100,7 @@ def run_shot(
     search: Search,
     note: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Match a shot, write its files into a folder that exists, and return what there is to say.
+    """Match a shot, make a folder, write its files there, and return what there is to say.
 
     Raises:
         InputError: the images are no pair in standard form, or are not of the rig's size.
@@ -80,15 +108,16 @@ def run_shot(
     if shot.left is None or shot.right is None:
         raise InputError(f"{shot.name}: {shot.problem or 'no image'}")
     left, right = shot.left, shot.right
-    if form is not None:
-        left, right = form.images(left, right)
     begun = time.perf_counter()
     try:
+        if form is not None:
+            left, right = form.images(left, right)
         result = match_pair(method, left, right, search, note)
     except InputError as error:
         where = shot.name if form is None else f"{shot.name}, put into standard form by the rig"
         raise InputError(f"{where}: {error}") from None
     seconds = time.perf_counter() - begun
+    make_folder(folder)
     if form is not None:
         result = _in_view(result, form)
         write_png(folder / "left.png", left)

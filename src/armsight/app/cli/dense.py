@@ -10,14 +10,13 @@ from typing import Any
 import click
 
 from armsight.app.cli.progress import bar
-from armsight.app.dense_files import make_folder
-from armsight.app.dense_run import result_line, run_shot, search_of
+from armsight.app.dense_files import check_folder, make_folder
+from armsight.app.dense_run import read_pair, result_line, run_shot, search_of
 from armsight.app.dense_table import Line, evaluate_scene, evaluation_json, table_text, write_evaluation
 from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.middlebury import find_scenes, load_scene
-from armsight.vision.image import read_image
 from armsight.vision.rectify import Rectification
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import open_source
@@ -78,7 +77,8 @@ def match(
     frame).
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
-    method, folder = open_method(name), make_folder(out)
+    method = open_method(name)
+    check_folder(out)
 
     def run(shot: Shot, where: Path) -> dict[str, Any]:
         search = search_of(form, max_disparity, near, shot)
@@ -87,7 +87,7 @@ def match(
         return record
 
     if pair is not None:
-        run(Shot(out.name, read_image(pair[0]), read_image(pair[1])), folder)
+        run(read_pair(*pair), out)
         return
     done, total = 0, 0
     with contextlib.closing(open_source(str(source))) as opened, bar("matching", None) as advance:
@@ -97,7 +97,7 @@ def match(
                 record = {"shot": shot.name, "problem": shot.problem}
                 click.echo(json.dumps(record) if as_json else result_line(record))
             else:
-                done += run(shot, make_folder(folder / shot.name))["problem"] is None
+                done += run(shot, out / shot.name)["problem"] is None
             advance()
     if not done:
         raise ArmsightError(f"{source}: none of {total} shots could be matched; their lines say why")
@@ -143,14 +143,17 @@ def evaluate(folder: Path, names: tuple[str, ...], out: Path | None, as_json: bo
     With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)
-    target = None if out is None else make_folder(out)
+    for path in scenes:
+        load_scene(path)  # all can be read, before anything is written
+    if out is not None:
+        make_folder(out)
     lines: list[Line] = []
     with bar("judging", len(scenes) * len(chosen)) as advance:
         for path in scenes:
             scene = load_scene(path)
             for name in chosen:
-                lines.append(evaluate_scene(scene, name, target))
+                lines.append(evaluate_scene(scene, name, out))
                 advance()
-    if target is not None:
-        write_evaluation(target, lines)
+    if out is not None:
+        write_evaluation(out, lines)
     click.echo(json.dumps(evaluation_json(lines)) if as_json else table_text(lines))

@@ -16,7 +16,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +25,7 @@ from armsight.files import read_text
 from armsight.vision.dense.judge import Truth, seen_by_right
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.pfm import read_pfm
+from armsight.vision.dense.tiff import read_tiff
 from armsight.vision.image import read_image
 
 _SUFFIXES = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".pfm", ".jpg", ".bmp")
@@ -98,9 +98,7 @@ def _read_truth(path: Path, name: str) -> Array:
         raw = read_pfm(path).astype(np.float64)
         return np.where(np.isfinite(raw) & (raw > 0), raw, np.nan)
     if path.suffix in (".tif", ".tiff"):
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # or it warns of tags it does not know
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.utils.logging.setLogLevel(level)
+        image = read_tiff(path)
         if image is None or image.ndim != 2:
             raise InputError(f"{path}: not a grey TIFF that can be read")
         values: Array = np.asarray(image, np.float64)
