@@ -2,7 +2,8 @@
 
 gain: the sensor's scale. wave, ripple: linearity error of a sensor, sin and cos of its angle and of multiples of it.
 backlash: half of it to either side, by the direction of approach: play that friction holds where the joint left it. slack:
-the same for play that the weight beyond the joint closes, whichever way it came. sag: a compliant gear under the links'
+the same for play that the weight beyond the joint closes, whichever way it came, save where the lever is so small that
+friction is stronger. sag: a compliant gear under the links'
 weight; the torque about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j
 link j's own vector.
 """
@@ -22,8 +23,9 @@ from armsight.robot.arm import Arm
 WAVES, RIPPLES = (1, 2), (3, 4, 5, 6, 7, 8)
 #: Fewer numbers measured than this cannot choose among the ripples' 72 coefficients without taking chance for a cause.
 ENOUGH = 350
-#: Weight closes a joint's play where it pulls with more than about this lever, m.
-LEAST_LEVER_M = 1e-2
+#: A bearing's friction holds a link in its play against weight with up to about this lever, m: some per cent of what the
+#: links of such arms have, as bearings' friction is of the load. Over half of it the play closes.
+FRICTION_M = 2e-3
 
 
 class Feature(NamedTuple):
@@ -85,11 +87,25 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
         elif f.kind == "backlash" and approach is not None:
             out[:, k] = -0.5 * approach[:, f.joint]
         elif f.kind == "slack":
-            lever = levers[:, f.joint, f.joint :].sum(axis=1)  # of the flange: where the weight is, is not known
-            out[:, k] = 0.5 * lever / np.hypot(lever, LEAST_LEVER_M)
+            out[:, k] = 0.5 * _side(_weight_lever(arm, levers, f.joint), approach, f.joint)
         elif f.kind == "sag":
             out[:, k] = levers[:, f.joint, f.detail[0]]
     return out
+
+
+def _weight_lever(arm: Arm, levers: Array, joint: int) -> Array:
+    """Return the lever (N,), m, of the weight beyond a joint, if links are rods that are all equally heavy by the metre."""
+    mass = np.hypot(arm.a, arm.d)[joint:] + 1e-9
+    beyond = np.cumsum(mass[::-1])[::-1] - 0.5 * mass  # of a link's own vector: half of itself, and all that follows
+    return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
+
+
+def _side(lever: Array, approach: Array | None, joint: int) -> Array:
+    """Return on which side of its play a link lies (N,), -1 to 1: weight's, or where that is weaker that of friction."""
+    if np.abs(lever).max(initial=0.0) < FRICTION_M:
+        return np.zeros(len(lever))  # it carries nothing: that is what ``backlash`` is for
+    pull = lever if approach is None else lever - FRICTION_M * approach[:, joint]
+    return np.asarray(pull / np.hypot(pull, 0.5 * FRICTION_M))
 
 
 def _levers(arm: Arm, q: Array, up_base: Array) -> Array:

@@ -27,6 +27,10 @@ PAYS = 1.0
 SURE = 8.0
 #: What the placement alone is.
 PLACEMENT = ("base", "tool")
+#: Harmonics make one curve together, and links' loads one sag: it pays or does not, and priors keep it small. Each number
+#: alone says nothing.
+CURVE = ("wave", "ripple")
+TOGETHER = (*CURVE, "sag")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
 
 
@@ -128,8 +132,29 @@ def grown(
         kept, losses = kept | added, tried[name]
         steps.append(Step(name, _named(model, added), _rms(losses, folds)))
         progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
+    kept = _together(model, folds, groups, kept, steps)
     kept, given_back = _pruned(model, start, folds, kept, steps)
     return Growth(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
+
+
+def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[Step]) -> Mask:
+    """Add what pays only together, as two causes can that hide each other, and give back the causes that it does not need."""
+    losses, whole = folds.losses(kept), kept.copy()
+    for mask in groups.values():
+        whole |= mask
+    if not groups or not _pays(losses, folds.losses(whole), folds):
+        return kept
+    added = dict(groups)
+    while added:
+        left = {name: _rms(folds.losses(whole & ~mask), folds) for name, mask in added.items()}
+        name = min(left, key=lambda n: left[n])
+        if left[name] > _rms(folds.losses(whole), folds):
+            break
+        whole &= ~added.pop(name)
+    for name in added:
+        del groups[name]
+    steps.append(Step(", ".join(added), _named(model, whole & ~kept), _rms(folds.losses(whole), folds)))
+    return whole
 
 
 def _reasons(
@@ -173,8 +198,8 @@ def _groups(model: Model, free: Mask) -> dict[str, Mask]:
         if not free[k] or p.kind in PLACEMENT:
             continue
         name = _GROUPS.get(p.kind, f"{p.kind} of joint {p.joint + 1}")
-        if p.kind in ("wave", "ripple"):
-            name += f", {p.name[-1]} a turn"
+        if p.kind in CURVE:
+            name = f"sensor curve of joint {p.joint + 1}"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups
 
@@ -194,9 +219,9 @@ def _pruned(
 ) -> tuple[Mask, dict[str, Array]]:
     """Give back, one at a time, parameters without which the held-out error is no worse."""
     given_back: dict[str, Array] = {}
-    placement = np.array([p.kind in PLACEMENT for p in model.parameters])
+    stays = np.array([p.kind in (*PLACEMENT, *TOGETHER) for p in model.parameters])
     while True:
-        doubtful = [int(k) for k in np.flatnonzero(kept & ~placement) if _doubt(folds, kept, int(k))]
+        doubtful = [int(k) for k in np.flatnonzero(kept & ~stays) if _doubt(folds, kept, int(k))]
         losses = folds.losses(kept)
         best = min(((_rms(folds.losses(_without(kept, k)), folds), k) for k in doubtful), default=None)
         if best is None or best[0] > _rms(losses, folds):

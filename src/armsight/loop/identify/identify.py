@@ -18,7 +18,8 @@ from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.evidence import scaled_prior
 from armsight.loop.identify.features import approaches
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit
-from armsight.loop.identify.growth import PLACEMENT, Step, grown
+from armsight.loop.identify.growth import PLACEMENT, TOGETHER, Step, grown
+from armsight.loop.identify.joint_noise import NO_CHANCE, JointNoise, joint_noise, with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.observable import Observed, observed
@@ -32,6 +33,8 @@ LEAST_POINTS, LEAST_FULL = 6, 4
 ALIKE = 0.02
 #: Poses that tell which causes there are; the final fit is to all of them.
 MOST = 4000
+#: Turns of fitting everything and laying what is left to the joints.
+TURNS = 3
 #: Correlations larger than this are told.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")
@@ -49,6 +52,8 @@ class Identified(Record):
         steps: how the model grew.
         singular_values: of the Jacobian of what the poses can tell, in units of prior sigmas.
         prior: (P,) prior sigmas, those of the causes as large as the data show them to be.
+        joint_sigma_rad: (6,) how far each joint is off by chance, from pose to pose; zero where the instrument's covariance
+            is not known, as nothing tells then what is the joints' and what the instrument's.
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma holds what the causes that
             did not pay, or hardly show, could still be, and what leaving them out has moved it. ``solution.cov`` is that
             of the fitted ones, the rest taken for nominal.
@@ -62,6 +67,7 @@ class Identified(Record):
     singular_values: Array
     prior: Array
     cov: Array
+    joint_sigma_rad: Array
 
     @property
     def left_out(self) -> NDArray[np.int64]:
@@ -127,32 +133,42 @@ def _identified(
     table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
     geometric = fit(model, start.x, part, table, prior)
     progress("every cause at once")
-    whole, prior, tellable = _everything(model, start, geometric, part, prior)
+    whole, prior, tellable, chance = _everything(model, start, geometric, part, prior)
+    part, measured = (with_joint_noise(model, whole.x, m, chance.sigma_rad) for m in (part, measured))
     progress("which causes pay")
-    growth = grown(model, whole, part, tellable.free, prior, progress)
+    # A curve's harmonics and a joint's loads stand together: each alone these poses may hardly show.
+    candidates = tellable.free | (tellable.possible & _of(model, TOGETHER))
+    growth = grown(model, whole, part, candidates, prior, progress)
     x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
     progress("the fit")
     solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)
     nominal = fit(model, start.x, measured, placement, prior, used=solution.used)
-    reasons = {**tellable.reasons, **growth.reasons}
+    kept_together = {model.names[k] for k in np.flatnonzero(growth.free & ~tellable.free)}
+    reasons = {**{n: told for n, told in tellable.reasons.items() if n not in kept_together}, **growth.reasons}
     cov = _whole(model, solution, measured, tellable.possible, prior)
     between = np.where(growth.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
     cov = np.where(growth.free[:, None] & growth.free, cov + np.diag(between**2), 0.0)
-    return Identified(model, nominal.x, solution, reasons, growth.steps, tellable.singular_values, prior, cov)
+    return Identified(
+        model, nominal.x, solution, reasons, growth.steps, tellable.singular_values, prior, cov, chance.sigma_rad
+    )
 
 
 def _everything(
     model: Model, start: Solution, geometric: Solution, measured: Measured, prior: Array
-) -> tuple[Solution, Array, Observed]:
-    """Fit all that may be off, twice: the first fit's noise tells how large the causes are, the second's what is seen."""
+) -> tuple[Solution, Array, Observed, JointNoise]:
+    """Fit all that may be off, in turns: a fit's noise tells how large the causes are, and what the joints do by chance."""
     noise = geometric.noise
     whole = geometric
     scaled = prior
-    for _ in range(2):
-        seen = observed(model, start.x, measured, prior, noise)
-        whole = fit(model, whole.x, measured, seen.possible, scaled, noise=noise)
-        noise, scaled = whole.noise, scaled_prior(model, whole, measured, seen.possible, prior)
-    return whole, scaled, observed(model, start.x, measured, scaled, noise)
+    weighed, chance = measured, NO_CHANCE
+    for _ in range(TURNS if measured.cov is not None else 2):
+        seen = observed(model, start.x, weighed, prior, noise)
+        whole = fit(model, whole.x, weighed, seen.possible, scaled, noise=noise)
+        if measured.cov is not None:
+            chance = joint_noise(model, whole, weighed, measured)
+            weighed = with_joint_noise(model, whole.x, measured, chance.sigma_rad)
+        noise, scaled = whole.noise, scaled_prior(model, whole, weighed, seen.possible, prior)
+    return whole, scaled, observed(model, start.x, weighed, scaled, noise), chance
 
 
 def _of(model: Model, kinds: tuple[str, ...]) -> Mask:

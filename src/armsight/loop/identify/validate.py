@@ -15,6 +15,7 @@ from armsight.errors import InputError
 from armsight.loop.identify.fit import fit, noise_cov
 from armsight.loop.identify.growth import PLACEMENT
 from armsight.loop.identify.identify import Identified
+from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.place import placed
@@ -113,6 +114,7 @@ def _over(model: Model, found: Identified, x: Array, measured: Measured) -> floa
     e, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
     free = found.solution.free
     P = found.solution.cov[np.ix_(free, free)]
-    C = noise_cov(measured, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
+    weighed = with_joint_noise(model, x, measured, found.joint_sigma_rad)
+    C = noise_cov(weighed, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
     whitened = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
     return float(np.sqrt(np.sum(whitened) / e.size))

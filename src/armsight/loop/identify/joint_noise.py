@@ -1,0 +1,106 @@
+"""How far each joint is off its reading by chance, from pose to pose: play that nothing holds on one side, jitter, hysteresis.
+
+Where the instrument's covariance is known, what residuals show beyond it is laid to the joints: each moves the body along
+its own column of the Jacobian, and a joint that lies anywhere in its play then spoils nothing but its own direction. The
+variances are those of the greatest likelihood, found by expectation and maximisation (Dempster, Laird and Rubin, Journal of
+the Royal Statistical Society B 39, 1977).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.loop.identify import chain
+from armsight.loop.identify.fit import Solution, noise_cov
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import Model
+
+#: Steps; the variances have settled to some per cent by then, which is better than so few poses tell them.
+STEPS = 60
+#: Where a step starts, rad and m: what is not there shrinks from it.
+START_RAD, START_M = 1e-3, 1e-4
+
+
+class JointNoise(NamedTuple):
+    """What is off by chance.
+
+    Attributes:
+        sigma_rad: (6,) of each joint.
+        off_rad: (N, 6) by how much each joint was off at each pose, as far as it can be told.
+        sigma_off_rad: (N, 6) their sigmas.
+    """
+
+    sigma_rad: Array
+    off_rad: Array
+    sigma_off_rad: Array
+
+
+#: Where nothing tells.
+NO_CHANCE = JointNoise(np.zeros(6), np.zeros((0, 6)), np.zeros((0, 6)))
+
+
+def joint_noise(model: Model, solution: Solution, weighed: Measured, measured: Measured) -> JointNoise:
+    """Lay residuals beyond the instrument's covariance to the joints.
+
+    Args:
+        model: the arm.
+        solution: a fit of it.
+        weighed: the poses as they were weighed in it.
+        measured: the poses, with the instrument's covariance alone.
+    """
+    phi = model.feature_values(measured.q, measured.approach)
+    e, J = model.linearised(solution.x, measured, phi)
+    free = J[:, :, solution.free]
+    taken = float(np.einsum("nif,fg,njg,nji->", free, _part(solution), free, _inverse_noise(weighed, solution)))
+    share = float(np.clip(1 - taken / e.size, 0.2, 1.0))  # what fitting has taken off the residuals
+    B = np.concatenate(
+        [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2
+    )
+    place = np.arange(e.shape[1]) // 3  # the residual noise of place and of turn, one variance each
+    if not model.full:
+        place[:] = 0
+    variance = np.concatenate([np.full(6, START_RAD**2), np.where(place == 0, START_M, START_RAD) ** 2])
+    used = solution.used
+    for _ in range(STEPS):
+        mean, spread = _expected(e, B, variance, measured)
+        second = (mean**2 / share + spread)[used].mean(axis=0)
+        variance = second
+        for k in np.unique(place):
+            variance[6:][place == k] = second[6:][place == k].mean()
+    mean, spread = _expected(e, B, variance, measured)
+    return JointNoise(np.sqrt(variance[:6]), mean[:, :6], np.sqrt(spread[:, :6]))
+
+
+def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
+    """Return the poses with what the joints are off by chance in their covariance."""
+    if measured.cov is None or not sigma_rad.any():
+        return measured
+    _, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
+    B = by_joints(model, J) * sigma_rad
+    return replace(measured, cov=measured.cov + B @ B.swapaxes(1, 2))
+
+
+def by_joints(model: Model, J: Array) -> Array:
+    """Return the derivative (N, M, 6) by the joints' angles, out of that by all parameters."""
+    return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.causes_at : len(chain.COLUMNS)])
+
+
+def _expected(e: Array, B: Array, variance: Array, measured: Measured) -> tuple[Array, Array]:
+    """Return mean (N, K) and variance (N, K) of every source at every pose, given the residuals; predicted is too large by it."""
+    assert measured.cov is not None  # for the type checker: nothing is laid to the joints without
+    S = measured.cov + (B * variance) @ B.swapaxes(1, 2)
+    gain = variance[:, None] * np.linalg.solve(S, B).swapaxes(1, 2)
+    mean = (gain @ e[..., None])[..., 0]
+    return mean, np.maximum(variance - np.einsum("nkm,nmk->nk", gain, B * variance), 0.0)
+
+
+def _part(solution: Solution) -> Array:
+    return np.asarray(solution.cov[np.ix_(solution.free, solution.free)])
+
+
+def _inverse_noise(measured: Measured, solution: Solution) -> Array:
+    return np.asarray(np.linalg.inv(noise_cov(measured, solution.noise)))
