@@ -29,7 +29,8 @@ STALLED_S = 0.5
 #: The fused track is written down so late, s: the sightings on both sides of a time have come by then. The loop does not
 #: wait for that.
 RECORD_LAG_S = 0.04
-_LAST_BATCHES = 32  # of readings that hold all within that lag
+_RECORD_EVERY_S = 0.02  # so much of it at a time: cheaper than turn by turn
+_LAST_BATCHES = 32  # of readings that hold all within lag and time
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 
 
@@ -143,6 +144,8 @@ class Loop:
 
     def _record(self) -> None:
         """Write down where the tool was, as late as RECORD_LAG_S: with the sightings on both sides of a time."""
+        if self.t_s - RECORD_LAG_S - self._written_s < _RECORD_EVERY_S:
+            return
         wanted = [s.t_s for s in self.log.joints[-_LAST_BATCHES:]]
         t_s = np.concatenate(wanted)
         t_s = t_s[(t_s > self._written_s) & (t_s <= self.t_s - RECORD_LAG_S)]

@@ -32,6 +32,10 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
+#: In motion the correction comes to what the estimator asks for with this time constant, s, or vision's period if longer:
+#: that is no feedback, as it hardly depends on the correction, but backlash that changes sides with every twitch would
+#: keep it twitching.
+FOLLOW_S = 0.08
 #: Singular values (linear rows over the arm's size) from which on a direction is corrected, and fully corrected.
 SINGULAR, EASY = 0.02, 0.04
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
@@ -118,6 +122,7 @@ class PoseServo:
         self.timing = timing
         size_m = float(np.hypot(arm.a, arm.d).sum())
         self._arm, self._scale = arm, np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])
+        self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
         self._correction = np.zeros(6)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
@@ -144,7 +149,7 @@ class PoseServo:
             last, following = self._missing(estimator, goal, ahead)
             push = following - last
             if mode is Mode.VISION:
-                push += self.timing.gain * (error if resting else last)
+                push += self.timing.gain * error if resting else self._follow * last
             change = self._joints(goal.q, push)
         if mode is Mode.VISION and resting:
             change += self._crossing(estimator, goal, error)

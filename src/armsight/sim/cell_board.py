@@ -20,8 +20,9 @@ from armsight.sim.cell_pots import COUNTS, HIGH_SHARE, LOW_SHARE
 from armsight.sim.cell_solids import Solids, inertia, weight_torque
 
 #: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
-#: speed, s.
-NATURAL_RAD_S = np.array([40.0, 40.0, 45.0, 50.0, 60.0, 60.0])
+#: speed, s. As stiff as the potentiometers' noise allows: where dry friction holds a joint that is off by little, only the
+#: integral frees it, and a loop that is closed on vision meanwhile winds up and hunts.
+NATURAL_RAD_S = np.array([50.0, 70.0, 80.0, 85.0, 90.0, 90.0])
 DAMPING, INTEGRAL_PER_S, FILTER_S = 1.0, 8.0, 0.004
 _SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
 
@@ -54,7 +55,8 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     joint["soft_min_rad"], joint["soft_max_rad"] = model.q_min, model.q_max
     joint["speed_limit_rad_s"] = _SPEED_SPARE * model.qd_max
     joint["deceleration_rad_s2"] = model.qdd_max
-    joint["duty_limit"], joint["duty_slew_per_s"], joint["current_cut_per_a_s"] = 1.0, 100.0, 20.0
+    # A narrower slew limit would cut the noise unevenly in motion, which brakes.
+    joint["duty_limit"], joint["duty_slew_per_s"], joint["current_cut_per_a_s"] = 1.0, 1000.0, 20.0
     joint["current_limit_ma"] = np.rint(900.0 * motors.current_max_a)
     joint["following_rad"], joint["stall_duty"], joint["stall_rad"] = 0.15, 0.9, 0.005
     joint["motor_direction"] = 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -78,6 +79,7 @@ class ShotTimes:
     stamp_s: float
 
 
+@lru_cache(maxsize=256)
 def shot_times(timing: Timing, seed: int, shot: int) -> ShotTimes:
     """Return the times of a shot.
 

@@ -22,6 +22,7 @@ PLAIN, TILES, GRAIN, PRINT = 0, 1, 2, 3
 _FAR = 1e9
 _NOTHING = np.float32(0.25)  # light from where nothing is
 _ORIGIN = np.zeros(3)
+_TILE = 16  # pixels on a side that are passed over together
 _STEP = 1e-4  # a shadow's ray starts so far off its surface, m
 
 Light = NDArray[np.float32]
@@ -244,6 +245,27 @@ def _shade(n: Array, d: Array, lamp: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _axis(a: Array, b: Array, radius: float, out: Array) -> None:
+    """Write into out (9,) what of a capsule between a and b :func:`_side` asks for: all but the ray."""
+    bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    long = bx * bx + by * by + bz * bz
+    ba = -(bx * a[0] + by * a[1] + bz * a[2])
+    out[0], out[1], out[2], out[3], out[4] = bx, by, bz, long, ba
+    out[5] = long * (a[0] * a[0] + a[1] * a[1] + a[2] * a[2] - radius * radius) - ba * ba
+    out[6], out[7], out[8] = by * a[2] - bz * a[1], bz * a[0] - bx * a[2], bx * a[1] - by * a[0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _side(d: Array, a: Array, axis: Array) -> int:
+    """Return on which side the unit ray d (3,) from the origin passes a cylinder without ends: 1, -1; 0 where it meets."""
+    bd = axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2]
+    B = -axis[3] * (a[0] * d[0] + a[1] * d[1] + a[2] * d[2]) - axis[4] * bd
+    if (axis[3] - bd * bd) * axis[5] <= B * B:
+        return 0
+    return 1 if axis[6] * d[0] + axis[7] * d[1] + axis[8] * d[2] > 0.0 else -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def moving(
     rays: Array,
     window: tuple[int, int, int, int],
@@ -268,28 +290,31 @@ def moving(
     """
     ends, radius, albedo = capsules
     u_first, v_first, u_end, v_end = window
-    p, n, d = np.empty(3), np.empty(3), np.empty(3)
+    p, n, axis = np.empty(3), np.empty(3), np.empty(9)
     for k in range(radius.size):
         a, b = ends[k, 0], ends[k, 1]
-        bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        long = bx * bx + by * by + bz * bz
-        ba = -(bx * a[0] + by * a[1] + bz * a[2])
-        aa = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
-        C = long * (aa - radius[k] * radius[k]) - ba * ba
-        for v in range(max(boxes_px[k, 1], v_first), min(boxes_px[k, 3], v_end)):
-            for u in range(max(boxes_px[k, 0], u_first), min(boxes_px[k, 2], u_end)):
-                x, y, z = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
-                bd = bx * x + by * y + bz * z
-                B = -long * (a[0] * x + a[1] * y + a[2] * z) - ba * bd
-                if (long - bd * bd) * C > B * B:  # beside the cylinder without ends: most pixels
+        _axis(a, b, radius[k], axis)
+        u0, u1 = max(boxes_px[k, 0], u_first), min(boxes_px[k, 2], u_end)
+        v0, v1 = max(boxes_px[k, 1], v_first), min(boxes_px[k, 3], v_end)
+        for v_tile in range(v0, v1, _TILE):
+            v_last = min(v_tile + _TILE, v1)
+            for u_tile in range(u0, u1, _TILE):
+                u_last = min(u_tile + _TILE, u1)
+                sides = _side(rays[v_tile, u_tile], a, axis) + _side(rays[v_tile, u_last - 1], a, axis)
+                sides += _side(rays[v_last - 1, u_tile], a, axis) + _side(rays[v_last - 1, u_last - 1], a, axis)
+                if abs(sides) == 4:  # all of the tile is to one side of it
                     continue
-                d[0], d[1], d[2] = x, y, z
-                t = _capsule(_ORIGIN, d, a, b, radius[k])
-                if t >= depth[v - v_first, u - u_first]:
-                    continue
-                for i in range(3):
-                    p[i] = t * d[i]
-                _capsule_normal(p, a, b, radius[k], n)
-                depth[v - v_first, u - u_first] = np.float32(t)
-                ids[v - v_first, u - u_first] = k + 1
-                light[v - v_first, u - u_first] = albedo[k] * _shade(n, d, lamp)
+                for v in range(v_tile, v_last):
+                    for u in range(u_tile, u_last):
+                        d = rays[v, u]
+                        if _side(d, a, axis) != 0:
+                            continue
+                        t = _capsule(_ORIGIN, d, a, b, radius[k])
+                        if t >= depth[v - v_first, u - u_first]:
+                            continue
+                        for i in range(3):
+                            p[i] = t * d[i]
+                        _capsule_normal(p, a, b, radius[k], n)
+                        depth[v - v_first, u - u_first] = np.float32(t)
+                        ids[v - v_first, u - u_first] = k + 1
+                        light[v - v_first, u - u_first] = albedo[k] * _shade(n, d, lamp)

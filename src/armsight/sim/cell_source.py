@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from armsight.sim.scene import Pattern, Placed, plate
 _BODY_M = 0.12
 #: A card that is held before the body: its sides, m; how far before it, m; its grey.
 _CARD_M, _CARD_BEFORE_M, _CARD_GREY = (0.34, 0.30), 0.08, 0.55
+#: So many ticks after an exposure the path is there on both sides of all its times.
+_SPARE_TICKS = 3
 #: Where the path is looked at within an exposure: its mean is the body's place in the image.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -57,6 +59,7 @@ class CellSource:
         self._patterns, self._T_tool_body = body
         self._strip = noise_strip(seed, timing.image_size_px)
         self._next = 0
+        self._begun: dict[int, list[Future[Image]]] = {}
         self._covers: list[tuple[float, float]] = []
         self._gone_s, self._gone = np.inf, ""
         self._pool = ThreadPoolExecutor(2)
@@ -90,10 +93,12 @@ class CellSource:
         for k in range(start, start + 5):
             if self._times(k).stamp_s <= now + 1e-9:
                 newest = k
-        if newest < self._next:
-            return None
-        self._next = newest + 1
-        return self._shot(newest)
+        shot = None
+        if newest >= self._next:
+            self._next = newest + 1
+            shot = self._shot(newest)
+        self._render_ahead(now)
+        return shot
 
     def close(self) -> None:
         """Let go of the threads."""
@@ -130,25 +135,35 @@ class CellSource:
             number: of the shot; its noise follows from it.
         """
         now = ShotTimes(self._now(), self._now(), self._now())
-        return self._rendered(f"{number:03d}", now, Shutter(), -1 - number, Placed(patterns, T_left_body))
+        left, right = self._rendering(now, Shutter(), -1 - number, Placed(patterns, T_left_body))
+        return Shot(f"{number:03d}", left.result(), right.result(), now.stamp_s)
 
     def _times(self, shot: int) -> ShotTimes:
         return shot_times(self._timing, self._seed, shot)
 
     def _shot(self, number: int) -> Shot:
-        times = self._times(number)
-        shot = self._rendered(f"{number:06d}", times, self._timing.shutter, number, None)
-        self.taken[shot.name] = times
-        return shot
+        times, name = self._times(number), f"{number:06d}"
+        left, right = self._begun.pop(number, None) or self._rendering(times, self._timing.shutter, number, None)
+        self.taken[name] = times
+        return Shot(name, left.result(), right.result(), times.stamp_s)
 
-    def _rendered(self, name: str, times: ShotTimes, shutter: Shutter, number: int, held: Placed | None) -> Shot:
-        """Render both images, each in a thread of its own: they share nothing that changes."""
-        work = [
+    def _render_ahead(self, now: float) -> None:
+        """Begin with the next shot's images where both exposures are over, while they are still on their way."""
+        times = self._times(self._next)
+        over = max(times.left_s, times.right_s) + self._seen_s() / 2 + _SPARE_TICKS * TICK_S
+        if self._next not in self._begun and over <= now < times.stamp_s:
+            self._begun = {self._next: self._rendering(times, self._timing.shutter, self._next, None)}
+
+    def _seen_s(self) -> float:
+        """Return how long an image looks from its first row's beginning to its last row's end, s."""
+        return self._timing.exposure_s + self._timing.row_s * self._timing.image_size_px[1]
+
+    def _rendering(self, times: ShotTimes, shutter: Shutter, number: int, held: Placed | None) -> list[Future[Image]]:
+        """Begin to render both images, each in a thread of its own: they share nothing that changes."""
+        return [
             self._pool.submit(self._image, side, t, shutter, number, held)
             for side, t in enumerate((times.left_s, times.right_s))
         ]
-        left, right = (future.result() for future in work)
-        return Shot(name, left, right, times.stamp_s)
 
     def _image(self, side: int, t_s: float, shutter: Shutter, number: int, held: Placed | None) -> Image:
         """Render one camera's image of the arm in the middle of an exposure."""

@@ -96,6 +96,14 @@ def _span(a: Slots, b: Slots, k: int) -> Span:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _one_cell(a: Slots, b: Slots, k: int) -> bool:
+    """Tell whether points k and k + 1 of two lines a, b (n, 2) lie in one cell: most do."""
+    i, j = a[k, 0], a[k, 1]
+    same = a[k + 1, 0] == i and b[k, 0] == i and b[k + 1, 0] == i
+    return bool(same and a[k + 1, 1] == j and b[k, 1] == j and b[k + 1, 1] == j)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _uniform(values: Array, span: Span) -> bool:
     """Tell whether all cells of a span have one value."""
     i0, i1, j0, j1 = span
@@ -286,6 +294,8 @@ def paint(
                 if share == 0.0:
                     continue
                 whole, value = share == 1.0, disc[3]
+            elif _one_cell(top_cells, bottom_cells, k):
+                whole, value = True, values[top_cells[k, 1], top_cells[k, 0]]
             else:
                 span = _span(top_cells, bottom_cells, k)
                 whole, value = _uniform(values, span), values[span[2], span[0]]

@@ -95,6 +95,7 @@ class KalmanEstimator:
         self._states = [_State(-np.inf, np.zeros(SIZE), np.diag(self._sigmas**2), zero, zero, None)]
         self._waiting: list[Sighting] = []
         self._outliers: list[Array] = []
+        self._newest: ArmEstimate | None = None  # until something is heard
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -103,6 +104,7 @@ class KalmanEstimator:
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
+        self._newest = None
         self._readings.add(states)
         if self._waiting:
             waiting, self._waiting = self._waiting, []
@@ -111,6 +113,7 @@ class KalmanEstimator:
 
     def vision(self, sighting: Sighting) -> Verdict:
         """Take what vision saw, in any order; returns what became of it."""
+        self._newest = None
         oldest, newest = self.span_s
         place = len(self._states)
         while place > 1 and self._after(self._states[place - 1], sighting):
@@ -138,7 +141,11 @@ class KalmanEstimator:
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
         """Return where the tool is at a time, by default that of the newest reading."""
-        return self.track(np.array([self.span_s[1] if t_s is None else t_s]))[0]
+        if t_s is not None:
+            return self.track(np.array([t_s]))[0]
+        if self._newest is None:
+            self._newest = self.track(np.array([self.span_s[1]]))[0]
+        return self._newest
 
     def track(self, t_s: Array) -> Track:
         """Return where the tool is at (N,) times."""
