@@ -3,7 +3,12 @@
 A surface (a mesh's, or what a reference shot showed), a cloud with its uncertainty and a first pose, such as the arm's,
 go in; a pose with covariance comes out. Iterative closest points, from each measured point to the tangent plane of the
 surface there (Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a reach that
-shrinks to what the cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body.
+shrinks to what the cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body;
+a mesh's outline too (``locate_cloud_outline.py``).
+
+A disparity is that of a window: where a surface turns or ends, its pixel shows a place beside. Points are therefore
+uncertain sideways by about half a window, and along the normal of a face that is seen askance that is most of their
+error; with the depth's sigma alone such faces, the worst measured ones, would outweigh all others.
 """
 
 from __future__ import annotations
@@ -19,20 +24,24 @@ from armsight.data import Array, Missed, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, transform
+from armsight.vision.locate_cloud_outline import outline_pull, ray_step, tangents
 
 #: Distance between the points a mesh is sampled at, m, and the neighbours that a normal of a cloud is fitted to.
 _SPACING_M, _NEIGHBOURS = 0.002, 24
 #: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the
 #: noise.
 _SHRINK, _SIGMAS = 0.9, 10.0
-#: How well the edge of a body is seen in a disparity map, sideways, m: about a pixel and a half at arm's length.
-_SIDEWAYS_M = 0.002
-_STEPS, _SETTLED_M = 100, 1e-6
+#: How uncertain a point is sideways, in steps from ray to ray: half of the 7 x 7 px that a match looks at, as a spread.
+_SIDEWAYS = 2.0
+#: The outline's reach is not less than so many of these.
+_OUTLINE_SIGMAS = 3.0
+_STEPS, _SETTLED_M = 60, 1e-5
 #: Points of a cloud at most (a fixed draw of them), at least, and how many neighbours share one error: disparities are
 #: smoothed over 9 x 9 px, half of it by weight.
 _MOST, _LEAST, _SHARED = 20000, 100, 40
 #: A direction that the surface leaves open (a sphere's turn): its pose is no measurement beyond this, m or rad.
 _OPEN = 0.05
+_NOTHING = f"fewer than {_LEAST} points of the cloud lie near the body's surface at the first pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +51,12 @@ class Surface(Record):
     Attributes:
         points: (N, 3) m, body frame.
         normals: (N, 3) unit, outward.
+        corners: (T, 3, 3) triangles of all of the surface, m; None where only a part of it is known, and no outline.
     """
 
     points: Array
     normals: Array
+    corners: Array | None = None
 
     @staticmethod
     def of_mesh(vertices: Array, triangles: NDArray[np.int64], spacing_m: float = _SPACING_M) -> Surface:
@@ -73,7 +84,7 @@ class Surface(Record):
         s, t = np.where(fold, 1 - s, s), np.where(fold, 1 - t, t)
         a, b, c = corners[owner].transpose(1, 0, 2)
         points = a + s[:, None] * (b - a) + t[:, None] * (c - a)
-        return Surface(points, cross[owner] / (2 * area[owner])[:, None])
+        return Surface(points, cross[owner] / (2 * area[owner])[:, None], corners)
 
     @staticmethod
     def of_cloud(points: Array, towards: Array) -> Surface:
@@ -127,26 +138,49 @@ def locate_cloud(
     p, sigma = checked(p_left, (None, 3), "p_left"), checked(sigma_m, (None,), "sigma_m")
     tree: cKDTree = cKDTree(surface.points)
     near = _nearest(tree, transform(inverse(T), p), 2 * reach_m)[0] <= 2 * reach_m
+    if np.count_nonzero(near) < _LEAST:
+        return Missed(_NOTHING)
+    step, around = ray_step(p[near]), p[_around(surface, p, T, reach_m)]
+    sideways = _SIDEWAYS * step * float(np.median(p[near, 2]))
     p, sigma = p[near], sigma[near]
     if len(p) > _MOST:
         drawn = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
         p, sigma = p[drawn], sigma[drawn]
     reach, shared = reach_m, max(1.0, _SHARED * len(p) / max(int(np.count_nonzero(near)), 1))
     for _ in range(_STEPS):
-        fit = _planes(surface, tree, p, sigma, T, reach)
+        fit = _planes(surface, tree, p, sigma, sideways, T, reach)
         if fit is None:
-            return Missed(f"fewer than {_LEAST} points of the cloud lie near the body's surface at the first pose")
+            return Missed(_NOTHING)
         H, g, gaps, least_reach = fit
+        if surface.corners is not None:
+            within = max(reach, _OUTLINE_SIGMAS * sideways)
+            sampled = surface.points, surface.normals
+            more = outline_pull(surface.corners, sampled, around, T, step, within, sideways)
+            H, g = H + more[0], g + more[1]
         if np.linalg.eigvalsh(H)[0] <= 1 / _OPEN**2:
             return Missed("the body's surface in view does not fix its pose: it can slide or turn along itself")
-        step = -np.linalg.solve(H, g)
-        T = np.asarray(T @ exp_se3(np.asarray(step, np.float64)))
-        settled = reach <= least_reach and np.abs(step).max() < _SETTLED_M
+        move = -np.linalg.solve(H, g)
+        T = np.asarray(T @ exp_se3(np.asarray(move, np.float64)))
+        settled = reach <= least_reach and np.abs(move).max() < _SETTLED_M
         reach = max(reach * _SHRINK, least_reach)
         if settled:
             break
     cov = np.linalg.inv(H) * shared * max(1.0, float(np.mean(gaps[:, 1] ** 2)))
     return CloudPose(T, np.asarray(cov), float(np.sqrt(np.mean(gaps[:, 0] ** 2))), len(gaps))
+
+
+def _around(surface: Surface, p: Array, T: Array, reach_m: float) -> NDArray[np.bool_]:
+    """Tell which points (N, 3) a body at a first pose, and twice the reach around it, may cover or lie beside."""
+    body = transform(T, surface.points)
+    body = body[body[:, 2] > 0]
+    if not len(body):
+        return np.zeros(len(p), np.bool_)
+    flat, margin = tangents(body), 2 * reach_m / float(np.median(body[:, 2]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rays = tangents(p)
+    return np.asarray(
+        (p[:, 2] > 0) & ((rays > flat.min(axis=0) - margin) & (rays < flat.max(axis=0) + margin)).all(axis=1)
+    )
 
 
 def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.int64]]:
@@ -156,7 +190,7 @@ def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.i
 
 
 def _planes(
-    surface: Surface, tree: cKDTree, p: Array, sigma: Array, T: Array, reach: float
+    surface: Surface, tree: cKDTree, p: Array, sigma: Array, sideways: float, T: Array, reach: float
 ) -> tuple[Array, Array, Array, float] | None:
     """Linearise the distances of points to the planes of the surface near them.
 
@@ -175,41 +209,14 @@ def _planes(
     gap = np.einsum("ni,ni->n", n, x - q)
     view = x - eye
     slant = np.abs(np.einsum("ni,ni->n", n, view)) / np.linalg.norm(view, axis=1)
-    noise = sigma[found] * np.maximum(slant, 0.2)  # the error lies along the view
+    noise = np.hypot(sigma[found] * slant, sideways * np.sqrt(np.clip(1 - slant**2, 0, None)))
     weight = np.clip(1 - (gap / reach) ** 2, 0, None) ** 2 / noise**2
     J = -np.concatenate([n, np.cross(x, n)], axis=1)  # of n . (exp(-xi) x - q)
-    H = J.T @ (weight[:, None] * J)
-    H_edge, g_edge = _overhang(x, q, n, gap, weight * noise**2, float(np.median(far[found])))
-    H, g = H + H_edge, J.T @ (weight * gap) + g_edge
+    H, g = J.T @ (weight[:, None] * J), J.T @ (weight * gap)
     inside = np.abs(gap) < _SIGMAS * noise * 2
     least_reach = _SIGMAS * float(np.median(np.maximum(noise, np.abs(gap))))
     gaps = np.column_stack([gap, gap / noise])[inside] if inside.any() else np.column_stack([gap, gap / noise])
     return H, g, gaps, least_reach
-
-
-def _overhang(x: Array, q: Array, n: Array, gap: Array, weight: Array, spacing: float) -> tuple[Array, Array]:
-    """Let points that stick out beyond the surface's edge pull it under them: planes alone do not hold it sideways.
-
-    Args:
-        x: (M, 3) points, body frame.
-        q: (M, 3) points of the surface nearest to them.
-        n: (M, 3) its normals there.
-        gap: (M,) distances from the planes, m.
-        weight: (M,) 0 to 1.
-        spacing: usual distance from the nearest point of the surface, m.
-
-    Returns:
-        (6, 6) information and (6,) gradient.
-    """
-    aside = x - q - gap[:, None] * n
-    out = np.linalg.norm(aside, axis=1)
-    beyond = out > 3 * spacing
-    if not beyond.any():
-        return np.zeros((6, 6)), np.zeros(6)
-    e = aside[beyond] / out[beyond][:, None]
-    J = -np.concatenate([e, np.cross(x[beyond], e)], axis=1)
-    w = weight[beyond] / _SIDEWAYS_M**2
-    return J.T @ (w[:, None] * J), J.T @ (w * out[beyond])
 
 
 def read_stl(path: str | Path, unit_m: float = 1e-3) -> tuple[Array, NDArray[np.int64]]:
