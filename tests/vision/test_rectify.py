@@ -1,11 +1,13 @@
 """Standard form against OpenCV's projections, for every camera model, and back."""
 
+import cv2
 import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.geometry.pose import pose
+from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
+from armsight.sim.bench import bench_rig
 from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, ordinary_rig
 from views import both_pixels
@@ -72,3 +74,32 @@ def test_images_of_another_size_are_refused():
     good = np.zeros((720, 1280), np.uint8)
     with pytest.raises(InputError, match="right image: 640x480"):
         form.images(good, np.zeros((480, 640), np.uint8))
+
+
+def test_a_verging_rig_agrees_with_opencv():
+    rig, p_left = bench_rig(), scene_points()
+    form, uv = rig.rectify(), both_pixels(bench_rig(), scene_points())
+    T = inverse(rig.T_left_right)
+    K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in (c.intrinsics for c in rig.cameras)]
+    bent, size = [c.distortion for c in rig.cameras], rig.left.image_size_px
+    turns = cv2.stereoRectify(K[0], bent[0], K[1], bent[1], size, T[:3, :3].copy(), T[:3, 3:].copy())[:2]
+    # Both turn the cameras until the rows are the same planes through the baseline; about the baseline they may choose
+    # another turn. OpenCV's own rows agree to its undistortion's last step.
+    P = np.array([[form.focal_px, 0, form.principal_px[0]], [0, form.focal_px, form.principal_px[1]], [0, 0, 1.0]])
+    for k, (side, ours) in enumerate((("left", form.T_left_rectleft), ("right", form.T_right_rectright))):
+        between = turns[k] @ ours[:3, :3]
+        np.testing.assert_allclose(between[0], [1, 0, 0], atol=1e-9)
+        place = cv2.undistortPoints(
+            uv[:, k][:, None], K[k], bent[k], R=ours[:3, :3].T, P=P,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+        )[:, 0]  # fmt: skip
+        np.testing.assert_allclose(form.to_rect(uv[:, k], side), place, atol=1e-6)
+        maps = cv2.initUndistortRectifyMap(K[k], bent[k], ours[:3, :3].T, P, size, cv2.CV_32FC2)[0]
+        here = form.map_left if side == "left" else form.map_right
+        high = np.array(size) - 1
+        theirs = ((maps >= 0) & (maps <= high)).all(axis=2)
+        np.testing.assert_array_equal(form.seen(side), theirs)
+        np.testing.assert_allclose(here[theirs], maps[theirs], atol=1e-3)
+    left, right = (form.to_rect(uv[:, k], side) for k, side in enumerate(("left", "right")))
+    assert np.abs(left[:, 1] - right[:, 1]).max() < 1e-8
+    np.testing.assert_allclose(form.points(left, left[:, 0] - right[:, 0]), p_left, atol=1e-9)

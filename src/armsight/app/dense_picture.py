@@ -17,6 +17,9 @@ _INK, _PAPER = (41, 31, 31), (255, 255, 255)
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 #: Colours (BGR) of an error map: right, off by more than each threshold, and no truth.
 _RIGHT, _OFF_1, _OFF_2, _OFF_4, _UNKNOWN = (225, 225, 225), (120, 200, 250), (40, 130, 235), (30, 30, 170), (90, 60, 40)
+#: How much darker what only the left camera sees is drawn, and what is right there.
+_DARKER = 0.75
+_HIDDEN = (169, 169, 169)
 
 
 def _colours(values: NDArray[np.floating[Any]], low: float, high: float) -> Image:
@@ -54,16 +57,24 @@ def paint_disparity(result: Disparity) -> Image:
 
 
 def _bar(canvas: Image, height: int, width: int, low: float, high: float) -> None:
-    """Draw the scale with five numbers beside the picture."""
+    """Draw the scale with round numbers beside the picture."""
     left = width + 10
     values = np.linspace(high, low, height)[:, None]
     canvas[:height, left : left + _BAR_PX] = np.repeat(_colours(values, low, high), _BAR_PX, axis=1)
-    for k in range(5):
-        y = round(k * (height - 1) / 4)
-        value = high + (low - high) * k / 4
-        _write(
-            canvas, f"{value:.3g}" + (" px" if k == 0 else ""), (left + _BAR_PX + 3, min(max(y + 4, 10), height - 2))
-        )
+    for value in _round_values(low, high):
+        y = round((high - value) / max(high - low, 1e-9) * (height - 1))
+        canvas[y, left + _BAR_PX : left + _BAR_PX + 3] = _INK
+        _write(canvas, f"{value:g} px", (left + _BAR_PX + 5, min(max(y + 4, 10), height - 2)))
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Return three to seven round numbers between low and high, or their middle where they are the same."""
+    span = high - low
+    if span < 1e-6:
+        return [float(f"{(low + high) / 2:.3g}")]
+    power = 10 ** np.floor(np.log10(span / 3))
+    step = next(float(power * k) for k in (10, 5, 2, 1) if span / (power * k) >= 3)
+    return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
 def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
@@ -74,7 +85,7 @@ def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
     for threshold, colour in ((1.0, _OFF_1), (2.0, _OFF_2), (4.0, _OFF_4)):
         picture[~(error <= threshold)] = colour
     hidden = truth.known & ~truth.seen
-    picture[hidden] = (0.75 * picture[hidden]).astype(np.uint8)
+    picture[hidden] = (_DARKER * picture[hidden]).astype(np.uint8)
     picture[~truth.known] = _UNKNOWN
     canvas = np.full((height + _CAPTION_PX, width, 3), _PAPER, np.uint8)
     canvas[:height] = picture
@@ -85,6 +96,7 @@ def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
         ("> 2", _OFF_2),
         ("> 4", _OFF_4),
         ("no truth", _UNKNOWN),
+        ("seen by one", _HIDDEN),
     ):
         cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), colour, -1)
         cv2.rectangle(canvas, (x, height + 8), (x + 10, height + 18), _INK, 1)
