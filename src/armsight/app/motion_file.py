@@ -21,7 +21,7 @@ from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
 CHAPTER = Path(__file__).with_name("chapter_motion.toml")
 #: Less of it.
 QUICK = Path(__file__).with_name("quick_motion.toml")
-_REST_S = 2.5
+_REST_S = 2.0
 _MOST = 1e9  # of any number; NaN is not below it
 #: Kind -> its own keys and how many numbers each has; those in the second place must be there.
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {

@@ -64,7 +64,7 @@ def rate_study(
 
 
 def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, plan: MotionPlan) -> RunData:
-    """Drive to the circle and along it."""
+    """Drive to the circle and along it, without a rest."""
     assert outcome.handeye is not None
     station.board.enable()
     log = Log()
@@ -76,7 +76,7 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     kinds = [motion.kind for motion in plan.motions]
     first = kinds.index("home") + 1 if "home" in kinds else 0
     last = kinds.index("circle") + 1
-    part = replace(plan, motions=plan.motions[first:last])
+    part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
     drive(loop, part, closed_on(servo, station.gravity), closed=True, progress=lambda line: None)
     truth, mounting = cell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -52,11 +52,13 @@ class ToolTrack(Record):
 
     def at(self, t_s: Array) -> Array:
         """Return the poses (N, 4, 4) at times within the track: straight and by slerp between its rows."""
-        out = np.tile(np.eye(4), (len(t_s), 1, 1))
-        for axis in range(3):
-            out[:, axis, 3] = np.interp(t_s, self.t_s, self.Ts_base_tool[:, axis, 3])
-        turns = Slerp(self.t_s, Rotation.from_matrix(self.Ts_base_tool[:, :3, :3]))
-        out[:, :3, :3] = turns(np.clip(t_s, self.t_s[0], self.t_s[-1])).as_matrix()
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
+        T0, T1, t0, t1 = (x[k] for x in (self.Ts_base_tool, self.t_s) for k in (after - 1, after))
+        share = np.clip((t_s - t0) / np.maximum(t1 - t0, 1e-12), 0.0, 1.0)[:, None]
+        out = T0.copy()
+        out[:, :3, 3] += share * (T1 - T0)[:, :3, 3]
+        turn = Rotation.from_matrix(np.swapaxes(T0[:, :3, :3], 1, 2) @ T1[:, :3, :3]).as_rotvec()
+        out[:, :3, :3] @= Rotation.from_rotvec(share * turn).as_matrix()
         return out
 
 

@@ -90,7 +90,7 @@ class Workcell:
     """An arm, its board, two cameras and a body.
 
     Attributes:
-        model: the nominal arm: all that anybody may know of it.
+        model: the arm as it is believed to be: all that anybody may know of it.
         link: the wire to the board, and all of its inside; see EmulatedLink.
         board: the board, configured, its drives off; the arm is at home, held by brakes.
         source: the cameras.
@@ -109,6 +109,7 @@ class Workcell:
         machine: str = "unicorn",
         rig: str = "parallel",
         model: Arm | None = None,
+        believed: Arm | None = None,
         distance_m: float = DISTANCE_M,
         baseline_m: float = BASELINE_M,
         noise: float = 2.0,
@@ -121,7 +122,8 @@ class Workcell:
             seed: of all that is drawn; the same seed gives the same numbers.
             machine: what runs the firmware: unicorn, qemu or host.
             rig: parallel or verging.
-            model: the nominal table; the chapter's arm by default.
+            model: the table that the arm was built to; the chapter's arm by default.
+            believed: the table that it is believed to have, as an identification found; ``model`` by default.
             distance_m: from the cameras to the body of the arm at home.
             baseline_m: between the cameras.
             noise: of the sensors, grey levels.
@@ -135,16 +137,17 @@ class Workcell:
         if not 0 <= noise <= 50:
             raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
         self.timing, amounts = open_timing(cameras), imperfections(arm)
-        self.model = model if model is not None else open_arm("six_r")
+        self._built_to = model if model is not None else open_arm("six_r")
+        self.model = believed if believed is not None else self._built_to
         self._rig, self._seed = open_rig(rig, self.timing.image_size_px, baseline_m), seed
-        self._parts = solids(self.model)
-        self._motors = chosen(self.model, self._parts)  # as the drawing has them: friction as usual
-        self.plant = ArmPlant(self.model, drawn(self.model, amounts, seed), seed)
+        self._parts = solids(self._built_to)
+        self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
+        self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
         self._stand(distance_m, noise)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD
         self.link = EmulatedLink(open_machine(machine), self.plant)
-        self.board = configured(self.link, configuration(self.model, self._parts, self._motors))
+        self.board = configured(self.link, configuration(self._built_to, self._parts, self._motors))
 
     def _stand(self, distance_m: float, noise: float) -> None:
         """Screw the body to the tool and stand the cameras before it."""
@@ -152,7 +155,7 @@ class Workcell:
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         self._T_tool_body = mount @ exp_se3(off)
-        self._T_base_rig = placed_rig(self.model, self._rig, mount, seed, distance_m)
+        self._T_base_rig = placed_rig(self._built_to, self._rig, mount, seed, distance_m)
         places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
         stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
         with ThreadPoolExecutor(2) as pool:
@@ -176,7 +179,7 @@ class Workcell:
 
     def gravity_duty(self, q: Array) -> Array:
         """Return the duty (6,) that carries the nominal arm's weight at joint angles q (6,), rad."""
-        return gravity_duty(self.model, self._parts, self._motors, q)
+        return gravity_duty(self._built_to, self._parts, self._motors, q)
 
     @cached_property
     def poses(self) -> Array:
