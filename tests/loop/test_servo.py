@@ -126,7 +126,7 @@ def test_without_any_vision_the_motion_is_commanded_as_it_is():
     cell.coming.clear()
     cell.advance(None, 100)
     motion = point_to_point(ARM, MIDDLE, GOAL)
-    step = PoseServo(ARM, timing(60)).step(motion, 0.3, cell.estimator, np.full(6, 0.1))
+    step = PoseServo(ARM, timing(60)).step(motion, 0.3, cell.estimator, lambda q: np.full(6, 0.1))
     ahead = motion.at(0.3 + PERIOD_S)
     assert step.mode is Mode.POTENTIOMETERS
     assert np.array_equal(step.command.q_ref, ahead.q)

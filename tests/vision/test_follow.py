@@ -235,3 +235,31 @@ def test_fast_motion_is_followed_once_two_searches_have_told_its_velocity():
         assert isinstance(follower.measure(Shot(str(k), left, right, k / 60)), PoseEstimate)
         ways.append(follower.way)
     assert ways[2:] == ["followed"] * 4
+
+
+def test_where_it_is_expected_it_is_found_without_a_search_of_the_whole_image(monkeypatch):
+    searches = []
+    monkeypatch.setattr("armsight.vision.follow.measure", lambda *a: (searches.append(a[2].name), measure(*a))[1])
+    hidden = {k: [(m, c) for m in range(3) for c in range(2)] for k in range(2, 12)}
+    off = exp_se3(np.array([0.01, -0.01, 0.01, 0.02, 0.0, 0.05]))  # some 15 px
+    follower, ways = Follower(RIG, BODY), []
+    for truth, shot in shots(PLATE, 15, 6, hidden):
+        result = follower.measure(shot, truth @ off)
+        ways.append(follower.way)
+        if isinstance(result, PoseEstimate):
+            assert np.linalg.norm(result.T_left_body[:3, 3] - truth[:3, 3]) < 1e-3
+        else:
+            assert ("was searched shortly before" in result.reason) == (shot.name not in searches)
+    assert ways == ["followed"] * 2 + ["lost"] * 10 + ["followed"] * 3
+    assert searches == ["2", "10"]  # where it was lost, and once more in vain
+
+
+def test_a_wrong_expectation_delays_a_search_and_no_more():
+    hidden = {k: [(m, c) for m in range(3) for c in range(2)] for k in range(2, 6)}
+    follower, wrong = Follower(RIG, BODY), exp_se3(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    ways = []
+    for truth, shot in shots(PLATE, 12, 7, hidden):
+        follower.measure(shot, truth @ wrong)
+        ways.append(follower.way)
+    assert ways[2:10] == ["lost"] * 8
+    assert ways[10:] == ["searched", "followed"]

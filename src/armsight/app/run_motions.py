@@ -48,7 +48,7 @@ class Sweep:
         duration_s: of the whole.
     """
 
-    def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, duration_s: float = 4.0) -> None:
+    def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, *, duration_s: float) -> None:
         self.duration_s, self._middle = duration_s, q_middle
         lifts = np.abs(arm.jacobian(q_middle)[2])  # of the tool by each joint, m/rad
         self._reach = reach_rad * (lifts > LOADED_M)
@@ -85,6 +85,5 @@ class Closed:
     def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return where the joints are to be a period from now for the tool to be right."""
         since = t_s - self._start_s
-        duty = self._gravity(self._trajectory.at(since + PERIOD_S).q)
-        step = self._servo.step(self._trajectory, since, estimator, duty)
+        step = self._servo.step(self._trajectory, since, estimator, self._gravity)
         return step.command, step.mode.name.lower()

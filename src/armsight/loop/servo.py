@@ -9,6 +9,7 @@ arm is singular. Gain, its margin, and what happens when vision is lost: docs/lo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -128,7 +129,11 @@ class PoseServo:
         self._rest_s, self._lasting = 0.0, np.zeros(6)
 
     def step(
-        self, motion: Trajectory, t_s: float, estimator: Estimator, gravity_duty: ArrayLike = (0.0,) * 6
+        self,
+        motion: Trajectory,
+        t_s: float,
+        estimator: Estimator,
+        gravity: Callable[[Array], ArrayLike] = np.zeros_like,
     ) -> ServoStep:
         """Make the next command.
 
@@ -136,12 +141,12 @@ class PoseServo:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
             estimator: where the tool is.
-            gravity_duty: (6,) duty that carries the arm's weight, passed on.
+            gravity: gives the duty (6,) that carries the arm's weight at joint angles (6,), passed on.
         """
-        duty = checked(gravity_duty, (6,), "gravity_duty")
         estimate, ahead = estimator.estimate(), motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
-        error = behind(self._arm.forward(motion.at(t_s).q), estimate.T_base_tool)
+        duty = checked(gravity(ahead.q), (6,), "gravity")
+        error = behind(self._arm.forward(goal.q), estimate.T_base_tool)
         mode = self._mode(estimate)
         resting = self._resting(estimate, goal, ahead)
         change = np.zeros(6)

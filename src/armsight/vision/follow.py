@@ -9,13 +9,12 @@ last predictions were, and everything from pixels to covariance is one compiled 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
+from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.disc_pose import SEEN, Found, Scene, velocity
 from armsight.vision.expected import bias_normals
@@ -28,18 +27,17 @@ from armsight.vision.markers.disc_model import workspace
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
-from armsight.vision.posefit import moved
 from armsight.vision.rehearse import rehearse
 from armsight.vision.rig import StereoRig
+from armsight.vision.track import LEAST_S, Track
 
 Way = Literal["followed", "searched", "lost"]
 
 #: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
 #: least and at the most; and in sizes of the last errors of prediction.
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
-#: A prediction older than so many shots, or so many times the time between the last two poses, is none; poses nearer to
-#: each other than so many seconds tell no velocity.
-_OLDEST_SHOTS, _OLDEST_STEPS, _LEAST_S = 3, 4.0, 1e-6
+#: While it is looked for where it is expected, the whole image is searched once in so many shots.
+_SEARCH_EVERY = 8
 #: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
 _JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
 _WORDS = {
@@ -49,40 +47,6 @@ _WORDS = {
     NOT_THERE: "not where it should be",
     OTHER_SIZE: "not of the size it should have",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Track(Record):
-    """What is known of a body's motion.
-
-    Attributes:
-        T_left_body: (4, 4) last pose.
-        twist: (6,) its velocity in the body's axes, per second, or per shot where shots carry no time.
-        t_s: time of the last pose, or the number of its shot.
-        shots: how many shots ago it was seen.
-        margin_px: how far off predictions may be.
-        step_s: from the pose before to the last; infinite where the twist is not known.
-        proven: whether the motion has foretold a pose before; what is far from it then is a jump.
-    """
-
-    T_left_body: Array
-    twist: Array
-    t_s: float
-    shots: int
-    margin_px: float
-    step_s: float
-    proven: bool
-
-    def foretells(self, t_s: float) -> bool:
-        """Whether it is known where to look at a time: not before the last pose, nor too long after."""
-        since = t_s - self.t_s
-        return self.shots < _OLDEST_SHOTS and _LEAST_S <= since < math.inf and since <= _OLDEST_STEPS * self.step_s
-
-    def predicted(self, t_s: float) -> Array:
-        """Return the pose (4, 4) at a time."""
-        T = np.empty((4, 4))
-        moved(self.T_left_body, self.twist * (t_s - self.t_s), T)
-        return T
 
 
 class Follower:
@@ -105,7 +69,7 @@ class Follower:
         """
         self.way, self.jump = "lost", None
         self._track: Track | None = None
-        self._count = 0
+        self._count = self._vain = 0
         if not follows(target):
             raise ValueError(
                 f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no codes"
@@ -143,8 +107,14 @@ class Follower:
         self._noise = disc_search.noise_of(black[0])
         self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
 
-    def measure(self, shot: Shot) -> PoseEstimate | Missed:
-        """Measure one shot; shots come in the order of their time."""
+    def measure(self, shot: Shot, expected: Array | None = None) -> PoseEstimate | Missed:
+        """Measure one shot; shots come in the order of their time.
+
+        Args:
+            shot: the pair of images.
+            expected: T_left_body (4, 4) where somebody else has the body, an arm's joints say, for when it is lost: it is
+                looked for there, and in the whole image only every so often, for that takes long.
+        """
         self._count += 1
         t_s = float(self._count) if shot.t_s is None else shot.t_s
         self.jump = None
@@ -153,12 +123,21 @@ class Follower:
         usable = shot.left is not None and shot.right is not None and shot.problem is None
         if usable and track is not None and track.foretells(t_s):
             result = self._followed(shot, track, t_s)
+        lost = self.way == "lost"
+        if usable and result is None and lost and expected is not None:
+            result = self._expected(shot, expected, t_s)
         if isinstance(result, PoseEstimate):
-            self.way = "followed"
+            self.way, self._vain = "followed", 0
             return result
-        result = measure(self.rig, self.target, shot)
+        if lost and expected is not None and 0 < self._vain < _SEARCH_EVERY:
+            result = Missed(
+                "not where it was lost, nor where it is expected; the whole image was searched shortly before"
+            )
+        else:
+            result, self._vain = measure(self.rig, self.target, shot), 0
         if isinstance(result, Missed):
             self.way = "lost"
+            self._vain += 1
             if track is not None:
                 self._track = Track(
                     track.T_left_body,
@@ -192,10 +171,22 @@ class Follower:
                     "expected"
                 )
         twist, step_s = np.zeros(6), math.inf
-        if track is not None and track.shots == 0 and _LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
+        if track is not None and track.shots == 0 and LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
             step_s = t_s - track.t_s  # two poses found by searching tell the velocity as well
             velocity(track.T_left_body, result.T_left_body, step_s, twist)
         self._track = Track(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
+
+    def _expected(self, shot: Shot, T_left_body: Array, t_s: float) -> PoseEstimate | None:
+        """Measure where somebody else has the body; None where that gives nothing to be believed."""
+        assert shot.left is not None
+        self._noise = disc_search.noise_of(grey(shot.left))
+        self._found.contrast[:] = 0.0
+        result = self._followed(
+            shot, Track(T_left_body, np.zeros(6), t_s - 1.0, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
+        )
+        if result is not None:  # where it was expected tells no velocity
+            self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
+        return result
 
     def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
         """Measure where the body should be; None where that gives nothing to be believed."""
