@@ -13,7 +13,7 @@ from armsight.app.experiment import Outcome, Progress, run_experiment
 from armsight.app.motion_file import CHAPTER, QUICK, MotionPlan, read_motions
 from armsight.app.rate_study import rate_study
 from armsight.app.run_calibrate import calibrated, handeye_poses
-from armsight.app.run_folder import Finished, write_run
+from armsight.app.run_folder import Finished, finish, make_room
 from armsight.app.run_station import Station
 from armsight.app.studies import Study, vision_studies
 from armsight.data import Array
@@ -66,6 +66,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
     boards, handeyes, study_shots = _AMOUNTS[demo.quick]
     progress("building the workcell")
     with Workcell(arm=demo.arm, cameras=demo.cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig) as cell:
+        make_room(demo.folder)
         progress("showing the board")
         calibration = calibrated(cell.board_spec, cell.board_shots(boards), progress)
         calibration.rig.save(demo.folder / "rig.json")
@@ -87,17 +88,11 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
             "cameras": demo.cameras,
             "board": cell.board.welcome.board,
             "machine": demo.machine,
-            "wall_s": time.perf_counter() - began,
         }
         finished = Finished(
-            cell.model, calibration.rig, outcome, plan, _truth(cell, outcome), facts, studies, cell.picture()
+            cell.model, calibration.rig, outcome, plan, _truth(cell, outcome), facts, began, studies, cell.picture()
         )
-    summary = write_run(finished, demo.folder)
-    if outcome.ended_by is not None:
-        raise ArmsightError(f"{outcome.ended_by}; what was measured until then is in {demo.folder}")
-    if outcome.interrupted:
-        raise KeyboardInterrupt
-    return summary
+    return finish(finished, demo.folder)
 
 
 def station_of(cell: Workcell) -> Station:

@@ -6,16 +6,19 @@ an interrupt leaves is a :class:`Outcome` with everything measured until then; t
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from armsight.app.motion_file import MotionPlan
+from armsight.app.run_beside import steady, uninterrupted
 from armsight.app.run_calibrate import HandEyeRun, find_delay, find_mounting
 from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
 from armsight.app.run_motions import Planned
 from armsight.app.run_passes import closed_on, drive, planned
+from armsight.app.run_ready import enable, rehearse
 from armsight.app.run_station import Station
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError
@@ -34,6 +37,7 @@ KEPT_SHOTS = 12
 PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
 #: From an image's arrival to its command: our own time, and the wait for the loop's next turn, s.
 _OWN_S = 0.002 + PERIOD_S / 2
+_STALE_S = 0.05
 
 
 @dataclass
@@ -102,12 +106,31 @@ def run_experiment(
         All that was measured, also where something ended it early.
     """
     outcome = Outcome(station.target.body)
+    with contextlib.nullcontext() if station.clock is None else steady():
+        _run(station, rig, plan, targets, outcome, progress, cover, close_loop)
+    return outcome
+
+
+def _run(
+    station: Station,
+    rig: StereoRig,
+    plan: MotionPlan,
+    targets: Array,
+    outcome: Outcome,
+    progress: Progress,
+    cover: Callable[[float, float], None] | None,
+    close_loop: bool,
+) -> None:
+    """Run the experiment; what ends it early is told in the outcome, and the arm is stopped."""
     loop: Loop | None = None
     try:
         progress("making ready to follow the body")
         follower = Follower(rig, station.target)
+        if station.clock is not None:
+            rehearse(station.arm)
+            station.board.receive(_STALE_S)  # what lay in the wire's buffer meanwhile
         loop = Loop(station, follower, outcome.log, KalmanEstimator(station.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
-        station.board.enable()
+        enable(station.board)
         _require_seen(loop, station, plan)
         _prepare(loop, station, plan, targets, outcome, progress)
         _passes(loop, station, plan, outcome, progress, cover, close_loop)
@@ -116,8 +139,9 @@ def run_experiment(
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
     finally:  # whatever it was, a mistake of ours among it: the arm stops
         if loop is not None:
-            _stopped(loop)
-    return outcome
+            with uninterrupted() as again:  # who presses Ctrl-C twice wants the arm stopped no less
+                _stopped(loop)
+            outcome.interrupted = outcome.interrupted or bool(again)
 
 
 def _stopped(loop: Loop) -> None:
@@ -130,12 +154,10 @@ def _stopped(loop: Loop) -> None:
 
 def _require_seen(loop: Loop, station: Station, plan: MotionPlan) -> None:
     """Raise where the body is not in view at the start: everything after would be for nothing."""
-    still = point_to_point(station.arm, plan.start, plan.start)
-    loop.run(
-        Planned(still, loop.t_s, station.gravity),
-        max(0.3, 3.0 / station.rate_hz),
-        Segment("calibration", "", "", False),
-    )
+    here = plan.start if station.clock is None else loop.log.joints[-1].q[-1]  # a real arm stands about there
+    there = point_to_point(station.arm, np.clip(here, station.arm.q_min, station.arm.q_max), plan.start)
+    look_s = there.duration_s + max(0.3, 3.0 / station.rate_hz)
+    loop.run_until_seen(Planned(there, loop.t_s, station.gravity), look_s, Segment("calibration", "", "", False))
     results = [result for _, _, result in loop.log.poses]
     if any(isinstance(result, PoseEstimate) for result in results):
         return

@@ -13,7 +13,7 @@ from armsight.data import Array, JointStates, PoseEstimate, Record, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.delay import estimate_delay
+from armsight.loop.delay import LEAST, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye import HandEye, calibrate_handeye
 from armsight.robot.arm import Arm
@@ -27,6 +27,8 @@ Progress = Callable[[str], None]
 #: How long the arm stands before it is measured, and for how long at least, s.
 SETTLE_S, LOOK_S = 0.25, 0.1
 DELAY_REST_S = 1.0  # before and after the sweep
+#: The sweep lasts so long, s, and longer where slow cameras would not take so many shots meanwhile: some may be missed.
+SWEEP_S, SWEEP_SHOTS = 4.0, LEAST + 6
 #: In the sweep joints keep their side of the backlash: what they are off beside what can be learned changes little.
 STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5)
 _DRAWS = 50  # for each pose wanted
@@ -132,7 +134,8 @@ def find_mounting(
         loop.run(Planned(way, loop.t_s, gravity), way.duration_s + SETTLE_S, segment, watch=False)
         looked = len(loop.log.poses)
         heard = len(loop.log.joints)
-        loop.run(Planned(way, loop.t_s - way.duration_s, gravity), look_s, Segment("calibration", "", "", False))
+        stands = Planned(way, loop.t_s - way.duration_s, gravity)
+        loop.run_until_seen(stands, look_s, Segment("calibration", "", "", False))
         results = [result for _, _, result in loop.log.poses[looked:]]
         good = [r for r in results if isinstance(r, PoseEstimate)]
         if good:
@@ -155,7 +158,8 @@ def find_mounting(
         )
     progress("hand-eye: where cameras and body are")
     q, Ts_left_body, cov = np.array(q_seen), np.array(Ts), np.array(covs)
-    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov)
+    Ts_base_flange = arm.forward(q) @ inverse(arm.T_flange_tool)
+    found = loop.compute(lambda: calibrate_handeye(Ts_base_flange, Ts_left_body, cov))
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array(approach), tuple(missed))
 
@@ -171,13 +175,13 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
         gravity: gives the duty that carries the arm at joint angles.
 
     Raises:
-        InputError: the sweep tells no delay.
+        CalibrationError: the sweep tells no delay.
         DeviceError: the board or a camera failed.
     """
     way = point_to_point(arm, q_start, q_middle)
     there = Segment("calibration", "sweep's start", "joints", False, trajectory=way)
     loop.run(Planned(way, loop.t_s, gravity), way.duration_s + DELAY_REST_S, there, watch=False)
-    sweep = Sweep(arm, q_middle)
+    sweep = Sweep(arm, q_middle, duration_s=max(SWEEP_S, SWEEP_SHOTS / loop.station.rate_hz))
     looked = len(loop.log.poses)
     controller = Planned(sweep, loop.t_s, gravity)
     loop.run(controller, sweep.duration_s, Segment("calibration", "sweep", "joints", False, trajectory=sweep))
@@ -188,4 +192,11 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
         np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])
     )
     newest = states.t_s > states.t_s[-1] - sweep.duration_s - 2 * DELAY_REST_S
-    return estimate_delay(arm, JointStates(states.t_s[newest], states.q[newest]), seen, prior=STEADY)
+    swept = JointStates(states.t_s[newest], states.q[newest])
+    if len(seen) < LEAST:
+        raise CalibrationError(
+            f"the body was seen {len(seen)} times in {sweep.duration_s:.1f} s of sweep, {LEAST} times at least are needed "
+            f"to tell how late the images come: are the cameras slower than {loop.station.rate_hz:g} Hz, or is the body "
+            "out of view near the end of the first motion?"
+        )
+    return loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY))

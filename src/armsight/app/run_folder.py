@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import math
 import shutil
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,18 +18,17 @@ import numpy as np
 
 from armsight.app.experiment import Outcome
 from armsight.app.motion_file import MotionPlan
-from armsight.app.poses import UPPER, csv_text, left_axes, pose_record
-from armsight.app.recording import record
-from armsight.app.run_calibrate import HandEyeRun
+from armsight.app.poses import csv_text, pose_record
+from armsight.app.run_beside import uninterrupted
 from armsight.app.run_data import RunData, assembled, cut, joints_of
+from armsight.app.run_files import joint_columns, write_handeye, write_shots
 from armsight.app.run_report import FIGURES, PAGE, RunReport, write_run_report
 from armsight.app.run_summary import summary_of
 from armsight.app.run_tracks import ToolTrack, write_columns, write_track
 from armsight.app.studies import Study
-from armsight.data import Array, Image, Missed, PoseEstimate, Shot
-from armsight.errors import InputError
+from armsight.data import Array, Image, Missed, PoseEstimate
+from armsight.errors import ArmsightError, InputError
 from armsight.files import write_text
-from armsight.geometry.rotation import quaternion_wxyz
 from armsight.robot.arm import Arm
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
@@ -37,6 +36,8 @@ from armsight.vision.rig import StereoRig
 #: Files of tracks, and the fields of RunData they hold.
 _TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "wanted")
 _SHOTS = "shots"
+#: What a command was based on -> how run.log says it.
+_BASED = {"planned": "as planned", "vision": "on vision", "bridged": "on the model while vision was missing"}
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Finished:
         plan: what was to be done.
         truth: times (N,) and poses (N, 4, 4) of the tool; None for a real arm.
         facts: what else the summary is to say, such as the seed.
+        began: when it began, by ``time.perf_counter``, s.
         studies: made after it.
         cell: (H, W, 3) BGR, the cell seen from aside; None for a real one.
     """
@@ -60,57 +62,116 @@ class Finished:
     plan: MotionPlan
     truth: tuple[Array, Array] | None
     facts: Mapping[str, Any]
+    began: float
     studies: Sequence[Study]
     cell: Image | None
 
 
+def finish(finished: Finished, folder: Path) -> dict[str, Any]:
+    """Write everything a run measured, and raise what ended it early.
+
+    Returns:
+        The summary, as summary.json has it.
+
+    Raises:
+        ArmsightError: what ended the run early, or that not all of it could be written; what could is whole.
+        KeyboardInterrupt: it was interrupted, or its writing was.
+    """
+    outcome = finished.outcome
+    ended = f"{outcome.said}; the arm was stopped" if outcome.said is not None else ""
+    try:
+        summary = write_run(finished, folder)
+    except InputError as error:
+        told = f"{ended}, and not all could be written: " if ended else ""
+        raise InputError(f"{told}{error}; what was written before is in {folder}") from None
+    if outcome.ended_by is not None:
+        raise ArmsightError(f"{ended}; what was measured until then is in {folder}")
+    if outcome.interrupted:
+        raise KeyboardInterrupt
+    return summary
+
+
 def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
-    """Write everything a run measured.
+    """Write everything a run measured; an interrupt has to wait until all is there but the report.
 
     Returns:
         The summary.
 
     Raises:
         InputError: a file cannot be written; those that were stay whole.
+        KeyboardInterrupt: it came meanwhile.
     """
-    outcome = finished.outcome
-    _make_room(folder)
+    with uninterrupted() as came:
+        summary, report = _write_measured(finished, folder)
+    if came:
+        raise KeyboardInterrupt
+    if report is not None:
+        write_run_report(report, folder)
+        summary["wall_s"] = _wall_s(finished)  # drawing takes its time, too
+        _write_summary(folder, summary)
+    return summary
+
+
+def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], RunReport | None]:
+    """Write the tables and the summary; returns it, and what the report is to show where there is enough for one."""
+    outcome, facts = finished.outcome, {**finished.facts, "wall_s": _wall_s(finished)}
     if outcome.log.joints:
-        write_columns(folder, "joints", _joint_columns(*joints_of(outcome.log)))
+        write_columns(folder, "joints", joint_columns(*joints_of(outcome.log)))
     write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
-    if outcome.handeye is not None:
-        _write_handeye(folder, outcome.handeye)
-    if outcome.handeye is None or not outcome.log.segments:
-        summary = {**finished.facts, "ended_by": outcome.said}
-        write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
-        return summary
+    if outcome.handeye is None:
+        return _write_summary(folder, {**facts, "ended_by": outcome.said}), None
+    write_handeye(folder, outcome.handeye)
     mounting = outcome.handeye.mounting
     run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
     for name, track in _tracks(run).items():
         write_track(folder, name, track)
-    _write_shots(folder / _SHOTS, outcome.kept)
     before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
-    summary = summary_of(finished.arm, outcome, finished.plan, run, before, after, finished.studies, finished.facts)
-    write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    figures = summary_of(finished.arm, outcome, finished.plan, run, before, after, finished.studies, facts)
+    summary = _write_summary(folder, figures)
     notes = _notes(finished, run)
     write_text(folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
+    write_shots(folder / _SHOTS, outcome.kept)
     shown = run if outcome.open_s is None else cut(run, outcome.open_s[0], run.t_s[-1])
-    report = RunReport(summary, shown, before, after, finished.studies, _picture(finished), finished.cell, notes)
-    write_run_report(report, folder)
+    return summary, RunReport(summary, shown, before, after, finished.studies, _picture(finished), finished.cell, notes)
+
+
+def _wall_s(finished: Finished) -> float:
+    """Return how long the run has taken by now, s."""
+    return time.perf_counter() - finished.began
+
+
+def _write_summary(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Write summary.json and return what it says: what is not known (NaN) is null there."""
+    summary: dict[str, Any] = _known(figures)
+    write_text(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     return summary
 
 
-def _make_room(folder: Path) -> None:
-    """Take away what an earlier run left here: none of it is to lie beside this one's."""
-    for name in (*FIGURES, "pose", "cell"):
-        (folder / f"{name}.png").unlink(missing_ok=True)
-    for name in (*_TRACKS, "joints"):
-        (folder / f"{name}.csv").unlink(missing_ok=True)
-        (folder / f"{name}.parquet").unlink(missing_ok=True)
-    for name in (PAGE, "summary.json", "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"):
-        (folder / name).unlink(missing_ok=True)
-    if (folder / _SHOTS).is_dir():
-        shutil.rmtree(folder / _SHOTS)
+def _known(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return a value with None for every number in it that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: _known(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_known(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def make_room(folder: Path) -> None:
+    """Take away what an earlier run left here: none of it is to lie beside this one's.
+
+    Raises:
+        InputError: something cannot be taken away.
+    """
+    names = [f"{name}.png" for name in (*FIGURES, "pose", "cell")]
+    names += [f"{name}.{kind}" for name in (*_TRACKS, "joints") for kind in ("csv", "parquet")]
+    names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"]
+    try:
+        if (folder / _SHOTS).is_dir():
+            shutil.rmtree(folder / _SHOTS)
+        for name in (*names, "summary.json"):  # by which an earlier run is known: the last to go
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{error.filename}: an earlier run's file cannot be removed: {error.strerror}") from None
 
 
 def _tracks(run: RunData) -> dict[str, ToolTrack]:
@@ -119,63 +180,10 @@ def _tracks(run: RunData) -> dict[str, ToolTrack]:
     return {name: track for name, track in tracks.items() if track is not None}
 
 
-def _joint_columns(t_s: Array, q: Array, q_wanted: Array) -> dict[str, Any]:
-    """Return the joints' columns: measured and wanted angles."""
-    named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
-    for joint in range(6):
-        named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
-        named[f"q{joint + 1}_wanted_rad"] = np.round(q_wanted[:, joint], 9)
-    return named
-
-
 def _pose_records(finished: Finished) -> list[dict[str, Any]]:
     """Return what vision measured shot by shot, in the left camera's frame, as ``measure`` writes it."""
     body = finished.outcome.body
     return [pose_record(name, float(t), body, result) for name, t, result in finished.outcome.log.poses]
-
-
-def _write_handeye(folder: Path, run: HandEyeRun) -> None:
-    """Write the hand-eye calibration, and the poses it was made from as ``armsight identify`` reads them."""
-    found, (position, angle) = run.found, run.found.held_out.rms()
-    told = {
-        "T_base_rig": run.mounting.T_base_rig.tolist(),
-        "T_tool_body": run.mounting.T_tool_body.tolist(),
-        "cov": found.cov.tolist(),
-        "held_out_position_rms_m": position,
-        "held_out_angle_rms_rad": angle,
-        "sigma_flange_m": found.sigma_flange_m,
-        "sigma_flange_rad": found.sigma_flange_rad,
-        "poses": len(run.q),
-        "missed": list(run.missed),
-    }
-    write_text(folder / "handeye.json", json.dumps(told, indent=1) + "\n")
-    T = run.Ts_left_body
-    covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
-    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
-    named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
-    turns = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
-    named |= {f"q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
-    named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
-    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(named)
-    writer.writerows(zip(*named.values(), strict=True))
-    write_text(folder / "handeye_poses.csv", out.getvalue())
-
-
-def _write_shots(folder: Path, shots: Sequence[Shot]) -> None:
-    """Write the kept shots as a recording."""
-    left = iter(shots)
-
-    class Kept:
-        def read(self) -> Shot | None:
-            return next(left, None)
-
-        def close(self) -> None:
-            pass
-
-    record(Kept(), folder)
 
 
 def _picture(finished: Finished) -> Image | None:
@@ -203,7 +211,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         else f"how late the images come was not found: {1e3 * outcome.delay.delay_s:g} ms taken",
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.outliers} not believed by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
-        "commands: " + ", ".join(f"{count} on {mode}" for mode, count in modes.most_common()),
+        "commands: " + ", ".join(f"{count} {_BASED.get(mode, f'on {mode}')}" for mode, count in modes.most_common()),
         *([] if outcome.said is None else [f"ended early: {outcome.said}"]),
     ]
 

@@ -1,21 +1,25 @@
 """The loop of a run: let a period pass, hear the joints, look, estimate, command; and keep all of it.
 
 Sim and hardware look alike from here: a :class:`~armsight.robot.boards.board.Board`, in whose ``receive`` time passes, and
-a function that hands out the newest shot there is. Time is the board's.
+a function that hands out the newest shot there is. Time is the board's. Where it passes by itself, a board that hears
+nothing for 100 ms stops its arm: there the loop goes on while something is computed that takes longer.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
+from armsight.app.run_beside import Still, Watch, beside
+from armsight.app.run_skew import Skew
 from armsight.app.run_station import Station
 from armsight.app.run_tracks import ToolTrack
-from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
+from armsight.data import JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
 from armsight.loop.estimators import ArmEstimate, Estimator, KalmanEstimator, Mounting, Verdict
 from armsight.robot.boards.codes import State
@@ -26,12 +30,16 @@ from armsight.vision.follow import Follower
 PERIOD_S = 0.004
 #: Without a shot for so long the cameras have stalled, s.
 STALLED_S = 0.5
+#: Searching an image for the body takes so long at most, on a computer with much else to do, s.
+SEARCH_S = 2.0
 #: The fused track is written down so late, s: the sightings on both sides of a time have come by then. The loop does not
 #: wait for that.
 RECORD_LAG_S = 0.04
 _RECORD_EVERY_S = 0.02  # so much of it at a time: cheaper than turn by turn
 _LAST_BATCHES = 32  # of readings that hold all within lag and time
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
+_LEAST_WAIT_S = 0.001  # for the board, though the loop is late: a board that is gone is known by waiting in vain
+_Result = TypeVar("_Result")
 
 
 class Controller(Protocol):
@@ -114,22 +122,45 @@ class Loop:
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.t_s = 0.0
         self._shot_s = -np.inf
-        self._last: tuple[float, Array] | None = None
+        self._skew = Skew(follower.rig, station.sync_s)
         self._written_s = -np.inf
+        self._watch = Watch(follower.measure, PERIOD_S)
+        # Of the host's clock, s: when the next turn is due, and when the shot that is looked at was taken up.
+        self._due = self._taken_s = 0.0
         while not log.joints:
             self.pass_time(PERIOD_S)
 
     def begin(self, estimator: KalmanEstimator) -> None:
         """Take another estimator from here on, after it has learned from everything measured so far."""
         assert self.mounting is not None
-        seen = [(t_s, pose) for _, t_s, pose in self.log.poses if isinstance(pose, PoseEstimate)]
-        at = 0
-        for states in self.log.joints:
-            estimator.joints(states)
-            while at < len(seen) and seen[at][0] <= states.t_s[-1]:
-                estimator.vision(self.mounting.sighting(seen[at][1], seen[at][0]))
-                at += 1
+        mounting = self.mounting
+        seen = deque((t_s, pose) for _, t_s, pose in self.log.poses if isinstance(pose, PoseEstimate))
+
+        def learn(heard: Sequence[JointStates]) -> None:
+            for states in heard:
+                estimator.joints(states)
+                while seen and seen[0][0] <= states.t_s[-1]:
+                    t_s, pose = seen.popleft()
+                    estimator.vision(mounting.sighting(pose, t_s))
+
+        heard = list(self.log.joints)
+        self.compute(lambda: learn(heard))
+        learn(self.log.joints[len(heard) :])  # what came meanwhile
         self.estimator, self._written_s = estimator, self.t_s
+
+    def compute(self, work: Callable[[], _Result]) -> _Result:
+        """Return what some long work comes to. Where time passes by itself, the loop goes on meanwhile and holds the arm.
+
+        Args:
+            work: touches nothing that the loop changes.
+
+        Raises:
+            DeviceError: the board failed meanwhile; and what the work raises.
+        """
+        if self.station.clock is None:
+            return work()
+        held, calm = Still(self._at_rest(PERIOD_S)), Segment("calibration", "", "", False)
+        return beside(work, lambda done: self._turns(held, done, calm, watch=False))
 
     def pass_time(self, wait_s: float) -> None:
         """Let time pass and hear the joints."""
@@ -137,6 +168,8 @@ class Loop:
         if not len(states.t_s):
             return
         self.t_s = float(states.t_s[-1])
+        if self.station.clock is not None:
+            self.station.clock.heard(self.t_s)
         self.log.joints.append(states)
         self.estimator.joints(states)
         self.log.live.append(self.estimator.estimate())
@@ -157,37 +190,30 @@ class Loop:
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
-        shot = self.station.poll()
-        if shot is None:
+        if self.station.clock is None:
+            newest = self._newest()
+            looked = None if newest is None else (newest, self.follower.measure(newest))
+        else:
+            looked = self._watch.take(self._newest)
+        if looked is not None or self._watch.busy:
+            self._shot_s = self.t_s
+        if looked is None:
             return None
-        began = time.perf_counter()
-        result = self.follower.measure(shot)
-        self._shot_s = self.t_s
+        shot, result = looked
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
-            result = self._with_skew(result, shot.t_s)
+            result = self._skew.widened(result, shot.t_s)
             if self.mounting is not None:
                 self.log.verdicts.append(self.estimator.vision(self.mounting.sighting(result, shot.t_s)))
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
-        return shot, began, result
+        return shot, self._taken_s, result
 
-    def _with_skew(self, pose: PoseEstimate, t_s: float) -> PoseEstimate:
-        """Widen the covariance by what the cameras' unsynchronised exposures do to a moving body.
-
-        Between the exposures it moves v dt along the baseline, which is taken for disparity: the depth is off by
-        Z / B v dt along the line of sight.
-        """
-        p = pose.T_left_body[:3, 3]
-        last, self._last = self._last, (t_s, p)
-        if last is None or not 0.0 < t_s - last[0] < STALLED_S:
-            return pose
-        baseline = self.follower.rig.T_left_right[:3, 3]
-        along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))
-        off = pose.T_left_body[:3, :3].T @ p * (self.station.sync_s * along / np.linalg.norm(baseline))
-        extra = np.zeros((6, 6))
-        extra[:3, :3] = np.outer(off, off)
-        return replace(pose, cov=pose.cov + extra, cov_noise=pose.cov_noise + extra)
+    def _newest(self) -> Shot | None:
+        """Return the newest shot, where there is one, on the board's clock."""
+        shot, clock = self.station.poll(), self.station.clock
+        self._taken_s = time.perf_counter()
+        return shot if shot is None or clock is None else clock.on_board(shot)
 
     def run(self, controller: Controller, duration_s: float, segment: Segment, *, watch: bool = True) -> None:
         """Let a controller command the joints for a while.
@@ -202,9 +228,25 @@ class Loop:
             DeviceError: the board left the enabled state (its faults are told), the cameras stalled, or a device is gone.
         """
         begin_s = self.t_s
+        self._turns(controller, lambda: self.t_s - begin_s >= duration_s - 1e-9, segment, watch=watch)
+
+    def run_until_seen(self, controller: Controller, duration_s: float, segment: Segment) -> None:
+        """Do as :meth:`run` does, and go on a little until the first shot has been measured."""
+        begin_s, before = self.t_s, len(self.log.poses)
+
+        def over() -> bool:
+            late_s = self.t_s - begin_s - duration_s + 1e-9
+            return late_s >= 0.0 and (len(self.log.poses) > before or late_s >= SEARCH_S)
+
+        self._turns(controller, over, segment, watch=True)
+
+    def _turns(self, controller: Controller, over: Callable[[], bool], segment: Segment, *, watch: bool) -> None:
+        """Let a controller command the joints until something is over."""
+        begin_s = self.t_s
+        self._watch.forget()
         try:
-            while self.t_s - begin_s < duration_s - 1e-9:
-                self.pass_time(PERIOD_S)
+            while not over():
+                self.pass_time(self._rest_of_period())
                 self._check_board()
                 looked = self.look() if watch else None
                 if watch:
@@ -220,13 +262,28 @@ class Loop:
         finally:
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
 
+    def _rest_of_period(self) -> float:
+        """Return how long to wait for the loop's next turn, s: what the last one has left of its period."""
+        if self.station.clock is None:
+            return PERIOD_S
+        now = time.monotonic()
+        self._due = max(self._due + PERIOD_S, now + _LEAST_WAIT_S)
+        return self._due - now
+
     def stop(self) -> None:
         """Bring the arm to rest where it is, and leave it held there."""
         if self.board.status.state is not State.ENABLED or not self.log.commands:
             return
+        still = replace(self._at_rest(_STOP_S), q_ref=self.board.joints.reference_rad)
+        turns = 1 if self.station.clock is None else round(_STOP_S / PERIOD_S)
+        for turn in range(turns):
+            self.board.send(replace(still, duration_s=_STOP_S * (1 - turn / turns)))
+            self.pass_time(_STOP_S / turns)
+
+    def _at_rest(self, duration_s: float) -> JointCommand:
+        """Return the command to be at rest where the newest command wanted the arm."""
         newest = self.log.commands[-1][1]
-        self.board.send(JointCommand(self.board.joints.reference_rad, np.zeros(6), newest.gravity_duty, _STOP_S))
-        self.pass_time(_STOP_S)
+        return JointCommand(newest.q_ref, np.zeros(6), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:
         """Raise where the board does not follow any more."""

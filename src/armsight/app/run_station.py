@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError
@@ -14,6 +15,54 @@ from armsight.vision.markers.targets import Composite
 from armsight.vision.sources.source import Source
 
 _JOIN_S = 2.0
+#: Crystals of host and board drift apart by less: 50 ppm each, and what the host's clock is slewed by.
+DRIFT = 2e-4
+#: A live image's stamp lies no further from now, s.
+_LIVE_S = 10.0
+
+
+class HostClock:
+    """Brings times of the host's clock, which stamps images, to the board's, which stamps readings.
+
+    A reading that is heard at h of the host's clock and stamped b by the board gives h - b: the offset of the clocks and
+    the time it was under way. The least of these is the offset and the shortest way; that is the same for all of a run, and
+    is taken up by the cameras' delay, which is measured afterwards. Between two such the least may rise as fast as clocks
+    drift: so it follows them, and one reading that came quickly is enough to bring it back.
+
+    Args:
+        now: the host's clock, s; the one that stamps the images.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._least_s: float | None = None
+        self._heard_s = 0.0
+
+    def heard(self, board_s: float) -> None:
+        """Take the board's time of the newest reading, which has come just now."""
+        now = self._now()
+        offset = now - board_s
+        if self._least_s is not None:
+            offset = min(offset, self._least_s + DRIFT * (now - self._heard_s))
+        self._least_s, self._heard_s = offset, now
+
+    def on_board(self, shot: Shot) -> Shot:
+        """Return a shot with its time on the board's clock; a reading must have been heard before.
+
+        Raises:
+            DeviceError: no live camera stamped it, by this computer's clock.
+        """
+        assert self._least_s is not None
+        if shot.t_s is None and shot.problem is not None:
+            return shot
+        if shot.t_s is None or abs(self._now() - shot.t_s) > _LIVE_S:
+            said = (
+                "has no time" if shot.t_s is None else f"was taken {self._now() - shot.t_s:.0f} s ago by its own time"
+            )
+            raise DeviceError(
+                f"shot {shot.name} {said}: is it of a recording? A run needs live cameras (usb:..., url:...)"
+            )
+        return replace(shot, t_s=shot.t_s - self._least_s)
 
 
 @dataclass(frozen=True)
@@ -28,6 +77,8 @@ class Station:
         gravity: gives the duty (6,) that carries the arm's weight at joint angles (6,); zeros where nobody knows.
         rate_hz: of the cameras.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
+        clock: of the computer that stamps the shots, and on which time passes by itself; None in lock-step, where shots are
+            on the board's clock and its time passes only in ``receive``.
     """
 
     arm: Arm
@@ -37,6 +88,7 @@ class Station:
     gravity: Callable[[Array], Array]
     rate_hz: float
     sync_s: float
+    clock: HostClock | None = None
 
 
 class LiveShots:
@@ -61,6 +113,9 @@ class LiveShots:
                 shot = self._source.read()
             except ArmsightError as error:
                 self._failure = error
+                return
+            except Exception as error:  # noqa: BLE001 - whatever it is, it is told by poll: nobody watches this thread
+                self._failure = DeviceError(f"reading the cameras failed: {type(error).__name__}: {error}")
                 return
             if shot is None:
                 self._failure = DeviceError("the source of images has come to its end")

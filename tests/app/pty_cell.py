@@ -1,0 +1,87 @@
+"""A workcell as devices are: its board behind a pseudo-terminal, its cameras stamped by another clock, time of its own.
+
+The board's clock goes on by itself, a millisecond at a time and never faster than real time; where the machine is loaded it
+goes slower, so that nothing hangs on how fast the machine is. It does not wait for the host: what the host does not read in
+time is lost, and a host that is silent for 100 of its milliseconds is silent. The host's clock is tied to it.
+"""
+
+import contextlib
+import os
+import pty
+import select
+import threading
+import time
+import tty
+from dataclasses import replace
+
+import numpy as np
+
+from armsight.errors import DeviceError
+from armsight.sim.workcell import Workcell
+
+#: The host's clock when the board's is 0, s; by how much it is faster; how far stamps are off, s.
+OFFSET_S, DRIFT, JITTER_S = 12345.678, 50e-6, 2e-4
+
+
+class PtyCell:
+    """A workcell on the other side of a cable."""
+
+    def __init__(self, **options):
+        self.cell = Workcell(machine="host", **options)
+        self.lock = threading.Lock()
+        self.master, self.slave = pty.openpty()
+        tty.setraw(self.slave)
+        os.set_blocking(self.master, False)
+        self.port = os.ttyname(self.slave)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def now(self):
+        """Return the host's clock."""
+        return self.host_s(self.cell.t_s)
+
+    def host_s(self, board_s):
+        return OFFSET_S + (1 + DRIFT) * board_s
+
+    def _run(self):
+        link = self.cell.link
+        while not self._stop.wait(0.0004):
+            ready, _, _ = select.select([self.master], [], [], 0)
+            try:
+                with self.lock:
+                    if ready:
+                        link.write(os.read(self.master, 4096))
+                    link.step(1)
+                    said = link.read(0.0)
+                with contextlib.suppress(BlockingIOError):  # nobody reads: lost
+                    os.write(self.master, said)
+            except (OSError, DeviceError):
+                return
+
+    def close(self):
+        self._stop.set()
+        self._thread.join()
+        os.close(self.slave)
+        os.close(self.master)
+        self.cell.close()
+
+
+class HostStamped:
+    """The cell's cameras, stamped by the host's clock."""
+
+    def __init__(self, far, seed=0):
+        self._far, self._rng = far, np.random.default_rng(seed)
+        self.closed = False
+
+    def read(self):
+        while not self.closed:
+            with self._far.lock:
+                shot = self._far.cell.source.poll()
+            if shot is not None:
+                return replace(shot, t_s=self._far.host_s(shot.t_s) + JITTER_S * self._rng.standard_normal())
+            time.sleep(0.001)
+        return None
+
+    def close(self):
+        self.closed = True
