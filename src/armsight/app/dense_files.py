@@ -20,6 +20,9 @@ from armsight.vision.rectify import Rectification
 
 #: Steps of a pixel in the 16-bit disparity image: 1023 px at most.
 PNG_STEPS = 64
+#: What a point of a cloud holds, and rows of the image whose points are written at a time.
+_FIELDS = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
+_ROWS_AT_ONCE = 64
 _STATES = {"measured": MEASURED, "hidden": OCCLUDED, "filled": FILLED, "not_in_view": NOTHING}
 
 
@@ -67,28 +70,35 @@ def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth
         image: (H, W) grey or (H, W, 3) BGR, the left image in standard form.
     """
     chosen = result.measured & np.isfinite(depth.depth_m)
-    v, u = np.nonzero(chosen)
-    p_left = form.points(np.column_stack([u, v]).astype(np.float64), result.disparity[chosen].astype(np.float64))
-    colours = image[chosen] if image.ndim == 3 else np.repeat(image[chosen][:, None], 3, axis=1)
+    count = int(np.count_nonzero(chosen))
+    kinds = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", "comment frame: left camera; x y z in m"]
+    header += ["comment sigma: standard deviation of the depth, m", f"element vertex {count}"]
+    header += [f"property {kinds[kind]} {name}" for name, kind in _FIELDS]
+    with replacing(path, "wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        for top in range(0, chosen.shape[0], _ROWS_AT_ONCE):
+            file.write(_vertices(slice(top, top + _ROWS_AT_ONCE), chosen, form, result, depth, image))
+    return count
+
+
+def _vertices(
+    strip: slice, chosen: NDArray[np.bool_], form: Rectification, result: Disparity, depth: Depth, image: Image
+) -> bytes:
+    """Return the points of some rows as PLY has them."""
+    v, u = np.nonzero(chosen[strip])
+    v += strip.start
+    p_left = form.points(np.column_stack([u, v]).astype(np.float64), result.disparity[v, u].astype(np.float64))
+    colours = image[v, u] if image.ndim == 3 else np.repeat(image[v, u][:, None], 3, axis=1)
     if colours.dtype == np.uint16:
         colours = colours >> 8
-    fields = (
-        [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
-    )
-    rows = np.empty(len(u), np.dtype(fields))
+    rows = np.empty(len(u), np.dtype(_FIELDS))
     for k, name in enumerate("xyz"):
         rows[name] = p_left[:, k]
     for k, name in enumerate(("blue", "green", "red")):
         rows[name] = colours[:, k]
-    rows["sigma"] = depth.sigma_m[chosen]
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", "comment frame: left camera; x y z in m"]
-    header += ["comment sigma: standard deviation of the depth, m", f"element vertex {len(rows)}"]
-    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
-    with replacing(path, "wb") as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
-        file.write(rows.tobytes())
-    return len(rows)
+    rows["sigma"] = depth.sigma_m[v, u]
+    return rows.tobytes()
 
 
 def write_result(folder: Path, result: Disparity, form: Rectification | None, image: Image) -> dict[str, Any]:
@@ -111,11 +121,11 @@ def write_result(folder: Path, result: Disparity, form: Rectification | None, im
     if form is None or result.problem is not None:
         return said
     depth = depth_of(form, result)
-    write_pfm(folder / "depth_mm.pfm", (1e3 * depth.depth_m).astype(np.float32))
-    write_pfm(folder / "depth_sigma_mm.pfm", (1e3 * depth.sigma_m).astype(np.float32))
+    write_pfm(folder / "depth_mm.pfm", depth.depth_m, 1e3)
+    write_pfm(folder / "depth_sigma_mm.pfm", depth.sigma_m, 1e3)
     said["points"] = write_cloud(folder / "cloud.ply", form, result, depth, image)
-    said["median_depth_mm"] = _median(1e3 * depth.depth_m[result.measured])
-    said["median_depth_sigma_mm"] = _median(1e3 * depth.sigma_m[result.measured])
+    said["median_depth_mm"] = _median(depth.depth_m[result.measured], 1e3)
+    said["median_depth_sigma_mm"] = _median(depth.sigma_m[result.measured], 1e3)
     return said
 
 
@@ -130,7 +140,7 @@ def facts(result: Disparity) -> dict[str, Any]:
     return said
 
 
-def _median(values: NDArray[np.floating[Any]]) -> float | None:
-    """Return the median of what is finite; None where nothing is."""
+def _median(values: NDArray[np.floating[Any]], scale: float = 1.0) -> float | None:
+    """Return the median of what is finite, times a scale; None where nothing is."""
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else None
+    return scale * float(np.median(finite, overwrite_input=True)) if finite.size else None

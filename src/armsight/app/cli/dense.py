@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from armsight.app.cli.progress import bar
+from armsight.app.dense_compile import compile_apart
 from armsight.app.dense_files import check_folder, make_folder
 from armsight.app.dense_run import read_pair, result_line, run_shot, search_of
 from armsight.app.dense_table import Line, evaluate_scene, evaluation_json, table_text, write_evaluation
@@ -77,8 +78,9 @@ def match(
     frame).
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
-    method = open_method(name)
     check_folder(out)
+    compile_apart(name)
+    method = open_method(name)
 
     def run(shot: Shot, where: Path) -> dict[str, Any]:
         search = search_of(form, max_disparity, near, shot)

@@ -8,10 +8,10 @@ deviation along each principal axis of the covariance, and interpolated.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from armsight.data import Array, Record
 from armsight.vision.dense.method import Disparity
@@ -20,6 +20,7 @@ from armsight.vision.triangulate import midpoints
 
 #: Places along rows, columns and inverse disparity at which the calibration's share is worked out.
 _COLUMNS, _ROWS, _DEPTHS = 7, 5, 4
+_ROWS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,25 +60,47 @@ def calibration_share(form: Rectification, uv: Array, disparity: Array) -> Array
 
 def depth_of(form: Rectification, result: Disparity) -> Depth:
     """Return depths with their standard deviations."""
-    z = np.where(form.seen("left"), form.depth(result.disparity), np.nan)
-    measured = result.measured & np.isfinite(z)
-    share = np.full(z.shape, np.nan)
-    share[measured] = _interpolated(form, result.disparity, measured) * z[measured]
-    per_px = z**2 / (form.focal_px * form.rig.baseline_m)
-    return Depth(z, np.hypot(per_px * result.sigma_px, share), share)
+    seen, shape = form.seen("left"), result.disparity.shape
+    z, share = np.full(shape, np.nan), _calibration(form, result.disparity, result.measured & seen)
+    sigma = np.empty(shape)
+    for top in range(0, shape[0], _ROWS_AT_ONCE):
+        rows = slice(top, top + _ROWS_AT_ONCE)
+        z[rows] = np.where(seen[rows], form.depth(result.disparity[rows]), np.nan)
+        share[rows] *= z[rows]
+        per_px = z[rows] ** 2 / (form.focal_px * form.rig.baseline_m)
+        sigma[rows] = np.hypot(per_px * result.sigma_px[rows], share[rows])
+    return Depth(z, sigma, share)
 
 
-def _interpolated(form: Rectification, disparity: NDArray[np.float32], measured: NDArray[np.bool_]) -> Array:
-    """Return the calibration's relative share (N,) at the measured pixels."""
-    v, u = np.nonzero(measured)
-    inverse = 1 / np.maximum(disparity[measured].astype(np.float64), 1e-3)
-    if not form.rig.cov.any() or not len(inverse):
-        return np.zeros(len(inverse))
+def _calibration(form: Rectification, disparity: NDArray[np.float32], measured: NDArray[np.bool_]) -> Array:
+    """Return the calibration's relative share (H, W) where it was measured, NaN elsewhere; a few rows at a time."""
+    measured = measured & (disparity > 0)  # what is infinitely far has no depth
+    out = np.where(measured, 0.0, np.nan)
+    if not form.rig.cov.any() or not measured.any():
+        return out
     height, width = measured.shape
-    low, high = float(inverse.min()), float(inverse.max()) * (1 + 1e-9) + 1e-12
+    least, most = (float(f(disparity[measured])) for f in (np.min, np.max))
+    low, high = 1 / most, 1 / least * (1 + 1e-9) + 1e-12
     axes = (np.linspace(0, height - 1, _ROWS), np.linspace(0, width - 1, _COLUMNS), np.linspace(low, high, _DEPTHS))
     rows, columns, inverses = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     share = calibration_share(form, np.column_stack([columns, rows]), 1 / inverses).reshape(_ROWS, _COLUMNS, _DEPTHS)
     whole = np.isfinite(share)
     share = np.where(whole, share, share[whole].max() if whole.any() else 0.0)  # corners that a camera does not see
-    return np.asarray(RegularGridInterpolator(axes, share)(np.column_stack([v, u, inverse])))
+    for top in range(0, height, _ROWS_AT_ONCE):
+        strip = slice(top, top + _ROWS_AT_ONCE)
+        v, u = np.nonzero(measured[strip])
+        inverse = 1 / disparity[strip][v, u].astype(np.float64)
+        places = ((v + top) / max(height - 1, 1), u / max(width - 1, 1), (inverse - low) / (high - low))
+        out[strip][v, u] = _between(share, *(np.clip(p, 0, 1) for p in places))
+    return out
+
+
+def _between(grid: Array, *places: Array) -> Array:
+    """Return the values (N,) of an evenly spaced grid between its points, linearly; places are 0 to 1 along each axis."""
+    out = np.zeros(len(places[0]))
+    cells = [np.minimum((p * (n - 1)).astype(int), n - 2) for p, n in zip(places, grid.shape, strict=True)]
+    parts = [p * (n - 1) - c for p, n, c in zip(places, grid.shape, cells, strict=True)]
+    for corner in product((0, 1), repeat=grid.ndim):
+        weight = np.prod([t if k else 1 - t for k, t in zip(corner, parts, strict=True)], axis=0)
+        out += weight * grid[tuple(c + k for c, k in zip(cells, corner, strict=True))]
+    return out

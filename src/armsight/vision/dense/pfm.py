@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +36,19 @@ def read_pfm(path: str | Path) -> NDArray[np.float32]:
     return np.ascontiguousarray(pixels[::-1], dtype=np.float32)
 
 
-def write_pfm(path: str | Path, image: NDArray[np.float32]) -> None:
+def write_pfm(path: str | Path, image: NDArray[np.floating[Any]], scale: float = 1.0) -> None:
     """Write a grey PFM file (H, W), little-endian; NaN becomes infinity, the benchmark's "unknown".
+
+    Args:
+        path: where to.
+        image: (H, W).
+        scale: what is written is so many times as much, as for mm in place of m.
 
     Raises:
         InputError: the file cannot be written.
     """
-    pixels = np.where(np.isnan(image), np.inf, image).astype("<f4")[::-1]
+    height, width = image.shape
     with replacing(path, "wb") as file:
-        file.write(f"Pf\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode())
-        file.write(np.ascontiguousarray(pixels).tobytes())
+        file.write(f"Pf\n{width} {height}\n-1.0\n".encode())
+        for row in image[::-1]:
+            file.write(np.where(np.isnan(row), np.inf, scale * row).astype("<f4").tobytes())
