@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,24 +116,46 @@ def write_run(finished: Finished, folder: Path) -> dict[str, Any]:
 def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], RunReport | None]:
     """Write the tables and the summary; returns it, and what the report is to show where there is enough for one."""
     outcome, facts = finished.outcome, {**finished.facts, "wall_s": _wall_s(finished)}
-    if outcome.log.joints:
-        write_columns(folder, "joints", joint_columns(*joints_of(outcome.log)))
-    write_text(folder / "poses.csv", csv_text(_pose_records(finished)))
-    if outcome.handeye is None:
-        return _write_summary(folder, {**facts, "ended_by": outcome.said}), None
-    write_handeye(folder, outcome.handeye)
-    mounting = outcome.handeye.mounting
-    run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
-    for name, track in _tracks(run).items():
-        write_track(folder, name, track)
-    before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
-    figures = summary_of(finished.arm, outcome, finished.plan, run, before, after, finished.studies, facts)
-    summary = _write_summary(folder, figures)
-    notes = _notes(finished, run)
-    write_text(folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
-    write_shots(folder / _SHOTS, outcome.kept)
+    with _as_much_as_fits() as keep:
+        if outcome.log.joints:
+            keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
+        keep(write_text, folder / "poses.csv", csv_text(_pose_records(finished)))
+        if outcome.handeye is None:
+            summary = _known({**facts, "ended_by": outcome.said})
+            keep(_write_summary, folder, summary)
+            return summary, None
+        keep(write_handeye, folder, outcome.handeye)
+        mounting = outcome.handeye.mounting
+        run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
+        for name, track in _tracks(run).items():
+            keep(write_track, folder, name, track)
+        before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
+        figures = summary_of(finished.arm, outcome, finished.plan, run, before, after, finished.studies, facts)
+        summary, notes = _known(figures), _notes(finished, run)
+        keep(_write_summary, folder, summary)
+        keep(write_text, folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
+        keep(write_shots, folder / _SHOTS, outcome.kept)
     shown = run if outcome.open_s is None else cut(run, outcome.open_s[0], run.t_s[-1])
     return summary, RunReport(summary, shown, before, after, finished.studies, _picture(finished), finished.cell, notes)
+
+
+@contextlib.contextmanager
+def _as_much_as_fits() -> Iterator[Callable[..., None]]:
+    """Write file after file, also after one that could not be written; the first such is told at the end.
+
+    The block is handed a function that calls what writes a file.
+    """
+    failed: list[InputError] = []
+
+    def keep(write: Callable[..., object], *arguments: object) -> None:
+        try:
+            write(*arguments)
+        except InputError as error:
+            failed.append(error)
+
+    yield keep
+    if failed:
+        raise failed[0]
 
 
 def _wall_s(finished: Finished) -> float:
@@ -140,15 +163,13 @@ def _wall_s(finished: Finished) -> float:
     return time.perf_counter() - finished.began
 
 
-def _write_summary(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Write summary.json and return what it says: what is not known (NaN) is null there."""
-    summary: dict[str, Any] = _known(figures)
+def _write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json."""
     write_text(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    return summary
 
 
 def _known(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value with None for every number in it that is not finite."""
+    """Return a value as JSON can hold it: None, there null, for every number in it that is not known."""
     if isinstance(value, Mapping):
         return {key: _known(one) for key, one in value.items()}
     if isinstance(value, list):

@@ -1,0 +1,120 @@
+"""Two clocks brought together, and cameras that are read beside the loop."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from armsight.app.run_station import DRIFT, HostClock, LiveShots
+from armsight.data import Shot
+from armsight.errors import DeviceError
+
+OFFSET_S = 12345.678
+
+
+class Clock:
+    """A host's clock set by hand."""
+
+    def __init__(self):
+        self.s = 0.0
+
+    def __call__(self):
+        return self.s
+
+
+def heard(rng, drift, seconds, *, pause=None, way_s=1e-3):
+    """Readings heard every 4 ms, late by the shortest way and up to 3 ms more, now and then much more.
+
+    Returns (board's time, host's true time then, host's time as brought over) of each, from 1 s on.
+    """
+    now = Clock()
+    clock, rows = HostClock(now), []
+    for board_s in np.arange(0.004, seconds, 0.004):
+        late = way_s + rng.uniform(0.0, 3e-3) + (0.05 if rng.uniform() < 0.05 else 0.0)
+        if pause is not None and pause[0] < board_s < pause[1]:
+            late += 0.03
+        host_s = OFFSET_S + (1 + drift) * board_s
+        now.s = host_s + late
+        clock.heard(board_s)
+        if board_s > 1.0:
+            rows.append((board_s, clock.on_board(Shot("1", None, None, host_s)).t_s))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6, 1.5e-4, -1e-3])
+def test_stamps_are_brought_to_the_boards_clock_but_for_the_shortest_way(drift):
+    rows = heard(np.random.default_rng(0), drift, 60.0)
+    off = rows[:, 1] - rows[:, 0]
+    # Taken late by h above the least: h is so that 250 readings a second, uniform over 3 ms, bring it down as fast as it
+    # may rise: (250 / 3 ms) h h / 2 = DRIFT - drift; four times that is rare. A constant is the delay's to take up.
+    h = np.sqrt(2 * max(DRIFT - drift, 0.0) * 3e-3 / 250)
+    assert np.abs(off.mean() + 1e-3) < 2 * h + abs(drift) * 0.02
+    assert np.ptp(off) < 8 * h + abs(drift) * 0.1
+
+
+def test_a_host_that_is_busy_for_a_while_does_not_upset_the_clock():
+    rows = heard(np.random.default_rng(1), 50e-6, 12.0, pause=(5.0, 9.0))
+    off = rows[:, 1] - rows[:, 0] + 1e-3
+    assert np.abs(off).max() < 4.1 * DRIFT + 2e-4  # it rises meanwhile, no faster than clocks drift
+    after = off[rows[:, 0] > 9.2]
+    assert np.abs(after).max() < 2e-4  # and is back with the first readings
+
+
+@pytest.mark.parametrize(
+    ("t_s", "said"), [(None, "has no time"), (3.0, "was taken 12343 s ago"), (1.7e9, "was taken -")]
+)
+def test_shots_of_a_recording_are_refused(t_s, said):
+    now = Clock()
+    clock = HostClock(now)
+    now.s = OFFSET_S
+    clock.heard(1.0)
+    with pytest.raises(DeviceError, match=f"shot 7 {said}.*live cameras"):
+        clock.on_board(Shot("7", None, None, t_s))
+    assert clock.on_board(Shot("8", None, None, None, "torn")).problem == "torn"
+
+
+class Reads:
+    """A source that hands out shots, and then what it is told to."""
+
+    def __init__(self, end):
+        self.end, self.left, self.closed = end, [Shot("1", None, None, 1.0)], False
+        self.taken = threading.Event()
+
+    def read(self):
+        if self.left:
+            return self.left.pop()
+        self.taken.wait(10.0)
+        if self.end is not None:
+            raise self.end
+        return None
+
+    def close(self):
+        self.closed = True
+
+
+def polled_until_it_raises(shots):
+    while True:
+        assert shots.poll() is None
+
+
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [
+        (None, "the source of images has come to its end"),
+        (DeviceError("left camera: gone"), "left camera: gone"),
+        (ZeroDivisionError("of ours"), "reading the cameras failed: ZeroDivisionError: of ours"),
+        (MemoryError(), "reading the cameras failed: MemoryError"),
+    ],
+)
+def test_whatever_ends_the_reading_is_told_where_shots_are_asked_for(end, said):
+    source = Reads(end)
+    shots = LiveShots(source)
+    first = None
+    while first is None:
+        first = shots.poll()
+    assert first.name == "1"
+    source.taken.set()
+    with pytest.raises(DeviceError, match=said):
+        polled_until_it_raises(shots)
+    shots.close()
+    assert source.closed
