@@ -14,7 +14,7 @@ from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.model_file import read_model
+from armsight.loop.identify.model_file import open_model, read_model
 from armsight.loop.identify.read import read_poses
 from armsight.robot.models import open_arm
 from cli_runs import Said, refused, run
@@ -52,7 +52,8 @@ def test_from_files_to_files(tmp_path, capsys):
     page = (out / "report.html").read_text()
     assert page.count("<img") == 5
     assert "http" not in page.split("</style>")[1]
-    refused(said(capsys, "--model", out / "corrected.toml", "--data", data), "corrected.toml", "nominal arm")
+    arm, urdf = open_model(str(out / "corrected.toml")), open_model(str(out / "corrected.urdf"))
+    np.testing.assert_allclose(arm.forward(np.ones(6)), urdf.forward(np.ones(6)), atol=1e-9)
 
 
 def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
@@ -60,7 +61,9 @@ def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
     assert answer.code == 0
     assert answer.out.splitlines()[0].startswith("held-out error ")
     assert "in five turns" in answer.out.splitlines()[0]
-    assert "not fitted, or not alone" in answer.out
+    assert "not fitted, or not alone" not in answer.out
+    assert "-v" in answer.out
+    assert "not fitted, or not alone" in said(capsys, "--model", "six_r", "--data", tmp_path / "p.csv", "-v").out
 
 
 def test_a_written_urdf_is_the_identified_arm():

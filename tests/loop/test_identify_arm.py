@@ -14,10 +14,13 @@ from armsight.loop.identify.growth import PLACEMENT
 from armsight.loop.identify.identify import contributions, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
+from armsight.loop.identify.model_file import open_model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.place import placed
 from armsight.loop.identify.plan import plan_poses
+from armsight.loop.identify.play import plays
 from armsight.loop.identify.priors import prior_sigma
+from armsight.loop.identify.toml_write import table_text
 from armsight.loop.identify.validate import validate
 from armsight.robot.models import open_arm
 
@@ -178,6 +181,44 @@ def test_readings_bring_the_tool_there(scene):
         back = corrected.readings(T, angles + 0.05, side)
         assert np.abs(log_se3(inverse(T) @ corrected.forward(back[None], side[None])[0])).max() < 1e-8
     assert corrected.readings(np.diag([1, 1, 1, 1.0]) + 5 * np.eye(4, k=3), q[0]) is None
+
+
+def test_what_is_written_is_read_as_the_same_arm(scene, tmp_path):
+    _, _, found, rng = scene
+    (tmp_path / "corrected.toml").write_text(table_text(found))
+    (tmp_path / "corrected.urdf").write_text(Corrected.of(found).urdf())
+    x, q = found.solution.x.copy(), rng.uniform(-1, 1, (20, 6))
+    assert found.model.table(x)[:, 4].any()  # Hayati's angles: axes a little off parallel
+    x[found.model.causes_at :] = 0.0
+    for name in ("corrected.toml", "corrected.urdf"):
+        arm = open_model(str(tmp_path / name))
+        np.testing.assert_allclose(arm.forward(q), found.model.tool_in_base(x, q, None), atol=1e-9)
+        assert arm.inverse(arm.forward(arm.home + 0.1), near=arm.home).best is not None
+
+
+def test_the_play_of_each_joint_is_told_or_why_it_is_not(scene):
+    w, measured, found, _ = scene
+    for play in plays(found, measured):  # here friction holds every joint on the side it came from
+        assert play.value_rad == pytest.approx(w.backlash[play.joint], abs=np.deg2rad(0.02))
+        assert abs(play.value_rad - w.backlash[play.joint]) < 4 * play.sigma_rad
+
+
+def test_a_joint_that_lies_anywhere_in_its_play_spoils_only_its_own_direction():
+    w, rng = worn(2), np.random.default_rng(7)
+    q, approach = poses(w.nominal, 60, rng)
+    w = replace(w, backlash=w.backlash * [0, 1, 1, 1, 1, 1])
+    half = np.deg2rad(0.1)
+    stood = np.clip(rng.uniform(-1.5, 1.5, 60), -1, 1) * half  # at a stop or between
+    seen = w.seen(q + stood[:, None] * np.eye(6)[0], approach, rng)
+    measured = replace(seen, q=q)
+    found = identify(w.nominal, measured)
+    assert found.joint_sigma_rad[0] == pytest.approx(stood.std(), rel=0.3)  # of 60 draws: 10 %
+    assert found.joint_sigma_rad[1:].max() < 0.3 * stood.std()
+    play = plays(found, measured)[0]
+    assert abs(play.value_rad - 2 * half) < 4 * play.sigma_rad < np.deg2rad(0.2)
+    assert "how far apart" in play.how
+    q, approach = poses(w.nominal, 200, rng)
+    assert distance_m(found.model, found.solution.x, w.T_rig_body(q, approach), q, approach).mean() < 0.2e-3
 
 
 def test_planned_poses_tell_more_than_random_ones(scene):

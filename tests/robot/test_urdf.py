@@ -241,13 +241,51 @@ def test_files_that_are_none_are_refused(tmp_path):
         read_urdf(tmp_path / "b.urdf")
 
 
-def test_a_rounded_right_angle_is_refused_and_ten_digits_are_not(tmp_path):
+def tilted(arm, sizes, seed=0):
+    """URDF text of an arm whose joints' origins are turned a little, and its forward kinematics as a plain product."""
+    rng, robot = np.random.default_rng(seed), ET.fromstring(urdf_text(arm))
+    frames = []
+    for i, joint in enumerate(robot.findall("joint")):
+        origin = joint.find("origin")
+        turn = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy").split()])
+        if 0 < i < 6:
+            turn = turn * Rotation.from_rotvec(rng.normal(0, sizes, 3))
+            origin.set("rpy", " ".join(repr(float(v)) for v in turn.as_euler("xyz")))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = turn.as_matrix(), [float(word) for word in origin.get("xyz").split()]
+        frames.append(T)
+
+    def forward(q):
+        out = np.eye(4)
+        for i, T in enumerate(frames):
+            spin = np.eye(4)
+            if i < 6:
+                spin[:3, :3] = Rotation.from_rotvec([0, 0, arm.direction[i] * q[i]]).as_matrix()
+            out = out @ T @ spin
+        return out
+
+    return ET.tostring(robot, encoding="unicode"), forward
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("name", ["six_r", "puma560"])
+def test_axes_a_little_off_parallel_are_read_exactly_and_inverted(name, size, tmp_path):
+    text, forward = tilted(MODELS[name], size)
+    (tmp_path / "arm.urdf").write_text(text)
+    arm = read_urdf(tmp_path / "arm.urdf")
+    found = 0
+    for q in np.random.default_rng(1).uniform(np.maximum(arm.q_min, -2), np.minimum(arm.q_max, 2), (10, 6)):
+        T = forward(q)
+        np.testing.assert_allclose(arm.forward(q), T, atol=1e-9)
+        best = arm.inverse(T, near=q).best
+        found += best is not None and np.abs(best - q).max() < 1e-6
+    assert found >= 9  # one may be next to a singularity
+
+
+def test_axes_too_near_to_parallel_for_any_digits_are_refused(tmp_path):
     path = tmp_path / "arm.urdf"
-    # Axes 2 and 3 are meant to be parallel; with an angle of 1e-5 between them their common normal is kilometres away.
-    path.write_text(changed('xyz="0.2515 0.0 0.0" rpy="0.0 0.0 0.0"', 'xyz="0.2515 0.1 0.0" rpy="0.00001 0.0 0.0"'))
-    with pytest.raises(
-        InputError, match=r"joints 'joint2' and 'joint3' are 0.00057 deg from parallel.*were angles rounded"
-    ):
+    path.write_text(changed('xyz="0.2515 0.0 0.0" rpy="0.0 0.0 0.0"', 'xyz="0.2515 0.1 0.0" rpy="0.00000001 0.0 0.0"'))
+    with pytest.raises(InputError, match=r"joints 'joint2' and 'joint3' are 5.7e-07 deg from parallel"):
         read_urdf(path)
     path.write_text(changed(RPY, 'rpy="-1.5707963268 0.0 0.0"'))
     np.testing.assert_allclose(read_urdf(path).forward(probes()), SIX_R.forward(probes()), atol=1e-9)

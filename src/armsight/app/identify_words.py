@@ -7,6 +7,7 @@ import numpy as np
 from armsight.app.identify_run import Run
 from armsight.loop.identify.identify import contributions
 from armsight.loop.identify.model import Parameter
+from armsight.loop.identify.play import Play, plays
 
 
 def headline(run: Run) -> str:
@@ -30,8 +31,8 @@ def value_text(p: Parameter, value: float) -> str:
     return f"{100 * value:.4f} %"
 
 
-def text(run: Run) -> str:
-    """Return everything that is printed after the headline."""
+def text(run: Run, *, everything: bool = False) -> str:
+    """Return what is printed after the headline; with ``everything`` also why the rest was not fitted."""
     found = run.found
     noise = f"noise {1e3 * found.solution.noise[0]:.3f} mm"
     if found.model.full:
@@ -50,14 +51,27 @@ def text(run: Run) -> str:
         if found.solution.free[k] and p.kind not in ("base", "tool"):
             value, sigma = found.value(p.name)
             row = (value_text(p, nominal[k]), value_text(p, value), value_text(p, sigma))
-            tied = "  tied" if p.name in found.reasons else ""
+            tied = "  with others (-v)" if p.name in found.reasons and not everything else ""
             lines.append(f"  {p.name:<12} {row[0]:>16} {row[1]:>16} {row[2]:>14}{tied}")
-    lines += _not_fitted(run)
+    lines += ["", "play of each joint, stop to stop:"]
+    lines += [f"  joint {p.joint + 1}  {_play_text(p)}" for p in plays(found, run.measured)]
+    left = sum(
+        not free and p.kind not in ("base", "tool")
+        for p, free in zip(found.model.parameters, found.solution.free, strict=True)
+    )
+    lines += _not_fitted(run) if everything else ["", f"{left} more parameters were not fitted; -v says why"]
     pairs = found.correlated()
     if pairs:
         lines += ["", "correlations over 0.9 (more varied poses tell them apart):"]
         lines += [f"  {a} and {b}: {c:+.3f}" for a, b, c in pairs]
     return "\n".join(lines)
+
+
+def _play_text(play: Play) -> str:
+    """Return a joint's play, and what showed it."""
+    if not np.isfinite(play.value_rad):
+        return play.how
+    return f"{np.degrees(play.value_rad):.3f} +- {np.degrees(play.sigma_rad):.3f} deg, by {play.how}"
 
 
 def _not_fitted(run: Run) -> list[str]:

@@ -18,6 +18,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
+from armsight.robot.arm_nearby import untilted
 from armsight.robot.checks import DEGREES, angle_refusal, angles_of, near_angles, pose_refusal, poses_of
 from armsight.robot.kinematics import chain, inverse, lanes
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
@@ -106,6 +107,8 @@ class Arm(Record):
             modified=self.convention == "modified",
         )
         closed, exact = recognised(table)
+        if not exact:
+            closed, _ = recognised(untilted(table))
         table[KIND] = closed[KIND] if exact else NEITHER
         object.__setattr__(self, "table", table)
         object.__setattr__(self, "_closed", closed)

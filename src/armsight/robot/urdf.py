@@ -51,7 +51,11 @@ def read_urdf(path: str | Path, *, tool_link: str | None = None) -> Arm:
     Raises:
         InputError: unreadable, malformed, no chain of six revolute joints, or one that no table holds exactly.
     """
-    text = read_text(path)
+    return parse_urdf(read_text(path), path, tool_link=tool_link)
+
+
+def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> Arm:
+    """Read an arm from URDF text; ``path`` is named in errors. Else as :func:`read_urdf`."""
     try:
         robot = ET.fromstring(text)
     except ET.ParseError as error:

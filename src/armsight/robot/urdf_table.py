@@ -20,8 +20,9 @@ from armsight.robot.arm import Arm
 
 #: Two frames differ by rounding below this, m and rad: numbers written with ten digits.
 EXACT = 1e-9
-#: A common normal further away than this many times the chain's length belongs to axes that were meant to be parallel.
-FAR = 100.0
+#: A common normal further away than this many times the chain's length leaves no digits to hold the chain exactly. Nearer
+#: ones do: an identified arm's axes are a little off parallel, and are meant to be.
+FAR = 1e6
 #: Random poses at which the table is held against the chain.
 PROBES = 16
 

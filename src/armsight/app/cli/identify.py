@@ -37,6 +37,7 @@ from armsight.vision.rig import StereoRig
 @click.option(
     "-o", "--out", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the corrected arm and the report."
 )
+@click.option("-v", "--verbose", is_flag=True, help="Say also why what was not fitted was not.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
 def command(
@@ -47,6 +48,7 @@ def command(
     turns: str | None,
     priors: tuple[str, ...],
     out: Path | None,
+    verbose: bool,
     as_json: bool,
 ) -> None:
     """Find what an arm really is: its table, joint zeros, sensors' errors, backlash and sag, each with sigma.
@@ -87,7 +89,7 @@ def command(
         click.echo(json.dumps({**facts, "wall_s": time.perf_counter() - started}))
         return
     click.echo(identify_words.headline(run))
-    click.echo(identify_words.text(run))
+    click.echo(identify_words.text(run, everything=verbose))
     if out is not None:
         click.echo(
             f"\nwritten: {out}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"

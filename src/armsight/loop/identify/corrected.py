@@ -87,21 +87,25 @@ class Corrected(Record):
 
     def urdf(self) -> str:
         """Return URDF text with everything that a URDF can hold: the table with Hayati's angles, base and tool."""
-        arm, beta = self.arm(), self.model.table(self.x)[:, chain.BETA]
-        robot = ET.fromstring(urdf_text(arm))
-        modified = arm.convention == "modified"
-        for i in range(6):
-            place = i if modified else i + 1  # the origin that holds row i's angles
-            if beta[i] == 0.0 or place > 5:
-                continue
-            origin = robot.findall("joint")[place].find("origin")
-            if origin is None:
-                raise InputError(f"{arm.name}: a URDF joint has no origin")
-            before = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy", "").split()])
-            turned = (before * Rotation.from_euler("y", beta[i])).as_euler("xyz")
-            origin.set("rpy", " ".join(repr(float(angle)) for angle in turned))
-        ET.indent(robot)
-        return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+        return tilted_urdf(self.arm(), self.model.table(self.x)[:, chain.BETA])
+
+
+def tilted_urdf(arm: Arm, beta: Array) -> str:
+    """Return an arm with Hayati's angles (6,), rad, after its rows as URDF text, exactly."""
+    robot = ET.fromstring(urdf_text(arm))
+    modified = arm.convention == "modified"
+    for i in range(6):
+        place = i if modified else i + 1  # the origin that holds row i's angles
+        if beta[i] == 0.0:
+            continue
+        origin = robot.findall("joint")[place].find("origin")
+        if origin is None:
+            raise InputError(f"{arm.name}: a URDF joint has no origin")
+        before = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy", "").split()])
+        turned = (before * Rotation.from_euler("y", beta[i])).as_euler("xyz")
+        origin.set("rpy", " ".join(repr(float(angle)) for angle in turned))
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
 def _square(T: Array) -> Array:

@@ -138,7 +138,7 @@ def grown(
 
 
 def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[Step]) -> Mask:
-    """Add what pays only together, as two causes can that hide each other, and give back the causes that it does not need."""
+    """Add what pays only together, as two causes can that hide each other, and give back what is not needed for it."""
     losses, whole = folds.losses(kept), kept.copy()
     for mask in groups.values():
         whole |= mask

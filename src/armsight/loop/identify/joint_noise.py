@@ -1,4 +1,4 @@
-"""How far each joint is off its reading by chance, from pose to pose: play that nothing holds on one side, jitter, hysteresis.
+"""How far each joint is off its reading by chance, from pose to pose: play that nothing holds on one side, jitter.
 
 Where the instrument's covariance is known, what residuals show beyond it is laid to the joints: each moves the body along
 its own column of the Jacobian, and a joint that lies anywhere in its play then spoils nothing but its own direction. The
@@ -90,7 +90,7 @@ def by_joints(model: Model, J: Array) -> Array:
 
 
 def _expected(e: Array, B: Array, variance: Array, measured: Measured) -> tuple[Array, Array]:
-    """Return mean (N, K) and variance (N, K) of every source at every pose, given the residuals; predicted is too large by it."""
+    """Return mean (N, K) and variance (N, K) of every source at every pose, given the residuals."""
     assert measured.cov is not None  # for the type checker: nothing is laid to the joints without
     S = measured.cov + (B * variance) @ B.swapaxes(1, 2)
     gain = variance[:, None] * np.linalg.solve(S, B).swapaxes(1, 2)

@@ -23,6 +23,7 @@ import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import read_text
+from armsight.loop.identify.identified_file import identified_arm
 from armsight.robot.arm import Arm
 from armsight.robot.models import open_arm
 from armsight.robot.urdf import read_urdf
@@ -66,7 +67,7 @@ def read_model(path: str | Path) -> Arm:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not TOML: {error}") from None
     if "identified" in given:
-        raise InputError(f"{path}: is the result of an identification; give the nominal arm that it was made from")
+        return identified_arm(path, given)
     rows = given.pop("joint", None)
     if not isinstance(rows, list) or len(rows) != 6 or not all(isinstance(row, dict) for row in rows):
         raise InputError(

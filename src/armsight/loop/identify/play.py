@@ -1,9 +1,9 @@
 """How much play each joint has, put together from all that shows it, or why these poses do not show it.
 
-Play shows where a joint comes to rest on both of its sides. Friction leaves a joint without weight on the side it came from
-(``backlash``); weight lays a joint on the side it pulls to (``slack``), whichever way it came; a joint that neither holds lies
-anywhere between its stops, and from how far apart it was found its play is read. A joint that weight holds on one side at all
-poses shows none: its play is a part of its zero.
+Play shows where a joint comes to rest on both of its sides. Friction leaves a joint without weight on the side it came
+from (``backlash``); weight lays a joint on the side it pulls to (``slack``), whichever way it came; a joint that neither
+holds lies anywhere between its stops, and its play is read from how far apart it was found. A joint that weight holds on
+one side at all poses shows none: its play is a part of its zero.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import norm
 
 from armsight.data import Array
 from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.joint_noise import joint_noise, with_joint_noise
+from armsight.loop.identify.joint_noise import by_joints, joint_noise, with_joint_noise
 from armsight.loop.identify.measured import Measured
 
-#: A joint scatters by itself where its chance is more than this many times as large as what one pose tells of it.
+#: A joint lies anywhere in its play where its chance is more than this many times as large as what one pose tells of it,
 LOOSE = 2.0
+#: and more than this part of what its two sides differ by: evenly anywhere between the stops it would be 0.29.
+LOOSE_SHARE = 0.12
 #: Of a pose's side: less than this part of the poses on one side are too few to show it.
 BOTH_SIDES = 0.02
 
@@ -55,23 +59,66 @@ def plays(found: Identified, measured: Measured) -> tuple[Play, ...]:
     out = []
     for i in range(6):
         columns = [k for k, f in enumerate(model.features) if f.joint == i and f.kind in ("backlash", "slack")]
-        if off is not None and found.joint_sigma_rad[i] > LOOSE * float(np.median(off.sigma_off_rad[:, i])):
-            stood = off.off_rad[:, i] + phi[:, columns] @ x[[model.causes_at + k for k in columns]]
-            out.append(_between_stops(i, stood, off.sigma_off_rad[:, i]))
+        carries = bool(phi[:, [k for k in columns if model.features[k].kind == "slack"]].any())
+        fitted = float(np.abs(x[[model.causes_at + k for k in columns]]).max(initial=0.0))
+        chance = float(found.joint_sigma_rad[i])
+        known = np.inf if off is None else LOOSE * float(np.median(off.sigma_off_rad[:, i]))
+        if off is not None and not carries and chance > max(known, LOOSE_SHARE * fitted):
+            # What was expected of it is taken back out of where it was found (Kalman's gain), and its own noise stays.
+            left = off.sigma_off_rad[:, i] ** 2
+            gain = 1 - left / chance**2
+            side = phi[:, columns] @ x[[model.causes_at + k for k in columns]]
+            noise = left / gain + _by_parameters(found, weighed, i)
+            out.append(_between_stops(i, off.off_rad[:, i] / gain + side, np.sqrt(noise)))
         else:
             out.append(_fitted(found, i, columns, phi))
     return tuple(out)
 
 
-def _between_stops(joint: int, stood: Array, sigma: Array) -> Play:
-    """Read the play of a joint that lies anywhere, from how far apart it was found."""
-    order = np.argsort(stood)
-    ends = [order[[0, 1, 2]], order[[-1, -2, -3]]]
-    extent = float(stood[ends[1][0]] - stood[ends[0][0]])
-    # What the outermost three differ by is how well an end is known, and what one pose tells of it.
-    spread = [float(np.ptp(stood[rows])) for rows in ends]
-    told = float(np.sqrt(np.sum(np.square(spread)) / 4 + np.sum(sigma[[ends[0][0], ends[1][0]]] ** 2)))
-    return Play(joint, extent, told, "nothing holds it on one side: from how far apart it was found")
+def _by_parameters(found: Identified, weighed: Measured, joint: int) -> Array:
+    """Return the variance (N,), rad^2, of where a joint stood that comes from the parameters' own."""
+    assert weighed.cov is not None  # for the type checker: a joint's chance is known only with it
+    model = found.model
+    J = model.linearised(found.solution.x, weighed, model.feature_values(weighed.q, weighed.approach))[1]
+    B = by_joints(model, J)[:, :, joint]
+    pull = np.linalg.solve(weighed.cov + 1e-18 * np.eye(weighed.size), B[..., None])[..., 0]
+    row = np.einsum("nm,nmp->np", pull, J) / np.einsum("nm,nm->n", pull, B)[:, None]
+    return np.asarray(np.einsum("np,pq,nq->n", row, found.cov, row))
+
+
+def _between_stops(joint: int, stood: Array, noise: Array) -> Play:
+    """Read the play of a joint that lies at its stops or anywhere between, by the greatest likelihood.
+
+    Args:
+        joint: which.
+        stood: (N,) where it stood, rad.
+        noise: (N,) sigma of these.
+    """
+
+    def cost(at: Array) -> float:
+        middle, half, stops = at[0], np.exp(at[1]), 1 / (1 + np.exp(-at[2]))  # the share that lies at a stop
+        left, right = (middle - half - stood) / noise, (middle + half - stood) / noise
+        between = (norm.cdf(right) - norm.cdf(left)) / (2 * half)
+        ends = (norm.pdf(left) + norm.pdf(right)) / (2 * noise)
+        return -float(np.log(stops * ends + (1 - stops) * between + 1e-12 / noise).sum())
+
+    extent = float(np.ptp(stood))
+    start = np.array([float(np.median(stood)), np.log(extent / 2), 0.0])
+    best = minimize(cost, start, method="Nelder-Mead", tol=1e-6)
+    half, step = float(np.exp(best.x[1])), 0.02
+
+    def beside(by: float) -> float:
+        """Return the least cost with another play, the rest free."""
+
+        def other(v: Array) -> float:
+            return cost(np.array([v[0], best.x[1] + by, v[1]]))
+
+        return float(minimize(other, best.x[[0, 2]], method="Nelder-Mead", tol=1e-6).fun)
+
+    around = [beside(-step), beside(step)]
+    curve = max((sum(around) - 2 * best.fun) / step**2, 1e-3)
+    told = "how far apart it was found, as nothing holds it on one side"
+    return Play(joint, 2 * half, 2 * half / float(np.sqrt(curve)), told)
 
 
 def _fitted(found: Identified, joint: int, columns: list[int], phi: Array) -> Play:

@@ -11,6 +11,9 @@ from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.identify import chain
 from armsight.loop.identify.identify import Identified
 
+#: Attribute of the arm -> its unit: what an identification leaves as it was, so that the file holds the whole arm.
+LIMITS = {"q_min": "rad", "q_max": "rad", "qd_max": "rad_s", "qdd_max": "rad_s2", "qddd_max": "rad_s3", "home": "rad"}
+
 
 def table_text(found: Identified) -> str:
     """Return the corrected arm as TOML, m and rad; every value with its sigma."""
@@ -31,6 +34,8 @@ def table_text(found: Identified) -> str:
             unit = "m" if c in (chain.D, chain.A) else "rad"
             lines.append(f"{column}_{unit} = {float(table[i, c])!r}")
             lines.append(f"sigma_{column}_{unit} = {float(sigma[i, c])!r}")
+        for key, unit in LIMITS.items():
+            lines.append(f"{key}_{unit} = {float(getattr(model.arm, key)[i])!r}")
     for k, feature in enumerate(model.features):
         at = model.causes_at + k
         if found.solution.free[at]:
