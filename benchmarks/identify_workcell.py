@@ -3,8 +3,8 @@
     python benchmarks/identify_workcell.py [seeds]
 
 Each pose is come to over its last 0.6 degrees in 1.5 s, from a side drawn for each joint, so that friction says where a
-joint without weight lies in its play. What is seen is the true pose with the noise that the cell's cameras have (0.03 mm, 0.004
-degrees); the images themselves are not drawn here.
+joint without weight lies in its play. What is seen is the true pose with the noise that the cell's cameras have (0.03 mm,
+0.004 degrees); the images themselves are not drawn here.
 """
 
 from __future__ import annotations
