@@ -1,8 +1,9 @@
 """A workcell as devices are: its board behind a pseudo-terminal, its cameras stamped by another clock, time of its own.
 
-The board's clock goes on by itself, a millisecond at a time and never faster than real time; where the machine is loaded it
-goes slower, so that nothing hangs on how fast the machine is. It does not wait for the host: what the host does not read in
-time is lost, and a host that is silent for 100 of its milliseconds is silent. The host's clock is tied to it.
+The board's clock goes on by itself, a millisecond at a time and not faster than real time; where the machine is loaded
+it goes slower. It does not wait for the host: what the host does not read in time is lost, and a host that is silent for
+SILENT_TICKS stops the arm. That is four times what boards usually allow, because on a loaded machine the host's thread
+may not run for a while; the calibrations take longer still. The host's clock is tied to the board's.
 """
 
 import contextlib
@@ -17,10 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from armsight.errors import DeviceError
+from armsight.robot.boards.opening import configured
 from armsight.sim.workcell import Workcell
 
 #: The host's clock when the board's is 0, s; by how much it is faster; how far stamps are off, s.
 OFFSET_S, DRIFT, JITTER_S = 12345.678, 50e-6, 2e-4
+SILENT_TICKS = 400
 
 
 class PtyCell:
@@ -28,6 +31,9 @@ class PtyCell:
 
     def __init__(self, **options):
         self.cell = Workcell(machine="host", **options)
+        config = self.cell.board.configuration()
+        config["silence_ticks"] = SILENT_TICKS
+        configured(self.cell.link, config)
         self.lock = threading.Lock()
         self.master, self.slave = pty.openpty()
         tty.setraw(self.slave)
@@ -46,7 +52,7 @@ class PtyCell:
 
     def _run(self):
         link = self.cell.link
-        while not self._stop.wait(0.0004):
+        while not self._stop.wait(0.0005):
             ready, _, _ = select.select([self.master], [], [], 0)
             try:
                 with self.lock:
@@ -59,11 +65,16 @@ class PtyCell:
             except (OSError, DeviceError):
                 return
 
-    def close(self):
+    def pull(self):
+        """Pull the cable: the port is gone."""
         self._stop.set()
         self._thread.join()
         os.close(self.slave)
         os.close(self.master)
+
+    def close(self):
+        if not self._stop.is_set():
+            self.pull()
         self.cell.close()
 
 

@@ -1,18 +1,23 @@
 """The loop of a run on a board and cameras that are made up: how it ends when something goes wrong."""
 
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from armsight.app import experiment
+from armsight.app import experiment, run_calibrate
 from armsight.app.experiment import run_experiment
 from armsight.app.motion_file import QUICK, read_motions
 from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
 from armsight.app.run_motions import Planned
 from armsight.app.run_station import Station
 from armsight.data import JointStates, Missed, Shot
-from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator
 from armsight.robot.boards.codes import State
 from armsight.robot.models import open_arm
@@ -51,7 +56,7 @@ class Blind:
         return Missed("nothing is seen")
 
 
-def station(board, last_shot_s=np.inf):
+def station(board, last_shot_s=np.inf, clock=None):
     """Cameras at 60 Hz that send nothing more from a time on."""
     newest = [0]
 
@@ -63,7 +68,7 @@ def station(board, last_shot_s=np.inf):
         return Shot(str(number), None, None, board.t_s)
 
     target = SimpleNamespace(body=SimpleNamespace(name="the body"))
-    return Station(ARM, board, poll, target, lambda q: np.zeros(6), 60.0, 0.0)
+    return Station(ARM, board, poll, target, lambda q: np.zeros(6), 60.0, 0.0, clock)
 
 
 def looped(board, **given):
@@ -119,3 +124,126 @@ def test_between_the_passes_the_arm_goes_back_to_the_start_by_a_way_of_its_own()
     experiment._to_start(loop, station(board), plan)
     q = np.array([end] + [command.q_ref for command in board.sent] + [plan.start])
     assert (np.abs(np.diff(q, axis=0)) <= ARM.qd_max * PERIOD_S + 1e-6).all()
+
+
+class Live:
+    """A clock that is the board's: time passes by itself."""
+
+    def heard(self, board_s):
+        pass
+
+    def on_board(self, shot):
+        return shot
+
+
+def test_the_loop_goes_on_while_something_is_computed():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    before = len(board.sent)
+
+    def work():
+        while len(board.sent) < before + 50:  # takes until the board has heard so often of the loop
+            time.sleep(0.001)
+        return 42
+
+    assert loop.compute(work) == 42
+    assert all((command.qd_ref == 0).all() for command in board.sent[before:])
+    assert all(np.allclose(command.q_ref, ARM.home) for command in board.sent[before:])
+    with pytest.raises(ZeroDivisionError):
+        loop.compute(lambda: 1 / 0)
+
+
+def test_in_lock_step_no_time_passes_while_something_is_computed():
+    board = Standing()
+    loop = looped(board)
+    stand(loop, 0.1)
+    t_s, sent = board.t_s, len(board.sent)
+    assert loop.compute(lambda: 42) == 42
+    assert (board.t_s, len(board.sent)) == (t_s, sent)
+
+
+def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    ended = threading.Event()
+
+    def work():
+        board.status.state = State.HOLDING
+        ended.wait(10.0)
+
+    with pytest.raises(DeviceError, match="went over to HOLDING"):
+        loop.compute(work)
+    ended.set()
+
+
+def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
+    board = Standing()
+    slow = SimpleNamespace(rig=None)
+
+    def measure(shot):
+        sent = len(board.sent)
+        while len(board.sent) < sent + 20:
+            time.sleep(0.001)
+        return Missed("searched in vain")
+
+    slow.measure = measure
+    loop = Loop(station(board, clock=Live()), slow, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    stand(loop, 1.0)
+    assert len(board.sent) >= 250
+    assert 1 <= len(loop.log.poses) <= len(board.sent) / 20
+    names = [name for name, _, _ in loop.log.poses]
+    still = point_to_point(ARM, ARM.home, ARM.home)
+    planned = Planned(still, loop.t_s, lambda q: np.zeros(6))
+    loop.run_until_seen(
+        planned, 0.02, Segment("calibration", "", "", False)
+    )  # what was begun before is not taken for it
+    (name,) = [name for name, _, _ in loop.log.poses[len(names) :]]
+    assert int(name) >= 60
+    assert board.t_s > 1.02
+
+
+def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatch):
+    board = Standing()
+
+    def fails(loop, *_):
+        stand(loop, 0.1)
+        raise KeyboardInterrupt
+
+    send = board.send
+
+    def sent(command):
+        if command.duration_s > 0.1:
+            os.kill(os.getpid(), signal.SIGINT)
+        send(command)
+
+    monkeypatch.setattr(board, "send", sent)
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "_require_seen", fails)
+    outcome = run_experiment(station(board), None, read_motions(ARM), ARM.home[None], progress=lambda line: None)
+    assert outcome.interrupted
+    assert board.sent[-1].duration_s == pytest.approx(0.3)
+    assert board.t_s > 0.4
+
+
+def test_where_time_passes_by_itself_the_stop_is_said_again_and_again():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    before = len(board.sent)
+    loop.stop()
+    durations = [command.duration_s for command in board.sent[before:]]
+    assert durations == pytest.approx(np.arange(0.3, 0.0, -PERIOD_S))
+
+
+def test_slow_cameras_are_given_a_longer_sweep(monkeypatch):
+    board = Standing()
+    loop = looped(board)
+    loop.mounting = SimpleNamespace()
+    slow = replace(loop.station, rate_hz=4.0)
+    monkeypatch.setattr(loop, "station", slow)
+    with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as told:
+        run_calibrate.find_delay(loop, ARM, ARM.home, ARM.home, lambda q: np.zeros(6))
+    assert "slower than 4 Hz" in str(told.value)

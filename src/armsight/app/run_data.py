@@ -104,8 +104,8 @@ def joints_of(log: Log) -> tuple[Array, Array, Array]:
     q = np.concatenate([s.q for s in log.joints])
     q_wanted = np.full_like(q, np.nan)
     for segment in log.segments:
-        if segment.trajectory is not None:
-            rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
+        rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
+        if segment.trajectory is not None and rows.any():
             since = t_s[rows] - segment.begin_s
             q_wanted[rows] = segment.trajectory.at(
                 since + (segment.trajectory.duration_s if _rests(segment) else 0.0)

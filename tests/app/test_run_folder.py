@@ -1,0 +1,146 @@
+"""A run's folder when the disk is full, the keyboard interrupts, or a figure is not known."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from armsight.app import run_files, run_folder
+from armsight.app.experiment import Outcome
+from armsight.app.run_files import write_shots
+from armsight.app.run_folder import Finished, finish, make_room, write_run
+from armsight.data import Body, JointStates, Missed, Shot
+from armsight.errors import ArmsightError, DeviceError, InputError
+
+BODY = Body("plate", ("A", "B", "C"), np.eye(3))
+
+
+def finished(readings=400, **said):
+    """A run that was broken off before the cameras were found."""
+    outcome = Outcome(BODY)
+    t_s = 1e-3 * np.arange(readings)
+    outcome.log.joints.append(JointStates(t_s, np.random.default_rng(0).standard_normal((readings, 6))))
+    outcome.log.poses.append(("000000", 0.1, Missed("nothing is seen")))
+    for name, value in said.items():
+        setattr(outcome, name, value)
+    facts = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
+    return Finished(SimpleNamespace(), None, outcome, SimpleNamespace(), None, facts, time.perf_counter(), [], None)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 96 kB."""
+    place = tmp_path / "small"
+    place.mkdir()
+    told = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", place]
+    mounted = subprocess.run(told, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", place], check=True)
+
+
+def test_what_is_not_known_is_null(tmp_path):
+    summary = write_run(finished(), tmp_path)
+    text = (tmp_path / "summary.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail) == summary
+    assert summary["sigma_m"] is None
+    assert summary["values"] == [1.0, None]
+    assert summary["count"] == 3
+    assert summary["said"] is True
+    assert summary["ended_by"] is None
+    assert list(summary) == ["arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
+
+
+def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
+    nothing = finished(interrupted=True)
+    nothing.outcome.log.joints.clear()
+    nothing.outcome.log.poses.clear()
+    with pytest.raises(KeyboardInterrupt):
+        finish(nothing, tmp_path)
+    assert json.loads((tmp_path / "summary.json").read_text())["ended_by"] == "interrupted"
+
+
+def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
+    gone = DeviceError("left camera: gone")
+    with pytest.raises(InputError) as told:
+        finish(finished(readings=4000, ended_by=gone), small_disk)
+    said = str(told.value)
+    assert "\n" not in said
+    assert said.startswith("left camera: gone; the arm was stopped, and not all could be written: ")
+    assert f"{small_disk / 'joints.csv'}: cannot be written: No space left on device" in said
+    assert said.endswith(f"what was written before is in {small_disk}")
+    assert json.loads((small_disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
+    assert list(csv.reader((small_disk / "poses.csv").read_text().splitlines()))
+    assert {path.name for path in small_disk.iterdir()} == {"summary.json", "poses.csv"}
+
+
+def shots(count):
+    rng = np.random.default_rng(1)
+    return [Shot(f"{n:06d}", *(rng.integers(0, 255, (2, 60, 80), np.uint8)), 0.1 * n) for n in range(count)]
+
+
+def test_shots_are_a_recording_or_are_not_there(small_disk, tmp_path):
+    write_shots(tmp_path / "shots", shots(3))
+    assert len((tmp_path / "shots" / "shots.csv").read_text().splitlines()) == 4
+    with pytest.raises(InputError, match=rf"{small_disk}/shots/\S+\.png: cannot be written: No space left"):
+        write_shots(small_disk / "shots", shots(30))
+    assert list(small_disk.iterdir()) == []
+    write_shots(tmp_path / "none", [])
+    assert not (tmp_path / "none").exists()
+
+
+def test_an_interrupt_while_shots_are_written_leaves_none_by_half(tmp_path, monkeypatch):
+    def interrupted(source, folder):
+        folder.mkdir()
+        (folder / "left000000.png").write_bytes(b"half")
+        return SimpleNamespace(directory=folder, interrupted=True, stopped="interrupted")
+
+    monkeypatch.setattr(run_files, "record", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_shots(tmp_path / "shots", shots(1))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_while_writing_waits_until_what_was_measured_is_there(tmp_path, monkeypatch):
+    write = run_folder.write_columns
+
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        write(*arguments)
+
+    monkeypatch.setattr(run_folder, "write_columns", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_run(finished(), tmp_path)
+    assert {"joints.csv", "joints.parquet", "poses.csv", "summary.json"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_what_ended_a_run_is_told_with_where_the_rest_is(tmp_path):
+    with pytest.raises(ArmsightError) as told:
+        finish(finished(ended_by=DeviceError("the board is gone")), tmp_path)
+    assert str(told.value) == f"the board is gone; the arm was stopped; what was measured until then is in {tmp_path}"
+
+
+def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
+    for name in ("report.html", "vision.csv", "vision.parquet", "errors.png", "summary.json", "mine.txt", "rig.json"):
+        (tmp_path / name).write_text("x")
+    (tmp_path / "shots").mkdir()
+    (tmp_path / "shots" / "shots.csv").write_text("x")
+    make_room(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.txt", "rig.json"}
+
+
+def test_what_cannot_make_room_is_named(tmp_path):
+    (tmp_path / "run.log").mkdir()  # a folder in a file's place
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(InputError, match=r"run\.log: an earlier run's file cannot be removed"):
+        make_room(tmp_path)
+    assert (tmp_path / "summary.json").exists()
