@@ -50,9 +50,9 @@ class Standing:
 class Blind:
     """A follower that sees nothing."""
 
-    rig = None
+    rig, way = None, "followed"
 
-    def measure(self, shot):
+    def measure(self, shot, expected=None):
         return Missed("nothing is seen")
 
 
@@ -180,9 +180,9 @@ def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
 
 def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     board = Standing()
-    slow = SimpleNamespace(rig=None)
+    slow = SimpleNamespace(rig=None, way="followed")
 
-    def measure(shot):
+    def measure(shot, expected=None):
         sent = len(board.sent)
         while len(board.sent) < sent + 20:
             time.sleep(0.001)

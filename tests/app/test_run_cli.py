@@ -1,0 +1,134 @@
+"""``armsight run`` typed wrong, and on the workcell."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from armsight.app import run_calibrate
+from armsight.app.cli import run as command
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.machines import open_machine
+from armsight.sim.workcell import Workcell
+from cli_runs import refused
+
+MOTION = """
+[[motion]]
+kind = "joints"
+name = "there"
+q_deg = [10.0, -46.6, 74.2, -14.7, -104.4, 5.0]
+rest_s = 0.5
+"""
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Files of the workcell that ``sim:`` opens, small cameras."""
+    try:
+        open_machine("host").close()
+    except (DeviceError, InputError) as error:
+        pytest.skip(f"the firmware is not built: {error}")
+    folder = tmp_path_factory.mktemp("files")
+    with Workcell(arm="worn", cameras="640x360@30", machine="host") as cell:
+        cell.truth.rig.save(folder / "rig.json")
+        (folder / "body.toml").write_text(cell.body_text)
+    (folder / "motion.toml").write_text(MOTION)
+    return folder
+
+
+def arguments(files, out, *more, source="sim:640x360@30", board="emulated:host", rig="rig.json", target="body.toml"):
+    named = ("--rig", files / rig, "--target", files / target, "--motion", files / "motion.toml")
+    return ("run", "--source", source, "--board", board, *named, "-o", out, *more)
+
+
+def test_the_workcell_by_name_is_run_as_devices_are(armsight, files, tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "_HANDEYE_POSES", 12)
+    monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.0)
+    said = armsight(*arguments(files, tmp_path / "run", "--open-loop", "--json"))
+    assert said.code == 0, said.err
+    assert said.err == ""
+    (summary,) = said.lines
+    assert summary["ended_by"] is None
+    assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=1e-3)
+    assert not (tmp_path / "run" / "truth.csv").exists()  # no more is known than of devices
+    assert (tmp_path / "run" / "report.html").exists()
+    assert (tmp_path / "run" / "body.toml").read_text() == (files / "body.toml").read_text()
+    assert "as planned" in (tmp_path / "run" / "run.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("source", "board"), [("sim:", "serial:/dev/ttyACM0"), ("usb:0,1", "emulated:"), ("usb:0,1", "emulated:host")]
+)
+def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, board):
+    said = armsight(*arguments(files, tmp_path / "run", source=source, board=board))
+    refused(said, f"--source {source} --board {board}", "go together")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"rig": "none.json"}, ("none.json", "no such file")),
+        ({"rig": "motion.toml"}, ("motion.toml",)),
+        ({"target": "none.toml"}, ("none.toml", "no such file")),
+        ({"board": "emulated:cray"}, ("cray", "emulated:host")),
+        ({"source": "sim:big"}, ("big", "WIDTHxHEIGHT@HZ")),
+        ({"source": "usb:0,1", "board": "serial:/dev/ttyNONE"}, ("/dev/ttyNONE", "no such port")),
+        ({"source": "usb:0,1", "board": "can:0"}, ("can:0", "serial:PORT")),
+    ],
+)
+def test_what_is_not_there_is_named(armsight, files, tmp_path, given, words):
+    refused(armsight(*arguments(files, tmp_path / "run", **given)), *words)
+
+
+def test_a_rig_that_was_never_calibrated(armsight, files, tmp_path):
+    rig = json.loads((files / "rig.json").read_text())
+    (tmp_path / "half.json").write_text(json.dumps({key: rig[key] for key in list(rig)[:2]}))
+    said = armsight(*arguments(files, tmp_path / "run", rig=tmp_path / "half.json"))
+    refused(said, "half.json")
+
+
+def test_another_arm_than_the_boards(armsight, files, tmp_path):
+    (tmp_path / "far.toml").write_text("start_deg = [40, 0, 0, 0, -90, 0]\n" + MOTION)
+    said = armsight(*arguments(files, tmp_path / "run", "--motion", tmp_path / "far.toml"))
+    refused(said, "joint 1 reads", "the motion starts at 40.0", "--model six_r")
+
+
+def test_a_run_where_a_file_stands_and_one_over_a_strangers_shots(armsight, files, tmp_path):
+    (tmp_path / "run").write_text("mine")
+    refused(armsight(*arguments(files, tmp_path / "run")), tmp_path / "run")
+    (tmp_path / "other" / "shots").mkdir(parents=True)
+    refused(armsight(*arguments(files, tmp_path / "other")), "holds shots that are of no earlier run")
+
+
+@pytest.mark.parametrize("stage", ["opening the devices", "making ready", "hand-eye: pose 1 "])
+def test_ctrl_c_before_and_in_motion(armsight, files, tmp_path, monkeypatch, stage):
+    steps = command.steps
+
+    class Told:
+        def __enter__(self):
+            self.shown = steps()
+            progress = self.shown.__enter__()
+
+            def told(line):
+                progress(line)
+                if line.startswith(stage):
+                    os.kill(os.getpid(), signal.SIGINT)
+
+            return told
+
+        def __exit__(self, *ended):
+            return self.shown.__exit__(*ended)
+
+    monkeypatch.setattr(command, "steps", Told)
+    said = armsight(*arguments(files, tmp_path / "run"))
+    assert said.code == 130
+    assert said.err.splitlines()[-1] == "armsight: interrupted"
+    assert "Traceback" not in said.err
+    if stage != "opening the devices":
+        assert json.loads((tmp_path / "run" / "summary.json").read_text())["ended_by"] == "interrupted"
+        assert f"what was measured until then is in {tmp_path / 'run'}" in said.err
+    if stage.startswith("hand-eye"):
+        joints = np.loadtxt(tmp_path / "run" / "joints.csv", delimiter=",", skiprows=1)
+        assert len(joints) > 300
