@@ -1,7 +1,9 @@
 """The loop of a run on a board and cameras that are made up: how it ends when something goes wrong."""
 
+import gc
 import os
 import signal
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -13,6 +15,7 @@ import pytest
 from armsight.app import experiment, run_calibrate
 from armsight.app.experiment import run_experiment
 from armsight.app.motion_file import QUICK, read_motions
+from armsight.app.run_beside import beside, steady, uninterrupted
 from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
 from armsight.app.run_motions import Planned
 from armsight.app.run_station import Station
@@ -247,3 +250,39 @@ def test_slow_cameras_are_given_a_longer_sweep(monkeypatch):
     with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as told:
         run_calibrate.find_delay(loop, ARM, ARM.home, ARM.home, lambda q: np.zeros(6))
     assert "slower than 4 Hz" in str(told.value)
+
+
+def test_an_interrupt_does_not_wait_for_what_is_being_computed():
+    ended, waited = threading.Event(), []
+
+    def meanwhile(done):
+        assert not done()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        beside(lambda: waited.append(ended.wait(10.0)), meanwhile)
+    assert waited == []
+    ended.set()
+
+
+def test_what_makes_a_loop_wait_is_put_back_afterwards():
+    before = sys.getswitchinterval()
+    with steady():
+        assert sys.getswitchinterval() < before
+        assert gc.get_freeze_count() > 1000
+    assert sys.getswitchinterval() == before
+    assert gc.get_freeze_count() == 0
+
+
+def test_interrupts_are_held_back_and_told():
+    with uninterrupted() as held:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.001)  # a place where it would have come
+    assert held == [signal.SIGINT]
+    with pytest.raises(KeyboardInterrupt):
+        raised()
+
+
+def raised():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10.0)
