@@ -19,7 +19,7 @@ from armsight.app.run_beside import Still, Watch, beside
 from armsight.app.run_skew import Skew
 from armsight.app.run_station import Station
 from armsight.app.run_tracks import ToolTrack
-from armsight.data import JointCommand, JointStates, Missed, PoseEstimate, Shot
+from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
 from armsight.loop.estimators import ArmEstimate, Estimator, KalmanEstimator, Mounting, Verdict
 from armsight.robot.boards.codes import State
@@ -124,7 +124,8 @@ class Loop:
         self._shot_s = -np.inf
         self._skew = Skew(follower.rig, station.sync_s)
         self._written_s = -np.inf
-        self._watch = Watch(follower.measure, PERIOD_S)
+        self._watch = Watch(self._measured, PERIOD_S)
+        self._expected: Array | None = None  # where a lost body should be in the shot that is looked at
         # Of the host's clock, s: when the next turn is due, and when the shot that is looked at was taken up.
         self._due = self._taken_s = 0.0
         while not log.joints:
@@ -192,7 +193,7 @@ class Loop:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
         if self.station.clock is None:
             newest = self._newest()
-            looked = None if newest is None else (newest, self.follower.measure(newest))
+            looked = None if newest is None else (newest, self._measured(newest))
         else:
             looked = self._watch.take(self._newest)
         if looked is not None or self._watch.busy:
@@ -209,10 +210,16 @@ class Loop:
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
         return shot, self._taken_s, result
 
+    def _measured(self, shot: Shot) -> PoseEstimate | Missed:
+        return self.follower.measure(shot, self._expected)
+
     def _newest(self) -> Shot | None:
         """Return the newest shot, where there is one, on the board's clock."""
         shot, clock = self.station.poll(), self.station.clock
         self._taken_s = time.perf_counter()
+        self._expected = None
+        if shot is not None and self.mounting is not None and self.follower.way == "lost":
+            self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
         return shot if shot is None or clock is None else clock.on_board(shot)
 
     def run(self, controller: Controller, duration_s: float, segment: Segment, *, watch: bool = True) -> None:

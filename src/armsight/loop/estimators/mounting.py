@@ -35,6 +35,10 @@ class Mounting(Record):
         """Return what a hand-eye calibration (eye to hand) of an arm found."""
         return Mounting(handeye.T_base_rig, inverse(arm.T_flange_tool) @ handeye.T_flange_body, handeye.cov)
 
+    def body(self, T_base_tool: Array) -> Array:
+        """Return T_left_body (4, 4) with the tool at a pose (4, 4), m."""
+        return np.asarray(inverse(self.T_base_rig) @ T_base_tool @ self.T_tool_body)
+
     def sighting(self, pose: PoseEstimate, t_s: float) -> Sighting:
         """Carry what vision measured over to the tool.
 
