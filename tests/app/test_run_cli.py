@@ -31,14 +31,14 @@ def files(tmp_path_factory):
     except (DeviceError, InputError) as error:
         pytest.skip(f"the firmware is not built: {error}")
     folder = tmp_path_factory.mktemp("files")
-    with Workcell(arm="worn", cameras="640x360@30", machine="host") as cell:
+    with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
         cell.truth.rig.save(folder / "rig.json")
         (folder / "body.toml").write_text(cell.body_text)
     (folder / "motion.toml").write_text(MOTION)
     return folder
 
 
-def arguments(files, out, *more, source="sim:640x360@30", board="emulated:host", rig="rig.json", target="body.toml"):
+def arguments(files, out, *more, source="sim:640x360@12", board="emulated:host", rig="rig.json", target="body.toml"):
     named = ("--rig", files / rig, "--target", files / target, "--motion", files / "motion.toml")
     return ("run", "--source", source, "--board", board, *named, "-o", out, *more)
 
