@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
+from armsight.loop.identify.model_file import open_model
+from armsight.robot.models import open_arm
 from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
@@ -41,6 +43,7 @@ class Demo:
         machine: what runs the firmware.
         rig: parallel or verging.
         quick: fewer calibration shots and motions, and no studies.
+        model: the table that the arm is believed to have, as ``open_model`` takes it; the one it was built to by default.
     """
 
     folder: Path
@@ -50,6 +53,7 @@ class Demo:
     machine: str = "unicorn"
     rig: str = "parallel"
     quick: bool = False
+    model: str | None = None
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str, Any]:
@@ -65,7 +69,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
     began = time.perf_counter()
     boards, handeyes, study_shots = _AMOUNTS[demo.quick]
     progress("building the workcell")
-    with Workcell(arm=demo.arm, cameras=demo.cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig) as cell:
+    with _cell(demo, demo.cameras) as cell:
         make_room(demo.folder)
         progress("showing the board")
         calibration = calibrated(cell.board_spec, cell.board_shots(boards), progress)
@@ -85,6 +89,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         facts = {
             "seed": demo.seed,
             "arm": demo.arm,
+            "model": demo.model or cell.model.name,
             "cameras": demo.cameras,
             "board": cell.board.welcome.board,
             "machine": demo.machine,
@@ -93,6 +98,16 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
             cell.model, calibration.rig, outcome, plan, _truth(cell, outcome), facts, began, studies, cell.picture()
         )
     return finish(finished, demo.folder)
+
+
+def _cell(demo: Demo, cameras: str) -> Workcell:
+    """Return the workcell of a demo, with some cameras."""
+    believed = None
+    if demo.model is not None:  # its tool is whatever was seen; the motions are of the one that was drawn
+        believed = replace(open_model(demo.model), T_flange_tool=open_arm("six_r").T_flange_tool)
+    return Workcell(
+        arm=demo.arm, cameras=cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig, believed=believed
+    )
 
 
 def station_of(cell: Workcell) -> Station:
@@ -129,9 +144,7 @@ def _studies(
         return []
 
     def at_rate(rate_hz: float) -> Workcell:
-        return Workcell(
-            arm=demo.arm, cameras=cameras_at(demo.cameras, rate_hz), seed=demo.seed, machine=demo.machine, rig=demo.rig
-        )
+        return _cell(demo, cameras_at(demo.cameras, rate_hz))
 
     found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
     return [*found, rate_study(at_rate, station_of, calibration.rig, outcome, plan, progress)]

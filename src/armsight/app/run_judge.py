@@ -80,8 +80,7 @@ def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]
 
 def singular(arm: Arm, q: Array) -> bool:
     """Say whether an arm at joint angles (6,) cannot move its tool in some direction, as far as the loop corrects it."""
-    size_m = float(np.hypot(arm.a, arm.d).sum())
-    J = arm.jacobian(q) / np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])[:, None]
+    J = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])[:, None]
     return bool(np.linalg.svd(J, compute_uv=False)[-1] < EASY)
 
 

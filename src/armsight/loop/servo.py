@@ -121,8 +121,7 @@ class PoseServo:
 
     def __init__(self, arm: Arm, timing: Timing) -> None:
         self.timing = timing
-        size_m = float(np.hypot(arm.a, arm.d).sum())
-        self._arm, self._scale = arm, np.array([size_m, size_m, size_m, 1.0, 1.0, 1.0])
+        self._arm, self._scale = arm, np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])
         self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
         self._correction = np.zeros(6)
         self._goal: Joints | None = None

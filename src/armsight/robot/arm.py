@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from functools import partial
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from armsight.robot.kinematics import chain, inverse, lanes
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
 from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised
-from armsight.robot.kinematics.table import KIND, packed
+from armsight.robot.kinematics.table import BASE, KIND, packed
 from armsight.robot.solutions import ManySolutions, Nearest, Solutions
 
 Convention = Literal["standard", "modified"]
@@ -137,6 +137,12 @@ class Arm(Record):
                 raise InputError(f"{self.name}: {name} is no rigid motion: its 3x3 part is no rotation")
             if (T[3] != (0, 0, 0, 1)).any():
                 raise InputError(f"{self.name}: {name} is no rigid motion: its last row is not 0 0 0 1")
+
+    @cached_property
+    def size_m(self) -> float:
+        """The length of all links together, m: what makes turning and moving of the tool comparable."""
+        rows = untilted(self.table)[:BASE].reshape(6, 6)
+        return float(np.hypot(rows[:, 0], rows[:, 1]).sum())
 
     def forward(self, q: ArrayLike) -> Array:
         """Return where the tool is.

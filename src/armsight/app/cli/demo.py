@@ -26,9 +26,16 @@ from armsight.app.run_tracks import require_pyarrow
     "--board", default="emulated:unicorn", show_default=True, help="emulated:unicorn, emulated:qemu or emulated:host."
 )
 @click.option("--rig", default="parallel", show_default=True, type=click.Choice(["parallel", "verging"]))
+@click.option(
+    "--model",
+    metavar="FILE",
+    help="The table the arm is believed to have, as corrected.toml of armsight identify; else the one it was built to.",
+)
 @click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
-def command(out: Path, seed: int, arm: str, cameras: str, board: str, rig: str, quick: bool, as_json: bool) -> None:
+def command(
+    out: Path, seed: int, arm: str, cameras: str, board: str, rig: str, model: str | None, quick: bool, as_json: bool
+) -> None:
     """Calibrate, measure the moving arm, show who is right, and close the loop, in a simulated workcell.
 
     Real physics, rendered cameras, and the real ARM firmware under emulation; needs no hardware. DIR receives the run:
@@ -44,7 +51,7 @@ def command(out: Path, seed: int, arm: str, cameras: str, board: str, rig: str, 
     open_folder(out)
     try:
         with steps() as progress:
-            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick), progress=progress)
+            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick, model), progress=progress)
     except KeyboardInterrupt:
         click.echo(f"the arm was stopped; what was measured until then is in {out}", err=True)
         raise

@@ -26,9 +26,9 @@ from armsight.app.run_tracks import require_pyarrow
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
+from armsight.loop.identify.model_file import open_model
 from armsight.robot.arm import Arm
 from armsight.robot.boards.opening import EMULATED, emulated_machine, open_board
-from armsight.robot.models import open_arm
 from armsight.sim.workcell import Workcell
 from armsight.vision.follow import follows
 from armsight.vision.markers.targets import Composite, open_target
@@ -52,7 +52,7 @@ _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
 @click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
 @click.option(
-    "--model", default="six_r", show_default=True, help="The arm: a name (armsight arm list) or a .urdf file."
+    "--model", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
 @click.option(
     "--motion", type=click.Path(path_type=Path), default=CHAPTER, help="What to do (TOML); the chapter's motion."
@@ -94,7 +94,7 @@ def command(
     """
     require_matplotlib()
     require_pyarrow()
-    arm, rig, target = open_arm(model), StereoRig.load(rig_path), open_target(target_spec)
+    arm, rig, target = open_model(model), StereoRig.load(rig_path), open_target(target_spec)
     if not follows(target):
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"

@@ -206,8 +206,7 @@ def _speeds(J: Array, V: Array, scale: Array) -> tuple[Array, float]:
 
 def _scale(arm: Arm) -> Array:
     """Return what the rows of the Jacobian (6,) are divided by: the arm's size for the linear ones."""
-    size_m = float(np.hypot(arm.a, arm.d).sum())
-    return np.array([size_m, size_m, size_m, 1, 1, 1])
+    return np.array([arm.size_m] * 3 + [1, 1, 1])
 
 
 def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:

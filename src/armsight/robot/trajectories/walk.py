@@ -115,8 +115,7 @@ def derivatives(arm: Arm, q: Array, places: Places) -> tuple[Array, Array]:
 def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
     """Return the smallest singular value (N,) and the sign of the determinant (N,) at joint angles (N, 6)."""
     # What the tool's point and its turning have in common: the arm's size.
-    size_m = float(np.hypot(arm.a, arm.d).sum())
-    J: Array = arm.jacobian(q) / np.array([size_m, size_m, size_m, 1, 1, 1])[:, None]
+    J: Array = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1, 1, 1])[:, None]
     return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), np.asarray(np.sign(np.linalg.det(J)))
 
 
