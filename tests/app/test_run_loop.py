@@ -16,7 +16,8 @@ from armsight.app import experiment, run_calibrate
 from armsight.app.experiment import run_experiment
 from armsight.app.motion_file import QUICK, read_motions
 from armsight.app.run_beside import beside, steady, uninterrupted
-from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
+from armsight.app.run_log import Log, Segment
+from armsight.app.run_loop import PERIOD_S, Loop
 from armsight.app.run_motions import Planned
 from armsight.app.run_station import Station
 from armsight.data import JointStates, Missed, Shot

@@ -15,7 +15,8 @@ import numpy as np
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_beside import steady, uninterrupted
 from armsight.app.run_calibrate import HandEyeRun, find_delay, find_mounting
-from armsight.app.run_loop import PERIOD_S, Log, Loop, Segment
+from armsight.app.run_log import Log, Segment
+from armsight.app.run_loop import PERIOD_S, Loop
 from armsight.app.run_motions import Planned
 from armsight.app.run_passes import closed_on, drive, planned
 from armsight.app.run_ready import enable, rehearse

@@ -11,7 +11,8 @@ from armsight.app.experiment import PRIOR, Outcome, Progress, timing
 from armsight.app.motion_file import MotionPlan
 from armsight.app.run_data import RunData, assembled
 from armsight.app.run_judge import track_figures
-from armsight.app.run_loop import Log, Loop
+from armsight.app.run_log import Log
+from armsight.app.run_loop import Loop
 from armsight.app.run_passes import closed_on, drive
 from armsight.app.run_station import Station
 from armsight.app.studies import Study

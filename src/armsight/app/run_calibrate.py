@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armsight.app.run_loop import Loop, Segment
+from armsight.app.run_log import Segment
+from armsight.app.run_loop import Loop
 from armsight.app.run_motions import Planned, Sweep
 from armsight.data import Array, JointStates, PoseEstimate, Record, Shot
 from armsight.errors import CalibrationError, InputError

@@ -131,7 +131,8 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
         plain_log(plot.yaxis)
         plot.set_title(title)
         plot.grid(axis="y", color="#e4e7eb", lw=0.6)
-        plot.legend(fontsize=7)
+        if plot.get_legend_handles_labels()[0]:
+            plot.legend(fontsize=7)
     paths.set_xlabel("time on the path, s")
     return figure
 

@@ -10,20 +10,20 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from armsight.app.run_beside import Still, Watch, beside
+from armsight.app.run_log import Log, Segment
 from armsight.app.run_skew import Skew
 from armsight.app.run_station import Station
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
-from armsight.loop.estimators import ArmEstimate, Estimator, KalmanEstimator, Mounting, Verdict
+from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.robot.boards.codes import State
-from armsight.robot.trajectories import Trajectory
 from armsight.vision.follow import Follower
 
 #: Period of the loop and so of the commands, s.
@@ -48,56 +48,6 @@ class Controller(Protocol):
     def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return the command to send at a time of the board's clock, and in a word what it is based on."""
         ...
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A stretch of a run.
-
-    Attributes:
-        phase: calibration, open_loop, closed_loop or rest.
-        motion: name of the motion, or of the one whose end the arm stands at; "" before the first.
-        kind: joints, home, line or circle, of that motion.
-        closed: whether the loop was closed on vision.
-        begin_s: on the board's clock.
-        end_s: likewise.
-        trajectory: what the joints were to do from ``begin_s`` on; None where nothing was planned.
-    """
-
-    phase: str
-    motion: str
-    kind: str
-    closed: bool
-    begin_s: float = 0.0
-    end_s: float = 0.0
-    trajectory: Trajectory | None = None
-
-
-@dataclass
-class Log:
-    """All that a run measured, as it came.
-
-    Attributes:
-        joints: the potentiometers, batch by batch.
-        fused: where the estimator has the tool at each reading, RECORD_LAG_S later, batch by batch.
-        live: where it had the tool at the newest reading, turn by turn: what the loop goes by.
-        poses: each shot's name, stamp and pose (the cameras' skew in its covariance), or why there is none.
-        verdicts: what the estimator made of those it was given.
-        commands: when each was sent, and what.
-        modes: what each was based on.
-        latency_s: our time from an image to the command that knows it, image by image, s.
-        segments: what happened when.
-    """
-
-    joints: list[JointStates] = field(default_factory=list)
-    fused: list[ToolTrack] = field(default_factory=list)
-    live: list[ArmEstimate] = field(default_factory=list)
-    poses: list[tuple[str, float, PoseEstimate | Missed]] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
-    commands: list[tuple[float, JointCommand]] = field(default_factory=list)
-    modes: list[str] = field(default_factory=list)
-    latency_s: list[float] = field(default_factory=list)
-    segments: list[Segment] = field(default_factory=list)
 
 
 class Loop:

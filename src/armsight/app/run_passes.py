@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from armsight.app.motion_file import MotionPlan
-from armsight.app.run_loop import Controller, Loop, Segment
+from armsight.app.run_log import Segment
+from armsight.app.run_loop import Controller, Loop
 from armsight.app.run_motions import Closed, Planned
 from armsight.data import Array
 from armsight.loop.servo import PoseServo
