@@ -104,6 +104,7 @@ def grown(
     measured: Measured,
     free: Mask,
     prior: Array,
+    together: Mask,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Growth:
     """Grow the model from base and tool alone.
@@ -114,11 +115,12 @@ def grown(
         measured: the poses.
         free: (P,) what the poses can tell.
         prior: (P,) prior sigmas.
+        together: (P,) harmonics and loads that stand only as parts of a whole.
         progress: is told what is tried.
     """
     part = measured.rows(start.used)
     folds = _folds(model, start, part, folds_of(part.q), prior)
-    groups = _groups(model, free)
+    groups = _groups(model, free, together)
     kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])
     losses = folds.losses(kept)
     steps = [Step("base and tool", _named(model, kept), _rms(losses, folds))]
@@ -132,8 +134,9 @@ def grown(
         kept, losses = kept | added, tried[name]
         steps.append(Step(name, _named(model, added), _rms(losses, folds)))
         progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
-    kept = _together(model, folds, groups, kept, steps)
-    kept, given_back = _pruned(model, start, folds, kept, steps)
+    if together.any():
+        kept = _together(model, folds, groups, kept, steps)
+    kept, given_back = _pruned(model, folds, kept, together, steps)
     return Growth(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
 
 
@@ -191,7 +194,7 @@ def _named(model: Model, mask: Mask) -> tuple[str, ...]:
     return tuple(model.names[k] for k in np.flatnonzero(mask))
 
 
-def _groups(model: Model, free: Mask) -> dict[str, Mask]:
+def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
     """Return the causes that can be added, each with its parameters."""
     groups: dict[str, Mask] = {}
     for k, p in enumerate(model.parameters):
@@ -199,7 +202,9 @@ def _groups(model: Model, free: Mask) -> dict[str, Mask]:
             continue
         name = _GROUPS.get(p.kind, f"{p.kind} of joint {p.joint + 1}")
         if p.kind in CURVE:
+            curve = [k for k, other in enumerate(model.parameters) if other.kind in CURVE and other.joint == p.joint]
             name = f"sensor curve of joint {p.joint + 1}"
+            name += "" if together[curve].any() else f", {p.name[-1]} a turn"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups
 
@@ -215,11 +220,11 @@ def _pays(without: Array, with_it: Array, folds: _Folds) -> bool:
 
 
 def _pruned(
-    model: Model, start: Solution, folds: _Folds, kept: Mask, steps: list[Step]
+    model: Model, folds: _Folds, kept: Mask, together: Mask, steps: list[Step]
 ) -> tuple[Mask, dict[str, Array]]:
     """Give back, one at a time, parameters without which the held-out error is no worse."""
     given_back: dict[str, Array] = {}
-    stays = np.array([p.kind in (*PLACEMENT, *TOGETHER) for p in model.parameters])
+    stays = together | np.array([p.kind in PLACEMENT for p in model.parameters])
     while True:
         doubtful = [int(k) for k in np.flatnonzero(kept & ~stays) if _doubt(folds, kept, int(k))]
         losses = folds.losses(kept)

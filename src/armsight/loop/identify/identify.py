@@ -35,6 +35,8 @@ ALIKE = 0.02
 MOST = 4000
 #: Turns of fitting everything and laying what is left to the joints.
 TURNS = 3
+#: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before.
+PLENTY = 10
 #: Correlations larger than this are told.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")
@@ -138,7 +140,9 @@ def _identified(
     progress("which causes pay")
     # A curve's harmonics and a joint's loads stand together: each alone these poses may hardly show.
     candidates = tellable.free | (tellable.possible & _of(model, TOGETHER))
-    growth = grown(model, whole, part, candidates, prior, progress)
+    few = len(part) * part.size < PLENTY * len(model.parameters)
+    together = _of(model, TOGETHER) & few
+    growth = grown(model, whole, part, candidates if few else tellable.free, prior, together, progress)
     x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
     progress("the fit")
     solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)

@@ -25,6 +25,8 @@ LOOSE = 2.0
 LOOSE_SHARE = 0.12
 #: Of a pose's side: less than this part of the poses on one side are too few to show it.
 BOTH_SIDES = 0.02
+#: A fitted play of fewer sigmas does not show.
+SURE = 3.0
 
 
 class Play(NamedTuple):
@@ -126,9 +128,10 @@ def _fitted(found: Identified, joint: int, columns: list[int], phi: Array) -> Pl
     model, x = found.model, found.solution.x
     at = {model.features[k].kind: k for k in columns}
     fitted = {kind: k for kind, k in at.items() if found.solution.free[model.causes_at + k]}
-    if fitted:
-        rows = np.array([model.causes_at + k for k in fitted.values()])
-        value = float(np.sum(x[rows]))
+    rows = np.array([model.causes_at + k for k in fitted.values()], np.int64)
+    value = float(np.sum(x[rows]))
+    # Play is not negative, and what chance makes of none is none.
+    if value > SURE * float(np.sqrt(found.cov[np.ix_(rows, rows)].sum())):
         how = " and ".join(
             {"backlash": "the side it came from", "slack": "the side weight pulls to"}[kind] for kind in fitted
         )
