@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FIGURES = {
     "1": ("Errors, all pixels with a truth, filled", dense_accuracy.errors),
     "2": ("Times, 1280x720, 128 disparities, one thread, CPU ms", dense_speed.times),
-    "3": ("Memory of one match beyond what was loaded before", dense_speed.memory),
+    "3": ("Memory of the whole command, everything loaded, 1280x720, 128 disparities", dense_speed.memory),
     "4": ("Errors inside 1.96 sigma, measured pixels that both cameras see", dense_accuracy.coverage),
     "5": ("A tool without markers at 0.8 m, rendered", dense_accuracy.tool),
 }

@@ -6,9 +6,9 @@ surface there (Chen and Medioni, "Object modelling by registration of multiple r
 shrinks to what the cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body;
 a mesh's outline too (``locate_cloud_outline.py``).
 
-A disparity is that of a window: where a surface turns or ends, its pixel shows a place beside. Points are therefore
-uncertain sideways by about half a window, and along the normal of a face that is seen askance that is most of their
-error; with the depth's sigma alone such faces, the worst measured ones, would outweigh all others.
+A disparity is that of a window: where a surface turns or ends, its pixel shows a place beside. Points near an edge are
+therefore uncertain sideways by about half a window, and along the normal of a face that is seen askance that is most of
+their error; with the depth's sigma alone such faces, the worst measured ones, would outweigh all others.
 """
 
 from __future__ import annotations
@@ -31,8 +31,12 @@ _SPACING_M, _NEIGHBOURS = 0.002, 24
 #: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the
 #: noise.
 _SHRINK, _SIGMAS = 0.9, 10.0
-#: How uncertain a point is sideways, in steps from ray to ray: half of the 7 x 7 px that a match looks at, as a spread.
-_SIDEWAYS = 2.0
+#: How uncertain a point is sideways, in steps from ray to ray: near an edge, where half of the 7 x 7 px that a match
+#: looks at shows something else, as a spread; and within a face.
+_SIDEWAYS, _WITHIN = 2.0, 1.0
+#: How near to an edge is near, in steps: the window's half and most of what smoothing adds. An edge is where normals turn
+#: by more than this (cosine), among so many neighbours at most.
+_NEAR_EDGE, _TURN, _AROUND = 6.0, 0.9, 40
 #: The outline's reach is not less than so many of these.
 _OUTLINE_SIGMAS = 3.0
 _STEPS, _SETTLED_M = 60, 1e-5
@@ -146,9 +150,12 @@ def locate_cloud(
     if len(p) > _MOST:
         drawn = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
         p, sigma = p[drawn], sigma[drawn]
+    beside = (
+        np.where(_near_edges(surface, tree, _NEAR_EDGE / _SIDEWAYS * sideways), 1.0, _WITHIN / _SIDEWAYS) * sideways
+    )
     reach, shared = reach_m, max(1.0, _SHARED * len(p) / max(int(np.count_nonzero(near)), 1))
     for _ in range(_STEPS):
-        fit = _planes(surface, tree, p, sigma, sideways, T, reach)
+        fit = _planes(surface, tree, p, sigma, beside, T, reach)
         if fit is None:
             return Missed(_NOTHING)
         H, g, gaps, least_reach = fit
@@ -183,6 +190,14 @@ def _around(surface: Surface, p: Array, T: Array, reach_m: float) -> NDArray[np.
     )
 
 
+def _near_edges(surface: Surface, tree: cKDTree, radius_m: float) -> NDArray[np.bool_]:
+    """Tell which points (N,) of a surface have others within a radius where it faces elsewhere."""
+    rows = np.asarray(tree.query(surface.points, k=_AROUND, distance_upper_bound=radius_m)[1])
+    padded = np.vstack([surface.normals, np.zeros(3)])  # a neighbour that is not there has the row after the last
+    cosine = np.einsum("nki,ni->nk", padded[rows], surface.normals)
+    return np.asarray(((cosine < _TURN) & (rows < len(surface.points))).any(axis=1))
+
+
 def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.int64]]:
     """Return how far (N,) the nearest point of the surface is, infinite beyond a reach, and its row."""
     far, rows = tree.query(p, distance_upper_bound=reach)
@@ -190,7 +205,7 @@ def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.i
 
 
 def _planes(
-    surface: Surface, tree: cKDTree, p: Array, sigma: Array, sideways: float, T: Array, reach: float
+    surface: Surface, tree: cKDTree, p: Array, sigma: Array, beside: Array, T: Array, reach: float
 ) -> tuple[Array, Array, Array, float] | None:
     """Linearise the distances of points to the planes of the surface near them.
 
@@ -209,7 +224,7 @@ def _planes(
     gap = np.einsum("ni,ni->n", n, x - q)
     view = x - eye
     slant = np.abs(np.einsum("ni,ni->n", n, view)) / np.linalg.norm(view, axis=1)
-    noise = np.hypot(sigma[found] * slant, sideways * np.sqrt(np.clip(1 - slant**2, 0, None)))
+    noise = np.hypot(sigma[found] * slant, beside[rows[found]] * np.sqrt(np.clip(1 - slant**2, 0, None)))
     weight = np.clip(1 - (gap / reach) ** 2, 0, None) ** 2 / noise**2
     J = -np.concatenate([n, np.cross(x, n)], axis=1)  # of n . (exp(-xi) x - q)
     H, g = J.T @ (weight[:, None] * J), J.T @ (weight * gap)
