@@ -280,6 +280,8 @@ def test_axes_a_little_off_parallel_are_read_exactly_and_inverted(name, size, tm
         best = arm.inverse(T, near=q).best
         found += best is not None and np.abs(best - q).max() < 1e-6
     assert found >= 9  # one may be next to a singularity
+    # The common normals of such axes are metres away: an arm's size is that of its links all the same.
+    assert arm.size_m == pytest.approx(MODELS[name].size_m, rel=0.03)
 
 
 def test_axes_too_near_to_parallel_for_any_digits_are_refused(tmp_path):

@@ -1,5 +1,7 @@
 """The workcell as a whole, with the firmware compiled for this computer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -204,3 +206,15 @@ def test_a_picture_of_the_cell(cell):
 def test_a_wrong_name_is_told_with_the_right_ones(given, said):
     with pytest.raises(InputError, match=said):
         Workcell(**{"machine": "host", "cameras": "320x240@60", **given})
+
+
+def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(cell):
+    off = replace(cell.model, a=cell.model.a + 0.002, name="believed")
+    with Workcell(arm="worn", cameras=SMALL, seed=3, machine="host", believed=off) as other:
+        assert other.model is off
+        for name in ("T_base_rig", "T_tool_body"):
+            assert np.array_equal(getattr(other.truth, name), getattr(cell.truth, name))
+        assert np.array_equal(other.plant.arm.table, cell.plant.arm.table)
+        assert np.array_equal(other.gravity_duty(off.home), cell.gravity_duty(off.home))
+        assert other.board.configuration() == cell.board.configuration()
+        assert not np.array_equal(other.poses, cell.poses)
