@@ -131,6 +131,9 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
         plain_log(plot.yaxis)
         plot.set_title(title)
         plot.grid(axis="y", color="#e4e7eb", lw=0.6)
+        plot.set_axisbelow(True)
+        low, high = plot.get_ylim()
+        plot.set_ylim(low, high * (high / low) ** 0.15)  # room for the legend
         if plot.get_legend_handles_labels()[0]:
             plot.legend(fontsize=7)
     paths.set_xlabel("time on the path, s")
