@@ -8,7 +8,7 @@ from arm_bench import ARM, MIDDLE, drawn, loads, product, small
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import BACKLASH, BASIS, COMPLIANCE, LINEARITY, POSE, REST, SIZE, Prior
+from armsight.loop.estimators.armerror import BACKLASH, BASIS, COMPLIANCE, FLOAT, LINEARITY, POSE, REST, SIZE, Prior
 from armsight.robot.models import MODELS
 from asserts import numeric_jacobian
 
@@ -24,9 +24,9 @@ ODD = dataclasses.replace(
 ARMS = [*MODELS.values(), ODD]
 
 
-def evaluated(arm, x, q, side):
+def evaluated(arm, x, q, unseen):
     T, H = np.empty((4, 4)), np.empty((6, SIZE))
-    armerror.pose_and_derivative(arm.table, x, q, side, T, H)
+    armerror.pose_and_derivative(arm.table, x, q, unseen, T, H)
     return T, H
 
 
@@ -34,62 +34,67 @@ def evaluated(arm, x, q, side):
 def test_without_errors_it_is_the_arm(arm):
     rng = np.random.default_rng(0)
     for q in rng.uniform(-2, 2, (10, 6)):
-        T, _ = evaluated(arm, np.zeros(SIZE), q, np.ones(6))
+        T, _ = evaluated(arm, np.zeros(SIZE), q, np.ones((3, 6)))
         assert np.abs(T - arm.forward(q)).max() < 1e-14 * np.abs(T).max() + 1e-15
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
 def test_the_derivative_is_exact_where_nothing_is_off(arm):
     rng = np.random.default_rng(1)
-    q, side = rng.uniform(-2, 2, 6), rng.uniform(-1, 1, 6)
-    T, H = evaluated(arm, np.zeros(SIZE), q, side)
+    q, unseen = rng.uniform(-2, 2, 6), rng.uniform(-1, 1, (3, 6))
+    T, H = evaluated(arm, np.zeros(SIZE), q, unseen)
     back = inverse(T)
-    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(arm, x, q, side)[0]), np.zeros(SIZE), 1e-3)
+    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(arm, x, q, unseen)[0]), np.zeros(SIZE), 1e-3)
     # A difference over 1e-3 of numbers rounded at 1e-16 times the reach, and step^4 of what is cut off: 1e-12.
     assert np.abs(H - numeric).max() < 3e-12
 
 
 def test_off_by_as_much_as_arms_are_the_derivative_is_off_by_as_little():
     rng = np.random.default_rng(2)
-    x, q, side = rng.normal(size=SIZE) * Prior().sigmas(0.0), MIDDLE, np.ones(6)
-    T, H = evaluated(ARM, x, q, side)
+    x, q, unseen = rng.normal(size=SIZE) * Prior().sigmas(0.0), MIDDLE, np.ones((3, 6))
+    T, H = evaluated(ARM, x, q, unseen)
     back = inverse(T)
     # exp(e + d) = exp(e) exp(J_r d), J_r = 1 - ad(e) / 2 ...: relative to the column half of e, 1 deg at most, and some mm.
-    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(ARM, x, q, side)[0]), x, 1e-3)
+    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(ARM, x, q, unseen)[0]), x, 1e-3)
     assert (np.abs(H - numeric).max(axis=0) <= 1.5e-2 * np.abs(numeric).max(axis=0) + 1e-12).all()
 
 
 def test_it_is_a_slow_arm_with_the_same_errors():
     rng = np.random.default_rng(3)
-    x, q, side = rng.normal(size=SIZE) * Prior().sigmas(0.0), rng.uniform(-1, 1, 6) + MIDDLE, rng.uniform(-1, 1, 6)
+    x, q, unseen = (
+        rng.normal(size=SIZE) * Prior().sigmas(0.0),
+        rng.uniform(-1, 1, 6) + MIDDLE,
+        rng.uniform(-1, 1, (3, 6)),
+    )
     joints = q.copy()
     for i in range(6):
         c = x[LINEARITY + BASIS * i : LINEARITY + BASIS * (i + 1)]
         joints[i] += c[0] * q[i]
         for k in (1, 2, 3):
             joints[i] += c[2 * k - 1] * np.sin(k * q[i]) + c[2 * k] * np.cos(k * q[i])
-    joints += -side * x[BACKLASH:COMPLIANCE] / 2 + x[COMPLIANCE:REST] * loads(q[None])[0] + x[REST:POSE]
+    joints += -unseen[0] * x[BACKLASH:FLOAT] / 2 - unseen[1] * x[FLOAT:COMPLIANCE] / 2
+    joints += x[COMPLIANCE:REST] * (loads(q[None])[0] + unseen[2]) + x[REST:POSE]
     T = product(joints[None], [small(x[6 * i : 6 * i + 6]) for i in range(7)])[0] @ small(x[POSE : POSE + 6])
-    found, _ = evaluated(ARM, x, q, side)
+    found, _ = evaluated(ARM, x, q, unseen)
     # Half the product of the last motion's turn (3 sigma: 5e-4) and shift (3e-4) is left out; nothing else is.
     assert np.abs(found - T).max() < 7.5e-8
 
 
 def test_offsets_are_what_the_joints_are_beyond_their_readings():
     rng = np.random.default_rng(5)
-    x, q, side = rng.normal(size=SIZE) * Prior().sigmas(0.0), MIDDLE, np.ones(6)
+    x, q, unseen = rng.normal(size=SIZE) * Prior().sigmas(0.0), MIDDLE, np.ones((3, 6))
     B = np.empty((6, SIZE))
-    armerror.offsets_by(ARM.table, q, side, B)
+    armerror.offsets_by(ARM.table, q, unseen, B)
     moved = x.copy()
     moved[LINEARITY:POSE] = 0
     moved[REST:POSE] = B @ x  # all of it told as rest instead
-    assert np.allclose(evaluated(ARM, moved, q, side)[0], evaluated(ARM, x, q, side)[0], atol=1e-14)
+    assert np.allclose(evaluated(ARM, moved, q, unseen)[0], evaluated(ARM, x, q, unseen)[0], atol=1e-14)
 
 
 def test_the_prior_is_what_arms_are_drawn_from():
     rng = np.random.default_rng(6)
     q = MIDDLE[None]
-    T, H = evaluated(ARM, np.zeros(SIZE), MIDDLE, np.zeros(6))
+    T, H = evaluated(ARM, np.zeros(SIZE), MIDDLE, np.zeros((3, 6)))
     cov = H @ np.diag(Prior().sigmas(0.0) ** 2) @ H.T
     draws = np.array([log_se3(inverse(T) @ drawn(rng).tool(q)[0]) for _ in range(120)])
     # 720 squares, normalised: 5 sigma of their mean, and 3 % for what is not linear.

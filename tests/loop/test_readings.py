@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
-from arm_bench import states
+from arm_bench import ARM, states
 
-from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, SPAN_S, STILL_SPAN_S, Readings
+from armsight.loop.estimators.parabola import SPAN_S
+from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, STILL_SPAN_S, Readings
 
 SIGMA = 3e-4
 
 
 def filled(q_of_t, seconds, sigma=1e-9, noise=None):
-    readings = Readings(sigma)
+    readings = Readings(sigma, ARM)
     t = np.arange(round(seconds * 1000)) * 1e-3
     q = q_of_t(t)[:, None] * np.ones(6)
     readings.add(states(t, q if noise is None else q + noise))
@@ -68,11 +69,11 @@ def test_the_side_is_the_play_operators():
         sides.append((angle - held) / (GAP_RAD / 2))
     # The parabola's end is off by q''' SPAN^3 / 120, at most 72 * SPAN^3 / 120 = 7e-5 rad, 0.04 of half a gap.
     # At the very start there are too few readings for a parabola.
-    assert np.abs(out.side[:, 0] - sides)[50:].max() < 0.1
+    assert np.abs(out.unseen[:, 0, 0] - sides)[50:].max() < 0.1
     travel = np.abs(np.diff(q)).sum()
     assert out.travel[-1, 0] == pytest.approx(travel, rel=1e-2)
     assert (np.diff(out.travel, axis=0) >= 0).all()
-    assert (np.diff(out.flips, axis=0) >= 0).all()
+    assert (np.diff(out.flips[:, 0], axis=0) >= 0).all()
 
 
 def test_noise_at_rest_neither_travels_nor_changes_sides():
@@ -84,8 +85,8 @@ def test_noise_at_rest_neither_travels_nor_changes_sides():
 
     readings, t = filled(q_of_t, 2.0, SIGMA, SIGMA * rng.normal(size=(2000, 6)))
     moving, resting = readings.at(np.array([0.5])), readings.at(t[-1:])
-    assert moving.side.min() > 0.99
-    assert resting.side.min() > 0.9
+    assert moving.unseen[:, 0].min() > 0.99
+    assert resting.unseen[:, 0].min() > 0.9
     assert (resting.travel - moving.travel).max() < 10 * SIGMA
 
 
@@ -93,7 +94,7 @@ def test_what_came_in_parts_is_as_what_came_at_once():
     def q_of_t(t):
         return 0.4 * np.sin(5 * t)
 
-    readings = Readings(1e-9)
+    readings = Readings(1e-9, ARM)
     t = np.arange(20_000) * 1e-3
     for part in np.array_split(t, 700):
         readings.add(states(part, q_of_t(part)[:, None] * np.ones(6)))
@@ -107,7 +108,7 @@ def test_what_came_in_parts_is_as_what_came_at_once():
 
 
 def test_few_readings_are_averaged_and_one_is_itself():
-    readings = Readings(SIGMA)
+    readings = Readings(SIGMA, ARM)
     readings.add(states([1.0], np.full((1, 6), 0.2)))
     out = readings.at(np.array([1.0]))
     assert (out.q == 0.2).all()

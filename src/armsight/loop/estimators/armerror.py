@@ -7,12 +7,13 @@ The true pose is modelled as
 with E_i = exp(e_i) a small motion of every link's frame (lengths, twists and zeros that differ from the table, and how the
 arm stands and holds its tool), d_i what its potentiometer does not say
 
-    d_i = c_i . b(q_i) - s_i w_i / 2 + k_i g_i(q) + r_i
+    d_i = c_i . b(q_i) - s_i w_i / 2 - f_i v_i / 2 + k_i (g_i(q) + h_i) + r_i
 
-(b: linearity, a line and harmonics; w_i: backlash, s_i its side; k_i: compliance, g_i the gravity torque of a unit load;
-r_i: the rest, that forgets itself as the joint moves), and x what no joint explains, forgetting itself likewise. The
-derivatives are by the right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_tool_frame) e
-(Sola, "A micro Lie theory", 2018, eq. 31).
+(b: linearity, a line and harmonics; w_i: backlash, s_i its side if friction decides on that; v_i and f_i: the same if
+weight and inertia do; k_i: compliance, g_i the gravity torque of a unit load, h_i that of its inertia; r_i: the rest, that
+forgets itself as the joint moves), and x what no joint explains, forgetting itself likewise. The derivatives are by the
+right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_tool_frame) e (Sola, "A micro Lie theory",
+2018, eq. 31).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ BASIS = 1 + 2 * HARMONICS
 #: Where the parts stand in the vector: the seven frames' tangents, linearity, backlash, compliance, rest, x, delay.
 LINKS, LINEARITY = 0, 42
 BACKLASH = LINEARITY + 6 * BASIS
-COMPLIANCE, REST, POSE, DELAY = BACKLASH + 6, BACKLASH + 12, BACKLASH + 18, BACKLASH + 24
+FLOAT, COMPLIANCE, REST, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 6))
 SIZE = DELAY + 1
 #: Zeros of the joints: the turn about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
@@ -56,12 +57,14 @@ class Prior:
         zero_rad: zero of a potentiometer, rad.
         gain: its scale, relative.
         harmonic_rad: amplitude of the first harmonic of its linearity; the k-th has it over k^1.5, rad.
-        backlash_rad: width of the backlash between potentiometer and link, rad.
+        backlash_rad: width of the backlash between potentiometer and link, rad, as far as friction decides on its side.
+        float_rad: the same as far as weight and inertia do.
         compliance: sag per gravity torque of a unit load, rad/m.
         rest_rad: what else a joint is off, rad.
         rest_travel_rad: travel in which it forgets that, rad.
         creep_rad: how far a link creeps in its backlash in a second while its potentiometer stands, rad.
-        flip_rad: how uncertain a joint is after a change of side, beyond the width, rad.
+        flip_rad: how uncertain a joint is after a change of side by friction, beyond the width, rad.
+        flip_float_rad: the same of a change by weight and inertia, rad.
         pose_m: what no joint explains, m.
         pose_rad: the same of the turn, rad.
         pose_travel_rad: travel of all joints together in which that is forgotten, rad.
@@ -76,11 +79,13 @@ class Prior:
     gain: float = 2e-3
     harmonic_rad: float = float(np.deg2rad(0.2))
     backlash_rad: float = float(np.deg2rad(0.2))
+    float_rad: float = float(np.deg2rad(0.2))
     compliance: float = 5e-3
-    rest_rad: float = float(np.deg2rad(0.1))
-    rest_travel_rad: float = 0.1
+    rest_rad: float = float(np.deg2rad(0.03))
+    rest_travel_rad: float = 0.05
     creep_rad: float = 0.0
-    flip_rad: float = float(np.deg2rad(0.03))
+    flip_rad: float = float(np.deg2rad(0.015))
+    flip_float_rad: float = float(np.deg2rad(0.05))
     pose_m: float = 1e-4
     pose_rad: float = float(np.deg2rad(0.01))
     pose_travel_rad: float = 1.0
@@ -95,7 +100,7 @@ class Prior:
         links[ZEROS] = np.hypot(links[ZEROS], self.zero_rad)
         harmonics = np.repeat(self.harmonic_rad / np.arange(1, HARMONICS + 1) ** 1.5, 2)
         linearity = np.tile(np.append(self.gain, harmonics), 6)
-        joints = np.repeat([self.backlash_rad, self.compliance, self.rest_rad], 6)
+        joints = np.repeat([self.backlash_rad, self.float_rad, self.compliance, self.rest_rad], 6)
         rest = np.repeat([self.pose_m, self.pose_rad], 3)
         return np.concatenate([links, linearity, joints, rest, [sigma_delay_s]])
 
@@ -141,8 +146,11 @@ def _loads(table: Array, q: Array, g: Array) -> None:
 
 
 @_kernel
-def offsets_by(table: Array, q: Array, side: Array, B: Array) -> None:
-    """Write the derivative (6, SIZE) of what the joints are beyond their readings by the vector x, the zeros left out."""
+def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
+    """Write the derivative (6, SIZE) of what the joints are beyond their readings by the vector x, the zeros left out.
+
+    What is unseen (3, 6) is that of ``readings.Smoothed``: the two sides of the backlash, the lever of inertia.
+    """
     g = np.empty(6)
     _loads(table, q, g)
     B[:] = 0.0
@@ -154,7 +162,8 @@ def offsets_by(table: Array, q: Array, side: Array, B: Array) -> None:
         for k in range(HARMONICS):
             B[i, at + 1 + 2 * k], B[i, at + 2 + 2 * k] = sk, ck
             sk, ck = sk * c + ck * s, ck * c - sk * s
-        B[i, BACKLASH + i], B[i, COMPLIANCE + i], B[i, REST + i] = -0.5 * side[i], g[i], 1.0
+        B[i, BACKLASH + i], B[i, FLOAT + i] = -0.5 * unseen[0, i], -0.5 * unseen[1, i]
+        B[i, COMPLIANCE + i], B[i, REST + i] = g[i] + unseen[2, i], 1.0
 
 
 @_kernel
@@ -172,14 +181,14 @@ def _adjoint(F: Frame, G: Frame, out: Array) -> None:
 
 
 @_kernel
-def pose_and_derivative(table: Array, x: Array, q: Array, side: Array, T: Array, H: Array) -> None:
-    """Write the tool's pose (4, 4) at readings q (6,) and its derivative (6, SIZE) by the vector x.
+def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Array, H: Array) -> None:
+    """Write the tool's pose (4, 4) at readings q (6,), unseen (3, 6), and its derivative (6, SIZE) by the vector x.
 
     The column of the delay is left zero: it stands in no pose, only in when it was seen.
     """
     motions, B = np.empty(84), np.empty((6, SIZE))
     _small_motions(x, motions)
-    offsets_by(table, q, side, B)
+    offsets_by(table, q, unseen, B)
     F = after(motions, 0, first_frame(table))
     frames = [F]
     for i in range(6):
@@ -200,7 +209,7 @@ def pose_and_derivative(table: Array, x: Array, q: Array, side: Array, T: Array,
             J = table[6 * i + 5] * H[row, 6 * i + 5]
             for k in range(LINEARITY + BASIS * i, LINEARITY + BASIS * (i + 1)):
                 H[row, k] = J * B[i, k]
-            for k in (BACKLASH + i, COMPLIANCE + i, REST + i):
+            for k in (BACKLASH + i, FLOAT + i, COMPLIANCE + i, REST + i):
                 H[row, k] = J * B[i, k]
     _store_moved(F, x[POSE : POSE + 6], T)
 
@@ -225,7 +234,7 @@ def _store_moved(F: Frame, x: Array, T: Array) -> None:
 
 
 @_kernel
-def poses_and_derivatives(table: Array, x: Array, q: Array, side: Array, Ts: Array, Hs: Array) -> None:
-    """Write the same for readings q, side (N, 6) and vectors x (N, SIZE) into (N, 4, 4) and (N, 6, SIZE)."""
+def poses_and_derivatives(table: Array, x: Array, q: Array, unseen: Array, Ts: Array, Hs: Array) -> None:
+    """Write the same for readings q (N, 6), unseen (N, 3, 6) and vectors x (N, SIZE) into (N, 4, 4) and (N, 6, SIZE)."""
     for n in range(len(q)):
-        pose_and_derivative(table, x[n], q[n], side[n], Ts[n], Hs[n])
+        pose_and_derivative(table, x[n], q[n], unseen[n], Ts[n], Hs[n])

@@ -11,7 +11,6 @@ shared covariance is added to what comes out (Schmidt, 1966: considered, not est
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,7 +18,8 @@ from scipy.stats import chi2
 from armsight.data import Array, JointStates
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import BACKLASH, DELAY, POSE, REST, SIZE, ZEROS, Prior
+from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, SIZE, ZEROS, Prior
+from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, shared
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.robot.arm import Arm
@@ -38,8 +38,6 @@ OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
-#: After so long a joint has crept wherever it could, s.
-LONGEST_CREEP_S = 4.0
 #: Joints that came no further than this between two sightings stood still, rad.
 STILL_RAD = 1e-5
 _GATE = float(chi2.isf(CHANCE, 6))
@@ -56,28 +54,6 @@ def _opened() -> Array:
 _OPENED = _opened()
 
 
-class _State(NamedTuple):
-    """The filter right after a sighting, or before the first.
-
-    ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``, ``travel`` (6,), ``flips`` (6,): when
-    that was and how far the joints had come; ``sighting``: what went in last.
-    """
-
-    t_s: float
-    x: Array
-    P: Array
-    travel: Array
-    flips: Array
-    sighting: Sighting | None
-
-
-class _Step(NamedTuple):
-    """What motion does to the state: factors (SIZE,) by which it is remembered, and variances (SIZE,) that are added."""
-
-    kept: Array
-    added: Array
-
-
 class KalmanEstimator:
     """Fuses potentiometers and vision.
 
@@ -89,10 +65,10 @@ class KalmanEstimator:
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
         self._arm, self._prior, self._delay = arm, prior or Prior(), delay
-        self._readings = Readings(self._prior.reading_rad)
-        self._sigmas = self._prior.sigmas(delay.sigma_s)
-        zero = np.zeros(6)
-        self._states = [_State(-np.inf, np.zeros(SIZE), np.diag(self._sigmas**2), zero, zero, None)]
+        self._readings = Readings(self._prior.reading_rad, arm)
+        self._model = ErrorModel(arm, self._prior, delay.sigma_s)
+        nowhere = np.zeros(6), np.zeros((2, 6))
+        self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), *nowhere, None)]
         self._waiting: list[Sighting] = []
         self._outliers: list[Array] = []
         self._newest: ArmEstimate | None = None  # until something is heard
@@ -151,13 +127,13 @@ class KalmanEstimator:
         """Return where the tool is at (N,) times."""
         joints = self._readings.at(np.asarray(t_s, dtype=float))
         state = self._states[-1]
-        step = self._moved(state, joints, t_s)
-        Ts, Hs = self._model(state.x * step.kept, joints.q, joints.side)
+        step = self._model.moved(state, joints, t_s)
+        Ts, Hs = self._model.poses(state.x * step.kept, joints.q, joints.unseen)
         by_state = Hs * step.kept[:, None, :]
         own = (by_state.reshape(-1, SIZE) @ state.P).reshape(Hs.shape) @ np.swapaxes(by_state, 1, 2)
-        own += (Hs * step.added[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._reading_noise(Hs, joints)
+        own += (Hs * step.added[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
         age = t_s - state.t_s
-        return Track(t_s, Ts, own + self._shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+        return Track(t_s, Ts, own + shared(state.sighting, Ts), own, joints.q, joints.qd, age)
 
     def smoothed(self, t_s: Array) -> Track:
         """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
@@ -170,7 +146,7 @@ class KalmanEstimator:
         parts = [self._between(ends, int(k), t_s[at == k]) for k in np.unique(at)]
         return Track(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Track)))
 
-    def _between(self, ends: list[_State], k: int, t_s: Array) -> Track:
+    def _between(self, ends: list[State], k: int, t_s: Array) -> Track:
         """Return where the tool was between the sightings k - 1 and k."""
         if k == len(ends) or k == 0:
             return self.track(t_s)
@@ -179,100 +155,67 @@ class KalmanEstimator:
         whole = float(np.abs(after.travel - before.travel).sum())
         times = (t_s - before.t_s) / max(after.t_s - before.t_s, 1e-9)
         share = np.clip(come / whole if whole > STILL_RAD else times, 0.0, 1.0)
-        ahead = self._moved(before, joints, t_s)
-        back = self._moved(
+        ahead = self._model.moved(before, joints, t_s)
+        back = self._model.moved(
             after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints, t_s
         )
-        Ts, Hs = self._model(before.x * ahead.kept, joints.q, joints.side)
-        Ts_after, _ = self._model(after.x * back.kept, joints.q, joints.side)
+        Ts, Hs = self._model.poses(before.x * ahead.kept, joints.q, joints.unseen)
+        Ts_after, _ = self._model.poses(after.x * back.kept, joints.q, joints.unseen)
         Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
         P = before.P + share[:, None, None] * (after.P - before.P)
         own = Hs @ P @ np.swapaxes(Hs, 1, 2)
         bridge = ahead.added * back.added / np.maximum(ahead.added + back.added, 1e-30)
-        own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._reading_noise(Hs, joints)
-        return Track(t_s, Ts, own + self._shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
+        own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
+        return Track(t_s, Ts, own + shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
         newest = np.array([self.span_s[1]])
         now, state = self._readings.at(newest), self._states[-1]
-        side = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.side)
-        return self._model(state.x * self._moved(state, now, newest).kept, q, side)[0]
+        unseen = np.repeat(now.unseen, len(q), axis=0)
+        unseen[:, 0] = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.unseen[:, 0])
+        return self._model.poses(state.x * self._model.moved(state, now, newest).kept, q, unseen)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
         newest = np.array([self.span_s[1]])
         now, state = self._readings.at(newest), self._states[-1]
-        step = self._moved(state, now, newest)
+        step = self._model.moved(state, now, newest)
         x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
         by = np.empty((6, SIZE))
-        armerror.offsets_by(self._arm.table, now.q[0], now.side[0], by)
+        armerror.offsets_by(self._arm.table, now.q[0], now.unseen[0], by)
         by[np.arange(6), ZEROS] = self._arm.direction
         sigma = np.sqrt(np.diag(P))
         return Learned(
             by @ x,
             np.sqrt(np.einsum("ij,jk,ik->i", by, P, by)),
-            x[BACKLASH : BACKLASH + 6],
+            x[BACKLASH : BACKLASH + 6] + x[FLOAT : FLOAT + 6],
             sigma[BACKLASH : BACKLASH + 6],
-            now.side[0],
+            now.unseen[0, 0],
             replace(self._delay, delay_s=self._delay.delay_s + float(x[DELAY]), sigma_s=float(sigma[DELAY])),
         )
 
     def _backlash(self) -> Array:
         """Return the widths (6,) to reckon with: what is learned, as far as it is, else the middle of what gears have."""
         state, part = self._states[-1], slice(BACKLASH, BACKLASH + 6)
-        known = 1 - np.diag(state.P)[part] / self._sigmas[part] ** 2
-        return np.asarray(known * state.x[part] + (1 - known) * GAP_RAD)
+        known = 1 - np.diag(state.P)[part] / self._model.sigmas[part] ** 2
+        both = state.x[part] + state.x[FLOAT : FLOAT + 6]
+        return np.asarray(known * both + (1 - known) * GAP_RAD)
 
     @staticmethod
-    def _after(state: _State, sighting: Sighting) -> bool:
+    def _after(state: State, sighting: Sighting) -> bool:
         """Say whether a state has seen what is newer than a sighting."""
         return state.sighting is not None and state.sighting.t_s > sighting.t_s
 
-    def _seen_s(self, sighting: Sighting, state: _State) -> float:
+    def _seen_s(self, sighting: Sighting, state: State) -> float:
         """Return when a sighting was, by the delay as a state knows it, s."""
         return sighting.t_s - self._delay.delay_s - float(state.x[DELAY])
 
-    def _model(self, x: Array, q: Array, side: Array) -> tuple[Array, Array]:
-        """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE); x may be one for all."""
-        Ts, Hs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, SIZE))
-        armerror.poses_and_derivatives(self._arm.table, np.broadcast_to(x, (len(q), SIZE)).copy(), q, side, Ts, Hs)
-        return Ts, Hs
-
-    def _moved(self, state: _State, joints: Smoothed, t_s: Array) -> _Step:
-        """Return what motion and time (N,) since a state, or before it, do to it: factors and variances (N, SIZE)."""
-        prior = self._prior
-        travel = np.maximum(joints.travel - state.travel, 0.0)
-        flips = np.maximum(joints.flips - state.flips, 0.0)
-        kept, added = np.ones((len(travel), SIZE)), np.zeros((len(travel), SIZE))
-        rest, free = slice(REST, REST + 6), slice(POSE, POSE + 6)
-        kept[:, rest] = np.exp(-travel / prior.rest_travel_rad)
-        kept[:, free] = np.exp(-travel.sum(axis=1, keepdims=True) / prior.pose_travel_rad)
-        for part in (rest, free):
-            added[:, part] = self._sigmas[part] ** 2 * (1 - kept[:, part] ** 2)
-        added[:, rest] += prior.creep_rad**2 * np.minimum(np.abs(t_s - state.t_s), LONGEST_CREEP_S)[:, None]
-        added[:, rest] += 0.5 * prior.flip_rad**2 * flips  # a whole change of side moves it from -1 to 1
-        return _Step(kept, added)
-
-    def _reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
-        """Return the covariances (N, 6, 6) of poses from the readings' noise."""
-        J = Hs[:, :, ZEROS]
-        return np.asarray(self._prior.reading_rad**2 * (J * joints.variance[:, None, :]) @ np.swapaxes(J, 1, 2))
-
-    @staticmethod
-    def _shared(sighting: Sighting | None, Ts: Array) -> Array:
-        """Return what all sightings share, (N, 6, 6), seen in the axes of poses (N, 4, 4)."""
-        if sighting is None:
-            return np.zeros((len(Ts), 6, 6))
-        turn = np.zeros((len(Ts), 6, 6))
-        turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ sighting.T_base_tool[:3, :3]
-        return np.asarray(turn @ sighting.cov_common @ np.swapaxes(turn, 1, 2))
-
-    def _take(self, before: _State, sighting: Sighting) -> tuple[_State | None, Verdict]:
+    def _take(self, before: State, sighting: Sighting) -> tuple[State | None, Verdict]:
         """Return the state after a sighting, None where it is an outlier."""
         t_s = max(self._seen_s(sighting, before), before.t_s)
         joints = self._readings.at(np.array([t_s]))
-        step = self._moved(before, joints, np.array([t_s]))
+        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept = step.kept[0]
         x, P = before.x * kept, before.P * np.outer(kept, kept)
         P[np.diag_indices(SIZE)] += step.added[0]
@@ -283,15 +226,15 @@ class KalmanEstimator:
         if verdict is Verdict.REOPENED:
             P[np.diag_indices(SIZE)] += _OPENED
         x, P = self._update(x, P, joints, sighting, first)
-        return _State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
+        return State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
 
     def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
         """Return how far a sighting is from the model (6,), its derivative (6, SIZE) by x, and the noise (6, 6)."""
-        Ts, Hs = self._model(x[None], joints.q, joints.side)
+        Ts, Hs = self._model.poses(x[None], joints.q, joints.unseen)
         H = Hs[0]
         velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
         H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
-        R = sighting.cov_noise + self._reading_noise(Hs, joints)[0]
+        R = sighting.cov_noise + self._model.reading_noise(Hs, joints)[0]
         R += self._delay.jitter_s**2 * np.outer(velocity, velocity)
         return log_se3(inverse(Ts[0]) @ sighting.T_base_tool), H, R
 

@@ -1,10 +1,10 @@
 """The potentiometers' readings of the last seconds: smoothed, with speeds, and with what hysteresis depends on.
 
 In: JointStates. Out: joint angles and speeds at any time kept, and the variance that smoothing leaves of a reading's noise.
-At a time t a parabola is laid through the readings of up to :data:`SPAN_S` around it, or before it where it is the newest
-(local polynomial fit, Savitzky and Golay, Anal. Chem. 36, 1964). Beside each reading stands how far every joint has
-travelled and on which side of its backlash it should be: the play operator (Krasnosel'skii and Pokrovskii, "Systems with
-hysteresis", 1989), behind a dead zone that the readings' noise does not cross.
+At a time t a parabola is laid through the readings of up to ``SPAN_S`` around it, or before it where it is the newest
+(``parabola``). Beside each reading stands how far every joint has travelled and on which side of its backlash it should be,
+twice: if friction decides on that, the play operator (Krasnosel'skii and Pokrovskii, "Systems with hysteresis", 1989),
+behind a dead zone that the readings' noise does not cross; if weight and inertia do, where its link floats (``floating``).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.geometry.check import checked
+from armsight.loop.estimators.floating import float_on, masses
+from armsight.loop.estimators.parabola import PARABOLA, SPAN_S, fit, window
+from armsight.robot.arm import Arm
 
-#: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
-#: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
-SPAN_S = 0.049
 #: A joint that shows no motion within this time around (or, where it is the newest, before) a time stands still there, s,
 #: and is averaged over it: the parabola's noise at its end is eight times the mean's.
 STILL_SPAN_S = 0.3
@@ -29,8 +29,6 @@ STILL_SPAN_S = 0.3
 _MOTION = 3.0
 #: Readings kept, s.
 KEPT_S = 2.0
-#: Fewest readings for a parabola; fewer are averaged.
-_PARABOLA = 5
 #: Dead zone before a joint counts as moved, in standard deviations of a smoothed newest reading. Less, and noise changes
 #: the sides of narrow gaps; more, and the sides change late.
 _DEAD = 5.0
@@ -40,6 +38,8 @@ _SETTLE_S = 0.3
 GAP_RAD = np.deg2rad(0.2)
 #: The least of it, rad: narrower, noise would change it.
 LEAST_GAP_RAD = np.deg2rad(0.05)
+#: What counts as motion of an arm, in standard deviations of a speed; while it stands, its links do.
+_STILL = 4.0
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
@@ -53,61 +53,29 @@ class Smoothed(NamedTuple):
         q: (N, 6) angles, rad.
         qd: (N, 6) speeds, rad/s.
         variance: (N, 6) what is left of a reading's variance.
-        side: (N, 6) where the joint should be in its backlash, -1 to 1: 1 when it came up from below.
+        unseen: (N, 3, 6) on what hangs where the links are beyond their shafts. First the side of the backlash if friction
+            decides on it, -1 to 1: 1 when the joint came up from below; then if weight and inertia do; then the lever of
+            what inertia does to a unit load, m.
         travel: (N, 6) how far the joint has moved in all, rad.
-        flips: (N, 6) how far ``side`` has moved in all.
+        flips: (N, 2, 6) how far the two sides have moved in all.
     """
 
     q: Array
     qd: Array
     variance: Array
-    side: Array
+    unseen: Array
     travel: Array
     flips: Array
 
 
 @_kernel
-def _fit(t: Array, q: Array, low: int, high: int, at: float, angles: Array, speeds: Array) -> float:
-    """Lay parabolas through rows low to high of q (N, 6); write value and slope at a time; return the variance left."""
-    n = high - low + 1
-    s1 = s2 = s3 = s4 = 0.0
-    for k in range(low, high + 1):
-        u = t[k] - at
-        s1, s2, s3, s4 = s1 + u, s2 + u * u, s3 + u * u * u, s4 + u * u * u * u
-    # The value's row of the inverse of the normal equations [n s1 s2; s1 s2 s3; s2 s3 s4], and the slope's.
-    a, b, c = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
-    d, e = n * s4 - s2 * s2, s1 * s2 - n * s3
-    determinant = n * a + s1 * b + s2 * c
-    plain = n < _PARABOLA
-    for i in range(6):
-        angles[i] = speeds[i] = 0.0
-    for k in range(low, high + 1):
-        u = t[k] - at
-        value = 1.0 / n if plain else (a + b * u + c * u * u) / determinant
-        slope = 0.0 if plain else (b + d * u + e * u * u) / determinant
-        for i in range(6):
-            angles[i] += value * q[k, i]
-            speeds[i] += slope * q[k, i]
-    return 1.0 / n if plain else a / determinant
-
-
-@_kernel
-def _window(t: Array, first: int, count: int, at: float, span: float) -> tuple[int, int]:
-    """Return the rows of a span of time around a time, s: around it as far as there are any, else before or after."""
-    last = first + count - 1
-    late = min(max(at + 0.5 * span, t[first] + span), t[last])
-    low = first + np.searchsorted(t[first : last + 1], late - span)
-    high = first + np.searchsorted(t[first : last + 1], late, side="right") - 1
-    return min(low, high), high
-
-
-@_kernel
 def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
-    """Write travel, flips, side, and the place behind the dead zone, of rows begin to end into memory (N, 4, 6)."""
-    angles, speeds = np.empty(6), np.empty(6)
+    """Write travel, flips, side, and the place behind the dead zone, of rows begin to end into memory (N, 8, 6)."""
+    motion = np.empty((3, 6))
+    angles = motion[0]
     for k in range(begin, end):
-        low, high = _window(t, first, k - first + 1, t[k], SPAN_S)
-        _fit(t, q, low, high, t[k], angles, speeds)
+        low, high = window(t, first, k - first + 1, t[k], SPAN_S)
+        fit(t, q, low, high, t[k], motion)
         for i in range(6):
             if k == first:
                 memory[k, :3, i] = 0.0
@@ -150,16 +118,17 @@ def _smooth(
     qds: Array,
     hysteresis: Array,
 ) -> Array:
-    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 3, 6); return the variances (N, 6)."""
-    variance = np.empty((len(at), 6))
+    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 8, 6); return the variances (N, 6)."""
+    variance, motion = np.empty((len(at), 6)), np.empty((3, 6))
     for n in range(len(at)):
-        low, high = _window(t, first, count, at[n], SPAN_S)
-        variance[n] = _fit(t, q, low, high, at[n], qs[n], qds[n])
-        low, high = _window(t, first, count, at[n], STILL_SPAN_S)
-        if high - low > 4 * _PARABOLA:
+        low, high = window(t, first, count, at[n], SPAN_S)
+        variance[n] = fit(t, q, low, high, at[n], motion)
+        qs[n], qds[n] = motion[0], motion[1]
+        low, high = window(t, first, count, at[n], STILL_SPAN_S)
+        if high - low > 4 * PARABOLA:
             _rest(q, low, high, sigma, qs[n], qds[n], variance[n])
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
-        hysteresis[n] = memory[k, :3]
+        hysteresis[n] = memory[k]
     return variance
 
 
@@ -168,14 +137,19 @@ class Readings:
 
     Args:
         sigma_rad: noise of one reading, rad.
+        arm: whose joints they are.
     """
 
-    def __init__(self, sigma_rad: float) -> None:
+    def __init__(self, sigma_rad: float, arm: Arm) -> None:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
         self._gap, self._sigma = np.full(6, GAP_RAD), sigma_rad
-        self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 4, 6))
-        self._first = self._count = 0
+        # Beside each reading: travel, flips, side, place behind the dead zone; then what ``floating`` writes.
+        self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 8, 6))
+        self._first = self._count = self._settled = 0
+        # The variance that a parabola leaves of its slope at its end is 192/(N SPAN^2).
+        self._still = float(_STILL * sigma_rad * np.sqrt(192 / (SPAN_S * 1000)) / SPAN_S)
+        self._table, (self._points, self._beside) = arm.table, masses(arm)
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -213,11 +187,17 @@ class Readings:
             keep = max(int(np.searchsorted(self._t[:end], self._t[end - 1] - KEPT_S)), end - _ROWS // 2)
             for memory in (self._t, self._q, self._memory):
                 memory[: end - keep] = memory[keep:end].copy()
-            self._first, self._count, end = 0, end - keep, end - keep
+            self._first, self._count, end, self._settled = 0, end - keep, end - keep, max(self._settled - keep, 0)
         self._t[end : end + len(t)], self._q[end : end + len(t)] = t, q
         self._count += len(t)
         # Only the very first row starts the hysteresis; later ones carry on from the row before.
-        _take(self._t, self._q, self._memory, self._first, end, end + len(t), self._dead, self._gap)
+        begin, end = end, end + len(t)
+        _take(self._t, self._q, self._memory, self._first, begin, end, self._dead, self._gap)
+        # The newest rows are smoothed by what came before them alone; as more comes, they are gone through again.
+        links = self._table, self._points, self._beside
+        floating, rows = self._memory[:, 4:], (self._first, self._settled, end)
+        float_on(self._t, self._q, floating, *rows, *links, self._still, self._gap)
+        self._settled = max(int(np.searchsorted(self._t[:end], self._t[end - 1] - 0.5 * SPAN_S)), self._settled)
 
     def at(self, t_s: Array) -> Smoothed:
         """Return the joints at (N,) times within those kept.
@@ -231,7 +211,14 @@ class Readings:
                 f"times {t_s.min():.4f} to {t_s.max():.4f} s were asked for; readings are kept from {oldest:.4f} to "
                 f"{newest:.4f} s"
             )
-        qs, qds, hysteresis = np.empty((len(t_s), 6)), np.empty((len(t_s), 6)), np.empty((len(t_s), 3, 6))
+        qs, qds, hysteresis = np.empty((len(t_s), 6)), np.empty((len(t_s), 6)), np.empty((len(t_s), 8, 6))
         kept = (self._t, self._q, self._memory, self._first, self._count)
         variance = _smooth(*kept, t_s, self._sigma, qs, qds, hysteresis)
-        return Smoothed(qs, qds, variance, hysteresis[:, 2], hysteresis[:, 0], hysteresis[:, 1])
+        return Smoothed(
+            qs,
+            qds,
+            variance,
+            np.stack([hysteresis[:, 2], -hysteresis[:, 4], hysteresis[:, 7]], axis=1),
+            hysteresis[:, 0],
+            hysteresis[:, [1, 6]],
+        )

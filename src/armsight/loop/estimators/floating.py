@@ -1,0 +1,216 @@
+"""Links that float in their backlash: where weight and inertia press them, step by step.
+
+In: angles, speeds and accelerations of the gears' shafts. Out: where each link stands in its play. A joint's gear can only
+push: where weight and acceleration press its link the one way, the link stands at that end of the play; where they change
+sign it leaves, coasts, and comes to the other end some time later. Potentiometers on the shafts see none of it. Of a link's
+angle beyond its shaft's e, a small one, the links' own equation of motion leaves
+
+    M(q) e'' = contact - tau(q, q', q'') - friction,    |e_i| <= w_i / 2,
+
+tau the torque that the links would need to follow their shafts, contact what the ends of the play push. It is stepped at
+the level of speeds, the contacts solved row by row (Moreau's scheme; Acary and Brogliato, "Numerical methods for nonsmooth
+dynamical systems", 2008, chapter 10). Masses are not known: links are rods of one weight per length along the table's d and
+a. That does, as only ratios count: of one torque to another, and to the friction of the links' bearings.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from armsight.data import Array
+from armsight.loop.estimators.parabola import SPAN_S, fit, window
+from armsight.robot.arm import Arm
+from armsight.robot.kinematics.chain import after_link, after_turn, first_frame
+from armsight.robot.kinematics.trig import sincos
+
+GRAVITY_M_S2 = 9.81
+#: Friction of a link's bearing, of the greatest torque that its weight and acceleration need: rolling bearings' order.
+BEARING = 0.01
+#: A rod is as thick as this share of the arm's length: what turns about its own axis has inertia, too.
+_THICK = 0.03
+#: Poses at which the arm is looked at for the greatest torque.
+_POSES = 64
+#: Friction grows up to this speed of the link, rad/s; a step that would jump over standstill does not.
+_SLOW_RAD_S = 0.01
+#: Sweeps over the contacts in a step; the last step's result starts them.
+_SWEEPS = 8
+
+#: A longer time than this between two readings counts as so much, s.
+_LONGEST_STEP_S = 0.01
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+def rods(arm: Arm) -> Array:
+    """Return points with mass (K, 5) that stand for an arm's links: link, mass, place in the frame after the joint's turn.
+
+    Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m.
+    """
+    rows, points = arm.table[:36].reshape(6, 6), []
+    for i, (a, d) in enumerate(rows[:, :2]):
+        for along in (-1, 1):
+            u = 0.5 + along / np.sqrt(12)
+            points += [(i, 0.5 * abs(d), 0.0, 0.0, (u - 1) * d), (i, 0.5 * abs(a), u * a, 0.0, 0.0)]
+    tip = arm.T_flange_tool[:3, 3]
+    c, s = rows[5, 2:4]
+    tip = np.array([rows[5, 0] + tip[0], c * tip[1] - s * tip[2], s * tip[1] + c * tip[2]])
+    points.append((5, float(np.linalg.norm(arm.T_flange_tool[:3, 3])), *(0.5 * tip)))
+    return np.array([point for point in points if point[1] > 0.0])
+
+
+def masses(arm: Arm) -> tuple[Array, Array]:
+    """Return the points (K, 5) that stand for an arm's links, and what each joint has beside them (3, 6).
+
+    That is the inertia of what turns about its own axis, kg m^2, its bearing's friction, N m, both of rods of 1 kg/m, and
+    by what a torque of theirs is to be multiplied to become the lever of a unit load, 1/N.
+    """
+    points = rods(arm)
+    whole = np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum()
+    own = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)]) * 0.5 * (_THICK * whole) ** 2
+    M, tau, weight, inertia = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6), np.zeros(6)
+    rng, still = np.random.default_rng(0), np.zeros(6)
+    for q in rng.uniform(arm.q_min, arm.q_max, (_POSES, 6)):
+        _dynamics(arm.table, points, own, q, still, still, M, tau)
+        weight, inertia = np.maximum(weight, np.abs(tau[0])), np.maximum(inertia, np.diag(M))
+    beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)])
+    return points, np.stack([own, BEARING * (weight + inertia * arm.qdd_max), 1 / (beyond * GRAVITY_M_S2)])
+
+
+@_kernel
+def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd: Array, M: Array, tau: Array) -> None:
+    """Write the inertia (6, 6) of the links, and what torques they need to bear their weight and to move so, (2, 6).
+
+    Speeds and accelerations go out from the base, link by link (Siciliano et al., "Robotics", 2009, section 7.5.2).
+    """
+    axes, J = np.empty((6, 6)), np.empty((6, 3))
+    M[:], tau[:] = 0.0, 0.0
+    wx = wy = wz = bx = by = bz = ax = ay = az = 0.0  # turning speed, its rate, and the acceleration of the axis' point
+    F, n = first_frame(table), 0
+    for i in range(6):
+        way = table[6 * i + 5]
+        zx, zy, zz = way * F[6], way * F[7], way * F[8]
+        ox, oy, oz = F[9], F[10], F[11]
+        axes[i] = np.array([zx, zy, zz, ox, oy, oz])
+        bx += zx * qdd[i] + qd[i] * (wy * zz - wz * zy)
+        by += zy * qdd[i] + qd[i] * (wz * zx - wx * zz)
+        bz += zz * qdd[i] + qd[i] * (wx * zy - wy * zx)
+        wx, wy, wz = wx + zx * qd[i], wy + zy * qd[i], wz + zz * qd[i]
+        s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
+        F = after_turn(table, i, c, s, F)
+        while n < len(points) and points[n, 0] == i:
+            mass, x, y, z = points[n, 1], points[n, 2], points[n, 3], points[n, 4]
+            px = F[9] + F[0] * x + F[3] * y + F[6] * z
+            py = F[10] + F[1] * x + F[4] * y + F[7] * z
+            pz = F[11] + F[2] * x + F[5] * y + F[8] * z
+            fx, fy, fz = _beyond(wx, wy, wz, bx, by, bz, px - ox, py - oy, pz - oz)
+            for j in range(i + 1):
+                rx, ry, rz = px - axes[j, 3], py - axes[j, 4], pz - axes[j, 5]
+                J[j, 0] = axes[j, 1] * rz - axes[j, 2] * ry
+                J[j, 1] = axes[j, 2] * rx - axes[j, 0] * rz
+                J[j, 2] = axes[j, 0] * ry - axes[j, 1] * rx
+                tau[0, j] += mass * GRAVITY_M_S2 * J[j, 2]
+                tau[1, j] += mass * (J[j, 0] * (ax + fx) + J[j, 1] * (ay + fy) + J[j, 2] * (az + fz))
+                for k in range(j + 1):
+                    M[j, k] += mass * (J[j, 0] * J[k, 0] + J[j, 1] * J[k, 1] + J[j, 2] * J[k, 2])
+            n += 1
+        F = after_link(table, i, F)
+        fx, fy, fz = _beyond(wx, wy, wz, bx, by, bz, F[9] - ox, F[10] - oy, F[11] - oz)
+        ax, ay, az = ax + fx, ay + fy, az + fz
+    for j in range(6):
+        M[j, j] += own[j]
+        tau[1, j] += own[j] * qdd[j]
+        for k in range(j):
+            M[k, j] = M[j, k]
+
+
+@_kernel
+def _beyond(
+    wx: float, wy: float, wz: float, bx: float, by: float, bz: float, rx: float, ry: float, rz: float
+) -> tuple[float, float, float]:
+    """Return the acceleration of a point at r of a body beyond that of its origin, for turning speed w and its rate b."""
+    vx, vy, vz = wy * rz - wz * ry, wz * rx - wx * rz, wx * ry - wy * rx
+    return (
+        by * rz - bz * ry + wy * vz - wz * vy,
+        bz * rx - bx * rz + wz * vx - wx * vz,
+        bx * ry - by * rx + wx * vy - wy * vx,
+    )
+
+
+@_kernel
+def _step(
+    table: Array,
+    points: Array,
+    beside: Array,
+    motion: Array,
+    dt: float,
+    half: Array,
+    place: Array,
+    speed: Array,
+    lever: Array,
+) -> None:
+    """Move links on in half their plays by a time dt: place and speed (6,) beyond their shafts, rad, rad/s; write levers.
+
+    The shafts' motion (3, 6) is angles, speeds and accelerations.
+    """
+    M, tau, b = np.empty((6, 6)), np.empty((2, 6)), np.empty(6)
+    _dynamics(table, points, beside[0], motion[0], motion[1], motion[2], M, tau)
+    for i in range(6):
+        slip = min(max((motion[1, i] + speed[i]) / _SLOW_RAD_S, -1.0), 1.0)
+        lever[i] = -tau[1, i] * beside[2, i]
+        b[i] = -dt * (tau[0, i] + tau[1, i] + beside[1, i] * slip)
+        for j in range(6):
+            b[i] += M[i, j] * speed[j]
+    for _ in range(_SWEEPS):
+        for i in range(6):
+            x = b[i]
+            for j in range(6):
+                if j != i:
+                    x -= M[i, j] * speed[j]
+            speed[i] = min(max(x / M[i, i], (-half[i] - place[i]) / dt), (half[i] - place[i]) / dt)
+    for i in range(6):
+        place[i] += dt * speed[i]
+
+
+@_kernel
+def float_on(
+    t: Array,
+    q: Array,
+    memory: Array,
+    first: int,
+    begin: int,
+    end: int,
+    table: Array,
+    points: Array,
+    beside: Array,
+    still: float,
+    gap: Array,
+) -> None:
+    """Let links float from row to row of readings.
+
+    Args:
+        t: (N,) times of the readings, s.
+        q: (N, 6) readings, rad.
+        memory: (N, 4, 6) to be written: place and speed in half gaps, how far the links have come in that, and lever of the
+            torque of inertia, m.
+        first: first row there is.
+        begin: first row to be written.
+        end: the row after the last.
+        table: of the arm.
+        points: what stands for its links (K, 5).
+        beside: what each joint has beside them (3, 6).
+        still: an arm none of whose joints is faster stands, and so do its links, rad/s.
+        gap: (6,) the play, rad.
+    """
+    motion, place, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
+    for k in range(max(begin, first + 1), end):
+        low, high = window(t, first, end - first, t[k], SPAN_S)
+        fit(t, q, low, high, t[k], motion)
+        before, now = memory[k - 1], memory[k]
+        place[:], speed[:] = before[0] * half, before[1] * half
+        if np.abs(motion[1]).max() > still:
+            _step(table, points, beside, motion, min(t[k] - t[k - 1], _LONGEST_STEP_S), half, place, speed, now[3])
+        else:
+            speed[:], now[3] = 0.0, 0.0
+        now[0], now[1] = place / half, speed / half
+        now[2] = before[2] + np.abs(now[0] - before[0])
