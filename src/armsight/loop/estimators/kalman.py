@@ -40,6 +40,8 @@ ITERATIONS, SETTLED = 4, 1e-3
 MOVES_RAD_S = 1e-3
 #: Joints that came no further than this between two sightings stood still, rad.
 STILL_RAD = 1e-5
+#: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
+WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
 _GATE = float(chi2.isf(CHANCE, 6))
 
 
@@ -189,18 +191,17 @@ class KalmanEstimator:
         return Learned(
             by @ x,
             np.sqrt(np.einsum("ij,jk,ik->i", by, P, by)),
-            x[BACKLASH : BACKLASH + 6] + x[FLOAT : FLOAT + 6],
-            sigma[BACKLASH : BACKLASH + 6],
+            WIDTHS @ x,
+            np.sqrt(np.diag(WIDTHS @ P @ WIDTHS.T)),
             now.unseen[0, 0],
             replace(self._delay, delay_s=self._delay.delay_s + float(x[DELAY]), sigma_s=float(sigma[DELAY])),
         )
 
     def _backlash(self) -> Array:
         """Return the widths (6,) to reckon with: what is learned, as far as it is, else the middle of what gears have."""
-        state, part = self._states[-1], slice(BACKLASH, BACKLASH + 6)
-        known = 1 - np.diag(state.P)[part] / self._model.sigmas[part] ** 2
-        both = state.x[part] + state.x[FLOAT : FLOAT + 6]
-        return np.asarray(known * both + (1 - known) * GAP_RAD)
+        state = self._states[-1]
+        known = 1 - np.diag(WIDTHS @ state.P @ WIDTHS.T) / (WIDTHS @ self._model.sigmas**2)
+        return np.asarray(known * (WIDTHS @ state.x) + (1 - known) * GAP_RAD)
 
     @staticmethod
     def _after(state: State, sighting: Sighting) -> bool:
