@@ -31,7 +31,7 @@ DELAY_REST_S = 1.0  # before and after the sweep
 #: The sweep lasts so long, s, and longer where slow cameras would not take so many shots meanwhile: some may be missed.
 SWEEP_S, SWEEP_SHOTS = 4.0, LEAST + 6
 #: In the sweep joints keep their side of the backlash: what they are off beside what can be learned changes little.
-STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5)
+STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5, flip_rad=0.0, flip_float_rad=0.0)
 _DRAWS = 50  # for each pose wanted
 _NEAR = np.radians(70.0)  # a joint that turned further has gone over to another configuration
 
