@@ -1,10 +1,13 @@
-"""What every test shares: one fixed hypothesis profile and the place of the real recordings."""
+"""What tests share: one fixed hypothesis profile, the place of the real recordings, the firmware of this computer."""
 
 import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.machines import open_machine
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -20,3 +23,12 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real recordings at {path}; set ARMSIGHT_DATA to their folder")
     return path
+
+
+@pytest.fixture(scope="session")
+def host_firmware() -> None:
+    """The firmware as code of this computer, or a skip that says why it is not there."""
+    try:
+        open_machine("host").close()
+    except (DeviceError, InputError) as error:
+        pytest.skip(f"the firmware is not built: {error}")

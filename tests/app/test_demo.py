@@ -15,6 +15,7 @@ from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
 from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
+from cli_runs import refused
 
 SHORT = """
 [[motion]]
@@ -207,3 +208,14 @@ def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):
     assert "times smaller" in said.out
     again = armsight("demo", "-o", tmp_path, "--json")
     assert again.lines[0]["seed"] == 4
+
+
+def test_a_model_that_is_none_leaves_nothing_behind(armsight, tmp_path):
+    (tmp_path / "none.toml").write_text("identified = true\n")
+    for model, said in (
+        ("none.toml", "none.toml: six [[joint]] tables"),
+        ("lost.toml", "lost.toml"),
+        ("lost.urdf", "lost.urdf"),
+    ):
+        refused(armsight("demo", "--model", tmp_path / model, "-o", tmp_path / "run"), said)
+        assert not (tmp_path / "run").exists()

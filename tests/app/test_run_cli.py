@@ -9,8 +9,6 @@ import pytest
 
 from armsight.app import run_calibrate
 from armsight.app.cli import run as command
-from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.machines import open_machine
 from armsight.sim.workcell import Workcell
 from cli_runs import refused
 
@@ -24,12 +22,8 @@ rest_s = 0.5
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def files(tmp_path_factory, host_firmware):
     """Files of the workcell that ``sim:`` opens, small cameras."""
-    try:
-        open_machine("host").close()
-    except (DeviceError, InputError) as error:
-        pytest.skip(f"the firmware is not built: {error}")
     folder = tmp_path_factory.mktemp("files")
     with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
         cell.truth.rig.save(folder / "rig.json")

@@ -18,14 +18,15 @@ from armsight.app import run_calibrate
 from armsight.app.cli import run as command
 from armsight.app.run_loop import Loop
 from armsight.app.run_station import HostClock
-from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import Fault, State
-from armsight.robot.boards.machines import open_machine
 from armsight.robot.boards.opening import open_board
 from cli_runs import refused
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+pytestmark = [
+    pytest.mark.usefixtures("host_firmware"),
+    pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
+]
 CAMERAS, RATE = "640x360@15", 15
 MOTION = """
 [[motion]]
@@ -41,14 +42,6 @@ by_mm = [20.0, -80.0, -10.0]
 duration_s = 0.9
 rest_s = 0.6
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _firmware():
-    try:
-        open_machine("host").close()
-    except (DeviceError, InputError) as error:
-        pytest.skip(f"the firmware is not built: {error}")
 
 
 @pytest.fixture

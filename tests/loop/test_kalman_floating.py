@@ -6,6 +6,7 @@ from arm_bench import ARM, MIDDLE, TICK_S, TrueArm, distance_mm, legs, link_moti
 
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior, floating
 from armsight.loop.estimators.readings import GAP_RAD, Readings
+from armsight.robot.models import MODELS
 
 OTHERS = np.arange(6) != 0
 
@@ -46,6 +47,18 @@ def test_rods_weigh_what_they_are_long():
     points = floating.rods(ARM)
     tip = np.linalg.norm(ARM.T_flange_tool[:3, 3])
     assert points[:, 1].sum() == pytest.approx(np.abs(ARM.a).sum() + np.abs(ARM.d).sum() + tip)
+
+
+@pytest.mark.parametrize("arm", MODELS.values(), ids=MODELS)
+def test_every_arm_has_links_that_weigh_and_resist(arm):
+    points, beside = floating.masses(arm)
+    assert np.all(np.diff(points[:, 0]) >= 0)
+    assert points[-1, 0] == 5
+    assert np.isfinite(beside).all()
+    assert (beside > 0).all()
+    M, tau, still = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6)
+    floating._dynamics(arm.table, points, beside[0], arm.home, still, still, M, tau)
+    assert np.linalg.eigvalsh(M).min() > 0
 
 
 def coasting(shaft, width, brake):

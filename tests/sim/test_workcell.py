@@ -9,20 +9,12 @@ from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import State
-from armsight.robot.boards.machines import open_machine
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell import Workcell
 from armsight.vision.markers.board import open_board
 
+pytestmark = pytest.mark.usefixtures("host_firmware")
 SMALL = "640x360@60"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _firmware():
-    try:
-        open_machine("host").close()
-    except (DeviceError, InputError) as error:
-        pytest.skip(f"the firmware is not built: {error}")
 
 
 @pytest.fixture

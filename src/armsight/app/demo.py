@@ -13,14 +13,14 @@ from armsight.app.experiment import Outcome, Progress, run_experiment
 from armsight.app.motion_file import CHAPTER, QUICK, MotionPlan, read_motions
 from armsight.app.rate_study import rate_study
 from armsight.app.run_calibrate import calibrated, handeye_poses
-from armsight.app.run_folder import Finished, finish, make_room
+from armsight.app.run_folder import Finished, finish, make_room, open_folder
 from armsight.app.run_station import Station
 from armsight.app.studies import Study, vision_studies
 from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
-from armsight.loop.identify.model_file import open_model
+from armsight.robot.arm import Arm
 from armsight.robot.models import open_arm
 from armsight.sim.cell_camera import open_timing
 from armsight.sim.workcell import Workcell
@@ -43,7 +43,7 @@ class Demo:
         machine: what runs the firmware.
         rig: parallel or verging.
         quick: fewer calibration shots and motions, and no studies.
-        model: the table that the arm is believed to have, as ``open_model`` takes it; the one it was built to by default.
+        believed: the table that the arm is believed to have, with whatever tool; the one it was built to by default.
     """
 
     folder: Path
@@ -53,7 +53,7 @@ class Demo:
     machine: str = "unicorn"
     rig: str = "parallel"
     quick: bool = False
-    model: str | None = None
+    believed: Arm | None = None
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str, Any]:
@@ -70,12 +70,13 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
     boards, handeyes, study_shots = _AMOUNTS[demo.quick]
     progress("building the workcell")
     with _cell(demo, demo.cameras) as cell:
+        plan = read_motions(cell.model, _MOTIONS[demo.quick])
+        open_folder(demo.folder)
         make_room(demo.folder)
         progress("showing the board")
         calibration = calibrated(cell.board_spec, cell.board_shots(boards), progress)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", cell.body_text)
-        plan = read_motions(cell.model, _MOTIONS[demo.quick])
         write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))
         targets = handeye_poses(cell.model, np.vstack([cell.model.home, cell.poses]), handeyes, demo.seed)
         outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
@@ -89,7 +90,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         facts = {
             "seed": demo.seed,
             "arm": demo.arm,
-            "model": demo.model or cell.model.name,
+            "model": cell.model.name if demo.believed is None else demo.believed.source,
             "cameras": demo.cameras,
             "board": cell.board.welcome.board,
             "machine": demo.machine,
@@ -102,9 +103,9 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
 
 def _cell(demo: Demo, cameras: str) -> Workcell:
     """Return the workcell of a demo, with some cameras."""
-    believed = None
-    if demo.model is not None:  # its tool is whatever was seen; the motions are of the one that was drawn
-        believed = replace(open_model(demo.model), T_flange_tool=open_arm("six_r").T_flange_tool)
+    believed = demo.believed
+    if believed is not None:  # its tool is whatever was seen; the motions are of the one that was drawn
+        believed = replace(believed, T_flange_tool=open_arm("six_r").T_flange_tool)
     return Workcell(
         arm=demo.arm, cameras=cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig, believed=believed
     )

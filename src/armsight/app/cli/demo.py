@@ -11,8 +11,8 @@ from armsight.app.cli.progress import steps
 from armsight.app.cli.run_words import tell
 from armsight.app.demo import Demo, run_demo
 from armsight.app.report_draw import require_matplotlib
-from armsight.app.run_folder import open_folder
 from armsight.app.run_tracks import require_pyarrow
+from armsight.loop.identify.model_file import open_model
 
 
 @click.command("demo")
@@ -48,10 +48,10 @@ def command(
         raise click.UsageError(
             f"--board {board}: the workcell's board is emulated:unicorn, emulated:qemu or emulated:host"
         )
-    open_folder(out)
+    believed = None if model is None else open_model(model)
     try:
         with steps() as progress:
-            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick, model), progress=progress)
+            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick, believed), progress=progress)
     except KeyboardInterrupt:
         click.echo(f"the arm was stopped; what was measured until then is in {out}", err=True)
         raise

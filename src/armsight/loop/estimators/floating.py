@@ -45,7 +45,8 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 def rods(arm: Arm) -> Array:
     """Return points with mass (K, 5) that stand for an arm's links: link, mass, place in the frame after the joint's turn.
 
-    Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m.
+    Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m. A last link without length is
+    a disc as long as it is thick.
     """
     rows, points = arm.table[:36].reshape(6, 6), []
     for i, (a, d) in enumerate(rows[:, :2]):
@@ -56,7 +57,10 @@ def rods(arm: Arm) -> Array:
     c, s = rows[5, 2:4]
     tip = np.array([rows[5, 0] + tip[0], c * tip[1] - s * tip[2], s * tip[1] + c * tip[2]])
     points.append((5, float(np.linalg.norm(arm.T_flange_tool[:3, 3])), *(0.5 * tip)))
-    return np.array([point for point in points if point[1] > 0.0])
+    points = [point for point in points if point[1] > 0.0]
+    if points[-1][0] != 5:
+        points.append((5, _thickness(arm), 0.0, 0.0, 0.0))
+    return np.array(points)
 
 
 def masses(arm: Arm) -> tuple[Array, Array]:
@@ -66,15 +70,19 @@ def masses(arm: Arm) -> tuple[Array, Array]:
     by what a torque of theirs is to be multiplied to become the lever of a unit load, 1/N.
     """
     points = rods(arm)
-    whole = np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum()
-    own = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)]) * 0.5 * (_THICK * whole) ** 2
+    beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)])
+    own = beyond * 0.5 * _thickness(arm) ** 2
     M, tau, weight, inertia = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6), np.zeros(6)
     rng, still = np.random.default_rng(0), np.zeros(6)
     for q in rng.uniform(arm.q_min, arm.q_max, (_POSES, 6)):
         _dynamics(arm.table, points, own, q, still, still, M, tau)
         weight, inertia = np.maximum(weight, np.abs(tau[0])), np.maximum(inertia, np.diag(M))
-    beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)])
     return points, np.stack([own, BEARING * (weight + inertia * arm.qdd_max), 1 / (beyond * GRAVITY_M_S2)])
+
+
+def _thickness(arm: Arm) -> float:
+    """Return how thick the rods are that stand for an arm's links, m."""
+    return float(_THICK * np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum())
 
 
 @_kernel
