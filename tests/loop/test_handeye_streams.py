@@ -1,8 +1,12 @@
 """Two clocks and a pivot."""
 
+import io
+import zipfile
+
 import numpy as np
 import pytest
 from handeye_motions import error
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
@@ -87,3 +91,32 @@ def test_a_tool_that_hardly_turns_is_refused():
         calibrate_pivot(pivoting(1, spread=0.01)[0])
     with pytest.raises(InputError, match="4 or more"):
         calibrate_pivot(pivoting(1)[0][:3])
+
+
+PAIRS = (
+    Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).parents[3] / "shared" / "data")) / "handeye" / "eth_posepairs"
+)
+
+
+def recorded(data_dir, archive, end):
+    """Times and poses t, x, y, z, qx, qy, qz, qw of a recording of others."""
+    with zipfile.ZipFile(data_dir / "handeye" / "eth_posepairs" / "datasets" / f"{archive}.zip") as files:
+        name = next(name for name in files.namelist() if name.endswith(end))
+        D = np.loadtxt(io.BytesIO(files.read(name)), delimiter=",")
+    T = np.tile(np.eye(4), (len(D), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(D[:, 4:8]).as_matrix(), D[:, 1:4]
+    return D[:, 0], T
+
+
+def test_a_simulated_arms_one_clock_has_no_offset_and_its_own_motion_gives_back_a_known_mounting(data_dir):
+    hand = PoseStream.of(*recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_hand.csv"), "hand")
+    t, T = recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_camera.csv")
+    found = calibrate_streams(hand, PoseStream.of(t, inverse(T), "eye"), eye="in_hand")
+    assert abs(found.offset_s) < 3 * found.sigma_offset_s
+    A, good = hand.at(t - OFFSET_S)  # what an eye of a known mounting, whose clock is behind, would have seen
+    rng = np.random.default_rng(0)
+    X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
+    B = inverse(A[good] @ X) @ Z @ exp_se3(rng.normal(0, [1e-3] * 3 + [2e-3] * 3, (int(good.sum()), 6)))
+    known = calibrate_streams(hand, PoseStream.of(t[good], B, "eye"), eye="in_hand")
+    assert abs(known.offset_s + OFFSET_S) < 3.5 * known.sigma_offset_s
+    assert np.abs(error(known.handeye, Z, X) / np.sqrt(np.diag(known.handeye.cov))).max() < 3.5

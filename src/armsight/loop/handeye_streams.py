@@ -3,7 +3,7 @@
 In: times and poses of the flange, times and poses of what is seen. Out: :class:`StreamHandEye` with the offset and its
 sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all offsets that
 leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: the covariance is that
-of blocks longer than the residuals' correlation (sandwich; Liang and Zeger, Biometrika 73, 1986), not of single poses.
+of blocks longer than the residuals' correlation (jackknife), not of single poses.
 """
 
 from __future__ import annotations
@@ -202,19 +202,23 @@ def _joint_step(hand: PoseStream, t_eye: Array, B: Array, offset: float, h: Hand
 
 
 def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h: HandEye) -> Array:
-    """Return the covariance (13, 13) that the scatter between blocks of time shows."""
+    """Return the covariance (13, 13) that leaving out blocks of time, one after the other, shows.
+
+    The delete-a-group jackknife: unlike the plain sandwich it allows for what each block pulls the fit its own way, which
+    counts where blocks are as few as the unknowns (Bell and McCaffrey, Survey Methodology 28, 2002).
+    """
     e, J, C, _ = _linear(hand, t_eye, B, offset, h)
     WJ = np.linalg.solve(C, J)
-    inverse_H = np.linalg.inv(np.einsum("nki,nkj->ij", J, WJ))
+    H = np.einsum("nki,nkj->nij", J, WJ)
+    whole = H.sum(axis=0)
     pulls = np.einsum("nki,nk->ni", WJ, e)
     whitened = (np.linalg.inv(np.linalg.cholesky(C)) @ e[..., None])[..., 0]
     length = int(np.clip(2 * _correlation_length(whitened), 1, max(len(e) // LEAST_BLOCKS, 1)))
     blocks = np.array_split(np.arange(len(e)), max(len(e) // length, 2))
-    sums = np.array([pulls[block].sum(axis=0) for block in blocks])
-    spread = sums.T @ sums * len(blocks) / (len(blocks) - 1)
-    plain = inverse_H
-    robust = inverse_H @ spread @ inverse_H
+    moved = np.array([np.linalg.solve(whole - H[block].sum(axis=0), pulls[block].sum(axis=0)) for block in blocks])
+    robust = moved.T @ moved * (len(blocks) - 1) / len(blocks)
     # Few blocks can scatter less than single poses would by chance: never claim more than independent poses allow.
+    plain = np.linalg.inv(whole)
     grow = np.sqrt(np.maximum(np.diag(plain) / np.diag(robust), 1.0))
     return np.asarray(robust * np.outer(grow, grow))
 
