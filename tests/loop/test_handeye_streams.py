@@ -93,11 +93,6 @@ def test_a_tool_that_hardly_turns_is_refused():
         calibrate_pivot(pivoting(1)[0][:3])
 
 
-PAIRS = (
-    Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).parents[3] / "shared" / "data")) / "handeye" / "eth_posepairs"
-)
-
-
 def recorded(data_dir, archive, end):
     """Times and poses t, x, y, z, qx, qy, qz, qw of a recording of others."""
     with zipfile.ZipFile(data_dir / "handeye" / "eth_posepairs" / "datasets" / f"{archive}.zip") as files:
