@@ -50,34 +50,38 @@ def worn_arms(told, seeds: int) -> None:
     told(f"  furthest of {len(off)} parameters from the truth", max(off), 3.0, "sigma")
     told(f"  share of them over 3 sigma: {sum(o > 3 for o in off)} of {len(off)}", np.mean(np.array(off) > 3), 0.01, "")
     told("  backlash, furthest", max(play), 0.02, "deg")
-    planned(told, min(seeds, 3))
+    planned(told, seeds)
 
 
 def planned(told, seeds: int) -> None:
-    """Poses that random choice needs for what planned ones reach, after a first few."""
-    shares = []
+    """Poses that random choice needs for what planned ones reach, after a first few: drawn all over, and about home."""
+    counts, more = np.array([15, 20, 25, 30, 40, 60]), 15
+    reached, all_over, home = [], [], []
     for seed in range(seeds):
         rng, w = np.random.default_rng(200 + seed), worn(seed)
         first = w.seen(*poses(w.nominal, FIRST, rng), rng)
         model, x = placed(Model.of(w.nominal, first, backlash=True), first)
-        plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), 15, done=first, seed=seed)
+        plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), more, done=first, seed=seed)
         q = rng.uniform(np.maximum(w.nominal.q_min, -np.pi), np.minimum(w.nominal.q_max, np.pi), (4000, 6))
         q = q[free_of_collision(model, q)]
         side = rng.choice([-1.0, 1.0], q.shape)
         truth = w.T_rig_body(q[:UNSEEN], side[:UNSEEN])
 
-        def error(more, sides, w=w, first=first, rng=rng, q=q, side=side, truth=truth):
+        def error(more, sides, w=w, first=first, seed=seed, q=q, side=side, truth=truth) -> float:
             both = np.concatenate([first.q, more]), np.concatenate([first.approach, sides])
-            found = identify(w.nominal, w.seen(*both, rng))
-            return distance_m(found.model, found.solution.x, truth, q[:UNSEEN], side[:UNSEEN]).mean()
+            found = identify(w.nominal, w.seen(*both, np.random.default_rng([seed, len(more)])))
+            return float(distance_m(found.model, found.solution.x, truth, q[:UNSEEN], side[:UNSEEN]).mean())
 
-        reached = error(plan.q, plan.approach)
-        needed = next(
-            (n for n in (10, 15, 20, 25, 30, 40, 60) if error(q[300 : 300 + n], side[300 : 300 + n]) <= reached), 80
-        )
-        shares.append(len(plan.q) / needed)
+        near, near_side = poses(w.nominal, max(counts), rng)
+        reached.append(error(plan.q, plan.approach))
+        all_over.append([error(q[300 : 300 + n], side[300 : 300 + n]) for n in counts])
+        home.append([error(near[:n], near_side[:n]) for n in counts])
         print(
-            f"     planned 15: {1e3 * reached:.3f} mm; random needs {needed} (predicted {plan.random_for(15)})",
-            flush=True,
+            f"     planned {more}: {1e3 * reached[-1]:.3f} mm; predicted as good as {plan.random_for(more)}", flush=True
         )
-    told("  planned poses, of the random ones needed", float(np.mean(shares)), 0.5, "")
+    for name, errors in (("all over", all_over), ("about home", home)):
+        mean = np.mean(errors, axis=0)
+        told_mm = ", ".join(f"{n}: {1e3 * e:.3f}" for n, e in zip(counts, mean, strict=True))
+        # Where the mean error of random ones falls to that of the planned; they are as many as were tried at most.
+        needed = float(np.interp(-np.log(np.mean(reached)), -np.log(np.minimum.accumulate(mean)), counts))
+        told(f"  planned poses, of the random ones {name}", more / needed, 0.5, "", f", {needed:.0f} ({told_mm} mm)")

@@ -1,22 +1,24 @@
 """Where to look next: the poses that tell most about an arm, and what so many more of them buy.
 
-Greedy choice among candidates that can be reached and seen: each next pose is the one that lowers most the predicted
-position error over the workspace (the trace of what the parameters' covariance does there, I-optimal, to first order; the
-noise amplification of what is wanted, not of numbers that nobody asks for). A pose brings the information J^T C^-1 J with
-the vision's covariance C there; the covariance is updated by the Woodbury identity, so that thousands of candidates cost
-little.
+Greedy choice among candidates that can be reached and seen, then exchange joint by joint (``design``): poses that lower
+most the predicted position error over the workspace (the trace of what the parameters' covariance does there, I-optimal, to
+first order; the noise amplification of what is wanted, not of numbers that nobody asks for). A pose brings the information
+J^T C^-1 J with the vision's covariance C there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.loop.identify.design import exchanged, greedy
+from armsight.loop.identify.evidence import SCALED
 from armsight.loop.identify.fit import Mask, weighted
 from armsight.loop.identify.growth import PLACEMENT
 from armsight.loop.identify.measured import Measured
@@ -29,8 +31,10 @@ CANDIDATES, PROBES = 1500, 200
 FLOOR_M, APART_M = 0.02, 0.06
 #: What nothing is known of at first: base and tool, m and rad.
 UNKNOWN = 0.1
-#: Candidates weighed at once: bounds the memory.
-_BATCH = 250
+#: Poses keep this far from the joints' limits, rad: a joint must have room to come from either side.
+ROOM_RAD = 0.03
+#: A prior sigma of a cause says how large it may be (a data sheet's limit); it mostly is this part of it.
+MOSTLY = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +76,7 @@ def plan_poses(
     Args:
         model: the arm with every parameter.
         x: (P,) where its base and tool are, at least roughly.
-        prior: (P,) prior sigmas.
+        prior: (P,) prior sigmas, as of a fit.
         noise: sigmas of place, m, and turn, rad, of the instrument, where ``cov`` does not say.
         n: how many poses.
         done: what was measured already.
@@ -84,42 +88,79 @@ def plan_poses(
         InputError: fewer candidates than ``n`` can be reached and seen.
     """
     rng = np.random.default_rng(seed)
-    q, approach, seen = _candidates(model, x, rng, visible, cov)
+    scene = Scene(model, x, noise, visible, cov)
+    q, approach, seen = _candidates(scene, rng)
     if len(q) < n:
         raise InputError(f"only {len(q)} of {CANDIDATES} poses can be reached and seen; {n} were asked for")
-    J = _whitened(model, x, seen, noise)
+    prior = np.where([p.kind in SCALED for p in model.parameters], MOSTLY * prior, prior)
     free = observed(model, x, seen, prior, noise).possible
-    P = _prior_covariance(model, prior, free)
+    P = _prior_covariance(prior, free)
     if done is not None:
-        Jd = _whitened(model, x, done, noise)[:, :, free].reshape(-1, int(free.sum()))
+        Jd = scene.whitened(done)[:, :, free].reshape(-1, int(free.sum()))
         P = np.asarray(np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd))
-    J = J[:, :, free]
+    J = scene.whitened(seen)[:, :, free]
     wanted = _wanted(model, x, seen, free, rng)
-    chosen, sigma = _greedy(J, P, wanted, n)
-    _, drawn = _greedy(J[rng.permutation(len(J))[: 4 * n]], P, wanted, min(4 * n, len(J)), in_order=True)
-    return Plan(q[chosen], approach[chosen], sigma, drawn)
+
+    def tells(q: Array, approach: Array) -> tuple[Array, Mask]:
+        return scene.whitened(scene.seen(q, approach))[:, :, free], scene.allowed(q, approach)
+
+    chosen, _ = greedy(J, P, wanted, n)
+    better, sides = exchanged(q[chosen], approach[chosen], tells, P, wanted, scene.limits, rng)
+    order, sigma = greedy(tells(better, sides)[0], P, wanted, n)
+    _, drawn = greedy(J[rng.permutation(len(J))[: 4 * n]], P, wanted, min(4 * n, len(J)), in_order=True)
+    return Plan(better[order], sides[order], sigma, drawn)
 
 
-def _candidates(
-    model: Model,
-    x: Array,
-    rng: np.random.Generator,
-    visible: Callable[[Array], NDArray[np.bool_]],
-    cov: Callable[[Array], Array] | None,
-) -> tuple[Array, Array, Measured]:
+class Scene(NamedTuple):
+    """What poses would be seen as, and which can be.
+
+    Attributes:
+        model: the arm with every parameter.
+        x: (P,) the vector.
+        noise: sigmas of place, m, and turn, rad, beyond ``cov``.
+        visible: says which poses T_rig_body (N, 4, 4) the cameras can see.
+        cov: gives the covariance (N, M, M) of what is seen of them; None: ``noise`` is all.
+    """
+
+    model: Model
+    x: Array
+    noise: tuple[float, float]
+    visible: Callable[[Array], NDArray[np.bool_]]
+    cov: Callable[[Array], Array] | None
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Return least and greatest joint angles (6,), rad, of a plan."""
+        arm = self.model.arm
+        return np.maximum(arm.q_min + ROOM_RAD, -np.pi), np.minimum(arm.q_max - ROOM_RAD, np.pi)
+
+    def T_rig_body(self, q: Array, approach: Array) -> Array:
+        """Return the body (N, 4, 4) in the rig."""
+        return np.asarray(self.model.T_rig_base(self.x) @ self.model.tool_in_base(self.x, q, approach))
+
+    def allowed(self, q: Array, approach: Array) -> Mask:
+        """Say which poses (N,) are free and visible."""
+        return free_of_collision(self.model, q) & self.visible(self.T_rig_body(q, approach))
+
+    def seen(self, q: Array, approach: Array) -> Measured:
+        """Return what would be seen without noise."""
+        model, T = self.model, self.T_rig_body(q, approach)
+        m = model.motion(self.x, q, model.feature_values(q, approach))
+        p = m.o[:, None] + (m.R @ model.tool_points(self.x).T).swapaxes(1, 2)
+        return Measured(q, p, T[:, :3, :3] if model.full else None, None if self.cov is None else self.cov(T), approach)
+
+    def whitened(self, measured: Measured) -> Array:
+        """Return the whitened Jacobians (N, M, P)."""
+        phi = self.model.feature_values(measured.q, measured.approach)
+        return weighted(self.model, self.x, measured, phi, self.noise)[1]
+
+
+def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
     """Return joint angles, directions of approach and what would be seen, of poses that are reachable, free and visible."""
-    arm = model.arm
-    q = rng.uniform(np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi), (4 * CANDIDATES, 6))
-    q = q[free_of_collision(model, q)]
+    q = rng.uniform(*scene.limits, (4 * CANDIDATES, 6))
     approach = rng.choice([-1.0, 1.0], q.shape)
-    T = model.T_rig_base(x) @ model.tool_in_base(x, q, approach)
-    rows = np.flatnonzero(visible(T))[:CANDIDATES]
-    q, approach, T = q[rows], approach[rows], T[rows]
-    points = model.tool_points(x)
-    m = model.motion(x, q, model.feature_values(q, approach))
-    p = m.o[:, None] + (m.R @ points.T).swapaxes(1, 2)
-    R = T[:, :3, :3] if model.full else None
-    return q, approach, Measured(q, p, R, None if cov is None else cov(T), approach)
+    rows = np.flatnonzero(scene.allowed(q, approach))[:CANDIDATES]
+    return q[rows], approach[rows], scene.seen(q[rows], approach[rows])
 
 
 def free_of_collision(model: Model, q: Array) -> Mask:
@@ -148,12 +189,7 @@ def _segments_apart(o: Array) -> bool:
     return True
 
 
-def _whitened(model: Model, x: Array, measured: Measured, noise: tuple[float, float]) -> Array:
-    phi = model.feature_values(measured.q, measured.approach)
-    return weighted(model, x, measured, phi, noise)[1]
-
-
-def _prior_covariance(model: Model, prior: Array, free: Mask) -> Array:
+def _prior_covariance(prior: Array, free: Mask) -> Array:
     sigma = np.where(np.isfinite(prior), prior, UNKNOWN)[free]
     return np.asarray(np.diag(sigma**2))
 
@@ -166,42 +202,3 @@ def _wanted(model: Model, x: Array, seen: Measured, free: Mask, rng: np.random.G
     J = J[:, :3].copy()
     J[:, :, [p.kind == PLACEMENT[0] for p in model.parameters]] = 0.0  # where the base is in the rig is not the arm's
     return J[:, :, free].reshape(-1, int(free.sum()))
-
-
-def _greedy(J: Array, P: Array, wanted: Array, n: int, *, in_order: bool = False) -> tuple[Array, Array]:
-    """Return rows chosen one by one, and the predicted RMS position error before and after each."""
-    P = P.copy()
-    left = np.ones(len(J), bool)
-    chosen: list[int] = []
-    W = wanted.T @ wanted
-    points = len(wanted) / 3
-
-    def rms() -> float:
-        return float(np.sqrt(np.einsum("ij,ji->", W, P) / points))
-
-    sigma = [rms()]
-    for k in range(n):
-        if in_order:
-            best = k
-        else:
-            rows = np.flatnonzero(left)
-            best = int(rows[np.argmax(_gains(J[rows], P, W))])
-        G = P @ J[best].T
-        S = np.eye(J.shape[1]) + J[best] @ G
-        P = P - G @ np.linalg.solve(S, G.T)
-        P = (P + P.T) / 2
-        left[best] = False
-        chosen.append(best)
-        sigma.append(rms())
-    return np.array(chosen), np.array(sigma)
-
-
-def _gains(J: Array, P: Array, W: Array) -> Array:
-    """Return by how much each pose lowers trace(W P): trace(S^-1 J P W P J^T)."""
-    PWP = P @ W @ P
-    out = np.empty(len(J))
-    for at in range(0, len(J), _BATCH):
-        part = J[at : at + _BATCH]
-        S = np.eye(J.shape[1]) + part @ P @ part.swapaxes(1, 2)
-        out[at : at + _BATCH] = np.einsum("nii->n", np.linalg.solve(S, part @ PWP @ part.swapaxes(1, 2)))
-    return out
