@@ -2,10 +2,14 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
 
+from armsight.app.motion_file import read_motions
+from armsight.robot.models import open_arm
+from armsight.sim.workcell import Workcell
 from cli_runs import Said, refused, run
 
 COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
@@ -52,10 +56,10 @@ def file_of(path, rows):
 def test_every_figure(tmp_path, capsys):
     (tmp_path / "run").mkdir()
     file_of(tmp_path / "run" / "check.csv", rows_of())
-    answer = said(capsys, tmp_path / "run", "--json", "-o", tmp_path / "figures.json")
+    answer = said(capsys, tmp_path / "run", "--json", "-o", tmp_path / "report")
     assert answer.code == 0
     (facts,) = answer.lines
-    assert json.loads((tmp_path / "figures.json").read_text()) == facts
+    assert json.loads((tmp_path / "report" / "check.json").read_text()) == facts
     assert set(facts["poses"]) == {f"P{k}" for k in range(1, 6)}
     for p in facts["poses"].values():
         assert p["count"] == 30
@@ -63,32 +67,116 @@ def test_every_figure(tmp_path, capsys):
         assert p["RP_m"]["clean"] < p["RP_m"]["raw"]
     assert facts["vAP_m"]["P1"]["raw"] == pytest.approx(2e-4, abs=1.5e-4)
     assert facts["distance"]["AD_m"]["raw"] < 1e-4
-    assert facts["path"]["AT_m"] == pytest.approx(5e-4, abs=1e-9)
-    assert facts["circle"]["backlash_m"] == pytest.approx([2e-4, 0], abs=2e-5)
+    assert facts["paths"]["path"]["AT_m"]["raw"] == pytest.approx(5e-4, abs=1e-9)
+    assert [play["raw"] for play in facts["circle"]["backlash_m"]] == pytest.approx([2e-4, 0], abs=2e-5)
     assert len(facts["drift"]["dAP_m"]) == 5
+    page = (tmp_path / "report" / "report.html").read_text()
+    for name in ("scatter", "drift", "paths", "circle"):
+        assert f'id="{name}"' in page
+        assert (tmp_path / "report" / f"check-{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert "http" not in page
+    again = said(capsys, tmp_path / "report" / "check.csv", "--json")
+    assert again.lines[0]["poses"]["P1"]["AP_m"]["raw"] == pytest.approx(facts["poses"]["P1"]["AP_m"]["raw"], abs=2e-9)
 
 
 def test_what_is_below_the_noise_is_said(tmp_path, capsys):
     rows = rows_of(sigma_arm=0.0, noise=1e-4)
-    answer = said(capsys, file_of(tmp_path / "c.csv", rows))
+    answer = said(capsys, file_of(tmp_path / "c.csv", rows), "-o", tmp_path / "report")
     assert answer.code == 0
-    assert "not resolvable" in answer.out
-    assert "play along x and y 0.2" in answer.out
+    assert "not resolvable: below" in answer.out
+    assert "could have been told" in answer.out
+    assert re.search(r"^play +along x +0\.2\d\d mm", answer.out, re.MULTILINE)
+    assert "not resolvable" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_a_constant_error_of_the_instrument_is_in_the_accuracy(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose"]
+    plain = said(capsys, file_of(tmp_path / "a.csv", rows), "--json").lines[0]["poses"]["P1"]
+    with open(tmp_path / "b.csv", "w", newline="") as file:
+        common = [f"sigma_common_{a}_m" for a in "xyz"]
+        csv.writer(file).writerows([[*COLUMNS, *COMMAND, *SIGMA, *common], *([*row, 1e-4, 1e-4, 1e-4] for row in rows)])
+    facts = said(capsys, tmp_path / "b.csv", "--json").lines[0]["poses"]["P1"]
+    assert facts["AP_m"]["sigma"] == pytest.approx(np.hypot(1e-4, plain["AP_m"]["sigma"]), rel=0.1)
+    assert plain["AP_m"]["sigma"] < 5e-5
+    assert facts["RP_m"] == plain["RP_m"]
+
+
+def test_the_wide_test(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    rows = []
+    for k in range(100):
+        command = rng.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.7])
+        off = rng.normal(0, 1e-3, 3)
+        rows.append(["pose", f"P{k}", 1, "", k, *(command + off), 1, 0, 0, 0, *command, 1, 0, 0, 0, 1e-5, 1e-5, 1e-5])
+    answer = said(capsys, file_of(tmp_path / "wide.csv", rows), "--json", "-o", tmp_path / "report")
+    (facts,) = answer.lines
+    assert facts["anywhere"]["count"] == 100
+    assert facts["anywhere"]["mean_m"]["clean"] == pytest.approx(1e-3 * np.sqrt(8 / np.pi), rel=0.2)
+    assert "poses" not in facts
+    assert (tmp_path / "report" / "check-anywhere.png").exists()
+    assert not (tmp_path / "report" / "check-scatter.png").exists()
 
 
 def test_the_plan(tmp_path, capsys):
-    answer = said(capsys, "--plan", "six_r", "-o", tmp_path / "plan.csv")
+    answer = said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.csv")
     assert answer.code == 0
-    assert "30 times" in answer.out
+    assert "cycles: 30" in answer.out
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
-    refused(said(capsys, "--plan", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    refused(said(capsys, "plan", "--model", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
+    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
+    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "rig.json", "no such file")
+    assert "--test" in said(capsys, "plan", "--help").out
+    assert "RUN|POSES.csv" in said(capsys, "--help").out
+
+
+@pytest.mark.parametrize(("test", "count"), [("poses", 1 + 2 * 5), ("wide", 1 + 2 * 100), ("line", 5), ("circle", 5)])
+def test_a_plan_is_a_motion_file(tmp_path, capsys, test, count):
+    out = tmp_path / "check.toml"
+    answer = said(capsys, "plan", "--model", "six_r", "--test", test, "--cycles", "2", "-o", out, "--json")
+    arm, plan = open_arm("six_r"), read_motions(open_arm("six_r"), out)
+    assert len(plan.motions) == count
+    (facts,) = answer.lines
+    attained = {}
+    for motion in plan.motions:
+        q = motion.trajectory.at(np.linspace(0, motion.trajectory.duration_s, 100)).q
+        assert arm.within_limits(q).all()
+        attained.setdefault(motion.name.split(" cycle ")[0], []).append(arm.forward(q[-1]))
+        p = arm.forward(q)[:, :3, 3]
+        if motion.kind == "circle":
+            radii = np.linalg.norm(p - facts["centre_m"], axis=1)
+            np.testing.assert_allclose(radii, 0.4 * facts["side_m"], atol=1e-8)
+            turned = np.abs(np.diff(p, axis=0)).sum()
+            assert turned > 2 * np.pi * 0.4 * facts["side_m"]
+    if test == "poses":
+        for name, T in zip(facts["poses"], facts["T_base_tool"], strict=True):
+            np.testing.assert_allclose(attained[name], [T, T], atol=1e-7)  # angles are written to 1e-6 deg
+
+
+def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
+    with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
+        cell.truth.rig.save(tmp_path / "rig.json")
+        (tmp_path / "body.toml").write_text(cell.body_text)
+        mounting = {"T_base_rig": cell.truth.T_base_rig.tolist(), "T_tool_body": cell.truth.T_tool_body.tolist()}
+    (tmp_path / "handeye.json").write_text(json.dumps(mounting))
+    seen = said(capsys, "plan", "--model", "six_r", "--test", "wide", "--seen-in", tmp_path, "--json").lines[0]
+    rig, T_base_rig = cell.truth.rig, np.array(mounting["T_base_rig"])
+    p = np.array(seen["T_base_tool"])[:, :3, 3]
+    p_left = (p - T_base_rig[:3, 3]) @ T_base_rig[:3, :3]
+    uv = rig.left.project(p_left)
+    assert np.all((uv > 0) & (uv < np.array(rig.left.image_size_px)))
+    (tmp_path / "handeye.json").write_text("{}")
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_base_rig")
 
 
 def test_mistakes(tmp_path, capsys):
-    refused(said(capsys), "run folder", "--plan")
+    assert said(capsys).code == 2
     refused(said(capsys, tmp_path / "none.csv"), "none.csv", "no such file")
-    refused(said(capsys, file_of(tmp_path / "a.csv", rows_of()), "--wide"), "--plan")
     good = rows_of()
+    refused(said(capsys, file_of(tmp_path / "a.csv", good), "--closed"), "--closed", "run's folder")
+    (tmp_path / "file").write_text("")
+    refused(said(capsys, tmp_path / "a.csv", "-o", tmp_path / "file"), "file", "no report")
     bad = tmp_path / "bad.csv"
     file_of(bad, [["dance", *good[0][1:]]])
     refused(said(capsys, bad), "line 2", "'dance'", "pose, path, circle")
@@ -97,7 +185,10 @@ def test_mistakes(tmp_path, capsys):
     file_of(bad, [[*good[0][:5], "nan", *good[0][6:]]])
     refused(said(capsys, bad), "line 2", "x_m", "finite")
     file_of(bad, good[:1])
-    refused(said(capsys, bad), "3 times")
+    refused(said(capsys, bad), "3 times", "repeatability")
+    file_of(bad, [row for row in good if row[0] == "pose" and row[2] == 0])
+    refused(said(capsys, bad, "-o", tmp_path / "none"), "5 poses", "3 times")
+    assert not (tmp_path / "none").exists()
     file_of(bad, [[*good[0][:8], 2, *good[0][9:]]] * 3)
     refused(said(capsys, bad), "line 2", "quaternion")
     file_of(bad, [row for row in good if row[0] == "circle" and row[3] == 1])

@@ -1,115 +1,87 @@
-"""Judge an arm from a CSV of attained poses: read, sort into the standard's tests, compute, say it in words.
-
-Columns: test (pose, path or circle), pose (its name; at a path or circle the station), cycle, x_m, y_m, z_m, qw, qx, qy, qz
-attained in the base; command_x_m .. command_qz commanded; sigma_x_m, sigma_y_m, sigma_z_m of the instrument; t_s and
-approach where they are known. Angles of a circle count from x towards y of the base unless the commands say otherwise.
-"""
+"""Judge an arm from what it attained: sort the rows into the standard's tests and compute its figures."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from armsight.app.check_folder import rows_of_run
+from armsight.app.check_rows import TESTS, Row, read_rows
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_table
-from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.loop import iso9283
-from armsight.loop.iso9283 import Figure
-from armsight.loop.iso9283_path import circle_figures, path_figures
+from armsight.loop.iso9283_figure import Figure
+from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
 
-TESTS = ("pose", "path", "circle")
-_PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-_TEXTS = ("test", "pose", "cycle", "approach")
-
-
-@dataclass(frozen=True)
-class Row:
-    """One attained pose of a file."""
-
-    line: int
-    test: str
-    pose: str
-    cycle: str
-    approach: str
-    numbers: dict[str, float]
-
-    def T(self, prefix: str = "") -> Array:
-        """Return the attained pose, or with the prefix "command_" the commanded one."""
-        n = self.numbers
-        q = np.array([n.get(prefix + name, float(name == "qw")) for name in _TURN])
-        if not 0.999 < np.linalg.norm(q) < 1.001:
-            raise InputError(
-                f"line {self.line}: quaternion {prefix}qw .. {prefix}qz has length {np.linalg.norm(q):.4g}, not 1"
-            )
-        return pose(from_quaternion_wxyz(q), np.array([n[prefix + name] for name in _PLACE]))
-
-    def cov(self) -> Array:
-        """Return the instrument's covariance (3, 3) of the place."""
-        return np.diag([self.numbers.get(f"sigma_{name}", 0.0) ** 2 for name in _PLACE])
+#: So many poses tell something of the workspace where none was attained often enough to tell of itself.
+_WIDE = 10
+#: So many times must the first pose have been attained for its drift.
+_DRIFTS = 10
 
 
-def read_check(path: Path) -> list[Row]:
-    """Read a file, or check.csv of a run folder.
+def read_check(path: Path, *, closed: bool = False) -> tuple[list[Row], list[str]]:
+    """Read what was attained, from a run's folder (or the check.csv in it) or from a CSV.
+
+    Args:
+        path: folder or file.
+        closed: of a run, take the motions with the loop closed on vision.
+
+    Returns:
+        The rows; what was left out, in words.
 
     Raises:
-        InputError: unreadable, a column missing, or a cell that is no number; the message names the line.
+        InputError: it cannot be read, or holds nothing that can be judged.
     """
-    file = path / "check.csv" if path.is_dir() else path
-    table = read_table(file)
-    if not table:
-        raise InputError(f"{file}: empty; a first line of column names is needed")
-    header = [name.strip() for name in table[0]]
-    needed = ("pose", *_PLACE, *(f"command_{name}" for name in _PLACE))
-    missing = [name for name in needed if name not in header]
-    if missing:
-        raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(needed)}")
-    rows = []
-    for line, cells in enumerate(table[1:], start=2):
-        if any(cell.strip() for cell in cells):
-            rows.append(_row(file, line, dict(zip(header, (cell.strip() for cell in cells), strict=False))))
-    if not rows:
-        raise InputError(f"{file}: no rows; one line an attained pose is needed")
-    return rows
+    if path.is_dir() and not (path / "check.csv").exists():
+        return rows_of_run(path, closed=closed)
+    if closed:
+        raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
+    return read_rows(path / "check.csv" if path.is_dir() else path), []
 
 
-def _row(file: Path, line: int, cells: dict[str, str]) -> Row:
-    texts = {name: cells.get(name, "") for name in _TEXTS}
-    test = texts["test"] or "pose"
-    if test not in TESTS:
-        raise InputError(f"{file}: line {line}: test is {test!r}; known are {', '.join(TESTS)}")
-    numbers = {}
-    for name, cell in cells.items():
-        if name in _TEXTS or not cell:
-            continue
-        try:
-            numbers[name] = float(cell)
-        except ValueError:
-            raise InputError(f"{file}: line {line}: {name} is {cell!r}, must be a number") from None
-        if not np.isfinite(numbers[name]):
-            raise InputError(f"{file}: line {line}: {name} is {cell}, must be a finite number")
-    for name in (*_PLACE, *(f"command_{name}" for name in _PLACE)):
-        if name not in numbers:
-            raise InputError(f"{file}: line {line}: {name} is empty")
-    return Row(line, test, texts["pose"], texts["cycle"], texts["approach"], numbers)
+def judge(rows: list[Row], notes: list[str]) -> dict[str, Any]:
+    """Return all figures that the rows allow, SI units.
 
+    Args:
+        rows: what was attained.
+        notes: what was left out of them; told where nothing is left.
 
-def judge(rows: list[Row]) -> dict[str, Any]:
-    """Return all figures that the rows allow, SI units: poses, multi_directional, distance, drift, path, circle."""
+    Returns:
+        poses (by name), anywhere (where each was attained too seldom), vAP_m, distance, drift, paths (by name), circle,
+        notes.
+
+    Raises:
+        InputError: too few rows for any figure.
+    """
     by_test = {test: [row for row in rows if row.test == test] for test in TESTS}
     facts: dict[str, Any] = {}
-    if by_test["pose"]:
+    seldom = _too_seldom(by_test["pose"])
+    if by_test["pose"] and seldom is None:
         facts |= _poses(by_test["pose"])
     if by_test["path"]:
-        facts["path"] = _path(by_test["path"])
+        paths = _groups(by_test["path"], lambda row: row.approach)
+        facts["paths"] = {name or "path": _path(name, group) for name, group in paths.items()}
     if by_test["circle"]:
         facts["circle"] = _circle(by_test["circle"])
-    return facts
+    if not facts:
+        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *notes]))
+    return facts | {"notes": notes}
+
+
+def _too_seldom(rows: list[Row]) -> str | None:
+    """Say why there is neither a repeatability nor enough of the workspace; None where there is, or no pose at all."""
+    counts = Counter(row.pose for row in rows).values()
+    if not rows or max(counts) >= iso9283.LEAST or len(counts) >= _WIDE:
+        return None
+    return (
+        f"{len(counts)} poses, none attained {iso9283.LEAST} times and more (the most: {max(counts)}), so there is no "
+        f"repeatability: 30 times are the standard's, or {_WIDE} poses and more once (armsight check plan)"
+    )
 
 
 def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
@@ -120,39 +92,61 @@ def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
 
 
 def _places(rows: list[Row]) -> Array:
-    return np.array([row.T()[:3, 3] for row in rows])
+    return np.array([row.T[:3, 3] for row in rows])
+
+
+def _off(rows: list[Row]) -> Array:
+    return np.array([row.T[:3, 3] - row.T_command[:3, 3] for row in rows])
+
+
+def _common(rows: list[Row]) -> Array:
+    return np.asarray(np.mean([row.cov_common for row in rows], axis=0))
+
+
+def _covs(rows: list[Row]) -> Array:
+    return np.array([row.cov for row in rows])
 
 
 def _poses(rows: list[Row]) -> dict[str, Any]:
-    facts: dict[str, Any] = {"poses": {}}
     groups = _groups(rows, lambda row: row.pose)
-    several = {}
-    for name, group in groups.items():
-        figures = iso9283.pose_figures(
-            np.array([row.T() for row in group]), group[0].T("command_"), np.array([row.cov() for row in group])
-        )
-        facts["poses"][name] = {
-            "count": figures.count,
-            "AP_m": _figure(figures.accuracy),
-            "AP_xyz_m": figures.accuracy_xyz.tolist(),
-            "AP_turn_rad": figures.accuracy_turn.tolist(),
-            "RP_m": _figure(figures.repeatability),
-            "RP_turn_rad": figures.repeatability_turn.tolist(),
-        }
-        ways = _groups([row for row in group if row.approach], lambda row: row.approach)
-        if len(ways) > 1:
-            several[name] = _figure(iso9283.multi_directional([_places(way) for way in ways.values()]))
-    if several:
-        facts["vAP_m"] = several
-    names = list(groups)
-    distance = _distance(groups[names[1]], groups[names[-1]]) if len(names) > 2 else None
-    if distance:
-        facts["distance"] = {"from": names[1], "to": names[-1], **distance}
-    timed = [row for row in groups[names[0]] if "t_s" in row.numbers]
-    if len(timed) >= 10:
-        times, wander = iso9283.drift(np.array([row.numbers["t_s"] for row in timed]), _places(timed))
-        facts["drift"] = {"pose": names[0], "t_s": times.tolist(), "dAP_m": wander.tolist()}
+    often = {name: group for name, group in groups.items() if len(group) >= iso9283.LEAST}
+    facts: dict[str, Any] = {}
+    if not often:
+        mean, largest = iso9283.anywhere(_off(rows), np.array([row.cov + row.cov_common for row in rows]))
+        facts["anywhere"] = {"count": len(rows), "mean_m": figure(mean), "max_m": figure(largest)}
+        return facts
+    facts["poses"] = {name: _pose(group) for name, group in often.items()}
+    several = {name: _ways(group) for name, group in often.items()}
+    facts |= {"vAP_m": known} if (known := {name: f for name, f in several.items() if f}) else {}
+    names = list(often)
+    if len(names) > 2:  # the standard's five: P2 and P4
+        first, last = names[1], names[3] if len(names) > 3 else names[-1]
+        distance = _distance(often[first], often[last])
+        facts |= {"distance": {"from": first, "to": last, **distance}} if distance else {}
+    timed = [row for row in often[names[0]] if row.t_s is not None]
+    if len(timed) >= _DRIFTS:
+        times, wander, largest = iso9283.drift(np.array([row.t_s for row in timed]), _places(timed))
+        facts["drift"] = {"pose": names[0], "t_s": times.tolist(), "dAP_m": wander.tolist(), "max_m": figure(largest)}
     return facts
+
+
+def _pose(rows: list[Row]) -> dict[str, Any]:
+    """Return AP and RP of a pose."""
+    figures = iso9283.pose_figures(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
+    return {
+        "count": figures.count,
+        "AP_m": figure(figures.accuracy),
+        "AP_xyz_m": figures.accuracy_xyz.tolist(),
+        "AP_turn_rad": figures.accuracy_turn.tolist(),
+        "RP_m": figure(figures.repeatability),
+        "RP_turn_rad": figures.repeatability_turn.tolist(),
+    }
+
+
+def _ways(rows: list[Row]) -> dict[str, float | None] | None:
+    """Return vAP of a pose; None where it was come to often from one direction only."""
+    ways = [way for way in _groups(rows, lambda row: row.approach).values() if len(way) > 1]
+    return figure(iso9283.multi_directional([_places(way) for way in ways])) if len(ways) > 1 else None
 
 
 def _distance(first: list[Row], last: list[Row]) -> dict[str, Any] | None:
@@ -161,24 +155,28 @@ def _distance(first: list[Row], last: list[Row]) -> dict[str, Any] | None:
     pairs = [(row, there[row.cycle]) for row in first if row.cycle and row.cycle in there]
     if len(pairs) < iso9283.LEAST:
         return None
-    a, b = _places([p[0] for p in pairs]), _places([p[1] for p in pairs])
-    commanded = float(np.linalg.norm(first[0].T("command_")[:3, 3] - last[0].T("command_")[:3, 3]))
-    AD, RD = iso9283.distance_figures(a, b, commanded, np.array([p[0].cov() for p in pairs]))
-    return {"commanded_m": commanded, "AD_m": _figure(AD), "RD_m": _figure(RD)}
+    a, b = (_places([p[k] for p in pairs]) for k in (0, 1))
+    commanded = float(np.linalg.norm((first[0].T_command - last[0].T_command)[:3, 3]))
+    AD, RD = iso9283.distance_figures(a, b, commanded, _covs([p[0] for p in pairs]))
+    return {"commanded_m": commanded, "AD_m": figure(AD), "RD_m": figure(RD)}
 
 
-def _path(rows: list[Row]) -> dict[str, Any]:
+def _path(name: str, rows: list[Row]) -> dict[str, Any]:
     cycles = _groups(rows, lambda row: row.cycle)
     lengths = {len(group) for group in cycles.values()}
     if len(lengths) != 1:
-        raise InputError(
-            f"path: every cycle must have the same stations; there are {', '.join(map(str, sorted(lengths)))}"
-        )
+        counts = ", ".join(map(str, sorted(lengths)))
+        raise InputError(f"path {name}: every cycle must have the same stations; there are {counts}".replace("  ", " "))
     attained = np.array([_places(group) for group in cycles.values()])
-    cov = np.array([[row.cov() for row in group] for group in cycles.values()])
-    command = np.array([row.T("command_")[:3, 3] for row in next(iter(cycles.values()))])
-    figures = path_figures(attained, command, cov)
-    return {"AT_m": figures.accuracy, "RT_m": _figure(figures.repeatability), "off_m": figures.off.tolist()}
+    cov = np.array([_covs(group) for group in cycles.values()])
+    command = np.array([row.T_command[:3, 3] for row in next(iter(cycles.values()))])
+    figures = path_figures(attained, command, cov, _common(rows))
+    return {
+        "count": len(attained),
+        "AT_m": figure(figures.accuracy),
+        "RT_m": figure(figures.repeatability),
+        "off_m": figures.off.tolist(),
+    }
 
 
 def _circle(rows: list[Row]) -> dict[str, Any]:
@@ -187,52 +185,22 @@ def _circle(rows: list[Row]) -> dict[str, Any]:
         raise InputError(
             "circle: approach must be 1 for counter-clockwise and -1 for clockwise, and both must be there"
         )
-    axes = np.eye(3)[:2]
-    figures = circle_figures(_places(ways["1"]), _places(ways["-1"]), axes)
+    command = np.array([row.T_command[:3, 3] for row in rows])
+    axes = plane_axes(np.linalg.svd(command - command.mean(axis=0), full_matrices=False)[2][2])
+    figures = circle_figures(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0))
     return {
         "centre_m": figures.centre.tolist(),
         "radius_m": figures.radius_m,
-        "circularity_m": figures.circularity_m,
-        "hysteresis_m": figures.hysteresis_m,
-        "backlash_m": figures.backlash_m.tolist(),
-        "sigma_backlash_m": figures.sigma_backlash_m,
+        "axes": axes.tolist(),
+        "circularity_m": figure(figures.circularity),
+        "hysteresis_m": figure(figures.hysteresis),
+        "steps_m": figures.steps_m.tolist(),
+        "backlash_m": [figure(f) for f in figures.backlash],
+        "angle_deg": figures.angle_deg.tolist(),
+        "radii_m": figures.radii_m.tolist(),
     }
 
 
-def _figure(figure: Figure) -> dict[str, float | None]:
-    return asdict(figure)
-
-
-def figure_text(figure: dict[str, float | None]) -> str:
-    """Return a figure as a person reads it, mm."""
-    raw, clean, sigma, least = (figure[key] for key in ("raw", "clean", "sigma", "resolvable"))
-    if clean is None:
-        least_mm = 1e3 * (least or 0)
-        return f"{1e3 * (raw or 0):.3f} mm as measured: not resolvable, the instrument could tell {least_mm:.3f} mm"
-    return f"{1e3 * clean:.3f} +- {1e3 * (sigma or 0):.3f} mm ({1e3 * (raw or 0):.3f} with the instrument's noise)"
-
-
-def text(facts: dict[str, Any]) -> str:
-    """Return all figures in words."""
-    lines = []
-    for name, p in facts.get("poses", {}).items():
-        lines.append(f"{name} ({p['count']} times)")
-        lines.append(f"  accuracy AP       {figure_text(p['AP_m'])}")
-        lines.append(f"  repeatability RP  {figure_text(p['RP_m'])}")
-        if name in facts.get("vAP_m", {}):
-            lines.append(f"  directions vAP    {figure_text(facts['vAP_m'][name])}")
-    if "distance" in facts:
-        d = facts["distance"]
-        lines.append(f"distance {d['from']} to {d['to']}, {1e3 * d['commanded_m']:.1f} mm")
-        lines += [f"  accuracy AD       {figure_text(d['AD_m'])}", f"  repeatability RD  {figure_text(d['RD_m'])}"]
-    if "drift" in facts:
-        lines.append(f"drift of {facts['drift']['pose']}: {1e3 * max(facts['drift']['dAP_m']):.3f} mm largest")
-    if "path" in facts:
-        lines.append(f"path accuracy AT {1e3 * facts['path']['AT_m']:.3f} mm")
-        lines.append(f"path repeatability RT {figure_text(facts['path']['RT_m'])}")
-    if "circle" in facts:
-        c = facts["circle"]
-        lines.append(f"circle of radius {1e3 * c['radius_m']:.3f} mm: circularity {1e3 * c['circularity_m']:.3f} mm")
-        play = " and ".join(f"{1e3 * b:.3f}" for b in c["backlash_m"])
-        lines.append(f"  play along x and y {play} mm, +- {1e3 * c['sigma_backlash_m']:.3f}")
-    return "\n".join(lines)
+def figure(figure: Figure) -> dict[str, float | None]:
+    """Return a figure as JSON has it."""
+    return {**asdict(figure), "sigma": figure.sigma}

@@ -15,30 +15,12 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
+from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, mean_errors, scatter
 
 #: Fewest attained poses of which a scatter is told.
 LEAST = 3
-#: A scatter is resolvable where it is over the noise by so many of its own sigmas (one side, 2.3 % by chance).
-RESOLVED = 2.0
-#: The bound given for what is not resolvable: one side, 95 %.
-BOUND = 1.645
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One figure of the standard.
-
-    Attributes:
-        raw: as the standard computes it, m or rad.
-        clean: without the instrument's noise; None where it cannot be resolved.
-        sigma: of ``clean``, or of ``raw`` where there is no clean one.
-        resolvable: the smallest figure that this test could have told from the instrument's noise.
-    """
-
-    raw: float
-    clean: float | None
-    sigma: float
-    resolvable: float
+#: Where an integral is summed: beyond its ends lie 1e-6 of it.
+_U = np.linspace(-28.0, 28.0, 113)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +44,14 @@ class PoseFigures(Record):
     repeatability_turn: Array
 
 
-def pose_figures(attained: Array, command: Array, cov: Array) -> PoseFigures:
+def pose_figures(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PoseFigures:
     """Judge one commanded pose (7.2.1 and 7.2.2).
 
     Args:
         attained: (n, 4, 4) poses, base.
         command: (4, 4) the pose commanded.
-        cov: (n, 3, 3) covariance of the attained places by the instrument, base's axes, m^2.
+        cov: (n, 3, 3) covariance of the attained places by the instrument, base's axes, m^2: what differs between them.
+        common: (3, 3) that of the instrument's constant error; none of it where it is not given.
 
     Raises:
         InputError: fewer than three poses.
@@ -77,13 +60,16 @@ def pose_figures(attained: Array, command: Array, cov: Array) -> PoseFigures:
     if n < LEAST:
         raise InputError(f"a pose was attained {n} times; {LEAST} times and more are needed, 30 are the standard's")
     p = attained[:, :3, 3]
-    middle = p.mean(axis=0)
+    off = p.mean(axis=0) - command[:3, 3]
     mean = mean_pose(attained)
-    off = middle - command[:3, 3]
     turns = log_so3(np.ascontiguousarray(mean[:3, :3].T @ attained[:, :3, :3]))
+    rng = np.random.default_rng(0)  # the same test, the same figures
+    errors = mean_errors(p[:, None], rng)
+    if common is not None:
+        errors = errors + drawn(common[None], rng)
     return PoseFigures(
         n,
-        _accuracy(off, p, cov),
+        beyond_noise(lengths, off[None], errors),
         off,
         log_so3(command[:3, :3].T @ mean[:3, :3]),
         repeatability(p, cov),
@@ -91,23 +77,8 @@ def pose_figures(attained: Array, command: Array, cov: Array) -> PoseFigures:
     )
 
 
-def _accuracy(off: Array, p: Array, cov: Array) -> Figure:
-    """Return AP: its square holds the variance of the barycentre, which is taken off."""
-    raw = float(np.linalg.norm(off))
-    variance = np.atleast_2d(np.cov(p.T)) / len(p)  # scatter of arm and instrument together, in the barycentre
-    floor = float(np.sqrt(np.trace(variance)))
-    along = off / raw if raw > 0 else np.array([1.0, 0.0, 0.0])
-    sigma = float(np.sqrt(max(float(along @ variance @ along), 0.0)))
-    clean = float(np.sqrt(max(raw**2 - floor**2, 0.0)))
-    resolvable = RESOLVED * floor
-    return Figure(raw, clean if raw > resolvable else None, sigma, resolvable)
-
-
 def repeatability(p: Array, cov: Array) -> Figure:
     """Return RP of places (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
-
-    The instrument's covariance is taken off the scatter's; what is left scales the figure by what mean and deviation of the
-    distance are in a normal scatter of that covariance.
 
     Args:
         p: (n, 3) places attained, m.
@@ -115,37 +86,33 @@ def repeatability(p: Array, cov: Array) -> Figure:
     """
     distance = np.linalg.norm(p - p.mean(axis=0), axis=1)
     raw = float(distance.mean() + 3 * distance.std(ddof=1))
-    S, C = np.atleast_2d(np.cov(p.T)), cov.mean(axis=0)
-    if not np.any(S):
-        return Figure(raw, 0.0, 0.0, 0.0)
-    spread = float(np.sqrt(2 * np.trace(S @ S) / (len(p) - 1)))  # sigma of the trace of S
-    noise = float(np.sqrt(2 * np.trace(C @ C) / (len(p) - 1)))  # the same of a scatter by the instrument alone
-    ratio = raw / distance_limit(S)
-    resolvable = ratio * distance_limit(C * (RESOLVED * noise / max(float(np.trace(C)), 1e-300)))
-    excess = float(np.trace(S) - np.trace(C))
-    sigma = raw * spread / (2 * float(np.trace(S)))
-    if excess <= RESOLVED * noise:
-        return Figure(raw, None, sigma, max(resolvable, ratio * _limit_of_trace(max(excess, 0.0) + BOUND * spread)))
-    clean = ratio * distance_limit(_positive(S - C))
-    return Figure(raw, clean, clean * spread / (2 * excess), resolvable)
+    S = np.atleast_2d(np.cov(p.T))
+    return scatter(S, cov.mean(axis=0), len(p), distance_limit, raw / float(distance_limit(S)) if np.any(S) else 0.0)
 
 
-def distance_limit(S: Array) -> float:
-    """Return E l + 3 sd l of the length l of a normal vector of covariance S (3, 3), from its first two moments."""
-    square, variance = float(np.trace(S)), 2 * float(np.trace(S @ S))
-    if square <= 0:
-        return 0.0
-    mean = np.sqrt(square) * (1 - variance / (8 * square**2))
-    return float(mean + 3 * np.sqrt(max(square - mean**2, 0.0)))
+def distance_limit(S: Array) -> Array:
+    """Return E l + 3 sd l of the length l of normal vectors of covariances S (..., 3, 3).
+
+    E l is the integral over u of (1 - prod_i (1 + 2 v_i e^u)^-1/2) e^(-u/2) / (2 sqrt pi), v_i the eigenvalues (Mathai and
+    Provost, "Quadratic forms in random variables", 1992, 3.2).
+    """
+    square = np.einsum("...ii->...", S)
+    share = np.maximum(np.linalg.eigvalsh(S), 0.0) / np.maximum(square, 1e-300)[..., None]
+    fallen = 1 / np.sqrt(np.prod(1 + 2 * share[..., None] * np.exp(_U), axis=-2))
+    mean = np.sqrt(square) * ((1 - fallen) * np.exp(-_U / 2)).sum(axis=-1) * (_U[1] - _U[0]) / (2 * np.sqrt(np.pi))
+    return np.asarray(mean + 3 * np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
-def _limit_of_trace(trace: float) -> float:
-    return distance_limit(np.eye(3) * trace / 3)
+def anywhere(off: Array, cov: Array) -> tuple[Figure, Figure]:
+    """Return the mean and the largest error over many poses, each attained once or twice: accuracy over the workspace.
 
-
-def _positive(S: Array) -> Array:
-    values, vectors = np.linalg.eigh(S)
-    return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
+    Args:
+        off: (N, 3) attained places less the commanded ones, m.
+        cov: (N, 3, 3) covariance by the instrument, all in, m^2.
+    """
+    errors = drawn(cov, np.random.default_rng(0))
+    mean = beyond_noise(lambda x: np.asarray(np.linalg.norm(x, axis=-1).mean(axis=-1)), off, errors)
+    return mean, beyond_noise(lengths, off, errors)
 
 
 def multi_directional(attained: list[Array]) -> Figure:
@@ -159,14 +126,16 @@ def multi_directional(attained: list[Array]) -> Figure:
     """
     if len(attained) < 2:
         raise InputError("a pose was come to from one direction only; two and more are needed")
+    i, j = np.triu_indices(len(attained), 1)
     middles = np.array([p.mean(axis=0) for p in attained])
-    variances = [float(np.trace(np.cov(p.T))) / len(p) if len(p) > 1 else 0.0 for p in attained]
-    apart = np.linalg.norm(middles[:, None] - middles, axis=2)
-    i, j = divmod(int(np.argmax(apart)), len(apart))
-    raw = float(apart[i, j])
-    floor = float(np.sqrt(variances[i] + variances[j]))
-    clean = float(np.sqrt(max(raw**2 - floor**2, 0.0))) if raw > RESOLVED * floor else None
-    return Figure(raw, clean, floor / np.sqrt(3), RESOLVED * floor)
+    errors = _errors_of_means(attained)
+    return beyond_noise(lengths, middles[i] - middles[j], errors[:, i] - errors[:, j])
+
+
+def _errors_of_means(groups: list[Array]) -> Array:
+    """Draw errors (B, k, 3) of the barycentres of k groups."""
+    rng = np.random.default_rng(0)
+    return np.stack([mean_errors(p, rng) for p in groups], axis=1)
 
 
 def distance_figures(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Figure, Figure]:
@@ -182,19 +151,13 @@ def distance_figures(from_m: Array, to_m: Array, commanded_m: float, cov: Array)
     d = np.linalg.norm(along, axis=1)
     ray = along / d[:, None]
     noise = 2 * float(np.einsum("ni,nij,nj->n", ray, cov, ray).mean())
-    n, variance = len(d), float(d.var(ddof=1))
-    sigma = float(np.sqrt(variance / n))
-    accuracy = abs(float(d.mean()) - commanded_m)
-    AD = Figure(accuracy, accuracy if accuracy > RESOLVED * sigma else None, sigma, RESOLVED * sigma)
-    chance = np.sqrt(2 / (n - 1))
-    least = 3 * float(np.sqrt(RESOLVED * chance * noise))
-    left = variance - noise
-    clean = 3 * float(np.sqrt(left)) if left > RESOLVED * chance * noise else None
-    raw = 3 * float(np.sqrt(variance))
-    return AD, Figure(raw, clean, raw * chance / 2, least)
+    errors = mean_errors(d[:, None, None], np.random.default_rng(0))
+    AD = beyond_noise(lengths, np.array([[d.mean() - commanded_m]]), errors)
+    S = np.atleast_2d(np.var(d, ddof=1))
+    return AD, scatter(S, np.atleast_2d(noise), len(d), lambda S: 3 * np.sqrt(S[..., 0, 0]), 1.0)
 
 
-def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array]:
+def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Figure]:
     """Return how the place of one pose wanders (7.5).
 
     Args:
@@ -203,9 +166,12 @@ def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array]:
         groups: parts of equal count in order of time.
 
     Returns:
-        (groups,) middle times, s; (groups,) distances of each group's barycentre from the first one's, m.
+        (groups,) middle times, s; (groups,) distances of each group's barycentre from the first one's, m; the largest.
     """
     order = np.array_split(np.argsort(t_s, kind="stable"), min(groups, len(p)))
     middles = np.array([p[rows].mean(axis=0) for rows in order])
     times = np.array([t_s[rows].mean() for rows in order])
-    return times, np.linalg.norm(middles - middles[0], axis=1)
+    errors = _errors_of_means([p[rows] for rows in order])
+    off = middles - middles[0]
+    figure = beyond_noise(lengths, off, errors - errors[:, :1])
+    return times, np.linalg.norm(off, axis=1), figure

@@ -5,36 +5,41 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2, t
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.loop.iso9283 import Figure, repeatability
+from armsight.loop.iso9283 import repeatability
+from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, mean_errors
 
 #: Degrees on either side of a reversal that are left out, and that are used, where its step is read off.
 NEAR_DEG, FAR_DEG = 3.0, 25.0
+#: Places of a circle this close are averaged, deg.
+_BIN_DEG = 4.0
 
 
 class PathFigures(NamedTuple):
     """A path followed several times.
 
     Attributes:
-        accuracy: AT, m: the largest distance of the mean path from the commanded one.
-        repeatability: RT: the largest over the stations.
+        accuracy: AT: the largest distance of the mean path from the commanded one.
+        repeatability: RT: that of the station with the largest as measured.
         off: (S,) distance of the mean path from the commanded one at every station, m.
     """
 
-    accuracy: float
+    accuracy: Figure
     repeatability: Figure
     off: Array
 
 
-def path_figures(attained: Array, command: Array, cov: Array) -> PathFigures:
+def path_figures(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathFigures:
     """Judge a path (8.2, 8.3).
 
     Args:
         attained: (n, S, 3) places, n times along the path, base, m.
         command: (S, 3) commanded places, in their order.
-        cov: (n, S, 3, 3) covariance by the instrument, m^2.
+        cov: (n, S, 3, 3) covariance by the instrument, m^2: what differs from place to place.
+        common: (3, 3) that of its constant error; none of it where it is not given.
 
     Raises:
         InputError: fewer than three times or stations.
@@ -46,9 +51,17 @@ def path_figures(attained: Array, command: Array, cov: Array) -> PathFigures:
     along /= np.linalg.norm(along, axis=1)[:, None]
     across = np.eye(3) - along[:, :, None] * along[:, None]  # only what is square to the path counts
     seen = (across @ (attained - command)[..., None])[..., 0]
-    off = np.linalg.norm(seen.mean(axis=0), axis=1)
-    each = [repeatability(seen[:, s], across[s] @ cov[:, s] @ across[s]) for s in range(stations)]
-    return PathFigures(float(off.max()), max(each, key=lambda figure: figure.raw), off)
+    middle, rng = seen.mean(axis=0), np.random.default_rng(0)
+    errors = mean_errors(seen, rng)
+    if common is not None:
+        errors = errors + (across @ drawn(common[None], rng)[..., None])[..., 0]
+    length = np.linalg.norm(seen - middle, axis=2)
+    worst = int(np.argmax(length.mean(axis=0) + 3 * length.std(axis=0, ddof=1)))
+    return PathFigures(
+        beyond_noise(lengths, middle, errors),
+        repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst]),
+        np.linalg.norm(middle, axis=1),
+    )
 
 
 class CircleFigures(NamedTuple):
@@ -57,23 +70,25 @@ class CircleFigures(NamedTuple):
     Attributes:
         centre: (3,) of the fitted circle, m.
         radius_m: of the fitted circle.
-        circularity_m: G, the largest less the smallest radius of either way, the larger of the two.
-        hysteresis_m: H, the largest difference of the radii of the two ways at one angle.
+        circularity: G, the largest less the smallest radius of either way, the larger of the two.
+        hysteresis: H, the largest difference of the radii of the two ways at one angle.
         steps_m: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive.
-        backlash_m: (2,) play along the circle's first and second axis: the mean of the four jumps where it turns back.
-        sigma_backlash_m: its sigma.
+        backlash: play along the circle's first and second axis: the mean of the four jumps where it turns back.
+        angle_deg: (B,) angles of the curves.
+        radii_m: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise.
     """
 
     centre: Array
     radius_m: float
-    circularity_m: float
-    hysteresis_m: float
+    circularity: Figure
+    hysteresis: Figure
     steps_m: Array
-    backlash_m: Array
-    sigma_backlash_m: float
+    backlash: tuple[Figure, Figure]
+    angle_deg: Array
+    radii_m: Array
 
 
-def circle_figures(ccw: Array, cw: Array, axes: Array) -> CircleFigures:
+def circle_figures(ccw: Array, cw: Array, axes: Array, cov: Array | None = None) -> CircleFigures:
     """Judge a circle, and read play off where an axis turns back.
 
     Where the path crosses an axis of the circle, the motion along that axis turns back: it lagged by half the play before,
@@ -83,6 +98,7 @@ def circle_figures(ccw: Array, cw: Array, axes: Array) -> CircleFigures:
         ccw: (N, 3) places counter-clockwise, m.
         cw: (M, 3) clockwise.
         axes: (2, 3) unit vectors of the circle's plane along which angles count from the first to the second.
+        cov: (3, 3) covariance of a place by the instrument, m^2; none where it is not given.
 
     Raises:
         InputError: a way does not go all around.
@@ -94,25 +110,56 @@ def circle_figures(ccw: Array, cw: Array, axes: Array) -> CircleFigures:
         gaps = np.diff(np.sort(np.append(angle, angle.min() + 360)))
         if len(angle) < 72 or gaps.max() > 15:
             raise InputError(f"the circle {name} has gaps: places every 5 degrees, all around, are needed")
-    steps, scatter = np.zeros((2, 4)), []
+    steps, variances = np.zeros((2, 4)), np.zeros((2, 4))
     for w, (angle, r) in enumerate(ways):
         for k in range(4):
-            steps[w, k], sigma = _step(angle, r, 90.0 * k, 1.0 if w == 0 else -1.0)
-            scatter.append(sigma)
-    grid = np.arange(0, 360, 2.0)
-    both = [np.interp(grid, np.sort(a), r[np.argsort(a)], period=360) for a, r in ways]
+            steps[w, k], variances[w, k] = _step(angle, r, 90.0 * k, 1.0 if w == 0 else -1.0)
     # At 0 and 180 degrees the motion along the second axis is fastest and that along the first turns back.
-    play = np.array([steps[:, 0::2].mean(), steps[:, 1::2].mean()])
-    off = axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0)
+    x, y = (_play(steps[:, k::2], variances[:, k::2]) for k in (0, 1))
+    grid, radii, counts = _binned(ways)
+    along = np.stack([np.cos(np.radians(grid)), np.sin(np.radians(grid))], axis=1) @ axes
+    noise = np.zeros((3, 3)) if cov is None else cov
+    errors = np.einsum("bwki,ki->bwk", drawn(noise / counts[..., None, None], np.random.default_rng(0)), along)
     return CircleFigures(
-        off,
+        axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0),
         radius,
-        max(float(np.ptp(r)) for _, r in ways),
-        float(np.abs(both[0] - both[1]).max()),
+        beyond_noise(lambda r: np.asarray(np.ptp(r, axis=-1).max(axis=-1)), radii, errors),
+        beyond_noise(lambda r: np.asarray(np.abs(r[:, 0] - r[:, 1]).max(axis=-1)), radii, errors),
         steps,
-        play,
-        float(np.sqrt(np.mean(np.square(scatter)) / 4)),
+        (x, y),
+        grid,
+        radii - radius,
     )
+
+
+def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return angles (B,), mean radii (2, B) about them, and of how many places (2, B); bins of no place are filled in."""
+    grid = np.arange(0, 360, _BIN_DEG)
+    radii, counts = np.zeros((2, len(grid))), np.ones((2, len(grid)))
+    for w, (angle, r) in enumerate(ways):
+        at = np.round(angle / _BIN_DEG).astype(int) % len(grid)
+        number = np.bincount(at, minlength=len(grid))
+        counts[w] = np.maximum(number, 1)
+        filled = number > 0
+        radii[w] = np.interp(grid, grid[filled], (np.bincount(at, r, len(grid)) / counts[w])[filled], period=360)
+    return grid, radii, counts
+
+
+def _play(steps: Array, variances: Array) -> Figure:
+    """Return the mean of jumps with its interval; negative where the radius falls, which play cannot make it do.
+
+    Where the jumps differ by more than their sigmas allow, the interval is that of their own scatter (Birge, Phys. Rev. 40,
+    1932): then something else than the play of that axis is at work, on arms of turning joints the usual case.
+    """
+    value, freedom = float(steps.mean()), steps.size - 1
+    scatter = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
+    if scatter > chi2.ppf(0.975, freedom):
+        sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(t.ppf(0.975, freedom))
+    else:
+        sigma, wide = float(np.sqrt(variances.sum())) / steps.size, 1.96
+    resolvable = wide * sigma
+    told = abs(value) > resolvable
+    return Figure(value, value if told else None, value - resolvable, value + resolvable, resolvable)
 
 
 def _fitted(p: Array) -> tuple[Array, float]:
@@ -123,7 +170,7 @@ def _fitted(p: Array) -> tuple[Array, float]:
 
 
 def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
-    """Return the jump of the radius at an angle, in the sense of motion, and its sigma: two lines through its sides."""
+    """Return the jump of the radius at an angle, in the sense of motion, and its variance: two lines through its sides."""
     from_it = way * ((angle - at + 180) % 360 - 180)
     sides = []
     for side in (-1.0, 1.0):
@@ -133,4 +180,17 @@ def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
         left = r[rows] - A @ x
         variance = float(left @ left) / max(len(left) - 2, 1) * float(np.linalg.inv(A.T @ A)[0, 0])
         sides.append((float(x[0]), variance))
-    return sides[1][0] - sides[0][0], float(np.sqrt(sides[0][1] + sides[1][1]))
+    return sides[1][0] - sides[0][0], sides[0][1] + sides[1][1]
+
+
+def plane_axes(normal: Array) -> Array:
+    """Return axes (2, 3) of a plane: the base's that lies nearest to it, and the one square to it, by the right hand.
+
+    Args:
+        normal: (3,) unit vector square to the plane; its sign does not count: about its largest part taken positive.
+    """
+    n = normal * np.sign(normal[np.argmax(np.round(np.abs(normal), 6))])
+    first = np.eye(3)[np.argmin(np.round(np.abs(n), 6))]
+    first = first - (first @ n) * n
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(n, first)])

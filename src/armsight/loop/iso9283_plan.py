@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
+from armsight.loop.servo import SINGULAR
 from armsight.robot.arm import Arm
 
 #: The poses sit this part of the diagonal from the cube's corners (6.8.1).
@@ -18,8 +21,10 @@ INSIDE = 0.1
 CUBES_M = (1.0, 0.63, 0.4, 0.25, 0.16, 0.1)
 #: Poses of the wider test, and cycles of the standard one.
 MANY, CYCLES = 100, 30
-#: Centres that are tried: at these parts of the home's distance from axis 1.
-NEARER = (1.0, 0.85, 0.7, 0.55)
+#: Centres that are tried: so far from axis 1 and above the base, in sizes of the arm, nearest to the tool at home first.
+AWAY, ABOVE = np.arange(0.35, 0.86, 0.05), np.arange(-0.1, 0.61, 0.05)
+#: How far joints stay from their limits, rad.
+CLEAR_RAD = float(np.radians(5.0))
 #: How far the tool turns from its turn at home in the wider test, rad.
 TURNED = 0.3
 
@@ -42,32 +47,81 @@ class CheckPlan(NamedTuple):
     centre: Array
 
 
-def plan_check(arm: Arm, *, centre: Array | None = None, wide: bool = False, seed: int = 0) -> CheckPlan:
-    """Choose the poses of a test in the largest cube that the arm reaches.
+def everywhere(Ts_base_tool: Array) -> NDArray[np.bool_]:
+    """Say of all poses (N, 4, 4) that they are allowed."""
+    return np.ones(len(Ts_base_tool), bool)
+
+
+def plan_check(
+    arm: Arm,
+    *,
+    centre: Array | None = None,
+    wide: bool = False,
+    seed: int = 0,
+    allowed: Callable[[Array], NDArray[np.bool_]] = everywhere,
+    feasible: Callable[[CheckPlan], bool] = lambda plan: True,
+) -> CheckPlan:
+    """Choose the poses of a test in the largest cube that the arm reaches, clear of its limits and of singularities.
 
     Args:
         arm: the arm.
-        centre: (3,) of the cube in the base, m; None: between the tool at home and axis 1, where the cube is largest.
+        centre: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
         wide: a hundred poses all over the cube, turned too, instead of the standard's five.
         seed: of the hundred.
+        allowed: says which poses (N, 4, 4) may be gone to, such as those that are seen.
+        feasible: says whether what is to be done in a cube can be; the next one is tried where it cannot.
 
     Raises:
-        InputError: not even the smallest cube is within reach.
+        InputError: not even the smallest cube will do.
     """
     home = arm.forward(arm.home)
-    axis = arm.T_base_0[:3, 3]
-    out = (home[:3, 3] - axis) * [1, 1, 0]  # nearer to axis 1 there is more room than at the rim of the reach
-    centres = [home[:3, 3] - (1 - share) * out for share in NEARER] if centre is None else [centre]
+    centres = _centres(arm, home[:3, 3]) if centre is None else centre[None]
     for side in CUBES_M:
         for middle in centres:
             Ts = _wide(home, middle, side, seed) if wide else _five(home, middle, side)
-            q = [arm.inverse(T, near=arm.home).best for T in Ts]
-            reached = [k for k, angles in enumerate(q) if angles is not None]
-            if len(reached) == len(Ts) or (wide and len(reached) >= MANY):
-                rows = reached[:MANY] if wide else reached
-                found = np.array([angles for k in rows if (angles := q[k]) is not None])
-                return CheckPlan(tuple(f"P{k + 1}" for k in range(len(rows))), Ts[rows], found, side, middle)
-    raise InputError(f"{arm.name}: no cube of {1e3 * CUBES_M[-1]:.0f} mm is within reach there; give another centre")
+            for q in _reached(arm, Ts, allowed):
+                rows = np.flatnonzero(np.isfinite(q).all(axis=1))[: MANY if wide else len(Ts)]
+                if len(rows) < (MANY if wide else len(Ts)):
+                    continue
+                plan = CheckPlan(tuple(f"P{k + 1}" for k in range(len(rows))), Ts[rows], q[rows], side, middle)
+                if feasible(plan):
+                    return plan
+    raise InputError(
+        f"{arm.name}: not even a cube of {1e3 * CUBES_M[-1]:.0f} mm there is within reach, clear of limits and, where "
+        "cameras are given, seen; give another centre"
+    )
+
+
+def _centres(arm: Arm, p_home: Array) -> Array:
+    """Return centres (N, 3) in the upright plane of axis 1 and the tool at home, nearest to that first."""
+    axis = arm.T_base_0[:3, 3]
+    out = (p_home - axis) * [1, 1, 0]
+    out = out / np.linalg.norm(out) if np.linalg.norm(out) > 0.1 * arm.size_m else np.array([1.0, 0.0, 0.0])
+    away, above = (g.ravel() for g in np.meshgrid(AWAY * arm.size_m, ABOVE * arm.size_m))
+    centres = axis + away[:, None] * out + above[:, None] * np.array([0.0, 0.0, 1.0])
+    return np.vstack([p_home, centres[np.argsort(np.linalg.norm(centres - p_home, axis=1), kind="stable")]])
+
+
+def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]]) -> Iterator[Array]:
+    """Give joint angles (N, 6) of poses, rad, for each configuration that the first of them can be in.
+
+    NaN where a pose is not reached in it, not clear or not allowed.
+    """
+    rows_m = np.array([arm.size_m] * 3 + [1.0] * 3)[:, None]
+    low, high = arm.q_min + CLEAR_RAD, arm.q_max - CLEAR_RAD
+    may = allowed(Ts)
+    first = arm.inverse(Ts[0], near=arm.home)
+    for signs, start in zip(first.signs, first.q, strict=True):
+        q = np.full((len(Ts), 6), np.nan)
+        if not may[0] or np.any((start < low) | (start > high)):
+            continue
+        for k in np.flatnonzero(may):
+            found = arm.inverse(Ts[k], near=start)
+            clear = (found.signs == signs).all(axis=1) & ((found.q >= low) & (found.q <= high)).all(axis=1)
+            for angles in found.q[clear][:1]:
+                if np.linalg.svd(arm.jacobian(angles) / rows_m, compute_uv=False)[-1] > SINGULAR:
+                    q[k] = angles
+        yield q
 
 
 def _five(home: Array, middle: Array, side: float) -> Array:
@@ -81,5 +135,6 @@ def _wide(home: Array, middle: Array, side: float, seed: int) -> Array:
     """Return twice as many poses as are wanted, at random over the cube and turned at random."""
     rng = np.random.default_rng(seed)
     places = middle + rng.uniform(-side / 2, side / 2, (2 * MANY, 3))
+    places[0] = middle  # tells the configuration that all are in
     turns = exp_so3(rng.uniform(-TURNED, TURNED, (2 * MANY, 3)))
     return np.array([pose(home[:3, :3] @ R, p) for R, p in zip(turns, places, strict=True)])

@@ -1,80 +1,130 @@
-"""``armsight check``: judge an arm as robots are judged (ISO 9283), or say which poses to go to for it."""
+"""``armsight check``: judge an arm as robots are judged (ISO 9283), or plan the motions of such a test."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from pathlib import Path
 
 import click
 import numpy as np
 
-from armsight.app import check_run
+from armsight.app.check_plan import CYCLES, Test, plan_csv, plan_test
+from armsight.app.check_report import write_check
+from armsight.app.check_run import judge, read_check
+from armsight.app.check_words import text
+from armsight.app.report import report_folder
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
-from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.identify.model_file import open_model
-from armsight.loop.iso9283_plan import CYCLES, CheckPlan, plan_check
+
+_KINDS = (".toml", ".csv")
 
 
-@click.command("check")
-@click.argument("data", required=False, metavar="[RUN|POSES.csv]", type=click.Path(path_type=Path))
-@click.option("--plan", "model", metavar="MODEL", help="Do not judge: choose the poses to go to with this arm.")
-@click.option("--wide", is_flag=True, help="With --plan: 100 poses all over the cube instead of the standard's five.")
-@click.option("--centre", nargs=3, type=float, metavar="X Y Z", help="With --plan: the cube's centre in the base, mm.")
+class _Check(click.Group):
+    """``armsight check DATA`` and ``armsight check plan``: what is no subcommand is data to judge."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args if args and args[0] in self.commands else ["judge", *args])
+
+
+@click.group("check", cls=_Check)
+def command() -> None:
+    """Judge an arm as robots are judged."""
+
+
+@command.command("judge")
+@click.argument("data", metavar="RUN|POSES.csv", type=click.Path(path_type=Path))
+@click.option("--closed", is_flag=True, help="Of a run: judge the motions with the loop closed on vision.")
 @click.option(
-    "-o", "--out", metavar="FILE", type=click.Path(path_type=Path), help="To write: figures (JSON) or plan (CSV)."
+    "-o", "--out", metavar="DIR", type=click.Path(path_type=Path), help="Folder for report.html, check.json, figures."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
-def command(
-    data: Path | None,
-    model: str | None,
-    wide: bool,
+def judged(data: Path, closed: bool, out: Path | None, as_json: bool) -> None:
+    """Judge an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
+
+    DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/check.md). Figures stand without the instrument's
+    own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
+    """
+    rows, notes = read_check(data, closed=closed)
+    facts = judge(rows, notes)
+    if out is not None:
+        write_check(facts, rows, data, report_folder(out))
+    for note in facts["notes"]:
+        click.echo(f"note: {note}", err=True)
+    if as_json:
+        click.echo(json.dumps(facts))
+        return
+    click.echo(text(facts))
+    if out is not None:
+        click.echo(f"\nwritten: {out}/report.html, check.json, check.csv")
+
+
+@command.command("plan")
+@click.option(
+    "--model", required=True, metavar="MODEL", help="The arm: a name (armsight arm list), a .toml or a .urdf."
+)
+@click.option(
+    "--test",
+    "name",
+    type=click.Choice(list(CYCLES)),
+    default="poses",
+    show_default=True,
+    help="Five poses in a cube; a hundred all over it; a line across it; a circle both ways.",
+)
+@click.option("--cycles", type=click.IntRange(1, 1000), help="How many times: 30 for poses, 1 wide, 10 line, 3 circle.")
+@click.option("--centre", nargs=3, type=float, metavar="X Y Z", help="The cube's centre in the base, mm.")
+@click.option("--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="On paths, mm/s.")
+@click.option(
+    "--seen-in", metavar="RUN", type=click.Path(path_type=Path), help="An earlier run: its cameras must see all of it."
+)
+@click.option(
+    "-o",
+    "--out",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="check.toml for armsight run --motion; .csv: the poses alone.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+def plan(
+    model: str,
+    name: str,
+    cycles: int | None,
     centre: tuple[float, float, float] | None,
+    speed: float,
+    seen_in: Path | None,
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Compute pose accuracy and repeatability, distance, path, drift and circle from attained poses.
+    """Plan a test in the largest cube the arm reaches, clear of its limits and of singularities.
 
-    Figures stand without the instrument's own noise; what is below it is called not resolvable. Columns: docs/check.md.
+    Poses and paths lie in the cube's diagonal plane, as ISO 9283 has it. Look at them in your cell before you run them.
     """
-    if (data is None) == (model is None):
-        raise InputError("give a run folder or a CSV to judge, or --plan MODEL to choose the poses of a test")
     if out is not None:
-        check_writable(out, apart_from=(data,))
-    if model is not None:
-        middle = None if centre is None else np.array(centre) / 1e3
-        _plan(plan_check(open_model(model), centre=middle, wide=wide), out, as_json)
-        return
-    if wide or centre is not None:
-        raise InputError("--wide and --centre go with --plan")
-    facts = check_run.judge(check_run.read_check(data)) if data is not None else {}
+        check_writable(out)
+        if out.suffix not in _KINDS or (out.suffix == ".csv" and name in ("line", "circle")):
+            raise InputError(f"{out}: a plan is written as .toml, motions to run, or, of poses, as .csv")
+    middle = None if centre is None else np.array(centre) / 1e3
+    test = plan_test(open_model(model), name, cycles, middle, speed / 1e3, seen_in)
     if out is not None:
-        write_text(out, json.dumps(facts, indent=1) + "\n")
-    click.echo(json.dumps(facts) if as_json else check_run.text(facts))
-
-
-def _plan(plan: CheckPlan, out: Path | None, as_json: bool) -> None:
-    """Print or write a plan."""
-    if out is not None:
-        write_text(out, _plan_csv(plan))
+        write_text(out, test.motions if out.suffix == ".toml" else plan_csv(test.plan))
     if as_json:
-        facts = {"poses": list(plan.names), "q_rad": plan.q.tolist(), "T_base_tool": plan.Ts_base_tool.tolist()}
-        click.echo(json.dumps({**facts, "side_m": plan.side_m, "cycles": 1 if len(plan.names) > 5 else CYCLES}))
+        click.echo(json.dumps(_facts(test)))
         return
-    cycles = "once and in several directions" if len(plan.names) > 5 else f"{CYCLES} times, always in the same order"
-    middle = " ".join(f"{1e3 * v:.0f}" for v in plan.centre)
-    click.echo(
-        f"{len(plan.names)} poses in a cube of {1e3 * plan.side_m:.0f} mm about {middle} mm; go to them {cycles}"
-    )
+    at = " ".join(f"{1e3 * v:.0f}" for v in test.plan.centre)
+    what = {"line": "a line", "circle": "a circle"}.get(name, f"{len(test.plan.names)} poses")
+    click.echo(f"{what} in a cube of {1e3 * test.plan.side_m:.0f} mm about {at} mm, cycles: {test.cycles}")
+    if out is not None and out.suffix == ".toml":
+        click.echo(f"written: {out}; run it: armsight run --motion {out} ... -o RUN; then: armsight check RUN")
 
 
-def _plan_csv(plan: CheckPlan) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    names = [f"command_{n}" for n in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
-    writer.writerow(["pose", *(f"q{i}_rad" for i in range(1, 7)), *names])
-    for name, q, T in zip(plan.names, plan.q, plan.Ts_base_tool, strict=True):
-        writer.writerow([name, *(f"{v:.9f}" for v in (*q, *T[:3, 3], *quaternion_wxyz(T[:3, :3])))])
-    return out.getvalue()
+def _facts(test: Test) -> dict[str, object]:
+    """Return a plan for programs."""
+    return {
+        "test": test.name,
+        "cycles": test.cycles,
+        "side_m": test.plan.side_m,
+        "centre_m": test.plan.centre.tolist(),
+        "poses": list(test.plan.names),
+        "q_rad": test.plan.q.tolist(),
+        "T_base_tool": test.plan.Ts_base_tool.tolist(),
+    }

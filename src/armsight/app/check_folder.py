@@ -1,0 +1,86 @@
+"""What a run's folder says about a test: where vision saw the tool at each commanded pose and along each path.
+
+In: wanted.csv (where the tool was to be), vision.csv, motion.toml. Out: rows for the judging. A rest belongs to the pose
+that was commanded there, wherever else in the motion that pose comes again; a line or circle to those over the same ground.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from armsight.app.check_paths import path_rows
+from armsight.app.check_rows import Row
+from armsight.app.check_stretch import Noise, Stretch, noise_of, plain, stood, stretches_of
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.pose import mean_pose
+from armsight.loop.iso9283 import LEAST
+
+#: Commands that differ by less are the same, m.
+_SAME_M = 1e-5
+#: A rest is judged that was seen in so many shots.
+_SHOTS = 3
+
+
+def rows_of_run(folder: Path, *, closed: bool) -> tuple[list[Row], list[str]]:
+    """Return what a run attained, and what was left out of it.
+
+    Args:
+        folder: of the run.
+        closed: take the motions with the loop closed on vision instead of those with potentiometers alone.
+
+    Raises:
+        InputError: no run, or none of its motions comes again.
+    """
+    stretches = stretches_of(folder, closed)
+    if not stretches:
+        which = "with the loop closed" if closed else "with potentiometers alone"
+        raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
+    noise = noise_of(stretches)
+    paths, run, notes = path_rows(stretches, noise)
+    rows, more = _rests([s for s in stretches if s.kind == "rest" and s.name not in run], noise)
+    return rows + paths, more + notes
+
+
+def _rests(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], list[str]]:
+    """Return a row for every rest at a pose that is judged."""
+    names: list[tuple[Array, str]] = []
+    visits: dict[tuple[str, str], list[Row]] = {}
+    times: Counter[tuple[str, str]] = Counter()
+    before, unseen = "the start", 0
+    for stretch in stretches:
+        T = stretch.wanted.Ts_base_tool[-1]
+        name = next((n for at, n in names if np.abs(at - T).max() < _SAME_M), None)
+        if name is None:
+            short = plain(stretch.name).removeprefix("to ")
+            name = short if all(short != n for _, n in names) else stretch.name
+            names.append((T, name))
+        way = (name, before)
+        times[way] += 1
+        Ts, _ = stood(stretch)
+        if len(Ts) >= _SHOTS:
+            t_s = float(stretch.wanted.t_s[-1])
+            seen = Row("pose", name, str(times[way]), before, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
+            visits.setdefault(way, []).append(seen)
+        unseen += len(Ts) < _SHOTS
+        before = name
+    notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
+    often = {name for (name, _), rows in visits.items() if len(rows) >= LEAST}
+    rows = []
+    for (name, before), came in visits.items():
+        if name in often and len(came) < LEAST:
+            notes.append(f"left out: {name} come to from {before}, too seldom ({len(came)})")
+        elif name in often or not often:
+            rows += came
+        elif came:
+            notes.append(f"left out: {name}, attained too seldom ({len(came)})")
+    return sorted(rows, key=lambda row: (_natural(row.pose), row.t_s)), notes
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which P2 comes before P10."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]

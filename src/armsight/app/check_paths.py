@@ -1,0 +1,123 @@
+"""Lines and circles of a run as rows for the judging: those run over the same ground several times, or both ways round."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.app.check_rows import Row
+from armsight.app.check_stretch import Noise, Stretch, plain
+from armsight.data import Array
+from armsight.geometry.pose import pose
+from armsight.loop.iso9283 import LEAST
+from armsight.loop.iso9283_path import plane_axes
+
+#: Paths that begin, pass and end nearer to each other are one, m.
+_SAME_M = 1e-4
+#: A path is judged at so many stations, seen in so many shots at least; a circle is one that goes all around, rad.
+_STATIONS, _SHOTS, _ROUND = 40, 10, 2 * np.pi * 0.999
+_AHEAD_M = 1e-4
+
+
+def path_rows(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], set[str], list[str]]:
+    """Return rows of a run's paths and its circle, the motions they are of, and what was left out.
+
+    Args:
+        stretches: of the run.
+        noise: the instrument.
+    """
+    groups = _grouped([s for s in stretches if s.kind in ("line", "circle") and len(s.seen) >= _SHOTS])
+    ways = {np.sign(turn): g for g in groups if g[0].kind == "circle" and abs(turn := _turned(g[0])[-1]) >= _ROUND}
+    circle = list(ways.values()) if len(ways) == 2 else []
+    rows: list[Row] = []
+    run, notes = {s.name for group in circle for s in group}, []
+    for group in groups:
+        if group[0].name in run:
+            continue
+        if len(group) < LEAST:
+            notes.append(f"left out: {plain(group[0].name)}, followed too seldom ({len(group)})")
+            continue
+        rows += _path(group, noise)
+        run |= {s.name for s in group}
+    return rows + [row for group in circle for row in _circle(group, noise)], run, notes
+
+
+def _grouped(paths: list[Stretch]) -> list[list[Stretch]]:
+    """Put those together that run over the same ground."""
+    groups: list[list[Stretch]] = []
+    for stretch in paths:
+        same = (g for g in groups if g[0].kind == stretch.kind and np.abs(_ends(g[0]) - _ends(stretch)).max() < _SAME_M)
+        found = next(same, None)
+        if found is None:
+            groups.append([stretch])
+        else:
+            found.append(stretch)
+    return groups
+
+
+def _ends(stretch: Stretch) -> Array:
+    """Return the first, a middle and the last commanded place (3, 3)."""
+    p = stretch.wanted.Ts_base_tool[:, :3, 3]
+    return p[[0, len(p) // 3, -1]]
+
+
+def _path(group: list[Stretch], noise: Noise) -> list[Row]:
+    """Return a path's rows: at stations of the command, where the attained path crosses the plane square to it."""
+    p = group[0].wanted.Ts_base_tool[:, :3, 3]
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    keep = np.concatenate([[True], np.diff(gone) > 0])
+    p, gone, since = p[keep], gone[keep], group[0].wanted.t_s[keep] - group[0].wanted.t_s[0]
+    stations = np.linspace(0.0, gone[-1], _STATIONS + 2)[1:-1]
+    rows = []
+    for cycle, stretch in enumerate(group, start=1):
+        s = np.interp(stretch.seen.t_s - stretch.wanted.t_s[0], since, gone)
+        s, off = _off(p, gone, stretch.seen.Ts_base_tool[:, :3, 3], s)
+        at = np.clip(np.searchsorted(s, stations), 1, len(s) - 1)
+        share = np.clip((stations - s[at - 1]) / (s[at] - s[at - 1]), 0.0, 1.0)
+        between = off[at - 1] + share[:, None] * (off[at] - off[at - 1])
+        weight, own = (1 - share) ** 2 + share**2, noise.moving(stretch)
+        for k, place in enumerate(_on(p, gone, stations)):
+            T, T_command = pose(np.eye(3), place + between[k]), pose(np.eye(3), place)
+            name = plain(stretch.name)
+            rows.append(Row("path", str(k + 1), str(cycle), name, None, T, T_command, weight[k] * own, noise.common))
+    return rows
+
+
+def _on(p: Array, gone: Array, s: Array) -> Array:
+    """Return places (N, 3) on a path (M, 3) so far along it."""
+    return np.stack([np.interp(s, gone, p[:, i]) for i in range(3)], axis=1)
+
+
+def _off(p: Array, gone: Array, was: Array, s: Array) -> tuple[Array, Array]:
+    """Return how far along a path places (N, 3) are, rising, and their offset from it (N, 3); s is about how far."""
+    for _ in range(4):  # to the foot on the path: when the tool was there does not count
+        ahead = _on(p, gone, s + _AHEAD_M) - _on(p, gone, s - _AHEAD_M)
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
+        s = np.clip(s + ((was - _on(p, gone, s)) * ahead).sum(axis=1), 0.0, gone[-1])
+    s, first = np.unique(s, return_index=True)
+    return s, was[first] - _on(p, gone, s)
+
+
+def _turned(stretch: Stretch) -> Array:
+    """Return how far a circle was to have turned (N,), rad, counter-clockwise."""
+    p = stretch.wanted.Ts_base_tool[:, :3, 3]
+    axes = plane_axes(np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][2])
+    flat = (p - (p.max(axis=0) + p.min(axis=0)) / 2) @ axes.T
+    angle = np.unwrap(np.arctan2(flat[:, 1], flat[:, 0]))
+    return np.asarray(angle - angle[0])
+
+
+def _circle(group: list[Stretch], noise: Noise) -> list[Row]:
+    """Return a circle's rows: the middle turn of each time round, without its start and end."""
+    rows = []
+    for cycle, stretch in enumerate(group, start=1):
+        turned = _turned(stretch)
+        there = np.interp(stretch.seen.t_s, stretch.wanted.t_s, turned)
+        way, own = "1" if turned[-1] > 0 else "-1", noise.moving(stretch)
+        for k in np.flatnonzero(np.abs(there - turned[-1] / 2) <= np.pi):
+            T = stretch.wanted.at(stretch.seen.t_s[k : k + 1])[0]
+            t_s = float(stretch.seen.t_s[k])
+            attained = stretch.seen.Ts_base_tool[k]
+            rows.append(
+                Row("circle", f"{np.degrees(there[k]):.2f}", str(cycle), way, t_s, attained, T, own, noise.common)
+            )
+    return rows

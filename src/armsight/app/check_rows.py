@@ -1,0 +1,133 @@
+"""What a test of ISO 9283 attained, row by row: read from a CSV and written as one; docs/check.md has its columns."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import read_table
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
+
+TESTS = ("pose", "path", "circle")
+_TEXTS = ("test", "pose", "cycle", "approach")
+_PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
+NEEDED = ("pose", *_PLACE, *(f"command_{name}" for name in _PLACE))
+_COLUMNS = (
+    *_TEXTS,
+    "t_s",
+    *_PLACE,
+    *_TURN,
+    *(f"command_{name}" for name in (*_PLACE, *_TURN)),
+    *(f"sigma_{name}" for name in _PLACE),
+    *(f"sigma_common_{name}" for name in _PLACE),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Row(Record):
+    """One attained pose.
+
+    Attributes:
+        test: pose, path or circle.
+        pose: its name; on a path or circle the station.
+        cycle: which time round.
+        approach: where it was come to from; of a path its name; on a circle 1 counter-clockwise, -1 clockwise.
+        t_s: when, s; None where that is not known.
+        T: (4, 4) attained, base.
+        T_command: (4, 4) commanded.
+        cov: (3, 3) covariance of the place by the instrument, base's axes, m^2: what differs from row to row.
+        cov_common: (3, 3) that of the instrument's constant error.
+    """
+
+    test: str
+    pose: str
+    cycle: str
+    approach: str
+    t_s: float | None
+    T: Array
+    T_command: Array
+    cov: Array
+    cov_common: Array
+
+
+def read_rows(file: Path) -> list[Row]:
+    """Read a CSV.
+
+    Raises:
+        InputError: unreadable, a column missing, or a cell that is no number; the message names the line.
+    """
+    table = read_table(file)
+    if not table:
+        raise InputError(f"{file}: empty; a first line of column names is needed")
+    header = [name.strip() for name in table[0]]
+    missing = [name for name in NEEDED if name not in header]
+    if missing:
+        raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}")
+    rows = []
+    for line, cells in enumerate(table[1:], start=2):
+        if any(cell.strip() for cell in cells):
+            named = dict(zip(header, (cell.strip() for cell in cells), strict=False))
+            rows.append(_row(f"{file}: line {line}", named))
+    if not rows:
+        raise InputError(f"{file}: no rows; one line an attained pose is needed")
+    return rows
+
+
+def _row(where: str, cells: dict[str, str]) -> Row:
+    test = cells.get("test", "") or "pose"
+    if test not in TESTS:
+        raise InputError(f"{where}: test is {test!r}; known are {', '.join(TESTS)}")
+    numbers = {}
+    for name in _COLUMNS[len(_TEXTS) :]:
+        cell = cells.get(name, "")
+        if not cell:
+            continue
+        try:
+            numbers[name] = float(cell)
+        except ValueError:
+            raise InputError(f"{where}: {name} is {cell!r}, must be a number") from None
+        if not np.isfinite(numbers[name]):
+            raise InputError(f"{where}: {name} is {cell}, must be a finite number")
+    for name in NEEDED[1:]:
+        if name not in numbers:
+            raise InputError(f"{where}: {name} is empty")
+    covs = [np.diag([numbers.get(f"{kind}_{name}", 0.0) ** 2 for name in _PLACE]) for kind in ("sigma", "sigma_common")]
+    return Row(
+        test,
+        cells["pose"],
+        cells.get("cycle", ""),
+        cells.get("approach", ""),
+        numbers.get("t_s"),
+        _pose(where, numbers, ""),
+        _pose(where, numbers, "command_"),
+        covs[0],
+        covs[1],
+    )
+
+
+def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
+    """Return a pose (4, 4); without a turn it has that of the base."""
+    q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _TURN])
+    if not 0.999 < np.linalg.norm(q) < 1.001:
+        raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {np.linalg.norm(q):.4g}, not 1")
+    return pose(from_quaternion_wxyz(q / np.linalg.norm(q)), np.array([numbers[prefix + name] for name in _PLACE]))
+
+
+def rows_csv(rows: list[Row]) -> str:
+    """Return rows as the CSV that they can be read from again; of a covariance its diagonal."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for row in rows:
+        numbers = [v for T in (row.T, row.T_command) for v in (*T[:3, 3], *quaternion_wxyz(T[:3, :3]))]
+        numbers += [v for cov in (row.cov, row.cov_common) for v in np.sqrt(np.diag(cov))]
+        t_s = "" if row.t_s is None else f"{row.t_s:.6f}"
+        writer.writerow([row.test, row.pose, row.cycle, row.approach, t_s, *(f"{v:.9f}" for v in numbers)])
+    return out.getvalue()

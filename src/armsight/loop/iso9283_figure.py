@@ -1,0 +1,136 @@
+"""A figure of a test: as measured, without what is only noise, its interval, and what the test could have told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, norm, t
+
+from armsight.data import Array
+
+#: Intervals hold the true figure so often; what is called resolvable is so by chance in half of the rest.
+INSIDE = 0.95
+_LOW, _HIGH = (1 - INSIDE) / 2, (1 + INSIDE) / 2
+_WIDE = float(norm.ppf(_HIGH))
+_DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of the standard.
+
+    Attributes:
+        raw: as the standard computes it, m or rad.
+        clean: without the noise; None where it cannot be resolved.
+        low: end of the interval of 95 % of the true figure; 0 where it cannot be resolved.
+        high: the other end; where the figure cannot be resolved, what it is below of.
+        resolvable: the smallest figure that this test could have told from noise.
+    """
+
+    raw: float
+    clean: float | None
+    low: float
+    high: float
+    resolvable: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation that belongs to the interval."""
+        return (self.high - self.low) / (2 * _WIDE)
+
+
+def beyond_noise(statistic: Callable[[Array], Array], value: Array, errors: Array) -> Figure:
+    """Return a statistic of a measured value without what the value's error adds to it.
+
+    The error is added a second time: what that does to the statistic, the first time did too (basic bootstrap; Davison and
+    Hinkley, "Bootstrap methods and their application", 1997, 5.2). Errors alone say what could have been resolved.
+
+    Args:
+        statistic: of arrays (B, ...) returns (B,), not negative, 0 for none.
+        value: (...) as measured.
+        errors: (B, ...) draws of its error.
+    """
+    raw = float(statistic(value[None])[0])
+    again, alone = statistic(value + errors), statistic(errors)
+    resolvable = float(np.quantile(alone, _HIGH))
+    low, high = (float(v) for v in np.quantile(again, [_LOW, _HIGH]))
+    if raw <= resolvable:
+        return Figure(raw, None, 0.0, max(high, resolvable), resolvable)
+    return Figure(raw, max(2 * raw - float(again.mean()), 0.0), max(2 * raw - high, 0.0), 2 * raw - low, resolvable)
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the greatest length (B,) of vectors (B, k, d)."""
+    return np.asarray(np.linalg.norm(vectors, axis=-1).max(axis=-1))
+
+
+def mean_errors(values: Array, rng: np.random.Generator) -> Array:
+    """Draw errors (B, ...) of the mean of values (n, ...), from their own scatter: also where parts go together.
+
+    They are as much wider as intervals by Student's t are: a scatter of few values is not well known.
+    """
+    n = len(values)
+    if n < 2:
+        return np.zeros((_DRAWS, *values.shape[1:]))
+    wider = float(t.ppf(_HIGH, n - 1)) / _WIDE
+    weights = rng.normal(0, wider / np.sqrt(n * (n - 1)), (_DRAWS, n))
+    return np.asarray(np.tensordot(weights, values - values.mean(axis=0), axes=1))
+
+
+def drawn(cov: Array, rng: np.random.Generator) -> Array:
+    """Draw normal errors (B, ..., 3) of covariances (..., 3, 3)."""
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.maximum(values, 0))[..., None, :]
+    return np.asarray((root @ rng.normal(size=(_DRAWS, *cov.shape[:-1], 1)))[..., 0])
+
+
+def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ratio: float) -> Figure:
+    """Return a figure of a scatter without the instrument's.
+
+    The trace of S is taken as a chi square with the freedom that the figure of such a scatter shows by trial; the interval
+    of the trace, less the noise, scales the figure.
+
+    Args:
+        S: (d, d) covariance of n values.
+        noise: (d, d) the instrument's.
+        n: how many.
+        figure: of covariances (..., d, d); goes with their root.
+        ratio: of the figure as measured to ``figure(S)``.
+    """
+    total, own = float(np.trace(S)), float(np.trace(noise))
+    raw = ratio * float(figure(S))
+    if total <= 0:
+        return Figure(raw, 0.0, 0.0, 0.0, 0.0)
+    freedom, bias = _freedom(S, n, figure)
+    low, high = (total * freedom / float(chi2.ppf(p, freedom)) - own for p in (_HIGH, _LOW))
+    alone = (n - 1) * own**2 / max(float(np.trace(noise @ noise)), 1e-300)
+    resolvable = float(figure(noise)) * np.sqrt(float(chi2.ppf(_HIGH, alone)) / alone - 1) if own > 0 else 0.0
+    left = _positive(S - noise)
+    left = left if np.any(left) else S  # of nothing left the shape is not known
+    unit = float(figure(left)) / np.sqrt(float(np.trace(left)))
+    high = unit / bias * float(np.sqrt(max(high, 0.0)))
+    if low <= 0:
+        return Figure(raw, None, 0.0, max(high, resolvable), resolvable)
+    return Figure(raw, ratio * unit * np.sqrt(total - own), unit / bias * np.sqrt(low), high, resolvable)
+
+
+def _freedom(S: Array, n: int, figure: Callable[[Array], Array]) -> tuple[float, float]:
+    """Return the freedom of a figure of a scatter, by trial: how it scatters itself; and by what factor it is off."""
+    x = drawn(np.broadcast_to(_whole(S), (n, 3, 3)), np.random.default_rng(0))[..., : len(S)]
+    x = x - x.mean(axis=1, keepdims=True)
+    tried = np.log(figure(x.swapaxes(1, 2) @ x / (n - 1)) / figure(S))
+    return float(np.clip(1 / (2 * tried.var()), 1.0, 3.0 * (n - 1))), float(np.exp(tried.mean()))
+
+
+def _whole(S: Array) -> Array:
+    """Return a covariance (d, d) as one (3, 3), the rest zero."""
+    out = np.zeros((3, 3))
+    out[: len(S), : len(S)] = S
+    return out
+
+
+def _positive(S: Array) -> Array:
+    values, vectors = np.linalg.eigh(S)
+    return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
