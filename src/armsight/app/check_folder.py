@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.check_paths import path_rows
-from armsight.app.check_rows import Row
+from armsight.app.check_paths import path_rows, turns_of
+from armsight.app.check_rows import Attained, Row
 from armsight.app.check_stretch import Noise, Stretch, noise_of, plain, stood, stretches_of
 from armsight.data import Array
 from armsight.errors import InputError
@@ -26,8 +26,8 @@ _SAME_M = 1e-5
 _SHOTS = 3
 
 
-def rows_of_run(folder: Path, *, closed: bool) -> tuple[list[Row], list[str]]:
-    """Return what a run attained, and what was left out of it.
+def attained_in(folder: Path, *, closed: bool) -> Attained:
+    """Return what a run attained.
 
     Args:
         folder: of the run.
@@ -41,9 +41,9 @@ def rows_of_run(folder: Path, *, closed: bool) -> tuple[list[Row], list[str]]:
         which = "with the loop closed" if closed else "with potentiometers alone"
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
     noise = noise_of(stretches)
-    paths, run, notes = path_rows(stretches, noise)
+    paths, run, circle, notes = path_rows(stretches, noise)
     rows, more = _rests([s for s in stretches if s.kind == "rest" and s.name not in run], noise)
-    return rows + paths, more + notes
+    return Attained(rows + paths, more + notes, turns_of(folder, circle))
 
 
 def _rests(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], list[str]]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
-from armsight.app.check_rows import Row
+from armsight.app.check_rows import Row, Turn
 from armsight.app.check_stretch import Noise, Stretch, plain
 from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_table
 from armsight.geometry.pose import pose
 from armsight.loop.iso9283 import LEAST
 from armsight.loop.iso9283_path import plane_axes
@@ -16,10 +20,14 @@ _SAME_M = 1e-4
 #: A path is judged at so many stations, seen in so many shots at least; a circle is one that goes all around, rad.
 _STATIONS, _SHOTS, _ROUND = 40, 10, 2 * np.pi * 0.999
 _AHEAD_M = 1e-4
+#: A joint turns back that moves by so much before and after, rad: less does not take up its backlash.
+_MOVES_RAD = float(np.radians(0.5))
+#: Joints that turn back within this share of the circle's time do so together.
+_NEAR = 0.015
 
 
-def path_rows(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], set[str], list[str]]:
-    """Return rows of a run's paths and its circle, the motions they are of, and what was left out.
+def path_rows(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], set[str], list[Stretch], list[str]]:
+    """Return rows of a run's paths and its circle, the motions they are of, the circle once each way, what was left out.
 
     Args:
         stretches: of the run.
@@ -38,7 +46,7 @@ def path_rows(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], set[st
             continue
         rows += _path(group, noise)
         run |= {s.name for s in group}
-    return rows + [row for group in circle for row in _circle(group, noise)], run, notes
+    return rows + [row for group in circle for row in _circle(group, noise)], run, [g[0] for g in circle], notes
 
 
 def _grouped(paths: list[Stretch]) -> list[list[Stretch]]:
@@ -121,3 +129,53 @@ def _circle(group: list[Stretch], noise: Noise) -> list[Row]:
                 Row("circle", f"{np.degrees(there[k]):.2f}", str(cycle), way, t_s, attained, T, own, noise.common)
             )
     return rows
+
+
+def turns_of(folder: Path, circle: list[Stretch]) -> list[Turn]:
+    """Return where joints were to turn back on a circle, by a run's joints.csv; none where it has none.
+
+    Args:
+        folder: of the run.
+        circle: the circle once each way.
+    """
+    file = folder / "joints.csv"
+    if not circle or not file.is_file():
+        return []
+    names = ["t_s", *(f"q{joint}_wanted_rad" for joint in range(1, 7))]
+    table = read_table(file)
+    try:
+        at = [table[0].index(name) for name in names]
+        values = np.array([[float(row[k]) for k in at] for row in table[1:]])
+    except (ValueError, IndexError):
+        raise InputError(f"{file}: not a run's joints: {', '.join(names)} are needed, numbers in every line") from None
+    turns = []
+    for stretch in circle:
+        turned = _turned(stretch)
+        rows = values[(values[:, 0] > stretch.wanted.t_s[0]) & (values[:, 0] < stretch.wanted.t_s[-1])]
+        for t_s, joints in _together(rows):
+            here = float(np.interp(t_s, stretch.wanted.t_s, turned)) - turned[-1] / 2
+            if abs(here) <= np.pi:
+                turns.append(Turn(joints, float(np.sign(turned[-1])), stretch.wanted.at(np.array([t_s]))[0, :3, 3]))
+    return turns
+
+
+def _together(rows: Array) -> list[tuple[float, tuple[int, ...]]]:
+    """Return when joints turn back, s, and which, of times and angles (N, 7); those at about the same time are one."""
+    each = sorted((t_s, joint) for joint in range(1, 7) for t_s in _turn_times(rows[:, 0], rows[:, joint]))
+    near = _NEAR * float(np.ptp(rows[:, 0])) if len(rows) else 0.0
+    found: list[tuple[float, tuple[int, ...]]] = []
+    for t_s, joint in each:
+        if found and t_s - found[-1][0] < near:
+            found[-1] = (found[-1][0], (*found[-1][1], joint))
+        else:
+            found.append((t_s, (joint,)))
+    return found
+
+
+def _turn_times(t_s: Array, q: Array) -> list[float]:
+    """Return when a joint turns back that moves by enough before and after it, s."""
+    if not len(q):
+        return []
+    ends = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(q))) != 0) + 1).tolist(), len(q) - 1]
+    enough = np.abs(np.diff(q[ends])) > _MOVES_RAD
+    return [float(at) for at in t_s[ends[1:-1]][enough[:-1] & enough[1:]]]

@@ -6,6 +6,7 @@ import csv
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,6 +56,34 @@ class Row(Record):
     T_command: Array
     cov: Array
     cov_common: Array
+
+
+class Turn(NamedTuple):
+    """Joints turn back on the circle.
+
+    Attributes:
+        joints: their numbers, 1 to 6.
+        way: 1 counter-clockwise, -1 clockwise.
+        p: (3,) where the tool is commanded then, base, m.
+    """
+
+    joints: tuple[int, ...]
+    way: float
+    p: Array
+
+
+class Attained(NamedTuple):
+    """What a test attained.
+
+    Attributes:
+        rows: all that is judged.
+        notes: what was left out, in words.
+        turns: where joints turn back on the circle, as far as that is known.
+    """
+
+    rows: list[Row]
+    notes: list[str]
+    turns: list[Turn]
 
 
 def read_rows(file: Path) -> list[Row]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.check_folder import rows_of_run
-from armsight.app.check_rows import TESTS, Row, read_rows
+from armsight.app.check_folder import attained_in
+from armsight.app.check_rows import TESTS, Attained, Row, Turn, read_rows
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop import iso9283
@@ -24,32 +24,28 @@ _WIDE = 10
 _DRIFTS = 10
 
 
-def read_check(path: Path, *, closed: bool = False) -> tuple[list[Row], list[str]]:
+def read_check(path: Path, *, closed: bool = False) -> Attained:
     """Read what was attained, from a run's folder (or the check.csv in it) or from a CSV.
 
     Args:
         path: folder or file.
         closed: of a run, take the motions with the loop closed on vision.
 
-    Returns:
-        The rows; what was left out, in words.
-
     Raises:
         InputError: it cannot be read, or holds nothing that can be judged.
     """
     if path.is_dir() and not (path / "check.csv").exists():
-        return rows_of_run(path, closed=closed)
+        return attained_in(path, closed=closed)
     if closed:
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
-    return read_rows(path / "check.csv" if path.is_dir() else path), []
+    return Attained(read_rows(path / "check.csv" if path.is_dir() else path), [], [])
 
 
-def judge(rows: list[Row], notes: list[str]) -> dict[str, Any]:
+def judge(attained: Attained) -> dict[str, Any]:
     """Return all figures that the rows allow, SI units.
 
     Args:
-        rows: what was attained.
-        notes: what was left out of them; told where nothing is left.
+        attained: the rows, and what was left out of them: that is told where nothing is left.
 
     Returns:
         poses (by name), anywhere (where each was attained too seldom), vAP_m, distance, drift, paths (by name), circle,
@@ -58,7 +54,7 @@ def judge(rows: list[Row], notes: list[str]) -> dict[str, Any]:
     Raises:
         InputError: too few rows for any figure.
     """
-    by_test = {test: [row for row in rows if row.test == test] for test in TESTS}
+    by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
     facts: dict[str, Any] = {}
     seldom = _too_seldom(by_test["pose"])
     if by_test["pose"] and seldom is None:
@@ -67,10 +63,10 @@ def judge(rows: list[Row], notes: list[str]) -> dict[str, Any]:
         paths = _groups(by_test["path"], lambda row: row.approach)
         facts["paths"] = {name or "path": _path(name, group) for name, group in paths.items()}
     if by_test["circle"]:
-        facts["circle"] = _circle(by_test["circle"])
+        facts["circle"] = _circle(by_test["circle"], attained.turns)
     if not facts:
-        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *notes]))
-    return facts | {"notes": notes}
+        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *attained.notes]))
+    return facts | {"notes": attained.notes}
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
@@ -179,7 +175,7 @@ def _path(name: str, rows: list[Row]) -> dict[str, Any]:
     }
 
 
-def _circle(rows: list[Row]) -> dict[str, Any]:
+def _circle(rows: list[Row], turns: list[Turn]) -> dict[str, Any]:
     ways = _groups(rows, lambda row: row.approach)
     if set(ways) != {"1", "-1"}:
         raise InputError(
@@ -187,7 +183,11 @@ def _circle(rows: list[Row]) -> dict[str, Any]:
         )
     command = np.array([row.T_command[:3, 3] for row in rows])
     axes = plane_axes(np.linalg.svd(command - command.mean(axis=0), full_matrices=False)[2][2])
-    figures = circle_figures(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0))
+    middle = (command.max(axis=0) + command.min(axis=0)) / 2
+    flat = np.array([turn.p - middle for turn in turns]).reshape(-1, 3) @ axes.T
+    at = (np.degrees(np.arctan2(flat[:, 1], flat[:, 0])) % 360).tolist()
+    asked = [(angle, turn.way) for angle, turn in zip(at, turns, strict=True)]
+    figures = circle_figures(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
     return {
         "centre_m": figures.centre.tolist(),
         "radius_m": figures.radius_m,
@@ -196,6 +196,10 @@ def _circle(rows: list[Row]) -> dict[str, Any]:
         "hysteresis_m": figure(figures.hysteresis),
         "steps_m": figures.steps_m.tolist(),
         "backlash_m": [figure(f) for f in figures.backlash],
+        "turns": [
+            {"joints": list(turn.joints), "way": turn.way, "angle_deg": angle, "jump_m": figure(jump)}
+            for turn, angle, jump in zip(turns, at, figures.jumps, strict=True)
+        ],
         "angle_deg": figures.angle_deg.tolist(),
         "radii_m": figures.radii_m.tolist(),
     }

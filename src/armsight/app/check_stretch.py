@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_table, read_text
-from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.loop.iso9283 import LEAST
 
 #: An arm that stands is judged by the end of its rest, s.
@@ -111,7 +110,10 @@ def _track(file: Path, more: tuple[str, ...]) -> tuple[ToolTrack, Array]:
         raise InputError(f"{file}: line {bad[0] + 2}: finite numbers are needed in {', '.join((*_COLUMNS, *more))}")
     if not len(numbers):
         raise InputError(f"{file}: no rows")
-    Ts = np.array([pose(from_quaternion_wxyz(n[4:8] / max(np.linalg.norm(n[4:8]), 1e-9)), n[1:4]) for n in numbers])
+    if not np.linalg.norm(numbers[:, 4:8], axis=1).all():
+        raise InputError(f"{file}: a quaternion qw .. qz is zero")
+    Ts = np.tile(np.eye(4), (len(numbers), 1, 1))
+    Ts[:, :3, 3], Ts[:, :3, :3] = numbers[:, 1:4], Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
     return ToolTrack(numbers[:, 0], Ts, texts[:, 0], texts[:, 1]), numbers[:, 8:]
 
 

@@ -22,6 +22,7 @@ MEANINGS = {
     "circularity": "largest less smallest radius",
     "hysteresis": "largest difference of the radii of both ways",
     "play": "how much the radius jumps where the motion along that direction turns back",
+    "jump": "the same where a joint turns back: what its backlash does to the radius there",
 }
 
 
@@ -54,6 +55,14 @@ def figures(facts: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, f
         yield "hysteresis", what, c["hysteresis_m"]
         for axis, play in zip(c["axes"], c["backlash_m"], strict=True):
             yield "play", f"along {direction(axis)}", play
+        for turn in c["turns"]:
+            way = "counter-clockwise" if turn["way"] > 0 else "clockwise"
+            joints = ", ".join(map(str, turn["joints"]))
+            yield (
+                "jump",
+                f"{'joints' if len(turn['joints']) > 1 else 'joint'} {joints} at {turn['angle_deg']:.0f} deg, {way}",
+                turn["jump_m"],
+            )
 
 
 def direction(axis: list[float]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from armsight.errors import InputError
 from armsight.loop.iso9283 import repeatability
 from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, mean_errors
 
-#: Degrees on either side of a reversal that are left out, and that are used, where its step is read off.
-NEAR_DEG, FAR_DEG = 3.0, 25.0
+#: Degrees on either side of a reversal that are left out, and that are used, where its step is read off. Until play is
+#: taken up the axis stands still: on the first 8 degrees play of up to 1 % of the radius is, 1 - cos 8 degrees.
+NEAR_DEG, FAR_DEG = 8.0, 32.0
 #: Places of a circle this close are averaged, deg.
 _BIN_DEG = 4.0
 
@@ -74,6 +76,7 @@ class CircleFigures(NamedTuple):
         hysteresis: H, the largest difference of the radii of the two ways at one angle.
         steps_m: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive.
         backlash: play along the circle's first and second axis: the mean of the four jumps where it turns back.
+        jumps: of the radius at each of the turns asked for.
         angle_deg: (B,) angles of the curves.
         radii_m: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise.
     """
@@ -84,11 +87,14 @@ class CircleFigures(NamedTuple):
     hysteresis: Figure
     steps_m: Array
     backlash: tuple[Figure, Figure]
+    jumps: tuple[Figure, ...]
     angle_deg: Array
     radii_m: Array
 
 
-def circle_figures(ccw: Array, cw: Array, axes: Array, cov: Array | None = None) -> CircleFigures:
+def circle_figures(
+    ccw: Array, cw: Array, axes: Array, cov: Array | None = None, turns: Sequence[tuple[float, float]] = ()
+) -> CircleFigures:
     """Judge a circle, and read play off where an axis turns back.
 
     Where the path crosses an axis of the circle, the motion along that axis turns back: it lagged by half the play before,
@@ -99,6 +105,7 @@ def circle_figures(ccw: Array, cw: Array, axes: Array, cov: Array | None = None)
         cw: (M, 3) clockwise.
         axes: (2, 3) unit vectors of the circle's plane along which angles count from the first to the second.
         cov: (3, 3) covariance of a place by the instrument, m^2; none where it is not given.
+        turns: where else the radius may jump: angles, deg, and the way, 1 counter-clockwise, -1 clockwise.
 
     Raises:
         InputError: a way does not go all around.
@@ -127,6 +134,7 @@ def circle_figures(ccw: Array, cw: Array, axes: Array, cov: Array | None = None)
         beyond_noise(lambda r: np.asarray(np.abs(r[:, 0] - r[:, 1]).max(axis=-1)), radii, errors),
         steps,
         (x, y),
+        tuple(_play(*(np.array([v]) for v in _step(*ways[int(way < 0)], at, way))) for at, way in turns),
         grid,
         radii - radius,
     )
@@ -153,7 +161,7 @@ def _play(steps: Array, variances: Array) -> Figure:
     """
     value, freedom = float(steps.mean()), steps.size - 1
     scatter = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
-    if scatter > chi2.ppf(0.975, freedom):
+    if freedom and scatter > chi2.ppf(0.975, freedom):
         sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(t.ppf(0.975, freedom))
     else:
         sigma, wide = float(np.sqrt(variances.sum())) / steps.size, 1.96

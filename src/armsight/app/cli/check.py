@@ -45,10 +45,10 @@ def judged(data: Path, closed: bool, out: Path | None, as_json: bool) -> None:
     DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/check.md). Figures stand without the instrument's
     own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
     """
-    rows, notes = read_check(data, closed=closed)
-    facts = judge(rows, notes)
+    attained = read_check(data, closed=closed)
+    facts = judge(attained)
     if out is not None:
-        write_check(facts, rows, data, report_folder(out))
+        write_check(facts, attained.rows, data, report_folder(out))
     for note in facts["notes"]:
         click.echo(f"note: {note}", err=True)
     if as_json:

@@ -1,0 +1,244 @@
+"""``armsight check`` on a run's folder, made here with a known arm and a known instrument."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from cli_runs import Said, refused, run
+
+NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
+OFF_M = np.array([1.5e-3, -8e-4, 4e-4])
+PLACES = {
+    "P1": (0.5, 0.0, 0.4),
+    "P2": (0.6, -0.1, 0.5),
+    "P3": (0.6, 0.1, 0.5),
+    "P4": (0.4, 0.1, 0.3),
+    "P5": (0.4, -0.1, 0.3),
+}
+COLUMNS = ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+SIGMAS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
+CENTRE, RADIUS, PLAY = np.array([0.5, 0.0, 0.4]), 0.08, 3e-4
+
+
+class Folder:
+    """A run's folder in the making: the tool is commanded 100 times a second, and seen 50 times."""
+
+    def __init__(self, folder, seed=0):
+        self.folder, self.rng, self.t = folder, np.random.default_rng(seed), 0.0
+        self.common = self.rng.normal(0, COMMON_M, 3)
+        self.wanted, self.seen, self.motions = [], [], []
+
+    def stretch(self, phase, name, places, off, *, hidden=False):
+        for k, (place, away) in enumerate(zip(places, off, strict=True)):
+            self.t += 0.01
+            self.wanted.append([self.t, *place, 1, 0, 0, 0, phase, name])
+            if k % 2 == 1 and not hidden:
+                at = place + away + self.common + self.rng.normal(0, NOISE_M, 3)
+                claimed = [np.hypot(NOISE_M, COMMON_M)] * 3
+                self.seen.append([self.t - 0.001, *at, 1, 0, 0, 0, *claimed, phase, name])
+
+    def motion(self, phase, name, kind, path, off, **options):
+        """A motion along a path with offsets, and the rest at its end."""
+        if phase == "open_loop":
+            self.motions.append((kind, name))
+        self.stretch(phase, name, path, off)
+        self.stretch("rest", name, np.repeat(path[-1:], 50, axis=0), np.repeat(off[-1:], 50, axis=0), **options)
+
+    def poses(self, phase, cycles, off=OFF_M, hidden=()):
+        before = np.array(PLACES["P3"])
+        for name, cycle in [("P5", 0)] + [(name, c + 1) for c in range(cycles) for name in PLACES]:
+            there = np.array(PLACES[name])
+            path = before + np.linspace(0, 1, 40)[:, None] * (there - before)
+            away = np.repeat((off + self.rng.normal(0, ARM_M, 3))[None], 40, axis=0)
+            called = f"{name} cycle {cycle}" if cycle else f"to {name}"
+            self.motion(phase, called, "joints", path, away, hidden=called in hidden)
+            before = there
+
+    def write(self):
+        for name, header, rows in (
+            ("wanted.csv", [*COLUMNS, "phase", "motion"], self.wanted),
+            ("vision.csv", [*COLUMNS, *SIGMAS, "phase", "motion"], self.seen),
+        ):
+            with open(self.folder / name, "w", newline="") as file:
+                csv.writer(file).writerows([header, *rows])
+        text = "".join(f'[[motion]]\nkind = "{kind}"\nname = "{name}"\n' for kind, name in self.motions)
+        (self.folder / "motion.toml").write_text(text)
+        return self.folder
+
+
+def said(capsys, *arguments):
+    capsys.readouterr()
+    code = run("check", *arguments)
+    out = capsys.readouterr()
+    return Said(code, out.out, out.err)
+
+
+def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):
+    made = Folder(tmp_path)
+    made.stretch("calibration", "hand-eye 1", np.zeros((40, 3)), np.zeros((40, 3)))
+    made.poses("open_loop", 30, hidden=("P2 cycle 7",))
+    made.poses("closed_loop", 5, off=np.zeros(3))
+    answer = said(capsys, made.write(), "--json", "-o", tmp_path / "report")
+    (facts,) = answer.lines
+    assert {name: p["count"] for name, p in facts["poses"].items()} == {
+        "P1": 30,
+        "P2": 29,
+        "P3": 30,
+        "P4": 30,
+        "P5": 30,
+    }
+    assert facts["notes"] == [
+        "1 rests were not seen, and are left out",
+        "left out: P5 come to from the start, too seldom (1)",
+    ]
+    unit = 3 * np.sqrt(3 - 8 / np.pi) + np.sqrt(8 / np.pi)  # E l + 3 sd l of a normal vector, known in closed form
+    held = [p["RP_m"]["low"] < unit * ARM_M < p["RP_m"]["high"] for p in facts["poses"].values()]
+    assert sum(held) >= 4
+    true = np.linalg.norm(OFF_M)
+    for p in facts["poses"].values():
+        assert p["AP_m"]["low"] < true < p["AP_m"]["high"]
+        assert (
+            0.8 * COMMON_M < p["AP_m"]["sigma"] < 1.2 * np.hypot(COMMON_M, ARM_M)
+        )  # what is common is not averaged out
+        assert p["RP_m"]["raw"] == pytest.approx(p["RP_m"]["clean"], rel=0.02)  # of 15 shots' mean little is noise
+    assert facts["distance"] | {"AD_m": 0, "RD_m": 0} == {
+        "from": "P2", "to": "P4", "commanded_m": pytest.approx(np.sqrt(0.12)), "AD_m": 0, "RD_m": 0
+    }  # fmt: skip
+    assert facts["drift"]["pose"] == "P1"
+    with open(tmp_path / "report" / "check.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["cycle"] for row in rows if row["pose"] == "P2"] == [str(c) for c in range(1, 31) if c != 7]
+    noise = np.array([float(row["sigma_x_m"]) for row in rows])
+    np.testing.assert_allclose(noise, NOISE_M / np.sqrt(15), rtol=0.1)
+    closed = said(capsys, tmp_path, "--closed", "--json").lines[0]
+    assert all(p["count"] == 5 for p in closed["poses"].values())
+    assert closed["poses"]["P1"]["AP_m"]["raw"] < 0.5 * true
+    assert said(capsys, tmp_path / "report", "--json").code == 0  # its check.csv
+
+
+def test_a_repeatability_below_the_noise(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(globals(), "ARM_M", 1e-6)
+    made = Folder(tmp_path)
+    made.poses("open_loop", 10)
+    answer = said(capsys, made.write(), "--json")
+    told = [p["RP_m"]["clean"] for p in answer.lines[0]["poses"].values()]
+    assert sum(clean is None for clean in told) >= 4  # 2.5 % each by chance
+
+
+def line(made, phase, cycles):
+    """There and back: 0.5 mm off at the middle, and late by 3 mm, which is no error of a path."""
+    s = np.linspace(0, 1, 200)
+    for cycle in range(1, cycles + 1):
+        for name, share in (("out", s), ("back", s[::-1])):
+            path = np.stack([0.4 + 0.2 * share, 0 * s, 0.4 + 0 * s], axis=1)
+            late = -3e-3 * np.sign(share[1] - share[0]) * np.sin(np.pi * s)
+            off = np.stack([late, 5e-4 * np.sin(np.pi * share), 0 * s], axis=1)
+            made.motion(phase, f"{name} cycle {cycle}", "line", path, off)
+
+
+def circle(made, phase):
+    """Both ways with a third more than a turn, play along y."""
+    a = np.radians(np.linspace(15, 435, 1000))
+    for name, angle in (("ccw", a), ("cw", a[::-1])):
+        path = CENTRE + RADIUS * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+        way = np.sign(angle[1] - angle[0])
+        off = np.stack([0 * a, -0.5 * PLAY * np.sign(-way * np.sin(angle)), 0 * a], axis=1)
+        made.motion(phase, f"{name} cycle 1", "circle", path, off)
+
+
+def test_paths_and_the_circle(tmp_path, capsys):
+    made = Folder(tmp_path)
+    line(made, "open_loop", 4)
+    circle(made, "open_loop")
+    answer = said(capsys, made.write(), "--json", "-o", tmp_path / "report")
+    (facts,) = answer.lines
+    assert "poses" not in facts
+    assert set(facts["paths"]) == {"out", "back"}
+    bow = np.array([0.0, 5e-4, 0.0]) + made.common * [0, 1, 1]
+    for p in facts["paths"].values():
+        assert p["count"] == 4
+        assert p["AT_m"]["raw"] == pytest.approx(np.linalg.norm(bow), abs=4 * NOISE_M)
+        assert p["AT_m"]["low"] < 5e-4 < p["AT_m"]["high"]
+        assert p["RT_m"]["clean"] is None or p["RT_m"]["low"] < 2 * NOISE_M  # all of it is the instrument's
+    c = facts["circle"]
+    assert c["radius_m"] == pytest.approx(RADIUS, abs=2e-5)
+    np.testing.assert_allclose(c["axes"], [[0, 1, 0], [0, 0, 1]], atol=1e-9)
+    play, none = c["backlash_m"]
+    assert play["low"] < PLAY < play["high"]
+    assert play["clean"] is not None
+    assert none["clean"] is None
+    assert (tmp_path / "report" / "check-circle.png").exists()
+    assert said(capsys, tmp_path / "report" / "check.csv", "--json").lines[0]["circle"]["radius_m"] == pytest.approx(
+        c["radius_m"], abs=1e-8
+    )
+
+
+def test_where_joints_turn_back(tmp_path, capsys):
+    made = Folder(tmp_path)
+    circle(made, "open_loop")
+    spans = [
+        [t for t, *_, phase, name in made.wanted if name == f"{w} cycle 1" and phase == "open_loop"]
+        for w in ("ccw", "cw")
+    ]
+    made.write()
+    with open(tmp_path / "joints.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t_s", *(f"q{joint}_wanted_rad" for joint in range(1, 7))])
+        for span in spans:
+            for t in span:
+                a = 15 + 420 * (t - span[0]) / (span[-1] - span[0])
+                a = a if span is spans[0] else 450 - a
+                # Joint 2 turns back at 0 and 180 degrees, as the play does; joint 4 by too little; the others never.
+                writer.writerow([t, t, np.cos(np.radians(a)), 0, 1e-3 * np.cos(np.radians(a)), -t, 0])
+    facts = said(capsys, tmp_path, "--json", "-o", tmp_path / "report").lines[0]
+    turns = facts["circle"]["turns"]
+    assert all(turn["joints"] == [2] for turn in turns)
+    found = sorted((turn["way"], round(turn["angle_deg"] / 180) % 2) for turn in turns)
+    assert found == [(-1, 0), (-1, 1), (1, 0), (1, 1)]
+    for turn in turns:
+        assert turn["jump_m"]["raw"] == pytest.approx(PLAY, abs=5 * turn["jump_m"]["sigma"])
+        assert turn["jump_m"]["sigma"] < 5e-5
+    assert "joint 2 at 180 deg, counter-clockwise" in said(capsys, tmp_path).out
+    (tmp_path / "joints.csv").write_text("t_s\n1\n")
+    refused(said(capsys, tmp_path), "joints.csv", "q1_wanted_rad")
+
+
+def test_folders_that_cannot_be_judged(tmp_path, capsys):
+    refused(said(capsys, tmp_path), tmp_path, "no run", "wanted.csv")
+    made = Folder(tmp_path)
+    made.poses("open_loop", 1)
+    circle(made, "open_loop")
+    line(made, "open_loop", 1)
+    whole = made.write()
+    answer = said(capsys, whole, "--json")  # one cycle: of the poses nothing, of the circle all
+    assert set(answer.lines[0]) == {"circle", "notes"}
+    refused(said(capsys, whole, "--closed"), "no motions with the loop closed")
+    (whole / "motion.toml").write_text("motion = 3")
+    refused(said(capsys, whole), "motion.toml", "not a motion file")
+    made = Folder(tmp_path)
+    made.poses("open_loop", 1)
+    refused(said(capsys, made.write(), "-o", tmp_path / "report"), "5 poses", "no repeatability", "armsight check plan")
+    assert not (tmp_path / "report").exists()
+    lines = (tmp_path / "vision.csv").read_text().splitlines()
+    for bad, words in (
+        (lines[0].replace("sigma_y_m", "sigma_q"), ("line 1", "sigma_y_m")),
+        (lines[1].replace(lines[1].split(",")[1], "nan"), ("line 2", "finite")),
+        (lines[1].replace(lines[1].split(",")[1], "x"), ("line 2", "numbers")),
+        ("0.1,0.2", ("line 2", "numbers")),
+    ):
+        first = "line 1" in words
+        (tmp_path / "vision.csv").write_text("\n".join([bad, *lines[1:]] if first else [lines[0], bad, *lines[2:]]))
+        refused(said(capsys, tmp_path), "vision.csv", *words)
+    (tmp_path / "vision.csv").write_text(lines[0] + "\n")
+    refused(said(capsys, tmp_path), "vision.csv", "no rows")
+    (tmp_path / "vision.csv").write_text("\n".join(lines[:3]))
+    refused(said(capsys, tmp_path), "hardly seen")
+
+
+def test_json_has_no_nan(tmp_path, capsys):
+    made = Folder(tmp_path)
+    made.poses("open_loop", 3)
+    facts = said(capsys, made.write(), "--json").lines[0]  # read strictly
+    assert json.dumps(facts, allow_nan=False)
