@@ -130,7 +130,10 @@ def test_accuracy_over_the_workspace():
     true = rng.normal(0, 1e-3, (100, 3))
     cov = np.broadcast_to(np.eye(3) * 4e-8, (100, 3, 3))
     mean, largest = np.linalg.norm(true, axis=1).mean(), np.linalg.norm(true, axis=1).max()
-    found = [iso9283.anywhere(true + rng.normal(0, 2e-4, (100, 3)), cov) for _ in range(100)]
+    common = np.eye(3) * 9e-8
+    found = [
+        iso9283.anywhere(true + rng.normal(0, 2e-4, (100, 3)) + rng.normal(0, 3e-4, 3), cov, common) for _ in range(100)
+    ]
     covers([f[0] for f in found], mean)
     covers([f[1] for f in found], largest)
 

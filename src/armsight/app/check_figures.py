@@ -153,18 +153,15 @@ def circle_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | Non
         ax.annotate(
             f"jump\n{jumps}", (np.radians(90 * k), -1.5 * span), ha="center", va="center", color=INK, fontsize=8
         )
+    told: list[float] = []
     for turn in c["turns"]:
-        colour, out = (BLUE, 1.45) if turn["way"] > 0 else (ORANGE, 1.2)
+        if any(abs((turn["angle_deg"] - other + 180) % 360 - 180) < 5 for other in told):
+            continue  # the same joints, the other way
+        told.append(turn["angle_deg"])
         at = np.radians(turn["angle_deg"])
-        ax.plot([at, at], [-0.2 * span, 1.05 * span], color=colour, lw=0.7, ls=":")
-        ax.annotate(
-            "J" + ",".join(map(str, turn["joints"])),
-            (at, out * span),
-            ha="center",
-            va="center",
-            color=colour,
-            fontsize=8,
-        )
+        ax.plot([at, at], [-0.2 * span, 1.1 * span], color=RED, lw=0.8, ls=":")
+        label = "J" + ",".join(map(str, turn["joints"]))
+        ax.annotate(label, (at, 1.3 * span), ha="center", va="center", color=RED, fontsize=8)
     first, second = (direction(axis) for axis in c["axes"])
     ax.set_title(
         f"radius {1e3 * c['radius_m']:.1f} mm, rings {step:g} mm apart; 0 deg is towards {first}, 90 deg towards {second}"

@@ -84,15 +84,21 @@ def plan_test(
         inside = np.all((q > arm.q_min + CLEAR_RAD) & (q < arm.q_max - CLEAR_RAD))
         return bool(inside and allowed(arm.forward(q)).all())
 
-    plan = plan_check(arm, centre=centre, wide=name == "wide", allowed=allowed, feasible=feasible)
+    try:
+        plan = plan_check(arm, centre=centre, wide=name == "wide", allowed=allowed, feasible=feasible)
+    except InputError as error:
+        raise InputError(f"{error}{', or a lower --speed' if done else ''}") from None
     times = CYCLES[name] if cycles is None else cycles
     texts = {"line": _line_text, "circle": _circle_text}
-    text = texts[name](arm, plan, times, speed_m_s) if name in texts else _poses_text(plan, times)
-    text = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/run.md.\n" + text
-    with tempfile.TemporaryDirectory() as folder:  # all of it is planned once before anybody is handed it
-        write_text(Path(folder) / "motion.toml", text)
+
+    def motions(cycles: int) -> str:
+        return texts[name](arm, plan, cycles, speed_m_s) if name in texts else _poses_text(plan, cycles)
+
+    with tempfile.TemporaryDirectory() as folder:  # it is planned as it will be; after two cycles all come again
+        write_text(Path(folder) / "motion.toml", motions(min(times, 2)))
         read_motions(arm, Path(folder) / "motion.toml")
-    return Test(name, times, plan, text)
+    head = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/run.md.\n"
+    return Test(name, times, plan, head + motions(times))
 
 
 def _seen_by(run: Path) -> Allowed:
@@ -158,8 +164,8 @@ def _joints(name: str, q: Array) -> str:
 
 
 def _poses_text(plan: CheckPlan, cycles: int) -> str:
-    """Return the motions from pose to pose; the first comes from the last, as in every other cycle."""
-    text = _joints(f"to {plan.names[-1]}", plan.q[-1])
+    """Return the motions from pose to pose; where there are cycles, the first comes from the last, as every other does."""
+    text = _joints(f"to {plan.names[-1]}", plan.q[-1]) if cycles > 1 else ""
     for cycle in range(1, cycles + 1):
         for name, q in zip(plan.names, plan.q, strict=True):
             text += _joints(f"{name} cycle {cycle}", q)

@@ -42,7 +42,8 @@ FIGURES: dict[str, tuple[str, Callable[[Mapping[str, Any], Sequence[Row]], Figur
         "The circle",
         circle_figure,
         "Deviations from the fitted circle, enlarged. Where the motion along an axis turns back the radius jumps by the "
-        "play: at each such place stands the jump counter-clockwise / clockwise, mm.",
+        "play: at each such place stands the jump counter-clockwise / clockwise, mm. J: these joints turn back there; the "
+        "play of an arm of turning joints shows there, and not where x or y turns back.",
     ),
 }
 

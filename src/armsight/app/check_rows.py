@@ -98,7 +98,8 @@ def read_rows(file: Path) -> list[Row]:
     header = [name.strip() for name in table[0]]
     missing = [name for name in NEEDED if name not in header]
     if missing:
-        raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}")
+        hint = "; of a run give the folder" if "phase" in header else ""
+        raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
     rows = []
     for line, cells in enumerate(table[1:], start=2):
         if any(cell.strip() for cell in cells):

@@ -108,7 +108,7 @@ def _poses(rows: list[Row]) -> dict[str, Any]:
     often = {name: group for name, group in groups.items() if len(group) >= iso9283.LEAST}
     facts: dict[str, Any] = {}
     if not often:
-        mean, largest = iso9283.anywhere(_off(rows), np.array([row.cov + row.cov_common for row in rows]))
+        mean, largest = iso9283.anywhere(_off(rows), _covs(rows), _common(rows))
         facts["anywhere"] = {"count": len(rows), "mean_m": figure(mean), "max_m": figure(largest)}
         return facts
     facts["poses"] = {name: _pose(group) for name, group in often.items()}

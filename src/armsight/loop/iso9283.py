@@ -103,14 +103,16 @@ def distance_limit(S: Array) -> Array:
     return np.asarray(mean + 3 * np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
-def anywhere(off: Array, cov: Array) -> tuple[Figure, Figure]:
+def anywhere(off: Array, cov: Array, common: Array) -> tuple[Figure, Figure]:
     """Return the mean and the largest error over many poses, each attained once or twice: accuracy over the workspace.
 
     Args:
         off: (N, 3) attained places less the commanded ones, m.
-        cov: (N, 3, 3) covariance by the instrument, all in, m^2.
+        cov: (N, 3, 3) covariance by the instrument, m^2: what differs from pose to pose.
+        common: (3, 3) that of its constant error.
     """
-    errors = drawn(cov, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    errors = drawn(cov, rng) + drawn(common[None], rng)
     mean = beyond_noise(lambda x: np.asarray(np.linalg.norm(x, axis=-1).mean(axis=-1)), off, errors)
     return mean, beyond_noise(lengths, off, errors)
 

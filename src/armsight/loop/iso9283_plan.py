@@ -74,6 +74,8 @@ def plan_check(
     Raises:
         InputError: not even the smallest cube will do.
     """
+    if centre is not None and not np.isfinite(centre).all():
+        raise InputError("the cube's centre must be three finite numbers")
     home = arm.forward(arm.home)
     centres = _centres(arm, home[:3, 3]) if centre is None else centre[None]
     for side in CUBES_M:

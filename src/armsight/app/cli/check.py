@@ -26,6 +26,12 @@ class _Check(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         return super().parse_args(ctx, args if args and args[0] in self.commands else ["judge", *args])
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name, found, rest = super().resolve_command(ctx, args)
+        return ("" if name == "judge" else name), found, rest  # as it is called
+
 
 @click.group("check", cls=_Check)
 def command() -> None:
