@@ -106,6 +106,7 @@ def plan_text(plan: Plan) -> str:
             else f"more than {len(plan.random_sigma_m) - 1} at random would do"
         )
         lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({told})" if k else ""))
+    lines.append("come to each from the side given, over the last half degree in a second or two")
     return "\n".join(lines)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,8 @@ def run_identify(
         how = f"{len(other)} poses of another file" + (", base and tool placed anew" if held_out.placed_anew else "")
         poses = other.q
     else:
-        held_out, poses, how = _left_out(arm, measured, priors, progress)
+        held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
+        how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
     return Run(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
 
 
@@ -162,19 +164,27 @@ def summary(run: Run) -> dict[str, Any]:
     }
 
 
-def check_folder(out: Path, apart_from: tuple[Path | None, ...]) -> Path:
-    """Make the folder of the results, before long work.
+@contextmanager
+def results_in(out: Path, apart_from: tuple[Path | None, ...]) -> Iterator[None]:
+    """Make the folder of the results before long work; where that fails, no folder made for it stays behind.
 
     Raises:
         InputError: it cannot be made or written to, or a result would replace what is read.
     """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from None
-    for name in (*FILES, "report.html"):
-        check_writable(out / name, apart_from=apart_from)
-    return out
+    try:
+        for name in (*FILES, "report.html"):
+            check_writable(out / name, apart_from=apart_from)
+        yield
+    except BaseException:  # an interrupt, too, must not leave an empty folder
+        for folder in made:
+            with suppress(OSError):  # one that holds something stays
+                folder.rmdir()
+        raise
 
 
 def write_results(run: Run, out: Path) -> None:

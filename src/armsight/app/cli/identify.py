@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from armsight.app import identify_words
 from armsight.app.cli.progress import steps
 from armsight.app.identify_plan import plan_csv, plan_from, plan_text
 from armsight.app.identify_report import write_identify_report
-from armsight.app.identify_run import check_folder, run_identify, summary, write_results
+from armsight.app.identify_run import results_in, run_identify, summary, write_results
 from armsight.app.report_draw import require_matplotlib
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
@@ -62,9 +63,8 @@ def command(
     arm = open_model(model)
     if out is not None:
         require_matplotlib()
-        check_folder(out, (data, other, Path(model)))
     started = time.perf_counter()
-    with steps() as progress:
+    with nullcontext() if out is None else results_in(out, (data, other, Path(model))), steps() as progress:
         progress("reading")
         read = read_poses(data, turns=turns)
         held = None if other is None else read_poses(other, turns=turns)

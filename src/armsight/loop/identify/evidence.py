@@ -7,6 +7,8 @@ Computation 4, 1992); on one linearisation it costs one factorisation of P x P.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
@@ -20,8 +22,9 @@ from armsight.loop.identify.model import Model
 SCALED = ("gain", "wave", "ripple", "backlash", "slack", "sag")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
 LEAST, MOST = 0.01, 1.0
-#: The factor is itself told by a handful of numbers, to some 40 %; it is taken at its upper end.
-WIDER = 1.5
+#: The factor is itself told by a handful of numbers; it is taken at the upper end of what they allow, where twice the log
+#: of the evidence has fallen by so much from its best (one sigma), and this far above the best at least.
+FALLEN, WIDER = 1.0, 1.5
 
 
 def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
@@ -52,7 +55,21 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
         return float(size + 2 * np.log(sigma[~flat]).sum() - b @ (scale * cho_solve(factor, scale * b)))
 
     best = minimize(cost, np.full(len(kinds), np.log(0.2)), method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.1})
-    return np.asarray(prior * _factors(of, best.x + np.log(WIDER)))
+    return np.asarray(prior * _factors(of, _upper_ends(cost, best.x)))
+
+
+def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
+    """Return the logs of the factors at the upper end of what the evidence allows, one kind at a time."""
+    out, allowed = best.copy(), cost(best) + FALLEN
+    for k in range(len(best)):
+        for log in np.arange(np.log(MOST), max(best[k], np.log(LEAST)), -0.2):
+            tried = best.copy()
+            tried[k] = log
+            if cost(tried) <= allowed:
+                out[k] = log
+                break
+        out[k] = max(out[k], best[k] + np.log(WIDER))
+    return out
 
 
 def _factors(of: Array, logs: Array) -> Array:

@@ -50,7 +50,7 @@ def all_features(backlash: bool, ripple: bool) -> tuple[Feature, ...]:
     """Return every cause there is; ``backlash`` where directions of approach are known, ``ripple`` with many poses."""
     found = []
     for i in range(6):
-        found.append(Feature(f"gain{i + 1}", "gain", i, "1"))
+        found.append(Feature(f"gain{i + 1}", "gain", i, "rad/rad"))
         for n in (*WAVES, *RIPPLES) if ripple else WAVES:
             kind = "wave" if n in WAVES else "ripple"
             found += [Feature(f"{kind}{i + 1}_{w}{n}", kind, i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]

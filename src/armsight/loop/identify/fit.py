@@ -26,6 +26,10 @@ CHANCE = 1e-7
 STEPS, SMALL_STEP = 25, 1e-3
 #: Rounds of leaving out gross errors and estimating the noise.
 ROUNDS = 6
+#: Residuals whose freedom a fit has taken but for this part of their number do not tell their noise.
+LEAST_FREEDOM = 0.1
+#: Added to a normal matrix of unit diagonal, so that rounding leaves it positive: far below what the data can tell.
+ROUNDING = 1e-12
 #: Noise below this, m or rad, is none: what rounding of a printed file leaves.
 LEAST_NOISE = 1e-9
 
@@ -100,7 +104,9 @@ def fit(
         part, part_phi = measured.rows(keep), phi[keep]
         x, H = _newton(model, x, part, part_phi, free, prior, noise, history)
         e = model.residuals(x, measured, phi)
-        before, noise = noise, _noise(part, e[keep], _taken(H, free, prior))
+        taken, before = _taken(H, free, prior), noise
+        if e[keep].size - taken >= LEAST_FREEDOM * e[keep].size:
+            noise = _noise(part, e[keep], taken)
         kept, keep = keep, (_sane(measured, e, noise) if used is None else keep)
         if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=LEAST_NOISE):
             break
@@ -163,7 +169,7 @@ def _newton(
         e, J = _free(model, x, measured, phi, free, noise)
         H, g = J.T @ J + np.diag(pull), J.T @ e + pull * (x - nominal)[free]
         scale = 1 / np.sqrt(np.diag(H))
-        factor = cho_factor(scale[:, None] * H * scale)
+        factor = cho_factor(scale[:, None] * H * scale + ROUNDING * np.eye(len(H)))
         step = scale * cho_solve(factor, scale * g)
         x = x.copy()
         x[free] -= step

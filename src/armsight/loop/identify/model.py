@@ -30,7 +30,7 @@ class Parameter:
     Attributes:
         name: such as "a2", "offset3", "gain1", "tool1_x".
         kind: "base", "tool", a column of the table, or a feature's kind.
-        unit: "m", "rad" or "1", "rad/m".
+        unit: "m", "rad", "rad/rad" (of a scale) or "rad/m".
         joint: 0 to 5; -1 for base and tool.
     """
 

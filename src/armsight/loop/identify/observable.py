@@ -71,7 +71,7 @@ def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tu
     reasons |= _told(model, ties, anywhere)
     for k, sigma in weak.items():
         unit = model.parameters[k].unit
-        told = f"these poses show it no better than {sigma:.2g} {unit}, less than is known before"
+        told = f"these poses tell it to {sigma:.2g} {unit} at best, worse than it is known before"
         reasons[model.names[k]] = f"kept at its nominal value: {told}"
     free = np.zeros(len(x), bool)
     free[kept] = True
@@ -89,7 +89,8 @@ def _told(model: Model, ties: dict[int, list[int]], anywhere: dict[int, list[int
         if not others:
             reasons[name] = f"kept at its nominal value: {_MOVES_NOTHING}"
         elif model.parameters[k].kind == "beta":
-            reasons[name] = f"not needed: {names} say it too where neighbouring axes are not parallel"
+            told = "tells" if len(others) == 1 else "together tell"
+            reasons[name] = f"not needed: {names} {told} the same where neighbouring axes are not parallel"
         elif k in anywhere:
             reasons[name] = f"kept at its nominal value: no pose can tell it from {names}"
         else:
