@@ -131,10 +131,12 @@ def test_the_plan(tmp_path, capsys):
     assert "RUN|POSES.csv" in said(capsys, "--help").out
 
 
-@pytest.mark.parametrize(("test", "count"), [("poses", 1 + 2 * 5), ("wide", 1 + 2 * 100), ("line", 5), ("circle", 5)])
-def test_a_plan_is_a_motion_file(tmp_path, capsys, test, count):
+@pytest.mark.parametrize(
+    ("test", "cycles", "count"), [("poses", 2, 1 + 2 * 5), ("wide", 1, 100), ("line", 2, 5), ("circle", 2, 5)]
+)
+def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
     out = tmp_path / "check.toml"
-    answer = said(capsys, "plan", "--model", "six_r", "--test", test, "--cycles", "2", "-o", out, "--json")
+    answer = said(capsys, "plan", "--model", "six_r", "--test", test, "--cycles", cycles, "-o", out, "--json")
     arm, plan = open_arm("six_r"), read_motions(open_arm("six_r"), out)
     assert len(plan.motions) == count
     (facts,) = answer.lines

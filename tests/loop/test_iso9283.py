@@ -53,21 +53,22 @@ def covers(figures, true):
 
 
 @pytest.mark.parametrize("shape", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.05, 0.05)])
-@pytest.mark.parametrize(("n", "noise"), [(10, 0.5), (30, 0.0), (30, 0.5), (30, 1.5)])
+@pytest.mark.parametrize(("n", "noise"), [(10, 0.5), (30, 0.0), (30, 0.5)])
 def test_the_instruments_noise_is_taken_off_and_the_interval_holds(shape, n, noise):
     arm = np.diag(np.square(shape))
     true, rng = population(arm), np.random.default_rng(7)
     C = np.eye(3) * noise**2 * np.trace(arm) / 3
     figures = []
-    for _ in range(150):
+    for _ in range(80):
         p = rng.multivariate_normal(np.zeros(3), arm + C, n)
         figures.append(iso9283.repeatability(p, np.broadcast_to(C, (n, 3, 3))))
     covers(figures, true)
     clean = [f.clean for f in figures if f.clean is not None]
     if n == 30 and noise < 1:  # all are resolved: none is left out, which would take the smallest
-        assert len(clean) == 150
-        assert np.mean(clean) == pytest.approx(true, rel=0.06)  # the standard's figure is 1 / n too small itself
-        assert np.mean([f.raw for f in figures]) == pytest.approx(population(arm + C), rel=0.06)
+        assert len(clean) == 80
+        # The standard's figure is 1 / n too small itself; it scatters by 17 % at most, so the mean of 80 by 2 %: 1 / n + 3 x 2 %.
+        assert np.mean(clean) == pytest.approx(true, rel=0.1)
+        assert np.mean([f.raw for f in figures]) == pytest.approx(population(arm + C), rel=0.1)
 
 
 def test_limit_of_distances_is_that_of_very_many():
@@ -111,7 +112,7 @@ def test_accuracy_and_distance_hold_their_intervals(n, off, common):
     rng = np.random.default_rng(11)
     figures, errors, scatters = [], [], []
     command = np.eye(4)
-    for _ in range(150):
+    for _ in range(80):
         p = rng.normal(0, ARM_M, (n, 3)) + off * np.array([0.8, 0.6, 0]) + rng.normal(0, common, 3)
         Ts = np.array([pose(np.eye(3), at) for at in p])
         cov = np.zeros((n, 3, 3))
@@ -164,6 +165,9 @@ def test_drift_is_seen():
     still = iso9283.drift(t, np.random.default_rng(0).normal(0, 1e-5, (50, 3)))[2]
     assert still.clean is None
     assert still.high < 4e-5
+    rng = np.random.default_rng(5)
+    steps = np.outer(np.repeat(np.arange(5), 6), [1, 0, 0])
+    covers([iso9283.drift(np.arange(30.0), rng.normal(0, 0.5, (30, 3)) + steps)[2] for _ in range(80)], 4)
 
 
 def test_a_path():
@@ -187,11 +191,12 @@ def test_a_path_holds_its_interval():
     command = np.stack([s, 0 * s, 0 * s], axis=1)
     bow = np.stack([0 * s, 1e-3 * np.sin(np.pi * s / 0.4), 0 * s], axis=1)
     figures = []
-    for _ in range(100):
+    for _ in range(60):
         common = rng.normal(0, 1e-4, 3)
         paths = command + bow + common + rng.normal(0, 5e-5, (10, 1, 3)) + rng.normal(0, 1e-5, (10, 40, 3))
-        figures.append(path_figures(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8).accuracy)
-    covers(figures, 1e-3)
+        figures.append(path_figures(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8))
+    covers([f.accuracy for f in figures], 1e-3)
+    covers([f.repeatability for f in figures], population(np.diag([0, 1, 1]) * (5e-5**2 + 1e-5**2)))
 
 
 @pytest.mark.parametrize("play", [(0.0, 0.0), (3e-4, 1e-4)])

@@ -15,7 +15,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
-from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, mean_errors, scatter
+from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, group_errors, lengths, mean_errors, scatter
 
 #: Fewest attained poses of which a scatter is told.
 LEAST = 3
@@ -173,7 +173,9 @@ def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Figure]:
     order = np.array_split(np.argsort(t_s, kind="stable"), min(groups, len(p)))
     middles = np.array([p[rows].mean(axis=0) for rows in order])
     times = np.array([t_s[rows].mean() for rows in order])
-    errors = _errors_of_means([p[rows] for rows in order])
+    within = np.concatenate([p[rows] - p[rows].mean(axis=0) for rows in order])  # one scatter for all: groups are small
+    counts = np.array([len(rows) for rows in order])
+    errors = group_errors(within, counts, np.random.default_rng(0))
     off = middles - middles[0]
     figure = beyond_noise(lengths, off, errors - errors[:, :1])
     return times, np.linalg.norm(off, axis=1), figure

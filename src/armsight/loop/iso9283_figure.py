@@ -79,6 +79,22 @@ def mean_errors(values: Array, rng: np.random.Generator) -> Array:
     return np.asarray(np.tensordot(weights, values - values.mean(axis=0), axes=1))
 
 
+def group_errors(within: Array, counts: Array, rng: np.random.Generator) -> Array:
+    """Draw errors (B, k, 3) of the means of k groups of so many values that scatter alike, as ``mean_errors``.
+
+    Args:
+        within: (n, 3) all values less their group's mean.
+        counts: (k,) how many each group has.
+        rng: draws them.
+    """
+    freedom = len(within) - len(counts)
+    if freedom < 1:
+        return np.zeros((_DRAWS, len(counts), 3))
+    wider = float(t.ppf(_HIGH, freedom)) / _WIDE
+    weights = rng.normal(0, wider / np.sqrt(freedom), (_DRAWS, len(counts), len(within)))
+    return np.asarray(weights @ within / np.sqrt(counts)[:, None])
+
+
 def drawn(cov: Array, rng: np.random.Generator) -> Array:
     """Draw normal errors (B, ..., 3) of covariances (..., 3, 3)."""
     values, vectors = np.linalg.eigh(cov)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, m
 NEAR_DEG, FAR_DEG = 8.0, 32.0
 #: Places of a circle this close are averaged, deg.
 _BIN_DEG = 4.0
+#: How often a scatter is tried again.
+_TRIALS = 200
 
 
 class PathFigures(NamedTuple):
@@ -57,13 +60,36 @@ def path_figures(attained: Array, command: Array, cov: Array, common: Array | No
     errors = mean_errors(seen, rng)
     if common is not None:
         errors = errors + (across @ drawn(common[None], rng)[..., None])[..., 0]
-    length = np.linalg.norm(seen - middle, axis=2)
-    worst = int(np.argmax(length.mean(axis=0) + 3 * length.std(axis=0, ddof=1)))
+    limits = _limits(seen - middle)
+    worst = int(np.argmax(limits))
+    RT = repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst])
     return PathFigures(
         beyond_noise(lengths, middle, errors),
-        repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst]),
+        _picked(RT, _chosen(seen - middle, rng)),
         np.linalg.norm(middle, axis=1),
     )
+
+
+def _limits(off: Array) -> Array:
+    """Return RP (..., S) at every station, of offsets (..., n, S, 3) from the mean path."""
+    length = np.linalg.norm(off, axis=-1)
+    return np.asarray(length.mean(axis=-2) + 3 * length.std(axis=-2, ddof=1))
+
+
+def _chosen(off: Array, rng: np.random.Generator) -> float:
+    """Return by how much the largest of all stations' RP is too large for being picked, by trial with the same scatter."""
+    n = len(off)
+    largest = float(_limits(off).max())
+    weights = rng.normal(0, 1 / np.sqrt(n - 1), (_TRIALS, n, n))
+    again = np.einsum("bni,isk->bnsk", weights, off)
+    tried = _limits(again - again.mean(axis=1, keepdims=True)).max(axis=-1)
+    return max(float(tried.mean()) / largest, 1.0) if largest > 0 else 1.0
+
+
+def _picked(figure: Figure, factor: float) -> Figure:
+    """Return a figure that was picked as the largest, by so much too large for that; its upper end stays."""
+    clean = None if figure.clean is None else figure.clean / factor
+    return replace(figure, clean=clean, low=figure.low / factor)
 
 
 class CircleFigures(NamedTuple):
