@@ -66,7 +66,7 @@ def test_the_instruments_noise_is_taken_off_and_the_interval_holds(shape, n, noi
     clean = [f.clean for f in figures if f.clean is not None]
     if n == 30 and noise < 1:  # all are resolved: none is left out, which would take the smallest
         assert len(clean) == 80
-        # The standard's figure is 1 / n too small itself; it scatters by 17 % at most, so the mean of 80 by 2 %: 1 / n + 3 x 2 %.
+        # The standard's figure is 1 / n too small itself, and scatters by 17 % at most, the mean of 80 by 2 %.
         assert np.mean(clean) == pytest.approx(true, rel=0.1)
         assert np.mean([f.raw for f in figures]) == pytest.approx(population(arm + C), rel=0.1)
 

@@ -51,6 +51,10 @@ def judged(data: Path, closed: bool, out: Path | None, as_json: bool) -> None:
     DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/check.md). Figures stand without the instrument's
     own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
     """
+    if out is not None and out.is_dir():
+        if (out / "wanted.csv").exists():
+            raise InputError(f"{out}: holds a run, whose report would be written over; choose another folder")
+        check_writable(out / "check.csv", apart_from=(data, data / "check.csv"))
     attained = read_check(data, closed=closed)
     facts = judge(attained)
     if out is not None:
