@@ -146,6 +146,37 @@ def test_mistakes_at_the_command_line(tmp_path, capsys):
     refused(said(capsys, "--model", "six_r", "--data", poses_csv(tmp_path / "few.csv", n=4)), "4 poses", "6")
 
 
+def test_fewer_numbers_than_parameters_are_said_and_still_fitted(tmp_path, capsys):
+    answer = said(capsys, "--model", "six_r", "--data", poses_csv(tmp_path / "p.csv", n=12), "--json")
+    assert answer.code == 0
+    assert "12 poses are 36 numbers for" in answer.err
+
+
+def test_mistakes_in_the_data_are_named_and_do_not_spoil_the_held_out_line(tmp_path, capsys):
+    path = poses_csv(tmp_path / "p.csv", n=60)
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    for line in (8, 26, 27):
+        rows[line - 1][6] = str(float(rows[line - 1][6]) + 10)
+    path.write_text("\n".join(",".join(row) for row in rows))
+    answer = said(capsys, "--model", "six_r", "--data", path, "--json")
+    (facts,) = answer.lines
+    assert facts["left_out_lines"] == [8, 26, 27]
+    assert "3 taken for mistakes apart" in facts["validation"]
+    assert facts["identified"]["max_m"] < 1e-3  # one mistake that stayed in would be 10 mm
+    told = {p["name"]: p for p in facts["parameters"]}
+    assert told["a2"]["value"] == pytest.approx(0.2535, abs=3 * told["a2"]["sigma"])
+
+
+def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
+    few, there = poses_csv(tmp_path / "few.csv", n=4), tmp_path / "there"
+    refused(said(capsys, "--model", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")
+    assert not (tmp_path / "new").exists()
+    there.mkdir()
+    refused(said(capsys, "--model", "six_r", "--data", few, "-o", there), "4 poses")
+    assert there.is_dir()
+    refused(said(capsys, "--model", "six_r", "--data", few, "-o", few), "cannot be made")
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
