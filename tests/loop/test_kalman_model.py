@@ -100,3 +100,13 @@ def test_the_prior_is_what_arms_are_drawn_from():
     # 720 squares, normalised: 5 sigma of their mean, and 3 % for what is not linear.
     squares = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(cov), draws)
     assert squares.mean() == pytest.approx(6, rel=5 * np.sqrt(2 / 720) + 0.03)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-9, 1e-3, 0.3, 2.9])
+def test_a_tangent_leads_from_one_pose_to_the_other(turn_rad):
+    rng = np.random.default_rng(11)
+    for _ in range(20):
+        T, axis = small(rng.normal(size=6)), rng.normal(size=3)
+        xi, found = np.concatenate([rng.normal(size=3), turn_rad * axis / np.linalg.norm(axis)]), np.empty(6)
+        armerror.tangent(T, T @ small(xi), found)
+        assert found == pytest.approx(xi, abs=1e-13 * (1 + 10 * turn_rad))

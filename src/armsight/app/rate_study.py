@@ -82,7 +82,7 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     truth, mounting = cell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
     Ts = mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
-    return assembled(log, station.arm, mounting, outcome.delay.delay_s, (truth.t_s, Ts))
+    return assembled(log, station.arm, mounting, outcome.delay, (truth.t_s, Ts))
 
 
 def _figures(run: RunData) -> tuple[float, float, int]:

@@ -200,4 +200,5 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
             f"to tell how late the images come: are the cameras slower than {loop.station.rate_hz:g} Hz, or is the body "
             "out of view near the end of the first motion?"
         )
-    return loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY))
+    sync_s = loop.station.sync_s
+    return loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 from armsight.app.run_log import Log, Segment
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, PoseEstimate, Record
-from armsight.loop.estimators import Mounting, Verdict
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators import Delay, Mounting, Sighting, Verdict
 from armsight.robot.arm import Arm
+
+#: Two poses further apart than this, s, tell no speed.
+_APART_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,7 @@ class RunData(Record):
 
 
 def assembled(
-    log: Log, arm: Arm, mounting: Mounting, delay_s: float, truth: tuple[Array, Array] | None = None
+    log: Log, arm: Arm, mounting: Mounting, delay: Delay, truth: tuple[Array, Array] | None = None
 ) -> RunData:
     """Bring a log onto one axis of time.
 
@@ -60,13 +64,13 @@ def assembled(
         log: of the run.
         arm: the nominal arm.
         mounting: where cameras and body are.
-        delay_s: how late the camera's stamps are.
+        delay: how late the camera's stamps are: what is not known of that, too, spoils the pose of a tool that moves.
         truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
     """
     t_s, q, q_wanted = joints_of(log)
     planned = np.isfinite(q_wanted).all(axis=1)
     named = _Named(log.segments)
-    seen = [mounting.sighting(p, t - delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
+    seen = [mounting.sighting(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(
         t_s,
@@ -76,7 +80,7 @@ def assembled(
         named.track(
             np.array([s.t_s for s in seen]),
             np.array([s.T_base_tool for s in seen]).reshape(-1, 4, 4),
-            np.array([s.cov_noise + s.cov_common for s in seen]).reshape(-1, 6, 6),
+            np.array([s.cov_noise + s.cov_common for s in seen]).reshape(-1, 6, 6) + _mistimed(seen, delay),
         ),
         named.track(
             np.concatenate([part.t_s for part in fused]),
@@ -96,6 +100,18 @@ def assembled(
         len(log.poses) - len(seen),
         sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
     )
+
+
+def _mistimed(seen: list[Sighting], delay: Delay) -> Array:
+    """Return what the stamps' errors add to the covariances (N, 6, 6) of poses of a moving tool."""
+    if len(seen) < 2:
+        return np.zeros((len(seen), 6, 6))
+    t_s, Ts = np.array([s.t_s for s in seen]), np.array([s.T_base_tool for s in seen])
+    k = np.arange(len(seen))
+    before, after = np.maximum(k - 1, 0), np.minimum(k + 1, len(seen) - 1)
+    apart_s = (t_s[after] - t_s[before])[:, None]
+    v = np.where(apart_s < _APART_S, log_se3(inverse(Ts[before]) @ Ts[after]) / apart_s, 0.0)
+    return np.asarray((delay.sigma_s**2 + delay.jitter_s**2) * v[:, :, None] * v[:, None, :])
 
 
 def joints_of(log: Log) -> tuple[Array, Array, Array]:

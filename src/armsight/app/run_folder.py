@@ -126,7 +126,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], R
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
         mounting = outcome.handeye.mounting
-        run = assembled(outcome.log, finished.arm, mounting, outcome.delay.delay_s, finished.truth)
+        run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth)
         for name, track in _tracks(run).items():
             keep(write_track, folder, name, track)
         before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))

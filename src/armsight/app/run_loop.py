@@ -214,7 +214,8 @@ class Loop:
                 self.log.modes.append(mode)
                 if looked is not None:
                     shot, began, result = looked
-                    self.log.latency_s.append(time.perf_counter() - began)
+                    if self.mounting is not None:  # before, no command knew what was seen
+                        self.log.latency_s.append(time.perf_counter() - began)
                     self.on_shot(shot, result)
         finally:
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))

@@ -30,20 +30,23 @@ FIRST_SIGMA_S, PASSES = 5e-3, 2
 MOST_SIGMA_S = 2e-3
 #: What the sides of the backlash, which the filter sees change a little late, leave of error; found on simulated sweeps, s.
 SYSTEMATIC_S = 1.5e-4
+#: The median of what a normal's draws are off, in sigma.
+_MEDIAN_OF_NORMAL = 0.6745
 #: Readings given to the filter ahead of a sighting, s.
 _AHEAD_S = 0.1
 
 
 def estimate_delay(
-    arm: Arm, states: JointStates, sightings: Sequence[Sighting], *, prior: Prior | None = None
+    arm: Arm, states: JointStates, sightings: Sequence[Sighting], *, prior: Prior | None = None, sync_s: float = 0.0
 ) -> Delay:
-    """Find how late the camera's stamps are.
+    """Find how late the camera's stamps are, and how far they scatter.
 
     Args:
         arm: the arm, as its table says it is.
         states: readings from before the first sighting to after the last.
         sightings: what vision saw meanwhile, in order of time; 20 or more, while the joints moved to and fro.
         prior: how far the arm may be off.
+        sync_s: standard deviation of the time between a shot's two exposures, s.
 
     Raises:
         InputError: too few sightings, or readings that do not cover them.
@@ -58,15 +61,27 @@ def estimate_delay(
         raise InputError(
             "the potentiometer readings do not cover the sightings; log them from a second before to a second after"
         )
-    delay = Delay(_coarse(arm, t, q, sightings, inside), FIRST_SIGMA_S)
+    jitter_s = float(np.hypot(_jitter(stamps), 0.5 * sync_s))  # of the middle between the two exposures
+    delay = Delay(_coarse(arm, t, q, sightings, inside), FIRST_SIGMA_S, jitter_s)
     for _ in range(PASSES):
-        delay = _filtered(arm, states, sightings, Delay(delay.delay_s, FIRST_SIGMA_S), prior)
+        delay = _filtered(arm, states, sightings, Delay(delay.delay_s, FIRST_SIGMA_S, jitter_s), prior)
     if delay.sigma_s > MOST_SIGMA_S:
         raise CalibrationError(
             f"the sweep determines the camera's delay to {1e3 * delay.sigma_s:.1f} ms only, {1e3 * MOST_SIGMA_S:.0f} are "
             "needed: move all joints to and fro, faster and with changing speed"
         )
-    return Delay(delay.delay_s, float(np.hypot(delay.sigma_s, SYSTEMATIC_S)))
+    return Delay(delay.delay_s, float(np.hypot(delay.sigma_s, SYSTEMATIC_S)), jitter_s)
+
+
+def _jitter(stamps: Array) -> float:
+    """Return by how much stamps (N,) of a camera that keeps its rate scatter, standard deviation, s.
+
+    A shot more or less between two of them does not count: their distance is compared with whole periods.
+    """
+    apart = np.diff(stamps)
+    period = np.median(apart)
+    off = np.abs(apart - np.maximum(np.round(apart / period), 1.0) * period)
+    return float(np.median(off) / _MEDIAN_OF_NORMAL / np.sqrt(2))
 
 
 def _coarse(arm: Arm, t: Array, q: Array, sightings: Sequence[Sighting], lags: Array) -> float:

@@ -22,7 +22,7 @@ _BLOCK = 256  # ticks whose noise is drawn at once
 Counts = NDArray[np.uint32]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, out: Array) -> None:
     """Write what potentiometers say too much at shaft angles (N, 6) into out (N, 6)."""
     for n in range(shaft.shape[0]):
@@ -34,7 +34,7 @@ def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, 
             out[n, i] = total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _converted(said: Array, low: Array, span: Array, noise: NDArray[np.float32], steps: float, counts: Counts) -> None:
     """Convert what wipers say (6,), rad, with noise (6, n) in steps; averages into counts (6,)."""
     n = noise.shape[1]

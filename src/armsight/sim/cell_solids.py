@@ -78,7 +78,7 @@ def solids(arm: Arm) -> Solids:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _row_frames(table: Array, q: Array, Ts: Array) -> None:
     """Write the row frames at joint angles q (6,) into Ts (7, 4, 4)."""
     Ts[0] = np.eye(4)
@@ -100,7 +100,7 @@ def row_frames(arm: Arm, q: Array) -> Array:
     return Ts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _weight(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
     """Add the torque of the weight of solids at centre (K, 3) of their row frames about the joints' axes to out (6,)."""
     for k in range(link.size):

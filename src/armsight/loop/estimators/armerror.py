@@ -18,6 +18,7 @@ right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
@@ -39,7 +40,7 @@ SIZE = DELAY + 1
 #: Zeros of the joints: the turn about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 @dataclass(frozen=True)
@@ -231,6 +232,34 @@ def _store_moved(F: Frame, x: Array, T: Array) -> None:
         T[row, 3] = F[9 + row] + F[row] * x[0] + F[3 + row] * x[1] + F[6 + row] * x[2]
     T[3, 0] = T[3, 1] = T[3, 2] = 0.0
     T[3, 3] = 1.0
+
+
+@_kernel
+def tangent(T: Array, T_to: Array, xi: Array) -> None:
+    """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for turns of less than 3 rad, to xi.
+
+    The turn's vector comes by its quaternion, the shift by the closed inverse of V (Sola, 2018, eq. 145, 174).
+    """
+    R, d = np.empty((3, 3)), np.empty(3)
+    for row in range(3):
+        d[row] = 0.0
+        for k in range(3):
+            d[row] += T[k, row] * (T_to[k, 3] - T[k, 3])
+        for col in range(3):
+            R[row, col] = T[0, row] * T_to[0, col] + T[1, row] * T_to[1, col] + T[2, row] * T_to[2, col]
+    w = 0.5 * math.sqrt(max(1.0 + R[0, 0] + R[1, 1] + R[2, 2], 1e-12))
+    a, b, c = (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)
+    sine = math.sqrt(a * a + b * b + c * c)
+    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    a, b, c = scale * a, scale * b, scale * c
+    square = a * a + b * b + c * c
+    half = 0.5 * math.sqrt(square)
+    bend = 1 / 12 + square / 720 if half < 1e-2 else (1.0 - half / math.tan(half)) / square
+    u, v, h = b * d[2] - c * d[1], c * d[0] - a * d[2], a * d[1] - b * d[0]
+    xi[0] = d[0] - 0.5 * u + bend * (b * h - c * v)
+    xi[1] = d[1] - 0.5 * v + bend * (c * u - a * h)
+    xi[2] = d[2] - 0.5 * h + bend * (a * v - b * u)
+    xi[3], xi[4], xi[5] = a, b, c
 
 
 @_kernel

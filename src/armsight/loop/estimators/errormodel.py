@@ -6,8 +6,10 @@ and what first-order Gauss-Markov processes in travel keep and add. Equations: d
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from armsight.data import Array
@@ -19,8 +21,6 @@ from armsight.robot.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.
 LONGEST_CREEP_S = 4.0
-
-
 #: So many times as uncertain a joint is after a change of side to those who learn from it. What comes some hundredths of a
 #: second early or late would be taken for a narrower backlash else.
 LEARNING = 6.0
@@ -62,6 +62,8 @@ class ErrorModel:
 
     def __init__(self, arm: Arm, prior: Prior, sigma_delay_s: float) -> None:
         self._arm, self._prior, self.sigmas = arm, prior, prior.sigmas(sigma_delay_s)
+        sides = prior.flip_rad, prior.flip_float_rad
+        self._forgets = np.array([prior.rest_travel_rad, prior.pose_travel_rad, prior.creep_rad, *sides])
 
     def poses(self, x: Array, q: Array, unseen: Array) -> tuple[Array, Array]:
         """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE); x may be one for all."""
@@ -74,25 +76,42 @@ class ErrorModel:
 
         Changes of side leave the joints ``learning`` times as uncertain as they are.
         """
-        prior = self._prior
-        travel = np.maximum(joints.travel - state.travel, 0.0)
-        flips = np.maximum(joints.flips - state.flips, 0.0)
-        kept, added = np.ones((len(travel), SIZE)), np.zeros((len(travel), SIZE))
-        rest, free = slice(REST, REST + 6), slice(POSE, POSE + 6)
-        kept[:, rest] = np.exp(-travel / prior.rest_travel_rad)
-        kept[:, free] = np.exp(-travel.sum(axis=1, keepdims=True) / prior.pose_travel_rad)
-        for part in (rest, free):
-            added[:, part] = self.sigmas[part] ** 2 * (1 - kept[:, part] ** 2)
-        added[:, rest] += prior.creep_rad**2 * np.minimum(np.abs(t_s - state.t_s), LONGEST_CREEP_S)[:, None]
-        # A whole change of side moves it from -1 to 1.
-        flipped = 0.5 * (prior.flip_rad**2 * flips[:, 0] + prior.flip_float_rad**2 * flips[:, 1])
-        added[:, rest] += learning**2 * flipped
+        kept, added = np.ones((len(t_s), SIZE)), np.zeros((len(t_s), SIZE))
+        come = (np.asarray(t_s, dtype=float) - state.t_s, joints.travel - state.travel, joints.flips - state.flips)
+        _forget(*come, self.sigmas, self._forgets, learning, kept, added)
         return Step(kept, added)
 
     def reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
         """Return the covariances (N, 6, 6) of poses from the readings' noise."""
         J = Hs[:, :, ZEROS]
         return np.asarray(self._prior.reading_rad**2 * (J * joints.variance[:, None, :]) @ np.swapaxes(J, 1, 2))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _forget(
+    time: Array,
+    travel: Array,
+    flips: Array,
+    sigmas: Array,
+    forgets: Array,
+    learning: float,
+    kept: Array,
+    added: Array,
+) -> None:
+    """Write into kept and added (N, SIZE), ones and zeros before, what times (N,), travel (N, 6) and flips (N, 2, 6) do."""
+    rest_travel, pose_travel, creep, flip, flip_float = forgets
+    for n in range(len(time)):
+        whole, crept = 0.0, creep**2 * min(abs(time[n]), LONGEST_CREEP_S)
+        for i in range(6):
+            way, k = max(travel[n, i], 0.0), REST + i
+            whole += way
+            kept[n, k] = math.exp(-way / rest_travel)
+            # A whole change of side moves it from -1 to 1.
+            flipped = flip**2 * max(flips[n, 0, i], 0.0) + flip_float**2 * max(flips[n, 1, i], 0.0)
+            added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + crept + 0.5 * learning**2 * flipped
+        for k in range(POSE, POSE + 6):
+            kept[n, k] = math.exp(-whole / pose_travel)
+            added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
 
 
 def shared(sighting: Sighting | None, Ts: Array) -> Array:

@@ -39,7 +39,7 @@ _SWEEPS = 8
 #: A longer time than this between two readings counts as so much, s.
 _LONGEST_STEP_S = 0.01
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 def rods(arm: Arm) -> Array:

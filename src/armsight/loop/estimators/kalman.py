@@ -19,7 +19,7 @@ from armsight.data import Array, JointStates
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, SIZE, ZEROS, Prior
-from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, shared
+from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step, shared
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.robot.arm import Arm
@@ -73,7 +73,9 @@ class KalmanEstimator:
         self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), *nowhere, None)]
         self._waiting: list[Sighting] = []
         self._outliers: list[Array] = []
-        self._newest: ArmEstimate | None = None  # until something is heard
+        # At the newest reading, until something is heard: the joints and what came of the state, and the tool.
+        self._here: tuple[Smoothed, Step] | None = None
+        self._newest: ArmEstimate | None = None
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -82,7 +84,7 @@ class KalmanEstimator:
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
-        self._newest = None
+        self._newest = self._here = None
         self._readings.add(states)
         if self._waiting:
             waiting, self._waiting = self._waiting, []
@@ -91,7 +93,7 @@ class KalmanEstimator:
 
     def vision(self, sighting: Sighting) -> Verdict:
         """Take what vision saw, in any order; returns what became of it."""
-        self._newest = None
+        self._newest = self._here = None
         oldest, newest = self.span_s
         place = len(self._states)
         while place > 1 and self._after(self._states[place - 1], sighting):
@@ -122,14 +124,24 @@ class KalmanEstimator:
         if t_s is not None:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
-            self._newest = self.track(np.array([self.span_s[1]]))[0]
+            self._newest = self._tracked(np.array([self.span_s[1]]), *self._now())[0]
         return self._newest
+
+    def _now(self) -> tuple[Smoothed, Step]:
+        """Return the joints at the newest reading, and what moved since the newest sighting."""
+        if self._here is None:
+            newest = np.array([self.span_s[1]])
+            joints = self._readings.at(newest)
+            self._here = joints, self._model.moved(self._states[-1], joints, newest)
+        return self._here
 
     def track(self, t_s: Array) -> Track:
         """Return where the tool is at (N,) times."""
         joints = self._readings.at(np.asarray(t_s, dtype=float))
+        return self._tracked(t_s, joints, self._model.moved(self._states[-1], joints, t_s))
+
+    def _tracked(self, t_s: Array, joints: Smoothed, step: Step) -> Track:
         state = self._states[-1]
-        step = self._model.moved(state, joints, t_s)
         Ts, Hs = self._model.poses(state.x * step.kept, joints.q, joints.unseen)
         by_state = Hs * step.kept[:, None, :]
         own = (by_state.reshape(-1, SIZE) @ state.P).reshape(Hs.shape) @ np.swapaxes(by_state, 1, 2)
@@ -164,25 +176,22 @@ class KalmanEstimator:
         Ts, Hs = self._model.poses(before.x * ahead.kept, joints.q, joints.unseen)
         Ts_after, _ = self._model.poses(after.x * back.kept, joints.q, joints.unseen)
         Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
-        P = before.P + share[:, None, None] * (after.P - before.P)
-        own = Hs @ P @ np.swapaxes(Hs, 1, 2)
-        bridge = ahead.added * back.added / np.maximum(ahead.added + back.added, 1e-30)
+        ends_own = [(Hs.reshape(-1, SIZE) @ end.P).reshape(Hs.shape) @ np.swapaxes(Hs, 1, 2) for end in (before, after)]
+        own = ends_own[0] + share[:, None, None] * (ends_own[1] - ends_own[0])
+        bridge = np.minimum(ahead.added, back.added)
         own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
         return Track(t_s, Ts, own + shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
-        newest = np.array([self.span_s[1]])
-        now, state = self._readings.at(newest), self._states[-1]
+        (now, step), state = self._now(), self._states[-1]
         unseen = np.repeat(now.unseen, len(q), axis=0)
         unseen[:, 0] = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.unseen[:, 0])
-        return self._model.poses(state.x * self._model.moved(state, now, newest).kept, q, unseen)[0]
+        return self._model.poses(state.x * step.kept, q, unseen)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
-        newest = np.array([self.span_s[1]])
-        now, state = self._readings.at(newest), self._states[-1]
-        step = self._model.moved(state, now, newest)
+        (now, step), state = self._now(), self._states[-1]
         x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
         by = np.empty((6, SIZE))
         armerror.offsets_by(self._arm.table, now.q[0], now.unseen[0], by)
@@ -237,7 +246,9 @@ class KalmanEstimator:
         H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
         R = sighting.cov_noise + self._model.reading_noise(Hs, joints)[0]
         R += self._delay.jitter_s**2 * np.outer(velocity, velocity)
-        return log_se3(inverse(Ts[0]) @ sighting.T_base_tool), H, R
+        z = np.empty(6)
+        armerror.tangent(Ts[0], sighting.T_base_tool, z)
+        return z, H, R
 
     def _update(
         self, x: Array, P: Array, joints: Smoothed, sighting: Sighting, first: tuple[Array, Array, Array]

@@ -16,7 +16,7 @@ SPAN_S = 0.049
 #: Fewest readings for a parabola; fewer are averaged.
 PARABOLA = 5
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 @_kernel

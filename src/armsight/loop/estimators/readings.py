@@ -43,7 +43,7 @@ _STILL = 4.0
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 class Smoothed(NamedTuple):

@@ -19,7 +19,7 @@ LANES = 8
 #: Size of forward_batch's workspace.
 WORK = 240
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel

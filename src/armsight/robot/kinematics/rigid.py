@@ -12,7 +12,7 @@ NOT_FINITE, NOT_RIGID = -1, -2
 #: A rotation may be off by this much and is then put right.
 _NEARLY_RIGID = 1e-6
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel

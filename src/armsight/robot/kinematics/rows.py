@@ -21,7 +21,7 @@ _TURN = 2.0 * np.pi
 #: Added to the key of a row outside the limits: more than any distance.
 _LAST = 1e9
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel

@@ -19,7 +19,7 @@ _P1, _P2, _P3 = 1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-2
 _TAN_8TH = np.sqrt(2.0) - 1.0
 _BEYOND_4TH, _BEYOND_HALF = 3.061616997868383e-17, 6.123233995736766e-17
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel

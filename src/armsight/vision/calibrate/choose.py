@@ -6,7 +6,9 @@ exposures of a pair are learned together with what they blur (empirical Bayes), 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,7 +122,9 @@ class Search(Record):
 
     def best(self, models: tuple[str, ...]) -> tuple[Trial, dict[str, HeldOut]]:
         """Return the first model that no later one beats by more than WORTH, and the held-out errors of all."""
-        trials = {name: trial for name in models if (trial := self.trial(name)) is not None}
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            tried = zip(models, threads.map(self.trial, models), strict=True)
+            trials = {name: trial for name, trial in tried if trial is not None}
         if not trials:
             raise CalibrationError("no distortion model could be adjusted to the detections")
         reference = next(iter(trials.values())).heldout
