@@ -43,8 +43,9 @@ def map_figure(run: Run) -> Figure:
         order = np.argsort(error)
         for row, (x, y, labels) in enumerate(views):
             ax = axes[row, column]
+            size = float(np.clip(2000 / len(x), 7, 25))  # few poses must not be lost on the page
             drawn = ax.scatter(
-                x[order], y[order], c=1e3 * error[order], s=7, cmap="viridis", vmin=0, vmax=top, linewidths=0
+                x[order], y[order], c=1e3 * error[order], s=size, cmap="viridis", vmin=0, vmax=top, linewidths=0
             )
             ax.set_aspect("equal", adjustable="box")
             ax.set_xlabel(f"{labels[0]}, m")
