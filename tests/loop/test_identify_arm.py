@@ -9,7 +9,6 @@ from worn_arm import distance_m, poses, worn
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.identify.corrected import Corrected
-from armsight.loop.identify.design import exchanged
 from armsight.loop.identify.fit import fit
 from armsight.loop.identify.growth import PLACEMENT
 from armsight.loop.identify.identify import contributions, identify
@@ -232,24 +231,6 @@ def test_planned_poses_tell_more_than_random_ones(scene):
     assert plan.random_for(12) >= 15
     assert w.nominal.within_limits(plan.q).all()
     assert free_of_collision(model, plan.q).all()
-
-
-def test_exchange_makes_a_choice_better_and_keeps_to_what_is_allowed():
-    """One unknown a joint, told by the joint's own angle: the best poses lie at the limits, whatever the start."""
-    rng = np.random.default_rng(4)
-
-    def tells(q, approach):
-        return (q * approach)[:, None, :], q[:, 0] <= 0.5
-
-    start, sides = rng.uniform(-0.3, 0.3, (8, 6)), np.ones((8, 6))
-    wanted = np.vstack([np.eye(6)] * 3)
-    limits = np.full(6, -1.0), np.ones(6)
-    q, approach = exchanged(start, sides, tells, np.eye(6), wanted, limits, rng)
-    H = np.eye(6) + np.einsum("nki,nkj->ij", *[tells(q, approach)[0]] * 2)
-    first = np.eye(6) + np.einsum("nki,nkj->ij", *[tells(start, sides)[0]] * 2)
-    assert np.trace(np.linalg.inv(H)) < 0.5 * np.trace(np.linalg.inv(first))
-    assert (np.abs(q) <= 1).all()
-    assert (q[:, 0] <= 0.5).all()
 
 
 def test_poses_all_alike_are_refused(scene):
