@@ -144,6 +144,7 @@ def minimise(
     robust: bool = True,
     free: NDArray[np.bool_] | None = None,
     max_steps: int = _MAX_STEPS,
+    least_decrease: float = _RELATIVE_DECREASE,
 ) -> Solution:
     """Find the minimum next to ``start`` for a given noise.
 
@@ -155,6 +156,7 @@ def minimise(
         robust: Cauchy loss, else plain least squares.
         free: (Q,) which shared parameters move, all that the model frees by default.
         max_steps: iterations at the most.
+        least_decrease: a step that lowers the cost by less than this share of it is the last.
 
     Returns:
         The minimum with its covariance.
@@ -180,7 +182,7 @@ def minimise(
         if trial is not None:
             new, new_residuals = _normal(model, trial, observations, W, free, robust)
             if new.cost <= normal.cost:
-                converged = normal.cost - new.cost <= _RELATIVE_DECREASE * new.cost
+                converged = normal.cost - new.cost <= least_decrease * new.cost
                 state, normal, residuals, damping = trial, new, new_residuals, max(damping / 10, 1e-12)
                 continue
         damping *= 10

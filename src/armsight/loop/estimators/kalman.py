@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from armsight.data import Array, JointStates
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, SIZE, ZEROS, Prior
+from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
 from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step, shared
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
@@ -42,6 +42,8 @@ MOVES_RAD_S = 1e-3
 STILL_RAD = 1e-5
 #: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
 WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
+#: The diagonal of a covariance, and the rows of what motion makes it forget.
+DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
 _GATE = float(chi2.isf(CHANCE, 6))
 
 
@@ -226,9 +228,10 @@ class KalmanEstimator:
         t_s = max(self._seen_s(sighting, before), before.t_s)
         joints = self._readings.at(np.array([t_s]))
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
-        kept = step.kept[0]
-        x, P = before.x * kept, before.P * np.outer(kept, kept)
-        P[np.diag_indices(SIZE)] += step.added[0]
+        x, P = before.x * step.kept[0], before.P.copy()
+        P[FORGETS] *= step.kept[0, FORGETS, None]
+        P[:, FORGETS] *= step.kept[0, FORGETS]
+        P[DIAGONAL] += step.added[0]
         z, H, R = first = self._innovation(x, joints, sighting)
         verdict = self._judge(z, H @ P @ H.T + R + sighting.cov_common)
         if verdict is Verdict.OUTLIER:
