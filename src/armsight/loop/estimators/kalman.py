@@ -272,12 +272,13 @@ class KalmanEstimator:
 
     def _judge(self, z: Array, S: Array) -> Verdict:
         """Say whether an innovation is to be believed."""
-        inverse_S = np.linalg.inv(S)
-        if z @ inverse_S @ z < _GATE:
+        if z @ np.linalg.solve(S, z) < _GATE:
             self._outliers = []
             return Verdict.USED
-        if self._outliers and (z - self._outliers[-1]) @ inverse_S @ (z - self._outliers[-1]) > _GATE:
-            self._outliers = []
+        if self._outliers:
+            apart = z - self._outliers[-1]
+            if apart @ np.linalg.solve(S, apart) > _GATE:
+                self._outliers = []
         self._outliers.append(z)
         if len(self._outliers) < STUBBORN:
             return Verdict.OUTLIER

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +36,14 @@ class Mounting(Record):
         """Return what a hand-eye calibration (eye to hand) of an arm found."""
         return Mounting(handeye.T_base_rig, inverse(arm.T_flange_tool) @ handeye.T_flange_body, handeye.cov)
 
+    @cached_property
+    def _to_tool(self) -> Array:
+        return adjoint(self.T_tool_body)
+
+    @cached_property
+    def _T_body_tool(self) -> Array:
+        return inverse(self.T_tool_body)
+
     def body(self, T_base_tool: Array) -> Array:
         """Return T_left_body (4, 4) with the tool at a pose (4, 4), m."""
         return np.asarray(inverse(self.T_base_rig) @ T_base_tool @ self.T_tool_body)
@@ -54,13 +63,14 @@ class Mounting(Record):
         """
         if not np.isfinite(t_s):
             raise InputError(f"t_s is {t_s}; a sighting needs the time of its exposure, s")
-        T_rig_body = checked(pose.T_left_body, (4, 4), "T_left_body")
-        to_tool = adjoint(self.T_tool_body)
-        by_mounting = np.concatenate([adjoint(inverse(T_rig_body)), -np.eye(6)], axis=1)
-        common = by_mounting @ self.cov @ by_mounting.T + _positive(pose.cov - pose.cov_noise)
+        T_rig_body, to_tool = checked(pose.T_left_body, (4, 4), "T_left_body"), self._to_tool
+        common = _positive(pose.cov - pose.cov_noise)
+        if self.cov.any():
+            by_mounting = np.concatenate([adjoint(inverse(T_rig_body)), -np.eye(6)], axis=1)
+            common = by_mounting @ self.cov @ by_mounting.T + common
         return Sighting(
             t_s,
-            self.T_base_rig @ T_rig_body @ inverse(self.T_tool_body),
+            self.T_base_rig @ T_rig_body @ self._T_body_tool,
             to_tool @ pose.cov_noise @ to_tool.T,
             to_tool @ common @ to_tool.T,
         )
@@ -68,5 +78,10 @@ class Mounting(Record):
 
 def _positive(cov: Array) -> Array:
     """Return a covariance (6, 6) without what rounding made negative."""
+    try:
+        np.linalg.cholesky(cov)
+        return cov
+    except np.linalg.LinAlgError:
+        pass
     values, vectors = np.linalg.eigh((cov + cov.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
