@@ -42,6 +42,9 @@ def test_how_far_stamps_scatter_is_told():
     assert estimate_delay(ARM, joints, lost).jitter_s == pytest.approx(jitter_s, rel=0.25)
     assert estimate_delay(ARM, joints, late, sync_s=4e-4).jitter_s == pytest.approx(np.hypot(3e-4, 2e-4), rel=0.25)
     assert estimate_delay(ARM, joints, sightings).jitter_s < 1e-9
+    # Stamps of whole milliseconds of a camera at 60 Hz are off by up to half of one.
+    joints, sightings = sweep(rng, worn, 0.03, 60)
+    assert estimate_delay(ARM, joints, sightings).jitter_s == pytest.approx(1e-3 / np.sqrt(12), rel=0.3)
 
 
 def test_its_sigma_is_honest():

@@ -110,3 +110,9 @@ def test_a_tangent_leads_from_one_pose_to_the_other(turn_rad):
         xi, found = np.concatenate([rng.normal(size=3), turn_rad * axis / np.linalg.norm(axis)]), np.empty(6)
         armerror.tangent(T, T @ small(xi), found)
         assert found == pytest.approx(xi, abs=1e-13 * (1 + 10 * turn_rad))
+
+
+def test_half_a_turn_is_not_taken_for_none():
+    found = np.empty(6)
+    armerror.tangent(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), found)
+    assert np.linalg.norm(found[3:]) == pytest.approx(np.pi)

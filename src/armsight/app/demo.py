@@ -44,6 +44,7 @@ class Demo:
         rig: parallel or verging.
         quick: fewer calibration shots and motions, and no studies.
         believed: the table that the arm is believed to have, with whatever tool; the one it was built to by default.
+        model: what the summary is to call it; its own name by default.
     """
 
     folder: Path
@@ -54,6 +55,7 @@ class Demo:
     rig: str = "parallel"
     quick: bool = False
     believed: Arm | None = None
+    model: str | None = None
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str, Any]:
@@ -90,7 +92,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         facts = {
             "seed": demo.seed,
             "arm": demo.arm,
-            "model": cell.model.name if demo.believed is None else demo.believed.source,
+            "model": demo.model or cell.model.name,
             "cameras": demo.cameras,
             "board": cell.board.welcome.board,
             "machine": demo.machine,

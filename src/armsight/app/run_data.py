@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.run_log import Log, Segment
+from armsight.app.run_skew import APART_S
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Delay, Mounting, Sighting, Verdict
 from armsight.robot.arm import Arm
-
-#: Two poses further apart than this, s, tell no speed.
-_APART_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +105,15 @@ def _mistimed(seen: list[Sighting], delay: Delay) -> Array:
     if len(seen) < 2:
         return np.zeros((len(seen), 6, 6))
     t_s, Ts = np.array([s.t_s for s in seen]), np.array([s.T_base_tool for s in seen])
-    k = np.arange(len(seen))
-    before, after = np.maximum(k - 1, 0), np.minimum(k + 1, len(seen) - 1)
-    apart_s = (t_s[after] - t_s[before])[:, None]
-    v = np.where(apart_s < _APART_S, log_se3(inverse(Ts[before]) @ Ts[after]) / apart_s, 0.0)
+    apart_s = np.diff(t_s)
+    tells = ((apart_s > 0.0) & (apart_s < APART_S)).astype(float)
+    speeds = tells[:, None] * log_se3(inverse(Ts[:-1]) @ Ts[1:]) / np.maximum(apart_s, 1e-9)[:, None]
+    # The mean of the speeds before and after a pose, as far as there are such.
+    v, count = np.zeros((len(seen), 6)), np.zeros((len(seen), 1))
+    for rows in (slice(None, -1), slice(1, None)):
+        v[rows] += speeds
+        count[rows] += tells[:, None]
+    v /= np.maximum(count, 1.0)
     return np.asarray((delay.sigma_s**2 + delay.jitter_s**2) * v[:, :, None] * v[:, None, :])
 
 

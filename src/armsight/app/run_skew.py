@@ -10,7 +10,7 @@ from armsight.data import Array, PoseEstimate
 from armsight.vision.rig import StereoRig
 
 #: Two poses further apart than this, s, tell no speed.
-_APART_S = 0.5
+APART_S = 0.5
 
 
 class Skew:
@@ -32,7 +32,7 @@ class Skew:
         """Return a pose with its covariance widened; poses come in order of time."""
         p = pose.T_left_body[:3, 3]
         last, self._last = self._last, (t_s, p)
-        if last is None or not 0.0 < t_s - last[0] < _APART_S:
+        if last is None or not 0.0 < t_s - last[0] < APART_S:
             return pose
         baseline = self._rig.T_left_right[:3, 3]
         along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))

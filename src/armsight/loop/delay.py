@@ -32,6 +32,8 @@ MOST_SIGMA_S = 2e-3
 SYSTEMATIC_S = 1.5e-4
 #: The median of what a normal's draws are off, in sigma.
 _MEDIAN_OF_NORMAL = 0.6745
+#: A stamp that is further off than this, in sigma, is no jitter but a hiccup.
+_STRAY = 4.0
 #: Readings given to the filter ahead of a sighting, s.
 _AHEAD_S = 0.1
 
@@ -79,9 +81,10 @@ def _jitter(stamps: Array) -> float:
     A shot more or less between two of them does not count: their distance is compared with whole periods.
     """
     apart = np.diff(stamps)
-    period = np.median(apart)
-    off = np.abs(apart - np.maximum(np.round(apart / period), 1.0) * period)
-    return float(np.median(off) / _MEDIAN_OF_NORMAL / np.sqrt(2))
+    periods = np.maximum(np.round(apart / np.median(apart)), 1.0)
+    off = np.abs(apart - periods * (apart.sum() / periods.sum()))
+    usual = off[off <= _STRAY * np.median(off) / _MEDIAN_OF_NORMAL]
+    return float(np.sqrt(np.mean(usual**2) / 2))
 
 
 def _coarse(arm: Arm, t: Array, q: Array, sightings: Sequence[Sighting], lags: Array) -> float:

@@ -51,7 +51,7 @@ def command(
     believed = None if model is None else open_model(model)
     try:
         with steps() as progress:
-            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick, believed), progress=progress)
+            summary = run_demo(Demo(out, arm, cameras, seed, machine, rig, quick, believed, model), progress=progress)
     except KeyboardInterrupt:
         click.echo(f"the arm was stopped; what was measured until then is in {out}", err=True)
         raise

@@ -39,6 +39,8 @@ FLOAT, COMPLIANCE, REST, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 6))
 SIZE = DELAY + 1
 #: Zeros of the joints: the turn about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
+#: The trace of a turn of 3 rad.
+_HALF_TURN = 1.0 + 2.0 * math.cos(3.0)
 
 _kernel = numba.njit(cache=True, error_model="numpy")
 
@@ -238,7 +240,9 @@ def _store_moved(F: Frame, x: Array, T: Array) -> None:
 def tangent(T: Array, T_to: Array, xi: Array) -> None:
     """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for turns of less than 3 rad, to xi.
 
-    The turn's vector comes by its quaternion, the shift by the closed inverse of V (Sola, 2018, eq. 145, 174).
+    The turn's vector comes by its quaternion, the shift by the closed inverse of V (Sola, 2018, eq. 145, 174). This is
+    ``geometry.pose.log_se3`` compiled, for the loop. Beyond 3 rad the axis hardly shows: told is half a turn about x, which
+    nothing in the filter believes.
     """
     R, d = np.empty((3, 3)), np.empty(3)
     for row in range(3):
@@ -247,7 +251,10 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
             d[row] += T[k, row] * (T_to[k, 3] - T[k, 3])
         for col in range(3):
             R[row, col] = T[0, row] * T_to[0, col] + T[1, row] * T_to[1, col] + T[2, row] * T_to[2, col]
-    w = 0.5 * math.sqrt(max(1.0 + R[0, 0] + R[1, 1] + R[2, 2], 1e-12))
+    if R[0, 0] + R[1, 1] + R[2, 2] < _HALF_TURN:
+        xi[0], xi[1], xi[2], xi[3], xi[4], xi[5] = d[0], d[1], d[2], math.pi, 0.0, 0.0
+        return
+    w = 0.5 * math.sqrt(1.0 + R[0, 0] + R[1, 1] + R[2, 2])
     a, b, c = (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)
     sine = math.sqrt(a * a + b * b + c * c)
     scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine

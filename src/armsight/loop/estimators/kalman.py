@@ -42,7 +42,7 @@ MOVES_RAD_S = 1e-3
 STILL_RAD = 1e-5
 #: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
 WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
-#: The diagonal of a covariance, and the rows of what motion makes it forget.
+#: The diagonal of a covariance, and the rows of what motion makes it forget: the rest and, next to it, the pose.
 DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
 _GATE = float(chi2.isf(CHANCE, 6))
 
@@ -180,6 +180,7 @@ class KalmanEstimator:
         Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
         ends_own = [(Hs.reshape(-1, SIZE) @ end.P).reshape(Hs.shape) @ np.swapaxes(Hs, 1, 2) for end in (before, after)]
         own = ends_own[0] + share[:, None, None] * (ends_own[1] - ends_own[0])
+        # Known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
         bridge = np.minimum(ahead.added, back.added)
         own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
         return Track(t_s, Ts, own + shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
@@ -237,7 +238,7 @@ class KalmanEstimator:
         if verdict is Verdict.OUTLIER:
             return None, verdict
         if verdict is Verdict.REOPENED:
-            P[np.diag_indices(SIZE)] += _OPENED
+            P[DIAGONAL] += _OPENED
         x, P = self._update(x, P, joints, sighting, first)
         return State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
 

@@ -43,6 +43,7 @@ _STILL = 4.0
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
+# Kernels of some microseconds keep the interpreter: to get it back from a busy thread takes longer.
 _kernel = numba.njit(cache=True, error_model="numpy")
 
 

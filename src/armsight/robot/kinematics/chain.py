@@ -20,6 +20,7 @@ GOOD, NOT_FINITE, NOT_RADIANS = 0, 1, 2
 #: No joint turns further than this, rad; an angle beyond it is most likely in degrees.
 MOST_RADIANS = 20.0
 
+# Kernels of some microseconds keep the interpreter: to get it back from a busy thread takes longer.
 _kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
