@@ -175,6 +175,15 @@ def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
     refused(said(capsys, "--model", "six_r", "--data", few, "-o", there), "4 poses")
     assert there.is_dir()
     refused(said(capsys, "--model", "six_r", "--data", few, "-o", few), "cannot be made")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    # A name too long, and a file in the way, come up only after the folder before them is made.
+    for out in (tmp_path / "new" / "deep" / ("x" * 300), tmp_path / "new" / ".." / "few.csv" / "deep"):
+        refused(said(capsys, "--model", "six_r", "--data", few, "-o", out), "cannot be made")
+        assert not (tmp_path / "new").exists()
+    refused(said(capsys, "--model", "six_r", "--data", few, "-o", tmp_path / "new" / ".." / "empty"), "4 poses")
+    assert not (tmp_path / "new").exists()
+    assert empty.is_dir()
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,23 @@ def test_streams_that_stand_still_or_do_not_overlap_are_refused():
         PoseStream.of(seen.t_s[:10], seen.Ts[:10], "eye")
 
 
+def test_a_direction_that_only_a_part_of_the_recording_tells_is_refused():
+    """The hand turns about one axis but for two seconds: no other part says how well the rest is known."""
+    t_hand, t_eye = np.arange(0, 20, 0.01), np.arange(0.5, 19.5, 1 / 30)
+
+    def hand(t):
+        xi = np.zeros((len(t), 6))
+        xi[:, 5] = np.sin(1.3 * t) + 0.4 * np.sin(3.1 * t)
+        xi[:, 3] = 0.5 * np.where((t > 10.2) & (t < 12.2), np.sin(np.pi * (t - 10.2)) ** 2, 0.0)
+        return exp_se3(xi)
+
+    slow = 1e-4 * np.sin(t_eye[:, None] * [0.9, 1.1, 0.7, 0.8, 1.0, 1.2] + np.arange(6))  # it makes the blocks long
+    X, Z = exp_se3(np.array([0.05, -0.02, 0.1, 0.3, -0.2, 0.4])), exp_se3(np.array([0.5, 0.1, 0.3, 0.2, 0.9, -0.4]))
+    seen = PoseStream.of(t_eye, inverse(Z) @ hand(t_eye) @ X @ exp_se3(slow), "eye")
+    with pytest.raises(CalibrationError, match=r"from \d+\.\d\d s to 1.* alone.*turn about two axes"):
+        calibrate_streams(PoseStream.of(t_hand, hand(t_hand), "hand"), seen)
+
+
 def pivoting(seed, n=40, spread=0.5, noise=1e-4):
     rng = np.random.default_rng(seed)
     tip, at = np.array([0.01, -0.02, 0.15]), np.array([0.4, 0.1, 0.3])

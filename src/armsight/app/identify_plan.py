@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.geometry.pose import inverse, transform
-from armsight.loop.identify.features import approaches
+from armsight.loop.identify.identify import begun
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.place import placed
 from armsight.loop.identify.plan import Plan, plan_poses
 from armsight.loop.identify.priors import prior_sigma
 from armsight.robot.arm import Arm
@@ -38,14 +37,17 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
         rig: the stereo rig; None: all that can be reached counts as seen, equally well.
         n: how many.
         seed: of the candidates.
+
+    Raises:
+        InputError: ``done`` is too few poses, or not of this arm; or fewer than ``n`` poses can be reached and seen.
+        CalibrationError: the poses of ``done`` are so alike that they do not tell where the arm is.
     """
     if done is None:
         T = arm.forward(arm.home[None])
         model = Model.of(arm, Measured(arm.home[None], T[:, None, :3, 3], T[:, :3, :3]), backlash=True)
-        x = model.nominal()
+        x, prior = model.nominal(), prior_sigma(model)
     else:
-        model, x = placed(Model.of(arm, done, backlash=approaches(done)), done)
-    prior = prior_sigma(model)
+        model, x, prior = begun(arm, done)
     if rig is None or done is None:
         return plan_poses(model, x, prior, NOISE, n, done=done, seed=seed), model
     seen = rig
@@ -54,7 +56,7 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
         return _visible(seen, Ts)
 
     def cov(Ts: Array) -> Array:
-        return _covariance(seen, Ts, model.full)
+        return _covariance(seen, Ts, None if model.full else model.points)
 
     return plan_poses(model, x, prior, (1e-6, 1e-6), n, done=done, visible=visible, cov=cov, seed=seed), model
 
@@ -75,8 +77,11 @@ def _in_cameras(rig: StereoRig, p_rig: Array) -> tuple[Array, Array]:
     return p_rig, transform(inverse(rig.T_left_right), p_rig)
 
 
-def _covariance(rig: StereoRig, Ts: Array, full: bool) -> Array:
-    """Return the covariance of bodies: of their middle from all markers, of their turn from the markers' spread."""
+def _covariance(rig: StereoRig, Ts: Array, points: int | None) -> Array:
+    """Return the covariance of bodies: of their middle from all markers, of their turn from the markers' spread.
+
+    With so many ``points`` of the tool instead of its full pose: theirs, each from its share of the markers.
+    """
     H = np.zeros((len(Ts), 3, 3))
     R_right_left = inverse(rig.T_left_right)[:3, :3]
     turns = (np.eye(3), R_right_left)
@@ -84,8 +89,8 @@ def _covariance(rig: StereoRig, Ts: Array, full: bool) -> Array:
         J = camera.project_jacobians(p)[1] @ R
         H += J.swapaxes(1, 2) @ J / SIGMA_PX**2
     C = np.linalg.inv(H) / MARKERS
-    if not full:
-        return C
+    if points is not None:
+        return np.asarray(np.kron(np.eye(points), min(points, MARKERS) * C))
     back = Ts[:, :3, :3].swapaxes(1, 2)
     out = np.zeros((len(Ts), 6, 6))
     out[:, :3, :3] = back @ C @ Ts[:, :3, :3]

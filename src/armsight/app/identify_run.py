@@ -171,20 +171,28 @@ def results_in(out: Path, apart_from: tuple[Path | None, ...]) -> Iterator[None]
     Raises:
         InputError: it cannot be made or written to, or a result would replace what is read.
     """
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    made: list[Path] = []
     try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
-    try:
+        _make(out, made)
         for name in (*FILES, "report.html"):
             check_writable(out / name, apart_from=apart_from)
         yield
     except BaseException:  # an interrupt, too, must not leave an empty folder
-        for folder in made:
+        for folder in reversed(made):
             with suppress(OSError):  # one that holds something stays
                 folder.rmdir()
         raise
+
+
+def _make(out: Path, made: list[Path]) -> None:
+    """Make a folder from the top down, and note each as it is made, so that those before one that fails are known."""
+    try:
+        for folder in (*reversed(out.parents), out):
+            if not folder.is_dir():
+                folder.mkdir(exist_ok=True)
+                made.append(folder)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from None
 
 
 def write_results(run: Run, out: Path) -> None:

@@ -34,6 +34,8 @@ ROUNDS, SETTLED_S = 12, 1e-6
 SPEED_S = 0.02
 #: Blocks at least: fewer cannot tell a variance.
 LEAST_BLOCKS = 8
+#: Of what is known in a direction, less than this part without one block is nothing: sigma a thousand times as large.
+LEAST_LEFT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +208,11 @@ def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h
 
     The delete-a-group jackknife: unlike the plain sandwich it allows for what each block pulls the fit its own way, which
     counts where blocks are as few as the unknowns (Bell and McCaffrey, Survey Methodology 28, 2002).
+
+    Raises:
+        CalibrationError: without one block a direction is undetermined, and nothing says how well it is known.
     """
-    e, J, C, _ = _linear(hand, t_eye, B, offset, h)
+    e, J, C, t = _linear(hand, t_eye, B, offset, h)
     WJ = np.linalg.solve(C, J)
     H = np.einsum("nki,nkj->nij", J, WJ)
     whole = H.sum(axis=0)
@@ -215,12 +220,37 @@ def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h
     whitened = (np.linalg.inv(np.linalg.cholesky(C)) @ e[..., None])[..., 0]
     length = int(np.clip(2 * _correlation_length(whitened), 1, max(len(e) // LEAST_BLOCKS, 1)))
     blocks = np.array_split(np.arange(len(e)), max(len(e) // length, 2))
-    moved = np.array([np.linalg.solve(whole - H[block].sum(axis=0), pulls[block].sum(axis=0)) for block in blocks])
+    rests = whole - np.array([H[block].sum(axis=0) for block in blocks])
+    _require_told_twice(whole, rests, [(t[block[0]], t[block[-1]]) for block in blocks])
+    moved = np.linalg.solve(rests, np.array([pulls[block].sum(axis=0) for block in blocks])[..., None])[..., 0]
     robust = moved.T @ moved * (len(blocks) - 1) / len(blocks)
     # Few blocks can scatter less than single poses would by chance: never claim more than independent poses allow.
     plain = np.linalg.inv(whole)
     grow = np.sqrt(np.maximum(np.diag(plain) / np.diag(robust), 1.0))
     return np.asarray(robust * np.outer(grow, grow))
+
+
+def _require_told_twice(whole: Array, rests: Array, spans: list[tuple[float, float]]) -> None:
+    """Refuse streams of which one block alone tells a direction.
+
+    Args:
+        whole: (13, 13) information of all blocks.
+        rests: (B, 13, 13) that without each.
+        spans: first and last time of each block, s.
+    """
+    advice = "turn about two axes, at changing speed, several times over the recording"
+    unit = 1 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # m, rad and s side by side
+    values, vectors = np.linalg.eigh(unit[:, None] * whole * unit)
+    if values[0] < np.finfo(float).eps * len(values) * values[-1]:
+        raise CalibrationError(f"these motions do not tell the time offset and the mounting apart: {advice}")
+    white = unit[:, None] * vectors / np.sqrt(values)  # makes the whole the unit matrix
+    left = np.linalg.eigvalsh(white.T @ rests @ white)[:, 0]
+    if left.min() < LEAST_LEFT:
+        first, last = spans[int(np.argmin(left))]
+        raise CalibrationError(
+            f"a direction of the mounting is told by the poses from {first:.2f} s to {last:.2f} s (eye's clock) alone, "
+            f"and nothing says how well: {advice}"
+        )
 
 
 def _correlation_length(e: Array) -> float:

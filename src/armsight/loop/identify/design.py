@@ -21,6 +21,7 @@ _BATCH = 250
 LEVELS, SWEEPS, LEAST_WON = 7, 3, 0.01
 
 #: Gives the whitened Jacobians (N, M, F) of poses q (N, 6) come to from sides (N, 6), and which of them are allowed.
+#: Those of poses that are not allowed do not count, but for the first.
 Tells = Callable[[Array, Array], tuple[Array, Mask]]
 
 

@@ -23,7 +23,8 @@ SCALED = ("gain", "wave", "ripple", "backlash", "slack", "sag")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
 LEAST, MOST = 0.01, 1.0
 #: The factor is itself told by a handful of numbers; it is taken at the upper end of what they allow, where twice the log
-#: of the evidence has fallen by so much from its best (one sigma), and this far above the best at least.
+#: of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The other kinds
+#: are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they give way.
 FALLEN, WIDER = 1.0, 1.5
 
 
@@ -59,7 +60,7 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
 
 
 def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
-    """Return the logs of the factors at the upper end of what the evidence allows, one kind at a time."""
+    """Return the logs of the factors at the upper end of what the evidence allows, each with the others at their best."""
     out, allowed = best.copy(), cost(best) + FALLEN
     for k in range(len(best)):
         for log in np.arange(np.log(MOST), max(best[k], np.log(LEAST)), -0.2):

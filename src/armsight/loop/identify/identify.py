@@ -111,18 +111,43 @@ def identify(
         InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
         CalibrationError: poses so alike that not even base and tool can be told.
     """
+    model, x, prior = begun(arm, measured, priors=priors, progress=progress)
+    progress("base and tool")
+    placement = _of(model, PLACEMENT)
+    start = fit(model, x, measured, placement, prior)
+    return _identified(model, start, measured, prior, placement, progress)
+
+
+def begun(
+    arm: Arm,
+    measured: Measured,
+    *,
+    priors: Mapping[str, float] | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+) -> tuple[Model, Array, Array]:
+    """Return the model, the vector (P,) of the nominal arm where base and tool are, and prior sigmas (P,).
+
+    What every identification, and the choice of its next poses, starts from; poses that cannot carry either are refused.
+
+    Args:
+        arm: the nominal arm.
+        measured: joint angles, and where the tool was seen.
+        priors: as in :func:`identify`.
+        progress: is told what is being done.
+
+    Raises:
+        InputError: too few poses, or data that cannot be of this arm.
+        CalibrationError: poses so alike that not even base and tool can be told.
+    """
     _require_enough(measured)
     arm = without_tool(arm)
     progress("is this the arm")
     check_plausible(arm, measured)
     model, x = placed(Model.of(arm, measured, backlash=approaches(measured)), measured)
     prior = prior_sigma(model, priors)
-    placement = _of(model, PLACEMENT)
     at = _first(model, x, measured, prior)
-    _require_placed(model, at.x, measured, prior, at.noise, placement)
-    progress("base and tool")
-    start = fit(model, at.x, measured, placement, prior)
-    return _identified(model, start, measured, prior, placement, progress)
+    _require_placed(model, at.x, measured, prior, at.noise, _of(model, PLACEMENT))
+    return model, at.x, prior
 
 
 def _identified(

@@ -102,7 +102,7 @@ def plan_poses(
     wanted = _wanted(model, x, seen, free, rng)
 
     def tells(q: Array, approach: Array) -> tuple[Array, Mask]:
-        return scene.whitened(scene.seen(q, approach))[:, :, free], scene.allowed(q, approach)
+        return scene.told(q, approach, free)
 
     chosen, _ = greedy(J, P, wanted, n)
     better, sides = exchanged(q[chosen], approach[chosen], tells, P, wanted, scene.limits, rng)
@@ -148,6 +148,19 @@ class Scene(NamedTuple):
         m = model.motion(self.x, q, model.feature_values(q, approach))
         p = m.o[:, None] + (m.R @ model.tool_points(self.x).T).swapaxes(1, 2)
         return Measured(q, p, T[:, :3, :3] if model.full else None, None if self.cov is None else self.cov(T), approach)
+
+    def told(self, q: Array, approach: Array, free: Mask) -> tuple[Array, Mask]:
+        """Return whitened Jacobians (N, M, F) by the free parameters, and which poses (N,) are allowed.
+
+        Of poses that are not allowed there is none (behind a camera no covariance stands for what is seen): zeros. The
+        first is the pose as it was, and always told.
+        """
+        allowed = self.allowed(q, approach)
+        rows = np.flatnonzero(allowed | (np.arange(len(q)) == 0))
+        told = self.whitened(self.seen(q[rows], approach[rows]))[:, :, free]
+        J = np.zeros((len(q), *told.shape[1:]))
+        J[rows] = told
+        return J, allowed
 
     def whitened(self, measured: Measured) -> Array:
         """Return the whitened Jacobians (N, M, P)."""

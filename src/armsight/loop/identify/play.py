@@ -75,25 +75,34 @@ def plays(found: Identified, measured: Measured) -> tuple[Play, ...]:
         else:
             fit = _fitted(found, i, columns, phi)
             told = 0.0 if off is None else float(np.median(off.sigma_off_rad[:, i]))
-            out.append(fit if carries else _to_the_stops(fit, chance, told, int(found.solution.used.sum())))
+            out.append(fit if carries else _to_the_stops(fit, chance, told, _come_from(i, found, measured)))
     return tuple(out)
 
 
-def _to_the_stops(play: Play, chance: float, told: float, n: int) -> Play:
+def _come_from(joint: int, found: Identified, measured: Measured) -> tuple[int, int]:
+    """Return how many of the poses used a joint came to from below, and from above."""
+    if measured.approach is None:
+        return 0, 0
+    side = measured.approach[found.solution.used, joint]
+    return int((side > 0).sum()), int((side < 0).sum())
+
+
+def _to_the_stops(play: Play, chance: float, told: float, sides: tuple[int, int]) -> Play:
     """Widen the play of a joint that friction holds near its stops, by how far short of them it was found.
 
     Where a link came to rest scatters, as the shaft goes back a little when it stops and leaves the link behind. A link is
-    never beyond its stops, so that the furthest of n is nearest to where they are: by the expected largest of n normal
-    numbers (Blom, Statistical Estimates and Transformed Beta-Variables, 1958). Only what single poses resolve of the
-    scatter is added. What is true may be anything from none to twice of what all of the scatter would make.
+    never beyond its stops, so that at each stop the furthest of the n poses that came to it is nearest to where it is: by
+    the expected largest of n normal numbers (Blom, Statistical Estimates and Transformed Beta-Variables, 1958). Only what
+    single poses resolve of the scatter is added. What is true may be anything from none to twice of what all of the scatter
+    would make.
 
     Args:
         play: the mean distance between where it was found from its two sides.
         chance: sigma of where it was found from one side, rad.
         told: how well a single pose tells it, rad.
-        n: how many poses.
+        sides: how many poses came to it from either side; one or none on a side tell nothing of its scatter.
     """
-    furthest = 2 * float(norm.ppf((n - 0.375) / (n + 0.25)))
+    furthest = sum(float(norm.ppf((n - 0.375) / (n + 0.25))) for n in sides if n > 1)
     short, most = furthest * float(np.sqrt(max(chance**2 - told**2, 0.0))), furthest * chance
     variance = play.sigma_rad**2 + most**2 / 3 + (most - short) ** 2
     return play._replace(value_rad=play.value_rad + short, sigma_rad=float(np.sqrt(variance)))
