@@ -42,42 +42,46 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
     noise = noise_of(stretches)
     paths, run, circle, notes = path_rows(stretches, noise)
-    rows, more = _rests([s for s in stretches if s.kind == "rest" and s.name not in run], noise)
+    rows, more = _rests([s for s in stretches if s.kind == "rest"], run, noise)
     return Attained(rows + paths, more + notes, turns_of(folder, circle))
 
 
-def _rests(stretches: list[Stretch], noise: Noise) -> tuple[list[Row], list[str]]:
-    """Return a row for every rest at a pose that is judged."""
+def _rests(stretches: list[Stretch], run: set[str], noise: Noise) -> tuple[list[Row], list[str]]:
+    """Return a row for every rest at a pose, but those at the ends of paths that are judged, and what was left out."""
     names: list[tuple[Array, str]] = []
     visits: dict[tuple[str, str], list[Row]] = {}
-    times: Counter[tuple[str, str]] = Counter()
+    times: Counter[str] = Counter()
     before, unseen = "the start", 0
     for stretch in stretches:
         T = stretch.wanted.Ts_base_tool[-1]
         name = next((n for at, n in names if np.abs(at - T).max() < _SAME_M), None)
+        if stretch.name in run:
+            before = name or plain(stretch.name)
+            continue
         if name is None:
             short = plain(stretch.name).removeprefix("to ")
             name = short if all(short != n for _, n in names) else stretch.name
             names.append((T, name))
         way = (name, before)
-        times[way] += 1
+        times[name] += 1
         Ts, _ = stood(stretch)
         if len(Ts) >= _SHOTS:
             t_s = float(stretch.wanted.t_s[-1])
-            seen = Row("pose", name, str(times[way]), before, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
+            seen = Row("pose", name, str(times[name]), before, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
             visits.setdefault(way, []).append(seen)
         unseen += len(Ts) < _SHOTS
         before = name
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
-    often = {name for (name, _), rows in visits.items() if len(rows) >= LEAST}
+    often = any(len(came) >= LEAST for came in visits.values())
+    attained: Counter[str] = Counter()
+    for (name, _), came in visits.items():
+        attained[name] += len(came)
     rows = []
     for (name, before), came in visits.items():
-        if name in often and len(came) < LEAST:
+        if often and len(came) < LEAST <= attained[name]:
             notes.append(f"left out: {name} come to from {before}, too seldom ({len(came)})")
-        elif name in often or not often:
+        else:
             rows += came
-        elif came:
-            notes.append(f"left out: {name}, attained too seldom ({len(came)})")
     return sorted(rows, key=lambda row: (_natural(row.pose), row.t_s)), notes
 
 

@@ -18,6 +18,7 @@ from armsight.app.motion_file import read_motions
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
+from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.iso9283_path import plane_axes
@@ -37,7 +38,7 @@ _MARGIN_PX, _LOOKED = 20.0, 200
 Allowed = Callable[[Array], NDArray[np.bool_]]
 
 
-class Test(NamedTuple):
+class PlannedTest(NamedTuple):
     """A test that was planned.
 
     Attributes:
@@ -55,7 +56,7 @@ class Test(NamedTuple):
 
 def plan_test(
     arm: Arm, name: str, cycles: int | None, centre: Array | None, speed_m_s: float, seen_in: Path | None
-) -> Test:
+) -> PlannedTest:
     """Plan a test.
 
     Args:
@@ -72,22 +73,17 @@ def plan_test(
     allowed = everywhere if seen_in is None else _seen_by(seen_in)
     paths = {"line": partial(_line, arm), "circle": partial(_circle, arm)}
     done = paths.get(name)
+    too_fast: list[CheckPlan] = []  # cubes whose poses would do, but not the path
 
     def feasible(plan: CheckPlan) -> bool:
-        if done is None:
-            return True
-        try:
-            way = done(plan, speed_m_s)
-        except InputError:
-            return False
-        q = way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
-        inside = np.all((q > arm.q_min + CLEAR_RAD) & (q < arm.q_max - CLEAR_RAD))
-        return bool(inside and allowed(arm.forward(q)).all())
+        good = done is None or _goes(arm, partial(done, plan, speed_m_s), allowed)
+        too_fast.extend([] if good else [plan])
+        return good
 
     try:
         plan = plan_check(arm, centre=centre, wide=name == "wide", allowed=allowed, feasible=feasible)
     except InputError as error:
-        raise InputError(f"{error}{', or a lower --speed' if done else ''}") from None
+        raise InputError(f"{error}{', or a lower --speed' if too_fast else ''}") from None
     times = CYCLES[name] if cycles is None else cycles
     texts = {"line": _line_text, "circle": _circle_text}
 
@@ -98,7 +94,18 @@ def plan_test(
         write_text(Path(folder) / "motion.toml", motions(min(times, 2)))
         read_motions(arm, Path(folder) / "motion.toml")
     head = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/run.md.\n"
-    return Test(name, times, plan, head + motions(times))
+    return PlannedTest(name, times, plan, head + motions(times))
+
+
+def _goes(arm: Arm, path: Callable[[], Trajectory], allowed: Allowed) -> bool:
+    """Say whether the arm can follow a path, clear of its limits and, all along it, where it may be."""
+    try:
+        way = path()
+    except InputError:
+        return False
+    q = way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
+    inside = np.all((q > arm.q_min + CLEAR_RAD) & (q < arm.q_max - CLEAR_RAD))
+    return bool(inside and allowed(arm.forward(q)).all())
 
 
 def _seen_by(run: Path) -> Allowed:
@@ -107,10 +114,12 @@ def _seen_by(run: Path) -> Allowed:
     file = run / "handeye.json"
     try:
         document = json.loads(read_text(file))
-        T_base_rig, T_tool_body = (np.array(document[key], float) for key in ("T_base_rig", "T_tool_body"))
-        T_rig_base = inverse(T_base_rig)
-    except (ValueError, KeyError, TypeError, IndexError):
+        T_base_rig, T_tool_body = (checked(document[key], (4, 4), key) for key in ("T_base_rig", "T_tool_body"))
+    except InputError as error:
+        raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None
+    except (ValueError, KeyError, TypeError):
         raise InputError(f"{file}: not a run's hand-eye calibration: T_base_rig and T_tool_body are needed") from None
+    T_rig_base = inverse(T_base_rig)
     T_right_left = inverse(rig.T_left_right)
 
     def seen(Ts: Array) -> NDArray[np.bool_]:
@@ -148,7 +157,7 @@ def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> Trajectory:
 
 
 def _start(arm: Arm, plan: CheckPlan, place: Array) -> Array:
-    """Return joint angles (6,) at a place, in the configuration of the poses."""
+    """Return joint angles (6,), rad, at a place (3,), base, m, in the configuration of the poses."""
     found = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], place), near=plan.q[0]).best
     if found is None:
         raise InputError("the circle is out of reach")
@@ -156,10 +165,12 @@ def _start(arm: Arm, plan: CheckPlan, place: Array) -> Array:
 
 
 def _numbers(values: Array) -> str:
+    """Return numbers (N,) as a motion file has them."""
     return "[" + ", ".join(f"{v:.6f}" for v in values) + "]"
 
 
 def _joints(name: str, q: Array) -> str:
+    """Return a motion to joint angles (6,), rad."""
     return f'\n[[motion]]\nkind = "joints"\nname = "{name}"\nq_deg = {_numbers(np.degrees(q))}\n'
 
 

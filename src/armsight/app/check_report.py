@@ -88,20 +88,25 @@ def _page(facts: Mapping[str, Any], images: Mapping[str, bytes], source: Path) -
     return html_page("armsight: check", "What robots are judged by", f"ISO 9283 · {source}", sections)
 
 
+def _mm(value: float | None) -> str:
+    """Return a length, m, in mm; nothing where there is none."""
+    return "" if value is None else f"{1e3 * value:.3f}"
+
+
 def _result(facts: Mapping[str, Any]) -> str:
     """Return the table of all figures."""
     rows = []
     for name, what, f in figures(facts):
-        raw, low, high, least = (f"{1e3 * (f[key] or 0.0):.3f}" for key in ("raw", "low", "high", "resolvable"))
-        told = "<b>not resolvable</b>" if f["clean"] is None else f"<b>{1e3 * f['clean']:.3f}</b>"
-        sigma = f"{1e3 * (f['sigma'] or 0.0):.3f}"
-        rows.append((text(name), text(what), told, sigma, f"{low} to {high}", raw, least))
+        raw, sigma, low, high, least = (_mm(f[key]) for key in ("raw", "sigma", "low", "high", "resolvable"))
+        told = "not resolvable" if f["clean"] is None else _mm(f["clean"])
+        ends = f"{low} to {high}" if low else ""
+        rows.append((text(name), text(what), f"<b>{told}</b>", sigma, ends, raw, least))
     head = ("", "of", "mm", "sigma", "95 %, from to", "as measured", "could be told")
     used = {name for name, _, _ in figures(facts)}
     meant = [f"{name}: {meaning}." for name, meaning in MEANINGS.items() if name in used]
     words = (
         "<p>Each figure without the noise, the interval that holds the true one 95 times in a hundred, and the figure as "
         "the standard computes it. What the noise could make as well is called not resolvable; from which figure on it "
-        "could have been told stands last.</p>\n"
+        "could have been told stands last. Without the instrument's sigma a figure may have no interval.</p>\n"
     )
     return words + table(head, rows, "numbers") + bullets(meant) + (bullets(facts["notes"]) if facts["notes"] else "")

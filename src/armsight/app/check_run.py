@@ -20,6 +20,8 @@ from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
 
 #: So many poses tell something of the workspace where none was attained often enough to tell of itself.
 _WIDE = 10
+#: Commands of one station that differ by less are the same, m.
+_SAME_M = 1e-5
 #: So many times must the first pose have been attained for its drift.
 _DRIFTS = 10
 
@@ -56,17 +58,20 @@ def judge(attained: Attained) -> dict[str, Any]:
     """
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
     facts: dict[str, Any] = {}
+    notes = list(attained.notes)
     seldom = _too_seldom(by_test["pose"])
-    if by_test["pose"] and seldom is None:
-        facts |= _poses(by_test["pose"])
+    if seldom is not None:
+        notes.insert(0, seldom)
+    elif by_test["pose"]:
+        facts |= _poses(by_test["pose"], notes)
     if by_test["path"]:
-        paths = _groups(by_test["path"], lambda row: row.approach)
-        facts["paths"] = {name or "path": _path(name, group) for name, group in paths.items()}
+        paths = _groups(by_test["path"], lambda row: row.approach or "path")
+        facts["paths"] = {name: _path(name, group) for name, group in paths.items()}
     if by_test["circle"]:
         facts["circle"] = _circle(by_test["circle"], attained.turns)
     if not facts:
-        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *attained.notes]))
-    return facts | {"notes": attained.notes}
+        raise InputError("; ".join(["nothing can be judged", *notes]))
+    return facts | {"notes": notes}
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
@@ -91,8 +96,12 @@ def _places(rows: list[Row]) -> Array:
     return np.array([row.T[:3, 3] for row in rows])
 
 
+def _commands(rows: list[Row]) -> Array:
+    return np.array([row.T_command[:3, 3] for row in rows])
+
+
 def _off(rows: list[Row]) -> Array:
-    return np.array([row.T[:3, 3] - row.T_command[:3, 3] for row in rows])
+    return np.asarray(_places(rows) - _commands(rows))
 
 
 def _common(rows: list[Row]) -> Array:
@@ -103,7 +112,8 @@ def _covs(rows: list[Row]) -> Array:
     return np.array([row.cov for row in rows])
 
 
-def _poses(rows: list[Row]) -> dict[str, Any]:
+def _poses(rows: list[Row], notes: list[str]) -> dict[str, Any]:
+    """Return the figures of poses; what is left out is added to the notes."""
     groups = _groups(rows, lambda row: row.pose)
     often = {name: group for name, group in groups.items() if len(group) >= iso9283.LEAST}
     facts: dict[str, Any] = {}
@@ -111,6 +121,9 @@ def _poses(rows: list[Row]) -> dict[str, Any]:
         mean, largest = iso9283.anywhere(_off(rows), _covs(rows), _common(rows))
         facts["anywhere"] = {"count": len(rows), "mean_m": figure(mean), "max_m": figure(largest)}
         return facts
+    notes += [
+        f"left out: {name}, attained too seldom ({len(group)})" for name, group in groups.items() if name not in often
+    ]
     facts["poses"] = {name: _pose(group) for name, group in often.items()}
     several = {name: _ways(group) for name, group in often.items()}
     facts |= {"vAP_m": known} if (known := {name: f for name, f in several.items() if f}) else {}
@@ -158,15 +171,22 @@ def _distance(first: list[Row], last: list[Row]) -> dict[str, Any] | None:
 
 
 def _path(name: str, rows: list[Row]) -> dict[str, Any]:
+    """Return AT and RT of a path; every time along it has the stations of the first."""
     cycles = _groups(rows, lambda row: row.cycle)
-    lengths = {len(group) for group in cycles.values()}
-    if len(lengths) != 1:
-        counts = ", ".join(map(str, sorted(lengths)))
-        raise InputError(f"path {name}: every cycle must have the same stations; there are {counts}".replace("  ", " "))
+    (first_cycle, first), *others = cycles.items()
+    for cycle, group in others:
+        same = [row.pose for row in group] == [row.pose for row in first]
+        if not same or np.abs(_commands(group) - _commands(first)).max() > _SAME_M:
+            raise InputError(
+                f"path {name}: every cycle must have the same stations, commanded to the same places and in the same "
+                f"order; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
+            )
     attained = np.array([_places(group) for group in cycles.values()])
     cov = np.array([_covs(group) for group in cycles.values()])
-    command = np.array([row.T_command[:3, 3] for row in next(iter(cycles.values()))])
-    figures = path_figures(attained, command, cov, _common(rows))
+    try:
+        figures = path_figures(attained, _commands(first), cov, _common(rows))
+    except InputError as error:
+        raise InputError(f"path {name}: {error}") from None
     return {
         "count": len(attained),
         "AT_m": figure(figures.accuracy),
@@ -181,7 +201,7 @@ def _circle(rows: list[Row], turns: list[Turn]) -> dict[str, Any]:
         raise InputError(
             "circle: approach must be 1 for counter-clockwise and -1 for clockwise, and both must be there"
         )
-    command = np.array([row.T_command[:3, 3] for row in rows])
+    command = _commands(rows)
     axes = plane_axes(np.linalg.svd(command - command.mean(axis=0), full_matrices=False)[2][2])
     middle = (command.max(axis=0) + command.min(axis=0)) / 2
     flat = np.array([turn.p - middle for turn in turns]).reshape(-1, 3) @ axes.T

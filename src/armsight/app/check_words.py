@@ -74,6 +74,8 @@ def direction(axis: list[float]) -> str:
 def said(figure: Mapping[str, float | None]) -> str:
     """Return what a figure is, in words."""
     raw, clean, low, high, least = (1e3 * (figure[k] or 0.0) for k in ("raw", "clean", "low", "high", "resolvable"))
+    if figure["low"] is None:
+        return f"{raw:.3f} mm as measured; no interval without the instrument's sigma"
     if figure["clean"] is None:
         below = f"below {high:.3f} mm" if low >= 0 else f"{low:.3f} to {high:.3f} mm"
         return f"not resolvable: {below}; {least:.3f} mm could have been told ({raw:.3f} as measured)"

@@ -108,9 +108,14 @@ def anywhere(off: Array, cov: Array, common: Array) -> tuple[Figure, Figure]:
 
     Args:
         off: (N, 3) attained places less the commanded ones, m.
-        cov: (N, 3, 3) covariance by the instrument, m^2: what differs from pose to pose.
+        cov: (N, 3, 3) covariance by the instrument, m^2: what differs from pose to pose. Where it is zero it is not
+            known, and what was attained once does not show it: the figures have no interval.
         common: (3, 3) that of its constant error.
     """
+    if not np.any(cov):
+        each = np.linalg.norm(off, axis=1)
+        mean, largest = (Figure(raw, raw, None, None, None) for raw in (float(each.mean()), float(each.max())))
+        return mean, largest
     rng = np.random.default_rng(0)
     errors = drawn(cov, rng) + drawn(common[None], rng)
     mean = beyond_noise(lambda x: np.asarray(np.linalg.norm(x, axis=-1).mean(axis=-1)), off, errors)
@@ -135,7 +140,7 @@ def multi_directional(attained: list[Array]) -> Figure:
 
 
 def _errors_of_means(groups: list[Array]) -> Array:
-    """Draw errors (B, k, 3) of the barycentres of k groups."""
+    """Draw errors (B, k, 3) of the barycentres of k groups of places (n, 3)."""
     rng = np.random.default_rng(0)
     return np.stack([mean_errors(p, rng) for p in groups], axis=1)
 

@@ -12,9 +12,10 @@ from armsight.data import Array
 
 #: Intervals hold the true figure so often; what is called resolvable is so by chance in half of the rest.
 INSIDE = 0.95
-_LOW, _HIGH = (1 - INSIDE) / 2, (1 + INSIDE) / 2
-_WIDE = float(norm.ppf(_HIGH))
-_DRAWS = 1000
+_LOW, HIGH = (1 - INSIDE) / 2, (1 + INSIDE) / 2
+WIDE = float(norm.ppf(HIGH))
+#: Errors that are drawn.
+DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -24,21 +25,24 @@ class Figure:
     Attributes:
         raw: as the standard computes it, m or rad.
         clean: without the noise; None where it cannot be resolved.
-        low: end of the interval of 95 % of the true figure; 0 where it cannot be resolved.
-        high: the other end; where the figure cannot be resolved, what it is below of.
-        resolvable: the smallest figure that this test could have told from noise.
+        low: end of the interval of 95 % of the true figure; where it cannot be resolved, 0, or of play, which has a sign,
+            still the end of its interval. None where the noise is not known.
+        high: the other end; where the figure cannot be resolved, what it is below of. None where the noise is not known.
+        resolvable: the smallest figure that this test could have told from noise. None where the noise is not known.
     """
 
     raw: float
     clean: float | None
-    low: float
-    high: float
-    resolvable: float
+    low: float | None
+    high: float | None
+    resolvable: float | None
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation that belongs to the interval."""
-        return (self.high - self.low) / (2 * _WIDE)
+    def sigma(self) -> float | None:
+        """Standard deviation that belongs to the interval; None where the figure cannot be resolved or has none."""
+        if self.clean is None or self.low is None or self.high is None:
+            return None
+        return (self.high - self.low) / (2 * WIDE)
 
 
 def beyond_noise(statistic: Callable[[Array], Array], value: Array, errors: Array) -> Figure:
@@ -54,8 +58,8 @@ def beyond_noise(statistic: Callable[[Array], Array], value: Array, errors: Arra
     """
     raw = float(statistic(value[None])[0])
     again, alone = statistic(value + errors), statistic(errors)
-    resolvable = float(np.quantile(alone, _HIGH))
-    low, high = (float(v) for v in np.quantile(again, [_LOW, _HIGH]))
+    resolvable = float(np.quantile(alone, HIGH))
+    low, high = (float(v) for v in np.quantile(again, [_LOW, HIGH]))
     if raw <= resolvable:
         return Figure(raw, None, 0.0, max(high, resolvable), resolvable)
     return Figure(raw, max(2 * raw - float(again.mean()), 0.0), max(2 * raw - high, 0.0), 2 * raw - low, resolvable)
@@ -73,9 +77,9 @@ def mean_errors(values: Array, rng: np.random.Generator) -> Array:
     """
     n = len(values)
     if n < 2:
-        return np.zeros((_DRAWS, *values.shape[1:]))
-    wider = float(t.ppf(_HIGH, n - 1)) / _WIDE
-    weights = rng.normal(0, wider / np.sqrt(n * (n - 1)), (_DRAWS, n))
+        return np.zeros((DRAWS, *values.shape[1:]))
+    wider = float(t.ppf(HIGH, n - 1)) / WIDE
+    weights = rng.normal(0, wider / np.sqrt(n * (n - 1)), (DRAWS, n))
     return np.asarray(np.tensordot(weights, values - values.mean(axis=0), axes=1))
 
 
@@ -89,9 +93,9 @@ def group_errors(within: Array, counts: Array, rng: np.random.Generator) -> Arra
     """
     freedom = len(within) - len(counts)
     if freedom < 1:
-        return np.zeros((_DRAWS, len(counts), 3))
-    wider = float(t.ppf(_HIGH, freedom)) / _WIDE
-    weights = rng.normal(0, wider / np.sqrt(freedom), (_DRAWS, len(counts), len(within)))
+        return np.zeros((DRAWS, len(counts), 3))
+    wider = float(t.ppf(HIGH, freedom)) / WIDE
+    weights = rng.normal(0, wider / np.sqrt(freedom), (DRAWS, len(counts), len(within)))
     return np.asarray(weights @ within / np.sqrt(counts)[:, None])
 
 
@@ -99,7 +103,7 @@ def drawn(cov: Array, rng: np.random.Generator) -> Array:
     """Draw normal errors (B, ..., 3) of covariances (..., 3, 3)."""
     values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.maximum(values, 0))[..., None, :]
-    return np.asarray((root @ rng.normal(size=(_DRAWS, *cov.shape[:-1], 1)))[..., 0])
+    return np.asarray((root @ rng.normal(size=(DRAWS, *cov.shape[:-1], 1)))[..., 0])
 
 
 def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ratio: float) -> Figure:
@@ -117,12 +121,12 @@ def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ra
     """
     total, own = float(np.trace(S)), float(np.trace(noise))
     raw = ratio * float(figure(S))
-    if total <= 0:
-        return Figure(raw, 0.0, 0.0, 0.0, 0.0)
-    freedom, bias = _freedom(S, n, figure)
-    low, high = (total * freedom / float(chi2.ppf(p, freedom)) - own for p in (_HIGH, _LOW))
     alone = (n - 1) * own**2 / max(float(np.trace(noise @ noise)), 1e-300)
-    resolvable = float(figure(noise)) * np.sqrt(float(chi2.ppf(_HIGH, alone)) / alone - 1) if own > 0 else 0.0
+    resolvable = float(figure(noise)) * np.sqrt(float(chi2.ppf(HIGH, alone)) / alone - 1) if own > 0 else 0.0
+    if total <= 0:  # rows all alike: rounded, or copied; they show less than the noise would
+        return Figure(raw, None if own > 0 else 0.0, 0.0, resolvable, resolvable)
+    freedom, bias = _freedom(S, n, figure)
+    low, high = (total * freedom / float(chi2.ppf(p, freedom)) - own for p in (HIGH, _LOW))
     left = _positive(S - noise)
     left = left if np.any(left) else S  # of nothing left the shape is not known
     unit = float(figure(left)) / np.sqrt(float(np.trace(left)))
@@ -133,7 +137,7 @@ def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ra
 
 
 def _freedom(S: Array, n: int, figure: Callable[[Array], Array]) -> tuple[float, float]:
-    """Return the freedom of a figure of a scatter, by trial: how it scatters itself; and by what factor it is off."""
+    """Return the freedom of a figure of a scatter (d, d), by trial: how it scatters; and by what factor it is off."""
     x = drawn(np.broadcast_to(_whole(S), (n, 3, 3)), np.random.default_rng(0))[..., : len(S)]
     x = x - x.mean(axis=1, keepdims=True)
     tried = np.log(figure(x.swapaxes(1, 2) @ x / (n - 1)) / figure(S))
@@ -148,5 +152,6 @@ def _whole(S: Array) -> Array:
 
 
 def _positive(S: Array) -> Array:
+    """Return the part of a symmetric matrix (d, d) that is positive semidefinite."""
     values, vectors = np.linalg.eigh(S)
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

@@ -12,11 +12,13 @@ from scipy.stats import chi2, t
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import repeatability
-from armsight.loop.iso9283_figure import Figure, beyond_noise, drawn, lengths, mean_errors
+from armsight.loop.iso9283_figure import DRAWS, HIGH, WIDE, Figure, beyond_noise, drawn, lengths, mean_errors
 
 #: Degrees on either side of a reversal that are left out, and that are used, where its step is read off. Until play is
 #: taken up the axis stands still: on the first 8 degrees play of up to 1 % of the radius is, 1 - cos 8 degrees.
 NEAR_DEG, FAR_DEG = 8.0, 32.0
+#: So many places must lie on either side of a reversal; a whole way has so many, and none further apart, deg.
+_SIDE, _PLACES, _GAP_DEG = 5, 72, 15.0
 #: Places of a circle this close are averaged, deg.
 _BIN_DEG = 4.0
 #: How often a scatter is tried again.
@@ -47,13 +49,18 @@ def path_figures(attained: Array, command: Array, cov: Array, common: Array | No
         common: (3, 3) that of its constant error; none of it where it is not given.
 
     Raises:
-        InputError: fewer than three times or stations.
+        InputError: fewer than three times or stations, or the path does not go on between stations.
     """
     n, stations = attained.shape[:2]
     if n < 3 or stations < 3:
         raise InputError(f"a path followed {n} times at {stations} stations; 3 of both are needed, 10 times are usual")
     along = np.gradient(command, axis=0)
-    along /= np.linalg.norm(along, axis=1)[:, None]
+    length = np.linalg.norm(along, axis=1)
+    if not length.all():
+        raise InputError(
+            f"at its station {np.argmin(length) + 1} the command does not go on: stations must follow each other along it"
+        )
+    along /= length[:, None]
     across = np.eye(3) - along[:, :, None] * along[:, None]  # only what is square to the path counts
     seen = (across @ (attained - command)[..., None])[..., 0]
     middle, rng = seen.mean(axis=0), np.random.default_rng(0)
@@ -89,7 +96,8 @@ def _chosen(off: Array, rng: np.random.Generator) -> float:
 def _picked(figure: Figure, factor: float) -> Figure:
     """Return a figure that was picked as the largest, by so much too large for that; its upper end stays."""
     clean = None if figure.clean is None else figure.clean / factor
-    return replace(figure, clean=clean, low=figure.low / factor)
+    low = None if figure.low is None else figure.low / factor
+    return replace(figure, clean=clean, low=low)
 
 
 class CircleFigures(NamedTuple):
@@ -130,19 +138,23 @@ def circle_figures(
         ccw: (N, 3) places counter-clockwise, m.
         cw: (M, 3) clockwise.
         axes: (2, 3) unit vectors of the circle's plane along which angles count from the first to the second.
-        cov: (3, 3) covariance of a place by the instrument, m^2; none where it is not given.
+        cov: (3, 3) covariance of a place by the instrument, m^2. The scatter from place to place tells the noise; where
+            this is more, this does.
         turns: where else the radius may jump: angles, deg, and the way, 1 counter-clockwise, -1 clockwise.
 
     Raises:
-        InputError: a way does not go all around.
+        InputError: a way does not go all around, or a reversal has too few places beside it.
     """
     flat = [p @ axes.T for p in (ccw, cw)]
     centre, radius = _fitted(np.concatenate(flat))
     ways = [(np.degrees(np.arctan2(*(p - centre).T[::-1])) % 360, np.linalg.norm(p - centre, axis=1)) for p in flat]
     for (angle, _), name in zip(ways, ("counter-clockwise", "clockwise"), strict=True):
-        gaps = np.diff(np.sort(np.append(angle, angle.min() + 360)))
-        if len(angle) < 72 or gaps.max() > 15:
-            raise InputError(f"the circle {name} has gaps: places every 5 degrees, all around, are needed")
+        gap = float(np.diff(np.sort(np.append(angle, angle.min() + 360))).max())
+        if len(angle) < _PLACES or gap > _GAP_DEG:
+            raise InputError(
+                f"the circle {name} has {len(angle)} places, up to {gap:.1f} degrees apart: {_PLACES} places and more are "
+                f"needed, all around, none further apart than {_GAP_DEG:.0f} degrees"
+            )
     steps, variances = np.zeros((2, 4)), np.zeros((2, 4))
     for w, (angle, r) in enumerate(ways):
         for k in range(4):
@@ -151,8 +163,10 @@ def circle_figures(
     x, y = (_play(steps[:, k::2], variances[:, k::2]) for k in (0, 1))
     grid, radii, counts = _binned(ways)
     along = np.stack([np.cos(np.radians(grid)), np.sin(np.radians(grid))], axis=1) @ axes
-    noise = np.zeros((3, 3)) if cov is None else cov
-    errors = np.einsum("bwki,ki->bwk", drawn(noise / counts[..., None, None], np.random.default_rng(0)), along)
+    known = np.zeros(len(grid)) if cov is None else np.einsum("ki,ij,kj->k", along, cov, along)
+    seen = np.array([[_place_to_place(angle, r)] for angle, r in ways])
+    sigma = np.sqrt(np.maximum(seen, known) / counts)
+    errors = sigma * np.random.default_rng(0).normal(size=(DRAWS, *sigma.shape))
     return CircleFigures(
         axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0),
         radius,
@@ -166,8 +180,26 @@ def circle_figures(
     )
 
 
+def _place_to_place(angle: Array, r: Array) -> float:
+    """Return the variance of radii (N,) at angles (N,), deg, m^2: how far each is off the line through its neighbours.
+
+    Whichever time round those are of: what comes slowly along the way is its form (Gasser, Sroka and Jennen-Steinmetz,
+    Biometrika 73, 1986).
+    """
+    order = np.argsort(angle, kind="stable")
+    at, r = angle[order], r[order]
+    before, after = (at - np.roll(at, 1)) % 360, (np.roll(at, -1) - at) % 360
+    span = before + after
+    share = np.where(span > 0, before / np.where(span > 0, span, 1.0), 0.5)
+    off = r - (1 - share) * np.roll(r, 1) - share * np.roll(r, -1)
+    return float((off**2 / (1 + share**2 + (1 - share) ** 2)).mean())
+
+
 def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return angles (B,), mean radii (2, B) about them, and of how many places (2, B); bins of no place are filled in."""
+    """Return of angles (N,), deg, and radii (N,), m, of both ways: angles (B,), mean radii (2, B) about them, and counts.
+
+    The counts (2, B) are of places; bins of no place are filled in.
+    """
     grid = np.arange(0, 360, _BIN_DEG)
     radii, counts = np.zeros((2, len(grid))), np.ones((2, len(grid)))
     for w, (angle, r) in enumerate(ways):
@@ -180,17 +212,19 @@ def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
 
 
 def _play(steps: Array, variances: Array) -> Figure:
-    """Return the mean of jumps with its interval; negative where the radius falls, which play cannot make it do.
+    """Return the mean of jumps (1, k) of variances (1, k) with its interval; negative where the radius falls.
+
+    Play cannot make it fall: its interval has a sign, and can reach below 0.
 
     Where the jumps differ by more than their sigmas allow, the interval is that of their own scatter (Birge, Phys. Rev. 40,
     1932): then something else than the play of that axis is at work, on arms of turning joints the usual case.
     """
     value, freedom = float(steps.mean()), steps.size - 1
-    scatter = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
-    if freedom and scatter > chi2.ppf(0.975, freedom):
-        sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(t.ppf(0.975, freedom))
+    apart = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
+    if freedom and apart > chi2.ppf(HIGH, freedom):
+        sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(t.ppf(HIGH, freedom))
     else:
-        sigma, wide = float(np.sqrt(variances.sum())) / steps.size, 1.96
+        sigma, wide = float(np.sqrt(variances.sum())) / steps.size, WIDE
     resolvable = wide * sigma
     told = abs(value) > resolvable
     return Figure(value, value if told else None, value - resolvable, value + resolvable, resolvable)
@@ -204,11 +238,20 @@ def _fitted(p: Array) -> tuple[Array, float]:
 
 
 def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
-    """Return the jump of the radius at an angle, in the sense of motion, and its variance: two lines through its sides."""
+    """Return the jump of the radius at an angle, in the sense of motion, m, and its variance: two lines through its sides.
+
+    ``angle`` and ``r`` (N,) are the places, deg and m.
+    """
     from_it = way * ((angle - at + 180) % 360 - 180)
     sides = []
     for side in (-1.0, 1.0):
         rows = (side * from_it > NEAR_DEG) & (side * from_it < FAR_DEG)
+        if rows.sum() < _SIDE or np.ptp(from_it[rows]) < _SIDE:
+            raise InputError(
+                f"the circle {'counter-clockwise' if way > 0 else 'clockwise'} has {rows.sum()} places between "
+                f"{NEAR_DEG:.0f} and {FAR_DEG:.0f} degrees to one side of {at:.0f} degrees: {_SIDE} and more are needed, "
+                f"over {_SIDE} degrees and more, as places every 4 degrees have"
+            )
         A = np.column_stack([np.ones(rows.sum()), from_it[rows] / FAR_DEG])
         x = np.linalg.lstsq(A, r[rows], rcond=None)[0]
         left = r[rows] - A @ x

@@ -19,8 +19,8 @@ from armsight.robot.arm import Arm
 INSIDE = 0.1
 #: Sizes of cubes that are tried, m, largest first: the standard's, and smaller ones for small arms (6.8.2).
 CUBES_M = (1.0, 0.63, 0.4, 0.25, 0.16, 0.1)
-#: Poses of the wider test, and cycles of the standard one.
-MANY, CYCLES = 100, 30
+#: Poses of the wider test.
+MANY = 100
 #: Centres that are tried: so far from axis 1 and above the base, in sizes of the arm, nearest to the tool at home first.
 AWAY, ABOVE = np.arange(0.35, 0.86, 0.05), np.arange(-0.1, 0.61, 0.05)
 #: How far joints stay from their limits, rad.
@@ -95,7 +95,7 @@ def plan_check(
 
 
 def _centres(arm: Arm, p_home: Array) -> Array:
-    """Return centres (N, 3) in the upright plane of axis 1 and the tool at home, nearest to that first."""
+    """Return centres (N, 3) in the upright plane of axis 1 and the tool at home (3,), base, m, nearest to that first."""
     axis = arm.T_base_0[:3, 3]
     out = (p_home - axis) * [1, 1, 0]
     out = out / np.linalg.norm(out) if np.linalg.norm(out) > 0.1 * arm.size_m else np.array([1.0, 0.0, 0.0])
@@ -105,7 +105,7 @@ def _centres(arm: Arm, p_home: Array) -> Array:
 
 
 def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]]) -> Iterator[Array]:
-    """Give joint angles (N, 6) of poses, rad, for each configuration that the first of them can be in.
+    """Give joint angles (N, 6) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
 
     NaN where a pose is not reached in it, not clear or not allowed.
     """
@@ -127,14 +127,14 @@ def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]])
 
 
 def _five(home: Array, middle: Array, side: float) -> Array:
-    """Return the centre and four places in a diagonal plane, all with the turn of home."""
+    """Return poses (5, 4, 4): the centre (3,) and four places in a diagonal plane, all with the turn of home (4, 4)."""
     far = side / 2 * (1 - 2 * INSIDE)
     corners = np.array([[0, 0, 0], [1, -1, 1], [1, 1, 1], [-1, 1, -1], [-1, -1, -1]])  # of the plane x = z
     return np.array([pose(home[:3, :3], middle + far * corner) for corner in corners])
 
 
 def _wide(home: Array, middle: Array, side: float, seed: int) -> Array:
-    """Return twice as many poses as are wanted, at random over the cube and turned at random."""
+    """Return twice as many poses (N, 4, 4) as are wanted, at random over the cube about its middle (3,), and turned so."""
     rng = np.random.default_rng(seed)
     places = middle + rng.uniform(-side / 2, side / 2, (2 * MANY, 3))
     places[0] = middle  # tells the configuration that all are in

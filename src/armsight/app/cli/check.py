@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armsight.app.check_plan import CYCLES, Test, plan_csv, plan_test
-from armsight.app.check_report import write_check
+from armsight.app.check_plan import CYCLES, PlannedTest, plan_csv, plan_test
+from armsight.app.check_report import PAGE, write_check
 from armsight.app.check_run import judge, read_check
 from armsight.app.check_words import text
 from armsight.app.report import report_folder
@@ -54,6 +54,10 @@ def judged(data: Path, closed: bool, out: Path | None, as_json: bool) -> None:
     if out is not None and out.is_dir():
         if (out / "wanted.csv").exists():
             raise InputError(f"{out}: holds a run, whose report would be written over; choose another folder")
+        if (out / PAGE).exists() and not (out / "check.json").exists():
+            raise InputError(
+                f"{out}: holds another command's {PAGE}, which would be written over; choose another folder"
+            )
         check_writable(out / "check.csv", apart_from=(data, data / "check.csv"))
     attained = read_check(data, closed=closed)
     facts = judge(attained)
@@ -127,7 +131,7 @@ def plan(
         click.echo(f"written: {out}; run it: armsight run --motion {out} ... -o RUN; then: armsight check RUN")
 
 
-def _facts(test: Test) -> dict[str, object]:
+def _facts(test: PlannedTest) -> dict[str, object]:
     """Return a plan for programs."""
     return {
         "test": test.name,
