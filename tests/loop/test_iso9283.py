@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import chi2, t
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose
@@ -46,10 +47,25 @@ def population(cov):
     return length.mean() + 3 * length.std()
 
 
-def covers(figures, true):
-    """Hold intervals to what they say: 95 % of them, a binomial of so many, hold the truth; not less by its 4 sigmas."""
+def covers(figures, true, widest):
+    """Hold intervals to what they say: 95 % of them, a binomial of so many, hold the truth; not less by its 4 sigmas.
+
+    Half of them are no wider than what is given.
+    """
     share = np.mean([figure.low <= true <= figure.high for figure in figures])
     assert share > 0.95 - 4 * np.sqrt(0.95 * 0.05 / len(figures)), share
+    width = np.median([figure.high - figure.low for figure in figures])
+    assert width < widest, (width, widest)
+
+
+def chi_width(n):
+    """Width of the interval of 95 % of a deviation of n numbers, as a share of it."""
+    return np.sqrt((n - 1) / chi2.ppf(0.025, n - 1)) - np.sqrt((n - 1) / chi2.ppf(0.975, n - 1))
+
+
+def mean_width(sigma, n):
+    """Width of Student's interval of 95 % of the mean of n numbers."""
+    return 2 * t.ppf(0.975, n - 1) * sigma / np.sqrt(n)
 
 
 @pytest.mark.parametrize("shape", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.05, 0.05)])
@@ -62,7 +78,8 @@ def test_the_instruments_noise_is_taken_off_and_the_interval_holds(shape, n, noi
     for _ in range(80):
         p = rng.multivariate_normal(np.zeros(3), arm + C, n)
         figures.append(iso9283.repeatability(p, np.broadcast_to(C, (n, 3, 3))))
-    covers(figures, true)
+    # No wider than that of a deviation of a needle-like scatter, which is known least; the noise is added to it.
+    covers(figures, true, 1.25 * (1 + noise**2) * chi_width(n) * true)
     clean = [f.clean for f in figures if f.clean is not None]
     if n == 30 and noise < 1:  # all are resolved: none is left out, which would take the smallest
         assert len(clean) == 80
@@ -121,9 +138,10 @@ def test_accuracy_and_distance_hold_their_intervals(n, off, common):
         AD, RD = iso9283.distance_figures(rng.normal(0, ARM_M[0], (n, 3)), to, 0.5 - off, cov)
         errors.append(AD)
         scatters.append(RD)
-    covers(figures, off)
-    covers(errors, off)
-    covers(scatters, 3 * ARM_M[0] * np.sqrt(2))
+    # A length of three parts reaches no further than its largest part's interval by half, and from 0 on.
+    covers(figures, off, 1.5 * np.hypot(mean_width(ARM_M[0], n), 4 * common))
+    covers(errors, off, 1.25 * mean_width(ARM_M[0] * np.sqrt(2), n))
+    covers(scatters, 3 * ARM_M[0] * np.sqrt(2), (1.25 + 2.5 / n) * chi_width(n) * 3 * ARM_M[0] * np.sqrt(2))
 
 
 def test_accuracy_over_the_workspace():
@@ -135,8 +153,11 @@ def test_accuracy_over_the_workspace():
     found = [
         iso9283.anywhere(true + rng.normal(0, 2e-4, (100, 3)) + rng.normal(0, 3e-4, 3), cov, common) for _ in range(100)
     ]
-    covers([f[0] for f in found], mean)
-    covers([f[1] for f in found], largest)
+    covers([f[0] for f in found], mean, 4 * np.hypot(2e-4 / 10, 3e-4))
+    covers([f[1] for f in found], largest, 1.25 * 4 * np.hypot(2e-4, 3e-4))
+    for figure, true in zip(iso9283.anywhere(true, 0 * cov, common), (mean, largest), strict=True):
+        assert figure.raw == figure.clean == pytest.approx(true)
+        assert figure.low is figure.high is figure.sigma is None  # attained once, and no sigma: the noise is not known
 
 
 def test_accuracy_below_its_own_scatter_is_not_resolvable():
@@ -167,7 +188,8 @@ def test_drift_is_seen():
     assert still.high < 4e-5
     rng = np.random.default_rng(5)
     steps = np.outer(np.repeat(np.arange(5), 6), [1, 0, 0])
-    covers([iso9283.drift(np.arange(30.0), rng.normal(0, 0.5, (30, 3)) + steps)[2] for _ in range(80)], 4)
+    found = [iso9283.drift(np.arange(30.0), rng.normal(0, 0.5, (30, 3)) + steps)[2] for _ in range(80)]
+    covers(found, 4, 1.25 * np.sqrt(2) * mean_width(0.5, 6))
 
 
 def test_a_path():
@@ -195,8 +217,29 @@ def test_a_path_holds_its_interval():
         common = rng.normal(0, 1e-4, 3)
         paths = command + bow + common + rng.normal(0, 5e-5, (10, 1, 3)) + rng.normal(0, 1e-5, (10, 40, 3))
         figures.append(path_figures(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8))
-    covers([f.accuracy for f in figures], 1e-3)
-    covers([f.repeatability for f in figures], population(np.diag([0, 1, 1]) * (5e-5**2 + 1e-5**2)))
+    covers([f.accuracy for f in figures], 1e-3, 1.5 * np.hypot(mean_width(np.hypot(5e-5, 1e-5), 10), 4e-4))
+    true = population(np.diag([0, 1, 1]) * (5e-5**2 + 1e-5**2))
+    covers([f.repeatability for f in figures], true, 1.5 * chi_width(10) * true)
+
+
+def test_a_path_goes_on():
+    command = np.array([[0.1, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
+    with pytest.raises(InputError, match="station 3 the command does not go on"):
+        path_figures(np.repeat(command[None], 3, axis=0), command, np.zeros((3, 5, 3, 3)))
+
+
+def test_rows_all_alike_show_less_than_the_noise():
+    cov = np.broadcast_to(np.eye(3) * 1e-8, (30, 3, 3))
+    figure = iso9283.repeatability(np.zeros((30, 3)), cov)
+    assert figure.clean is None
+    assert figure.sigma is None
+    # The trace of 30 places is known to 1 / sqrt(2 * 87), its 97.5 % is 2 sigmas up.
+    least = float(iso9283.distance_limit(np.eye(3) * 1e-8)) * np.sqrt(1.96 * np.sqrt(2 / 87))
+    assert figure.high == figure.resolvable == pytest.approx(least, rel=0.05)
+    assert iso9283.repeatability(np.zeros((30, 3)), 0 * cov).clean == 0  # known without noise
+    RD = iso9283.distance_figures(np.zeros((30, 3)), np.ones((30, 3)), 1.0, cov)[1]
+    assert RD.clean is None
+    assert RD.high > 0
 
 
 @pytest.mark.parametrize("play", [(0.0, 0.0), (3e-4, 1e-4)])
@@ -210,14 +253,45 @@ def test_play_is_read_off_the_quadrants(play):
         ways.append(p - 0.5 * np.array([*play, 0]) * np.sign(speed) + rng.normal(0, 1e-5, p.shape) + [0.4, 0.1, 0.3])
     figures = circle_figures(*ways, np.eye(3)[:2])
     for found, true in zip(figures.backlash, play, strict=True):
-        assert abs(found.raw - true) < 5 * found.sigma
-        assert found.sigma < 1e-5
+        sigma = (found.high - found.low) / (2 * 1.96)
+        assert abs(found.raw - true) < 5 * sigma
+        assert sigma < 1e-5
+        assert found.sigma == (pytest.approx(sigma, rel=1e-4) if true else None)
         assert (found.clean is not None) == (true > 0)
     # At the jumps both ways differ by the play, elsewhere by its share along the radius.
     assert figures.hysteresis.raw == pytest.approx(np.hypot(*play), abs=6e-5 if any(play) else 3e-5)
     np.testing.assert_allclose(figures.centre, [0.4, 0.1, 0.3], atol=5e-6)
-    with pytest.raises(InputError, match="gaps"):
+    with pytest.raises(InputError, match="300 places, up to 210.5 degrees apart"):
         circle_figures(ways[0][:300], ways[1], np.eye(3)[:2])
+
+
+def ring(angle_deg):
+    a = np.radians(angle_deg)
+    return np.stack([0.1 * np.cos(a), 0.1 * np.sin(a), 0 * a], axis=1)
+
+
+def test_a_reversal_needs_places_beside_it():
+    whole = ring(np.arange(0.5, 360, 1.0))
+    asked = ring(np.arange(1.0, 361, 4.0))  # what the message asks for
+    circle_figures(asked, asked, np.eye(3)[:2])
+    angle = np.arange(0.5, 360, 1.0)
+    few = angle[(angle < 8) | (angle > 32) | (np.abs(angle - 20) < 2)]
+    one_place = np.sort(np.append(np.repeat(20.0, 9), angle[(angle < 8) | (angle > 32)]))
+    for places, count in ((few, 4), (one_place, 9)):
+        with pytest.raises(InputError, match=f"clockwise has {count} places between 8 and 32 degrees .* of 0 degrees"):
+            circle_figures(ring(places), whole, np.eye(3)[:2])
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_circularity_holds_its_interval_without_a_sigma(times):
+    rng, figures = np.random.default_rng(8), []
+    angle = np.tile(np.arange(0, 360, 0.5), times)
+    true = ring(angle) * (1 + 2e-3 * np.cos(2 * np.radians(angle)))[:, None]  # an oval, 0.4 mm of circularity
+    for _ in range(60):
+        ways = [true + rng.normal(0, 1e-4, true.shape) for _ in range(2)]
+        figures.append(circle_figures(*ways, np.eye(3)[:2]).circularity)
+    # 8 places a bin. Below the error's own largest of two ways of 90, 2 * 3.3 sigmas with 97.5 %; above two means' interval.
+    covers(figures, 4e-4, (2 * 3.3 + 2 * np.sqrt(2)) * 1e-4 / np.sqrt(8 * times))
 
 
 def test_jumps_that_do_not_agree_are_no_play():
@@ -232,12 +306,13 @@ def test_jumps_that_do_not_agree_are_no_play():
     assert play.resolvable > 3e-4
 
 
-def test_noise_alone_makes_no_circularity():
+@pytest.mark.parametrize("cov", [None, np.eye(3) * 9e-10])
+def test_noise_alone_makes_no_circularity(cov):
     rng, angle, told = np.random.default_rng(3), np.linspace(0, 2 * np.pi, 720, endpoint=False), 0
     for _ in range(40):
         ways = [np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0 * angle], axis=1) for _ in range(2)]
         ways = [p + rng.normal(0, 3e-5, p.shape) for p in ways]
-        figures = circle_figures(*ways, np.eye(3)[:2], np.eye(3) * 9e-10)
+        figures = circle_figures(*ways, np.eye(3)[:2], cov)
         told += (figures.circularity.clean is not None) + (figures.hysteresis.clean is not None)
     assert told <= 8  # of 80; 2.5 % by chance
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -170,14 +170,24 @@ def circle_figures(
     return CircleFigures(
         axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0),
         radius,
-        beyond_noise(lambda r: np.asarray(np.ptp(r, axis=-1).max(axis=-1)), radii, errors),
-        beyond_noise(lambda r: np.asarray(np.abs(r[:, 0] - r[:, 1]).max(axis=-1)), radii, errors),
+        _widest(lambda r: np.asarray(np.ptp(r, axis=-1).max(axis=-1)), radii, errors),
+        _widest(lambda r: np.asarray(np.abs(r[:, 0] - r[:, 1]).max(axis=-1)), radii, errors),
         steps,
         (x, y),
         tuple(_play(*(np.array([v]) for v in _step(*ways[int(way < 0)], at, way))) for at, way in turns),
         grid,
         radii - radius,
     )
+
+
+def _widest(statistic: Callable[[Array], Array], radii: Array, errors: Array) -> Figure:
+    """Return a largest difference of radii (2, B), with draws (D, 2, B) of their errors.
+
+    The largest of many is picked where the error is large too, more than adding errors once more shows. But no error makes
+    it larger by more than that error's own largest difference: that bounds its lower end.
+    """
+    figure = beyond_noise(statistic, radii, errors)
+    return figure if figure.clean is None else replace(figure, low=figure.raw - float(figure.resolvable or 0.0))
 
 
 def _place_to_place(angle: Array, r: Array) -> float:
