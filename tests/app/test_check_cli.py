@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.app.motion_file import read_motions
+from armsight.geometry.pose import pose
 from armsight.robot.models import open_arm
 from armsight.sim.workcell import Workcell
 from cli_runs import Said, refused, run
@@ -123,6 +124,10 @@ def test_the_plan(tmp_path, capsys):
     assert "cycles: 30" in answer.out
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
     refused(said(capsys, "plan", "--model", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    nowhere = said(capsys, "plan", "--model", "six_r", "--test", "line", "--centre", "nan", "0", "0")
+    refused(nowhere, "finite numbers")
+    assert "--speed" not in nowhere.err
+    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
     refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
     refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
     refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
@@ -149,8 +154,8 @@ def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
         if motion.kind == "circle":
             radii = np.linalg.norm(p - facts["centre_m"], axis=1)
             np.testing.assert_allclose(radii, 0.4 * facts["side_m"], atol=1e-8)
-            turned = np.abs(np.diff(p, axis=0)).sum()
-            assert turned > 2 * np.pi * 0.4 * facts["side_m"]
+            turned = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()  # 100 chords, each shorter than its arc by 1e-3
+            assert turned == pytest.approx(np.radians(420) * 0.4 * facts["side_m"], rel=2e-3)
     if test == "poses":
         for name, T in zip(facts["poses"], facts["T_base_tool"], strict=True):
             np.testing.assert_allclose(attained[name], [T, T], atol=1e-7)  # angles are written to 1e-6 deg
@@ -160,16 +165,67 @@ def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
     with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
         cell.truth.rig.save(tmp_path / "rig.json")
         (tmp_path / "body.toml").write_text(cell.body_text)
-        mounting = {"T_base_rig": cell.truth.T_base_rig.tolist(), "T_tool_body": cell.truth.T_tool_body.tolist()}
+        near = cell.truth.T_base_rig @ pose(np.eye(3), np.array([0, 0, 0.6]))  # so near that not all fits in
+        mounting = {"T_base_rig": near.tolist(), "T_tool_body": cell.truth.T_tool_body.tolist()}
     (tmp_path / "handeye.json").write_text(json.dumps(mounting))
-    seen = said(capsys, "plan", "--model", "six_r", "--test", "wide", "--seen-in", tmp_path, "--json").lines[0]
     rig, T_base_rig = cell.truth.rig, np.array(mounting["T_base_rig"])
-    p = np.array(seen["T_base_tool"])[:, :3, 3]
-    p_left = (p - T_base_rig[:3, 3]) @ T_base_rig[:3, :3]
-    uv = rig.left.project(p_left)
-    assert np.all((uv > 0) & (uv < np.array(rig.left.image_size_px)))
+
+    def share_seen(*options):
+        """Of the tool's places of a plan, how many both cameras have in their images."""
+        plan = said(capsys, "plan", "--model", "six_r", "--test", "wide", "--json", *options).lines[0]
+        p_left = (np.array(plan["T_base_tool"])[:, :3, 3] - T_base_rig[:3, 3]) @ T_base_rig[:3, :3]
+        p_right = (p_left - rig.T_left_right[:3, 3]) @ rig.T_left_right[:3, :3]
+        good = np.ones(len(p_left), bool)
+        for camera, p in ((rig.left, p_left), (rig.right, p_right)):
+            uv = camera.project(p)
+            good &= (p[:, 2] > 0) & ((uv > 0) & (uv < np.array(camera.image_size_px))).all(axis=1)
+        return good.mean()
+
+    assert share_seen() < 0.95  # else it would say nothing that all of it is seen:
+    assert share_seen("--seen-in", tmp_path) == 1
     (tmp_path / "handeye.json").write_text("{}")
     refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_base_rig")
+    (tmp_path / "handeye.json").write_text(json.dumps(mounting | {"T_tool_body": [1, 2, 3]}))
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)")
+
+
+def test_without_a_sigma_errors_have_no_interval(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    with open(tmp_path / "wide.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["pose", *COLUMNS[5:8], *COMMAND[:3]])
+        for k in range(20):
+            command = rng.uniform(0.3, 0.7, 3)
+            writer.writerow([f"P{k}", *(command + rng.normal(0, 1e-3, 3)), *command])
+    answer = said(capsys, tmp_path / "wide.csv", "-o", tmp_path / "report")
+    assert answer.out.count("no interval without the instrument's sigma") == 2
+    facts = json.loads((tmp_path / "report" / "check.json").read_text())
+    assert facts["anywhere"]["mean_m"]["low"] is facts["anywhere"]["mean_m"]["sigma"] is None
+
+
+def test_a_few_poses_too_seldom_are_told(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose" and (row[1] != "P3" or row[2] < 2)]
+    (facts,) = said(capsys, file_of(tmp_path / "c.csv", rows), "--json").lines
+    assert facts["notes"] == ["left out: P3, attained too seldom (2)"]
+
+
+def test_another_reports_page_is_not_written_over(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "report.html").write_text("another's")
+    file = file_of(tmp_path / "c.csv", rows_of())
+    refused(said(capsys, file, "-o", tmp_path / "other"), "another command's report.html", "another folder")
+    assert (tmp_path / "other" / "report.html").read_text() == "another's"
+
+
+def test_paths_whose_stations_differ(tmp_path, capsys):
+    rows, bad = [row for row in rows_of() if row[0] == "path"], tmp_path / "bad.csv"
+    moved = [[*row[:12], row[12] + 1e-3 * (row[1] == 4 and row[2] == 2), *row[13:]] for row in rows]
+    refused(said(capsys, file_of(bad, moved)), "path path", "same stations", "cycle 2")
+    swapped = [[row[0], {3: 4, 4: 3}.get(row[1], row[1]) if row[2] == 1 else row[1], *row[2:]] for row in rows]
+    refused(said(capsys, file_of(bad, swapped)), "same stations", "cycle 1")
+    refused(said(capsys, file_of(bad, rows[:-1])), "same stations", "19 rows")
+    still = [[*row[:12], 0.4 if row[1] in (4, 5, 6) else row[12], *row[13:]] for row in rows]
+    refused(said(capsys, file_of(bad, still)), "path path", "station 6", "does not go on")
 
 
 def test_mistakes(tmp_path, capsys):

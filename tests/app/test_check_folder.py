@@ -6,6 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from armsight.app.check_figures import paths_figure
+from armsight.app.check_paths import _turn_times
+from armsight.app.check_rows import read_rows
 from cli_runs import Said, refused, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
@@ -140,11 +143,11 @@ def line(made, phase, cycles):
             made.motion(phase, f"{name} cycle {cycle}", "line", path, off)
 
 
-def circle(made, phase):
+def circle(made, phase, radius=RADIUS, names=("ccw", "cw")):
     """Both ways with a third more than a turn, play along y."""
     a = np.radians(np.linspace(15, 435, 1000))
-    for name, angle in (("ccw", a), ("cw", a[::-1])):
-        path = CENTRE + RADIUS * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+    for name, angle in zip(names, (a, a[::-1]), strict=True):
+        path = CENTRE + radius * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
         way = np.sign(angle[1] - angle[0])
         off = np.stack([0 * a, -0.5 * PLAY * np.sign(-way * np.sin(angle)), 0 * a], axis=1)
         made.motion(phase, f"{name} cycle 1", "circle", path, off)
@@ -175,6 +178,109 @@ def test_paths_and_the_circle(tmp_path, capsys):
     assert said(capsys, tmp_path / "report" / "check.csv", "--json").lines[0]["circle"]["radius_m"] == pytest.approx(
         c["radius_m"], abs=1e-8
     )
+
+
+def lines(made, names, to=(0.6, 0.0, 0.4), unseen=()):
+    """Lines between the same ends; of some a part is not seen: seconds of their 2 s."""
+    s = np.linspace(0, 1, 200)[:, None]
+    for name in names:
+        path = np.array([0.4, 0, 0.4]) + s * (np.array(to) - [0.4, 0, 0.4])
+        start = made.t
+        made.motion("open_loop", name, "line", path, 0 * path + [0, 5e-4, 0])
+        for first, last in dict(unseen).get(name, ()):
+            made.seen = [row for row in made.seen if not start + first < row[0] <= start + last]
+
+
+def test_lines_of_any_name(tmp_path, capsys):
+    made = Folder(tmp_path)
+    lines(made, [f"line {n}" for n in (1, 3, 5, 7)])  # as motions are called that have no name
+    answer = said(capsys, made.write(), "--json")
+    assert {name: p["count"] for name, p in answer.lines[0]["paths"].items()} == {"line 1": 4}
+
+
+def test_two_lines_of_one_name_are_two(tmp_path, capsys):
+    made = Folder(tmp_path)
+    for first in (1, 3, 5):
+        lines(made, [f"go cycle {first}"])
+        lines(made, [f"go cycle {first + 1}"], to=(0.5, 0.1, 0.4))
+    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    assert {name: p["count"] for name, p in facts["paths"].items()} == {"go": 3, "go cycle 2": 3}
+    drawn = paths_figure(facts, read_rows(tmp_path / "report" / "check.csv")).axes[0].lines
+    assert len(drawn) == 2 * (1 + 3)  # each mean path, and its own times round
+
+
+def test_what_nobody_saw_is_not_made_up(tmp_path, capsys):
+    made = Folder(tmp_path)
+    unseen = {
+        "go cycle 2": [(0.8, 1.2)],
+        "go cycle 3": [(0.0, 0.2)],
+        "go cycle 4": [(1.8, 2.0)],
+        "go cycle 5": [(0.0, 1.9)],
+    }
+    lines(made, [f"go cycle {n}" for n in range(1, 8)], unseen=unseen)
+    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    assert facts["paths"]["go"]["count"] == 3
+    notes = " ".join(facts["notes"])
+    assert "go cycle 2, not seen over 4" in notes  # 0.4 s of 100 mm/s
+    assert "go cycle 3, not seen from its first station to its last" in notes
+    assert "go cycle 4, not seen from its first station to its last" in notes
+    assert "go cycle 5, seen in 5 shots; 10 are needed" in notes
+    with open(tmp_path / "report" / "check.csv") as file:
+        assert {row["cycle"] for row in csv.DictReader(file) if row["test"] == "path"} == {"1", "5", "6"}
+
+
+def test_of_two_circles_both_ways_one_is_judged(tmp_path, capsys):
+    made = Folder(tmp_path)
+    circle(made, "open_loop")
+    circle(made, "open_loop", radius=0.05, names=("small ccw", "small cw"))
+    (facts,) = said(capsys, made.write(), "--json").lines
+    assert facts["circle"]["radius_m"] == pytest.approx(RADIUS, abs=2e-5)
+    assert any("small ccw cycle 1, small cw cycle 1" in note for note in facts["notes"])
+
+
+def test_circles_that_differ_are_no_pair(tmp_path, capsys):
+    made = Folder(tmp_path)
+    circle(made, "open_loop", names=("ccw", "cw"))
+    made.motions = [(kind, name) for kind, name in made.motions if name != "cw cycle 1"]
+    for track in (made.wanted, made.seen):
+        track[:] = [row for row in track if row[-1] != "cw cycle 1"]
+    lone = Folder(tmp_path, seed=1)
+    circle(lone, "open_loop", radius=0.05, names=("no", "small cw"))
+    late = made.t
+    for mine, other in ((made.wanted, lone.wanted), (made.seen, lone.seen)):
+        mine += [[late + row[0], *row[1:]] for row in other if row[-1] == "small cw cycle 1"]
+    made.motions.append(("circle", "small cw cycle 1"))
+    refused(said(capsys, made.write()), "nothing can be judged", "ccw, followed too seldom (1)")
+
+
+def test_visits_are_counted_by_pose_and_ways_over_all_rests(tmp_path, capsys):
+    made = Folder(tmp_path)
+    made.poses("open_loop", 4)
+    lines(made, ["go cycle 1", "go cycle 2", "go cycle 3"])
+    made.poses("open_loop", 0)
+    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    # P5 from the start once, from P4 four times, and after the lines from where they end.
+    assert "left out: P5 come to from go, too seldom (1)" in facts["notes"]
+    with open(tmp_path / "report" / "check.csv") as file:
+        rows = [row for row in csv.DictReader(file) if row["pose"] == "P5"]
+    assert [row["cycle"] for row in rows] == ["2", "3", "4", "5"]  # the first was from the start
+
+
+def test_poses_attained_once_are_told_where_others_are_judged(tmp_path, capsys):
+    made = Folder(tmp_path)
+    made.poses("open_loop", 3)
+    there = np.repeat([[0.55, 0.0, 0.35]], 40, axis=0)
+    made.motion("open_loop", "aside", "joints", there, 0 * there)
+    (facts,) = said(capsys, made.write(), "--json").lines
+    assert facts["notes"].count("left out: aside, attained too seldom (1)") == 1
+
+
+def test_a_joint_that_stands_where_it_turns_back():
+    t_s = np.arange(9.0)
+    q = np.array([0.0, 0.1, 0.2, 0.2, 0.1, 0.0, 0.0, -0.1, -0.2])
+    assert _turn_times(t_s, q) == [2.0]
+    assert _turn_times(t_s, np.abs(t_s - 4)) == [4.0]
+    assert _turn_times(t_s, 0 * q) == []
 
 
 def test_where_joints_turn_back(tmp_path, capsys):
