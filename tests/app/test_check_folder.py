@@ -339,6 +339,8 @@ def test_folders_that_cannot_be_judged(tmp_path, capsys):
         first = "line 1" in words
         (tmp_path / "vision.csv").write_text("\n".join([bad, *lines[1:]] if first else [lines[0], bad, *lines[2:]]))
         refused(said(capsys, tmp_path), "vision.csv", *words)
+    (tmp_path / "vision.csv").write_text("\n".join([*lines[:4], lines[2], *lines[4:]]))
+    refused(said(capsys, tmp_path), "vision.csv", "line 5", "times must rise")
     (tmp_path / "vision.csv").write_text(lines[0] + "\n")
     refused(said(capsys, tmp_path), "vision.csv", "no rows")
     (tmp_path / "vision.csv").write_text("\n".join(lines[:3]))

@@ -155,8 +155,8 @@ def test_accuracy_over_the_workspace():
     ]
     covers([f[0] for f in found], mean, 4 * np.hypot(2e-4 / 10, 3e-4))
     covers([f[1] for f in found], largest, 1.25 * 4 * np.hypot(2e-4, 3e-4))
-    for figure, true in zip(iso9283.anywhere(true, 0 * cov, common), (mean, largest), strict=True):
-        assert figure.raw == figure.clean == pytest.approx(true)
+    for figure, its in zip(iso9283.anywhere(true, 0 * cov, common), (mean, largest), strict=True):
+        assert figure.raw == figure.clean == pytest.approx(its)
         assert figure.low is figure.high is figure.sigma is None  # attained once, and no sigma: the noise is not known
 
 
@@ -261,7 +261,7 @@ def test_play_is_read_off_the_quadrants(play):
     # At the jumps both ways differ by the play, elsewhere by its share along the radius.
     assert figures.hysteresis.raw == pytest.approx(np.hypot(*play), abs=6e-5 if any(play) else 3e-5)
     np.testing.assert_allclose(figures.centre, [0.4, 0.1, 0.3], atol=5e-6)
-    with pytest.raises(InputError, match="300 places, up to 210.5 degrees apart"):
+    with pytest.raises(InputError, match=r"300 places, up to 210\.5 degrees apart"):
         circle_figures(ways[0][:300], ways[1], np.eye(3)[:2])
 
 
@@ -290,7 +290,7 @@ def test_circularity_holds_its_interval_without_a_sigma(times):
     for _ in range(60):
         ways = [true + rng.normal(0, 1e-4, true.shape) for _ in range(2)]
         figures.append(circle_figures(*ways, np.eye(3)[:2]).circularity)
-    # 8 places a bin. Below the error's own largest of two ways of 90, 2 * 3.3 sigmas with 97.5 %; above two means' interval.
+    # 8 places a bin. Below the error's own largest, of two ways of 90, 2 * 3.3 sigmas; above the interval of two means.
     covers(figures, 4e-4, (2 * 3.3 + 2 * np.sqrt(2)) * 1e-4 / np.sqrt(8 * times))
 
 

@@ -14,17 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from armsight.app.run_tracks import ToolTrack
+from armsight.app.run_tracks import ToolTrack, read_track
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_table, read_text
+from armsight.files import read_text
 from armsight.loop.iso9283 import LEAST
 
 #: An arm that stands is judged by the end of its rest, s.
 WINDOW_S = 0.3
-_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 _SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 
 
@@ -71,8 +69,8 @@ def stretches_of(folder: Path, closed: bool) -> list[Stretch]:
     for name in ("wanted.csv", "vision.csv", "motion.toml"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: is no run, {name} is missing: give a folder of armsight run or demo, or a CSV")
-    wanted, _ = _track(folder / "wanted.csv", ())
-    seen, sigma = _track(folder / "vision.csv", _SIGMAS)
+    wanted, _ = read_track(folder / "wanted.csv", ())
+    seen, sigma = read_track(folder / "vision.csv", _SIGMAS)
     kinds = _kinds(folder / "motion.toml")
     named = np.char.add(np.char.add(wanted.phase, "/"), wanted.motion)
     ends = [0, *(np.flatnonzero(named[1:] != named[:-1]) + 1).tolist(), len(named)]
@@ -87,42 +85,6 @@ def stretches_of(folder: Path, closed: bool) -> list[Stretch]:
         kind = "rest" if phase == "rest" else kinds.get(name, "joints")
         found.append(Stretch(name, kind, part, seen[rows], sigma[rows]))
     return found
-
-
-def _track(file: Path, more: tuple[str, ...]) -> tuple[ToolTrack, Array]:
-    """Read a track, and further columns (N, k)."""
-    table = read_table(file)
-    header = table[0] if table else []
-    columns = (*_COLUMNS, "phase", "motion", *more)
-    for name in columns:
-        if name not in header:
-            raise InputError(f"{file}: line 1: column {name} is missing; needed are {', '.join(columns)}")
-    at = [header.index(name) for name in columns]
-    body = table[1:]
-    try:
-        numbers = np.array([[float(row[k]) for k in (*at[:8], *at[10:])] for row in body]).reshape(-1, 8 + len(more))
-        texts = np.array([[row[k] for k in at[8:10]] for row in body], dtype=str).reshape(-1, 2)
-    except (ValueError, IndexError):
-        line = next(n for n, row in enumerate(body, start=2) if not _whole(row, at))
-        raise InputError(f"{file}: line {line}: numbers are needed in {', '.join(_COLUMNS)}") from None
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    if len(bad):
-        raise InputError(f"{file}: line {bad[0] + 2}: finite numbers are needed in {', '.join((*_COLUMNS, *more))}")
-    if not len(numbers):
-        raise InputError(f"{file}: no rows")
-    if not np.linalg.norm(numbers[:, 4:8], axis=1).all():
-        raise InputError(f"{file}: a quaternion qw .. qz is zero")
-    Ts = np.tile(np.eye(4), (len(numbers), 1, 1))
-    Ts[:, :3, 3], Ts[:, :3, :3] = numbers[:, 1:4], Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
-    return ToolTrack(numbers[:, 0], Ts, texts[:, 0], texts[:, 1]), numbers[:, 8:]
-
-
-def _whole(row: list[str], at: list[int]) -> bool:
-    """Say whether a line has all its cells, and numbers where they must be."""
-    try:
-        return bool([float(row[k]) for k in (*at[:8], *at[10:])]) and len(row) > max(at)
-    except (ValueError, IndexError):
-        return False
 
 
 def _kinds(file: Path) -> dict[str, str]:
