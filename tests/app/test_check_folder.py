@@ -322,6 +322,7 @@ def test_folders_that_cannot_be_judged(tmp_path, capsys):
     whole = made.write()
     answer = said(capsys, whole, "--json")  # one cycle: of the poses nothing, of the circle all
     assert set(answer.lines[0]) == {"circle", "notes"}
+    assert "left out: all poses, as none was attained 3 times" in answer.lines[0]["notes"]
     refused(said(capsys, whole, "--closed"), "no motions with the loop closed")
     (whole / "motion.toml").write_text("motion = 3")
     refused(said(capsys, whole), "motion.toml", "not a motion file")

@@ -60,9 +60,7 @@ def judge(attained: Attained) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     notes = list(attained.notes)
     seldom = _too_seldom(by_test["pose"])
-    if seldom is not None:
-        notes.insert(0, seldom)
-    elif by_test["pose"]:
+    if by_test["pose"] and seldom is None:
         facts |= _poses(by_test["pose"], notes)
     if by_test["path"]:
         paths = _groups(by_test["path"], lambda row: row.approach or "path")
@@ -70,7 +68,8 @@ def judge(attained: Attained) -> dict[str, Any]:
     if by_test["circle"]:
         facts["circle"] = _circle(by_test["circle"], attained.turns)
     if not facts:
-        raise InputError("; ".join(["nothing can be judged", *notes]))
+        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *notes]))
+    notes += [f"left out: all poses, as none was attained {iso9283.LEAST} times"] if seldom else []
     return facts | {"notes": notes}
 
 
