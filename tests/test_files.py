@@ -196,6 +196,10 @@ def test_tables_are_read_as_cells(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text('\ufeffname,x\n"a, b",1\n\n"two\nlines",2\n', encoding="utf-8")
     assert read_table(path) == [["name", "x"], ["a, b", "1"], [], ["two\nlines", "2"]]
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        path.write_text(f"a{mark}b\n1{mark}2\n")
+        with pytest.raises(InputError, match=rf"table\.csv: line 1: columns are parted by {name}"):
+            read_table(path)
     path.write_text("x" * 200_000)
     with pytest.raises(InputError, match=r"table\.csv: not a table: field larger than field limit"):
         read_table(path)

@@ -37,12 +37,16 @@ def read_table(path: str | Path) -> list[list[str]]:
     """Read a CSV file into rows of cells; a byte-order mark before the first is left out.
 
     Raises:
-        InputError: missing, unreadable, not text or not a table.
+        InputError: missing, unreadable, not text or not a table, or one whose cells are parted by semicolons or tabs.
     """
     try:
-        return list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
+        rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
     except csv.Error as error:
         raise InputError(f"{path}: not a table: {error}") from None
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if rows and len(rows[0]) == 1 and mark in rows[0][0]:
+            raise InputError(f"{path}: line 1: columns are parted by {name}; save it with commas between them")
+    return rows
 
 
 class _Named(io.FileIO):

@@ -102,6 +102,11 @@ def test_plan(tmp_path, capsys):
     assert (np.diff(facts["sigma_m"]) < 0).all()
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
     refused(said(capsys, "plan", "--model", "six_r", "--rig", tmp_path / "rig.json"), "--data")
+    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.toml"), "plan.toml", ".csv")
+    told = said(capsys, "plan", "--model", "six_r", "-n", "5", "-o", tmp_path / "plan.csv").out
+    for q in np.degrees(facts["q_rad"]):
+        assert all(f"{v:.2f}" in told for v in q)
+    assert told.endswith(f"written: {tmp_path / 'plan.csv'}\n")
 
 
 @pytest.mark.parametrize(

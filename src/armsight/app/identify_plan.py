@@ -111,7 +111,14 @@ def plan_text(plan: Plan) -> str:
             else f"more than {len(plan.random_sigma_m) - 1} at random would do"
         )
         lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({told})" if k else ""))
-    lines.append("come to each from the side given, over the last half degree in a second or two")
+    lines.append(
+        "joints, deg; come to each from the side given (+: its angle grew), over the last half degree in a second or two:"
+    )
+    for k, (q, side) in enumerate(zip(plan.q, plan.approach, strict=True), 1):
+        lines.append(
+            f"  {k:3d} "
+            + "".join(f"{np.degrees(v):9.2f} {'+' if s > 0 else '-'}" for v, s in zip(q, side, strict=True))
+        )
     return "\n".join(lines)
 
 

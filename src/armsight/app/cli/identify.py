@@ -117,6 +117,8 @@ def plan(
     if rig is not None and data is None:
         raise InputError("--rig needs --data: without any pose measured, where the arm is to the cameras is not known")
     if out is not None:
+        if out.suffix != ".csv":
+            raise InputError(f"{out}: poses are written as .csv; name it so")
         check_writable(out, apart_from=(data, rig))
     with steps() as progress:
         progress("choosing poses")
@@ -129,6 +131,8 @@ def plan(
         click.echo(json.dumps({**facts, "random_sigma_m": chosen.random_sigma_m.tolist()}))
     else:
         click.echo(plan_text(chosen))
+        if out is not None:
+            click.echo(f"\nwritten: {out}")
 
 
 def _priors(texts: tuple[str, ...]) -> dict[str, float]:
