@@ -1,22 +1,27 @@
-"""What is wrong with data that fit an arm far too badly: units, order or signs of the joints; and what to do.
+"""What is wrong with data that fit an arm far too badly, and what to do.
 
-The linear placement (``place``) needs no start and gives a scale for free; it is tried for every order and sign of the
-joints on a few poses. A cheap arm is off by 10 to 15 mm; data that are off by a tenth of the space they span are of
-another arm, or another order.
+Units, order or signs of the joints, a left-handed frame of the instrument, angles read in another way.
+The linear placement (``place``) needs no start and gives a scale and a handedness for free; it is tried for every order
+and sign of the joints on a few poses. A cheap arm is off by 10 to 15 mm; data that are off by a tenth of the space they
+span are of another arm, or another order. Of the explanations that fit alike the one with the fewest mistakes is told.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.loop.handeye_start import kronecker
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.place import linear_placement
+from armsight.loop.identify.place import linear_placement, turn_between
+from armsight.loop.identify.priors import SIGMA
+from armsight.loop.identify.read import TURNS, AnglesMeasured, turned
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain
 
@@ -24,10 +29,18 @@ from armsight.robot.kinematics import chain
 BAD_SHARE, BAD_M = 0.08, 0.015
 #: A proposal must be this many times better than what was given.
 BETTER = 4.0
+#: Only what fits this many times better is told from something simpler. A wrong sign that hardly moves the tool can take
+#: up a part of the arm's own errors by chance; to halve them it must lie along them to a cosine of 0.87, which, as these
+#: errors have some 15 independent directions (zeros, lengths and angles), is 3.4 sigma.
+CLEAR = 2.0
+#: Fits better than this, m and rad, are alike: files are rounded, instruments tell hundredths of a degree.
+ALIKE_M, ALIKE_RAD = 1e-6, np.deg2rad(0.01)
 #: A scale off by more than this is a unit.
 SCALE_OFF = 0.2
-#: Poses looked at.
-POSES = 80
+#: Turns off by more than this, rad, are not of this arm: twice what is known of zeros and twists, all six joints together.
+BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
+#: Poses looked at, and those that every order and sign is tried on.
+POSES, FEW = 80, 24
 #: What joint angles may have been multiplied by.
 _ANGLES = (
     (np.pi / 180, "degrees; name the columns q1_deg .. q6_deg"),
@@ -36,13 +49,57 @@ _ANGLES = (
 #: Orders whose signs are tried, best first.
 ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
+_GIVEN = tuple(range(6))
+
+
+class Off(NamedTuple):
+    """How far points are off an arm, RMS, m: in a right-handed frame, in a left-handed one; and the points' scale."""
+
+    right: float
+    left: float
+    scale: float
+
+
+class Mistakes(NamedTuple):
+    """The column each joint stands in, each joint's sign, whether the frame is left-handed; and how far off that is, m."""
+
+    order: tuple[int, ...]
+    signs: tuple[int, ...]
+    left: bool
+    off: float
+
+    @property
+    def number(self) -> int:
+        """How many mistakes these are: signs, a frame, and exchanges of two columns that make the order."""
+        cycles = {frozenset(_cycle(self.order, i)) for i in _GIVEN}
+        return self.signs.count(-1) + self.left + 6 - len(cycles)
+
+    @property
+    def told(self) -> str:
+        """The mistakes in words."""
+        told = [
+            "two of the instrument's axes are swapped, or one's sign is turned (its frame is left-handed)"
+        ] * self.left
+        if self.order != _GIVEN:
+            told.append("the joints' order is " + ", ".join(f"q{i + 1}" for i in self.order))
+        if -1 in self.signs:
+            told.append("the sign is turned of joint " + ", ".join(str(i + 1) for i in _GIVEN if self.signs[i] < 0))
+        return " and ".join(told)
+
+
+def _cycle(order: tuple[int, ...], start: int) -> list[int]:
+    """Return the columns that change places with one another, from one of them on."""
+    out = [start]
+    while order[out[-1]] != start:
+        out.append(order[out[-1]])
+    return out
 
 
 def check_plausible(arm: Arm, measured: Measured) -> None:
     """Refuse data that cannot be of this arm, with what would make them fit.
 
     Raises:
-        InputError: with the unit, the order or the signs that fit, or that none does.
+        InputError: with the unit, the order, the signs, the frame or the reading of angles that fit, or that none does.
     """
     if np.abs(measured.q).max() > chain.MOST_RADIANS:
         row, joint = divmod(int(np.argmax(np.abs(measured.q))), 6)
@@ -52,31 +109,35 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
         )
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
     q, p = measured.q[rows], measured.p_rig[rows]
-    off, scale = misfit(arm, q, p)
-    span = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=2))))
+    off, _, scale = misfit(arm, q, p)
     scaled = abs(np.log(scale)) > np.log1p(SCALE_OFF)
-    good = off < max(BAD_SHARE * span, BAD_M * (scale if scaled else 1.0))
+    good = off < max(BAD_SHARE * _span(p), BAD_M * (scale if scaled else 1.0))
     if good and not scaled:
+        _check_turns(arm, measured, rows)
         return
     told = _angles(arm, q, p, off)
     if told is None:
-        told = _unit(scale) if good else _proposal(arm, q, p, off, max(BAD_SHARE * span, BAD_M))
+        told = _unit(scale) if good else _proposal(arm, q, p, off)
     raise InputError(told or _no_arm(off))
 
 
-def misfit(arm: Arm, q: Array, p_rig: Array) -> tuple[float, float]:
-    """Return the RMS distance of points from an arm placed freely, m as measured, and the scale of the points."""
+def misfit(arm: Arm, q: Array, p_rig: Array) -> Off:
+    """Return how far points (N, K, 3) are off an arm placed freely at q (N, 6), in frames of either hand."""
     T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
     R, o = T[:, :3, :3], T[:, :3, 3]
     M, _, t = linear_placement(R, o, p_rig)
     scale = float(np.cbrt(abs(np.linalg.det(M))))
     if not scale > 1e-12:
-        return np.inf, 1.0
+        return Off(np.inf, np.inf, 1.0)
     U, _, Vt = np.linalg.svd(M)
-    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt * scale
-    e = p_rig @ turn.T - (o[:, None] + (R @ t.T).swapaxes(1, 2))
-    e -= e.mean(axis=(0, 1))
-    return float(np.sqrt(np.mean(np.sum(e**2, axis=2)))) / scale, 1 / scale
+    there = o[:, None] + (R @ t.T).swapaxes(1, 2)
+    offs = []
+    for hand in (1.0, -1.0):
+        turn = U @ np.diag([1.0, 1.0, hand * np.linalg.det(U @ Vt)]) @ Vt * scale
+        e = p_rig @ turn.T - there
+        e -= e.mean(axis=(0, 1))
+        offs.append(float(np.sqrt(np.mean(np.sum(e**2, axis=2)))) / scale)
+    return Off(offs[0], offs[1], 1 / scale)
 
 
 def _unit(scale: float) -> str:
@@ -93,55 +154,141 @@ def _angles(arm: Arm, q: Array, p: Array, off: float) -> str | None:
     """Return the unit of the joint angles that makes the data fit, scale and all, or None."""
     for factor, what in _ANGLES:
         if np.abs(q * factor).max() < chain.MOST_RADIANS:
-            better, scale = misfit(arm, q * factor, p)
+            better, _, scale = misfit(arm, q * factor, p)
             if abs(np.log(scale)) < np.log1p(SCALE_OFF) and better < off / BETTER:
-                return (
-                    f"the arm's motions fit if the joint angles are in {what} (off by {1e3 * off:.0f} mm as they are)"
-                )
+                return f"the motions fit if the joint angles are in {what} (off by {1e3 * off:.0f} mm as they are)"
     return None
 
 
-def _proposal(arm: Arm, q: Array, p: Array, off: float, bad: float) -> str | None:
-    """Return the order and the signs that make the data fit, or None."""
-    order, signs, best = _search(arm, q, p)
-    if best > min(off / BETTER, bad):
+def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str | None:
+    """Return the frame, the order and the signs that make the data fit, or None."""
+    unit = min((1.0, 1e-3, 1e3), key=lambda u: abs(np.log(_span(p) / _span(arm.forward(q)[:, None, :3, 3]) / u)))
+    p = p / unit
+    # Not the larger of the two, as for data as they are given: of thousands of ways some fit roughly by chance.
+    alike = _search(arm, q, p, min(off / BETTER, BAD_M, BAD_SHARE * _span(p)))
+    if not alike:
         return None
-    told = []
-    if order != tuple(range(6)):
-        told.append("the joints' order is " + ", ".join(f"q{i + 1}" for i in order))
-    if (signs < 0).any():
-        told.append("the sign is turned of joint " + ", ".join(str(i + 1) for i in np.flatnonzero(signs < 0)))
+    best = alike[0]
+    told = (
+        f"the data fit this arm if {best.told}{'' if unit == 1.0 else f' and the points are in {_SCALES[unit]}'} (off by "
+        f"{1e3 * off:.0f} mm as they are, {1e3 * best.off:.1f} mm so): put the columns right"
+    )
+    other = next((m for m in alike if m.left != best.left and m.number <= best.number + 1), None)
+    if other is not None:
+        told += f"; as well, these data cannot tell which, if {other.told}"
+    flipped = [tuple(-s if i == j else s for i, s in enumerate(best.signs)) for j in _GIVEN]
+    either = [str(j + 1) for j in _GIVEN if any(m[:3] == (best.order, flipped[j], best.left) for m in alike)]
+    return told + (f"; whether the sign of joint {', '.join(either)} is right they cannot tell" if either else "")
+
+
+def _span(p: Array) -> float:
+    """Return how far points (N, K, 3) spread about their middle, RMS."""
+    return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=2))))
+
+
+def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
+    """Return what fits within a limit, and as well as anything does, fewest mistakes first.
+
+    Signs in the given order and every order with the given signs are tried, then both together where neither fits.
+    """
+    few = np.linspace(0, len(q) - 1, min(FEW, len(q))).astype(int)
+    signs = list(itertools.product((1, -1), repeat=6))
+    tried = _tried(arm, q[few], p[few], ((_GIVEN, s) for s in signs))
+    orders = sorted(
+        _tried(arm, q[few], p[few], ((o, signs[0]) for o in itertools.permutations(_GIVEN))), key=lambda m: m.off
+    )
+    found = _fitting(arm, q, p, [*tried, *orders], limit)
+    if not found:
+        best = list(dict.fromkeys(m.order for m in orders))[:ORDERS]
+        found = _fitting(arm, q, p, _tried(arm, q[few], p[few], itertools.product(best, signs)), limit)
+    return found
+
+
+def _tried(arm: Arm, q: Array, p: Array, ways: Iterable[tuple[tuple[int, ...], tuple[int, ...]]]) -> list[Mistakes]:
+    """Return how far off the points are in each order and with each signs, in frames of either hand."""
+    out = []
+    for order, signs in ways:
+        at = misfit(arm, q[:, order] * signs, p)
+        if abs(np.log(at.scale)) < np.log1p(SCALE_OFF):
+            out += [Mistakes(order, signs, False, at.right), Mistakes(order, signs, True, at.left)]
+    return out
+
+
+def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) -> list[Mistakes]:
+    """Return those that fit all poses within a limit and about as well as the best, fewest mistakes first."""
+    near = CLEAR * max(min((m.off for m in tried), default=np.inf), ALIKE_M)
+    every = [
+        again
+        for order, signs in dict.fromkeys(m[:2] for m in tried if m.off < min(CLEAR * near, CLEAR * limit))
+        for again in _tried(arm, q, p, [(order, signs)])
+    ]
+    best = max(min((m.off for m in every), default=np.inf), ALIKE_M)
+    if best > limit:
+        return []
+    return sorted((m for m in every if m.off < CLEAR * best), key=lambda m: (m.number, m.off))
+
+
+def _check_turns(arm: Arm, measured: Measured, rows: Array) -> None:
+    """Refuse turns of the body that are not those of the arm, where its places are."""
+    if measured.R_rig_body is None:
+        return
+    q, p, R = measured.q[rows], measured.p_rig[rows], measured.R_rig_body[rows]
+    off = turn_misfit(arm, q, R)
+    told = None
+    if off > ALIKE_RAD:
+        if isinstance(measured, AnglesMeasured):
+            told = _reading(arm, q, measured.angles_deg[rows], off, measured.turns)
+        told = told or _turned_signs(arm, q, p, R, off)
+    if told is None and off > BAD_RAD:
+        told = (
+            f"these turns are not of this arm, whose places fit: they are off by {np.degrees(off):.0f} deg, and no reading "
+            "of them and no sign of a joint mends it; leave them out, or put them right"
+        )
+    if told is not None:
+        raise InputError(told)
+
+
+def turn_misfit(arm: Arm, q: Array, R_rig_body: Array) -> float:
+    """Return how far turns (N, 3, 3) are off an arm placed freely at q (N, 6): the median angle, rad."""
+    A = arm.forward(q)
+    B = np.tile(np.eye(4), (len(q), 1, 1))
+    B[:, :3, :3] = R_rig_body
+    X, Z = kronecker(A, B)
+    return float(np.median(turn_between(A[:, :3, :3] @ X[:3, :3], Z[:3, :3] @ R_rig_body)))
+
+
+def _reading(arm: Arm, q: Array, angles_deg: Array, off: float, given: str) -> str | None:
+    """Return the reading of the angles that clearly fits better, or None."""
+    offs = {name: turn_misfit(arm, q, turned(angles_deg, name)) for name in TURNS}
+    best = min(offs, key=lambda name: offs[name])
+    if max(offs[best], ALIKE_RAD) > min(off / CLEAR, BAD_RAD):
+        return None
+    same = [name for name in TURNS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one
     return (
-        f"the data fit this arm if {' and '.join(told)} (off by {1e3 * off:.0f} mm as they are, {1e3 * best:.1f} mm so): "
-        "put the columns right"
+        f"the turns fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as {given} (off by "
+        f"{np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): give --turns {same[0]}"
     )
 
 
-def _search(arm: Arm, q: Array, p: Array) -> tuple[tuple[int, ...], Array, float]:
-    """Return the order and the signs that fit best: signs in the given order, then every order, then both."""
-    signs = [np.array(s, float) for s in itertools.product((1.0, -1.0), repeat=6)]
-    few = np.linspace(0, len(q) - 1, min(24, len(q))).astype(int)
-
-    def off(order: tuple[int, ...], sign: Array, rows: NDArray[np.int64]) -> float:
-        return misfit(arm, q[rows][:, order] * sign, p[rows])[0]
-
-    same = tuple(range(6))
-    best = min((off(same, s, few), 0, same, i) for i, s in enumerate(signs))
-    orders = sorted((off(order, signs[0], few), order) for order in itertools.permutations(range(6)))
-    tried = [best, (orders[0][0], 1, orders[0][1], 0)]
-    every = np.arange(len(q))
-    _, _, order, i = min(tried, key=lambda t: t[0])
-    found = off(order, signs[i], every)
-    if found > off(same, signs[0], every) / BETTER:
-        both = min((off(order, s, few), order, i) for _, order in orders[:ORDERS] for i, s in enumerate(signs))
-        order, i, found = both[1], both[2], off(both[1], signs[both[2]], every)
-    return order, signs[i], found
+def _turned_signs(arm: Arm, q: Array, p: Array, R: Array, off: float) -> str | None:
+    """Return the fewest signs that make the turns fit where the places, which hardly tell them, fit as well, or None."""
+    near = CLEAR * max(misfit(arm, q, p).right, ALIKE_M)
+    ways = _tried(arm, q, p, ((_GIVEN, s) for s in itertools.product((1, -1), repeat=6)))
+    fits = {m: turn_misfit(arm, q * m.signs, R) for m in ways if not m.left and m.off < near}
+    best = max(min(fits.values(), default=np.inf), ALIKE_RAD)
+    if best > min(off / BETTER, BAD_RAD):
+        return None
+    told = min((m for m, at in fits.items() if at < CLEAR * best), key=lambda m: (m.number, fits[m]))
+    return (
+        f"the turns fit this arm if {told.told} (off by {np.degrees(off):.1f} deg as they are, "
+        f"{np.degrees(fits[told]):.2f} deg so): put the columns right"
+    )
 
 
 def _no_arm(off: float) -> str:
     return (
-        f"these data are not of this arm: placed as well as can be it is off by {1e3 * off:.0f} mm; no unit, order or sign "
-        "of the joints mends it. Is it the right model, with the table's right convention?"
+        f"these data are not of this arm: placed as well as can be it is off by {1e3 * off:.0f} mm; no unit, frame, order "
+        "or sign of the joints mends it. Is it the right model, with the table's right convention?"
     )
 
 

@@ -8,6 +8,7 @@ approach6 (1, -1, 0).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,19 @@ from armsight.loop.identify.measured import Measured
 #: How three angles are meant: a rotation vector, or turns about x, y, z in this order; capitals: about turned axes.
 TURNS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AnglesMeasured(Measured):
+    """Full poses whose turns came as three angles, which may be meant in another way than was said.
+
+    Attributes:
+        angles_deg: (N, 3) rx, ry, rz as they stand in the file, degrees.
+        turns: how they were said to be meant, one of TURNS.
+    """
+
+    angles_deg: Array
+    turns: str
 
 
 class Read(NamedTuple):
@@ -165,7 +179,8 @@ def _measured(path: str | Path, at: dict[str, Array], turns: str | None) -> Meas
         return Measured(q, p, None, None, approach)
     if p.shape[1] != 1:
         raise InputError(f"{path}: angles go with one point, p1; there are {p.shape[1]}")
-    return Measured(q, p, _turns(at, turns), None, approach)
+    angles = np.stack([at[f"r{axis}_deg"] for axis in "xyz"], axis=1)
+    return AnglesMeasured(q, p, turned(angles, turns), None, approach, angles_deg=angles, turns=turns)
 
 
 def _rotations(path: str | Path, at: dict[str, Array]) -> Array:
@@ -178,13 +193,12 @@ def _rotations(path: str | Path, at: dict[str, Array]) -> Array:
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 
-def _turns(at: dict[str, Array], turns: str) -> Array:
-    angles = {axis: at[f"r{axis}_deg"] for axis in "xyz"}
-    order = "xyz" if turns == "rotvec" else turns.lower()
-    given = np.radians(np.stack([angles[axis] for axis in order], axis=1))
-    return np.asarray(
-        (Rotation.from_rotvec(given) if turns == "rotvec" else Rotation.from_euler(turns, given)).as_matrix()
-    )
+def turned(angles_deg: Array, turns: str) -> Array:
+    """Return the turns (N, 3, 3) that angles rx, ry, rz (N, 3), degrees, mean in one of the ways of TURNS."""
+    if turns == "rotvec":
+        return np.asarray(Rotation.from_rotvec(np.radians(angles_deg)).as_matrix())
+    given = np.radians(angles_deg[:, ["xyz".index(axis) for axis in turns.lower()]])
+    return np.asarray(Rotation.from_euler(turns, given).as_matrix())
 
 
 def _covariance(path: str | Path, at: dict[str, Array], R: Array) -> Array:
