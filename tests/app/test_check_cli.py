@@ -253,3 +253,40 @@ def test_mistakes(tmp_path, capsys):
     refused(said(capsys, bad), "circle", "clockwise")
     bad.write_text("pose,x_m\nP1,0\n")
     refused(said(capsys, bad), "y_m", "missing")
+
+
+def changed(row, **cells):
+    """A row with other cells."""
+    names = [*COLUMNS, *COMMAND, *SIGMA]
+    return [cells.get(name, cell) for name, cell in zip(names, row, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: [changed(r, sigma_y_m=-1e-4) for r in rows], ["line 2", "sigma_y_m", "below zero"]),
+        (lambda rows: [changed(r, sigma_y_m="") for r in rows], ["line 2", "sigma_y_m is missing"]),
+        (lambda rows: [changed(r, command_qw="") for r in rows], ["line 2", "command_qw is missing"]),
+        (lambda rows: [changed(r, pose="") for r in rows[:1]] + rows[1:], ["line 2", "pose is empty"]),
+        (lambda rows: [*rows, rows[3]], ["P4", "twice", "cycle 0"]),
+        (lambda rows: [changed(rows[0], command_x_m=0.5), *rows[1:]], ["P1", "several commands"]),
+        (lambda rows: [changed(r, x_m=1e3 * r[5]) for r in rows], ["mm from their commands", "in m"]),
+        (lambda rows: [changed(r, x_m=r[6], y_m=r[5]) for r in rows], ["mm from their commands", "frame"]),
+    ],
+)
+def test_what_no_arm_attains_is_refused(tmp_path, capsys, change, words):
+    rows = [row for row in rows_of() if row[0] == "pose" and row[2] < 5]
+    refused(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *words)
+
+
+def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp_path, capsys):
+    rows = [changed(row, cycle="", t_s="", x_m=round(row[5], 3), y_m=round(row[6], 3), z_m=round(row[7], 3))
+            for row in rows_of() if row[0] == "pose" and row[2] < 5]  # fmt: skip
+    answer = said(capsys, file_of(tmp_path / "round.csv", [row[: -len(SIGMA)] for row in rows]))
+    assert answer.code == 0
+    assert "noise is taken for none" in answer.err
+
+
+def test_a_motion_file_is_told_from_what_was_attained(tmp_path, capsys):
+    assert said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
+    refused(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")

@@ -20,6 +20,12 @@ TESTS = ("pose", "path", "circle")
 _TEXTS = ("test", "pose", "cycle", "approach")
 _PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
 NEEDED = ("pose", *_PLACE, *(f"command_{name}" for name in _PLACE))
+#: Columns that go with each other: what stands before the names, and the names.
+_TOGETHER = (("command", _TURN), ("sigma", _PLACE), ("sigma_common", _PLACE))
+#: An arm that is further off its commands than this is none: units or frames are mixed up.
+_FAR_M = 0.1
+#: Commands of one pose differ by rounding at most, m (and its turn's matrix).
+_SAME_M = 1e-5
 _COLUMNS = (
     *_TEXTS,
     "t_s",
@@ -99,6 +105,7 @@ def read_rows(file: Path) -> list[Row]:
     missing = [name for name in NEEDED if name not in header]
     if missing:
         hint = "; of a run give the folder" if "phase" in header else ""
+        hint = "; a motion file is for armsight run --motion" if file.suffix == ".toml" else hint
         raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
     rows = []
     for line, cells in enumerate(table[1:], start=2):
@@ -107,7 +114,30 @@ def read_rows(file: Path) -> list[Row]:
             rows.append(_row(f"{file}: line {line}", named))
     if not rows:
         raise InputError(f"{file}: no rows; one line an attained pose is needed")
+    _require_sense(file, rows)
     return rows
+
+
+def _require_sense(file: Path, rows: list[Row]) -> None:
+    """Raise InputError where rows cannot be what an arm attained: twice the same, or nowhere near the commands."""
+    seen: set[tuple[object, ...]] = set()
+    sent: dict[str, Array] = {}
+    for row in rows:
+        what = (row.test, row.pose, row.cycle, row.approach, row.t_s, *row.T[:3].ravel())
+        if row.cycle and what in seen:
+            raise InputError(
+                f"{file}: pose {row.pose} stands there twice, in cycle {row.cycle} and to the last digit; once is enough"
+            )
+        seen.add(what)
+        apart = row.T_command - sent.setdefault(row.pose, row.T_command) if row.test == "pose" else np.zeros(1)
+        if np.abs(apart).max() > _SAME_M:
+            raise InputError(f"{file}: pose {row.pose} has several commands; give each place a name of its own")
+    off_m = float(np.median([np.linalg.norm(row.T[:3, 3] - row.T_command[:3, 3]) for row in rows]))
+    if off_m > _FAR_M:
+        raise InputError(
+            f"{file}: half of the rows are more than {1e3 * off_m:.0f} mm from their commands: both must be in m, in one "
+            "frame, and their columns in order"
+        )
 
 
 def _row(where: str, cells: dict[str, str]) -> Row:
@@ -128,6 +158,15 @@ def _row(where: str, cells: dict[str, str]) -> Row:
     for name in NEEDED[1:]:
         if name not in numbers:
             raise InputError(f"{where}: {name} is empty")
+    if not cells["pose"]:
+        raise InputError(f"{where}: pose is empty; it needs a name")
+    for part in (_TURN, *(tuple(f"{kind}_{name}" for name in names) for kind, names in _TOGETHER)):
+        lost = [name for name in part if name not in numbers]
+        if 0 < len(lost) < len(part):
+            raise InputError(f"{where}: {lost[0]} is missing, though others of {', '.join(part)} are there")
+    for name in (f"{kind}_{name}" for kind in ("sigma", "sigma_common") for name in _PLACE):
+        if numbers.get(name, 0.0) < 0.0:
+            raise InputError(f"{where}: {name} is {numbers[name]:g}; a standard deviation is never below zero")
     covs = [np.diag([numbers.get(f"{kind}_{name}", 0.0) ** 2 for name in _PLACE]) for kind in ("sigma", "sigma_common")]
     return Row(
         test,

@@ -40,7 +40,9 @@ def read_check(path: Path, *, closed: bool = False) -> Attained:
         return attained_in(path, closed=closed)
     if closed:
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
-    return Attained(read_rows(path / "check.csv" if path.is_dir() else path), [], [])
+    rows = read_rows(path / "check.csv" if path.is_dir() else path)
+    untold = not any(row.cov.any() for row in rows)
+    return Attained(rows, ["no sigma_x_m .. are given: the instrument's noise is taken for none"] if untold else [], [])
 
 
 def judge(attained: Attained) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def judged(data: Path, closed: bool, out: Path | None, as_json: bool) -> None:
         return
     click.echo(text(facts))
     if out is not None:
-        click.echo(f"\nwritten: {out}/report.html, check.json, check.csv")
+        click.echo(f"\nwritten: {out}/report.html with its figures as PNG, check.json, check.csv")
 
 
 @command.command("plan")
