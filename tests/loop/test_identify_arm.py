@@ -242,7 +242,7 @@ def test_poses_all_alike_are_refused(scene):
 
 def test_too_few_poses_are_refused_and_few_are_enough_for_little(scene):
     w, measured, _, _ = scene
-    with pytest.raises(InputError, match="fewer than 4"):
+    with pytest.raises(InputError, match="fewer than 6"):
         identify(w.nominal, measured.rows(np.arange(3)))
     found = identify(w.nominal, measured.rows(np.arange(10)))
     assert found.solution.free.sum() < 60

@@ -28,7 +28,7 @@ from armsight.loop.identify.priors import prior_sigma
 from armsight.robot.arm import Arm
 
 #: Fewest poses: what places base and tool, with some to spare.
-LEAST_POINTS, LEAST_FULL = 6, 4
+LEAST = 6
 #: Joints that move less than this, rad, do not move.
 ALIKE = 0.02
 #: Poses that tell which causes there are; the final fit is to all of them.
@@ -218,10 +218,9 @@ def _first(model: Model, x: Array, measured: Measured, prior: Array) -> Solution
 
 
 def _require_enough(measured: Measured) -> None:
-    least = LEAST_POINTS if measured.R_rig_body is None else LEAST_FULL
-    if len(measured) < least:
+    if len(measured) < LEAST:
         raise InputError(
-            f"{len(measured)} poses are fewer than {least}, which base and tool alone need; 50 and more are advised"
+            f"{len(measured)} poses are fewer than {LEAST}, which base and tool alone need; 50 and more are advised"
         )
     if np.ptp(measured.q, axis=0).max() < ALIKE:
         raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
