@@ -51,7 +51,7 @@ def test_from_files_to_files(tmp_path, capsys):
     assert json.loads((out / "identify.json").read_text())["parameters"] == facts["parameters"]
     page = (out / "report.html").read_text()
     assert page.count("<img") == 5
-    assert "http" not in page.split("</style>")[1]
+    assert "://" not in page.split("</style>")[1]
     arm, urdf = open_model(str(out / "corrected.toml")), open_model(str(out / "corrected.urdf"))
     np.testing.assert_allclose(arm.forward(np.ones(6)), urdf.forward(np.ones(6)), atol=1e-9)
 

@@ -245,7 +245,7 @@ def test_too_few_poses_are_refused_and_few_are_enough_for_little(scene):
     with pytest.raises(InputError, match="fewer than 6"):
         identify(w.nominal, measured.rows(np.arange(3)))
     found = identify(w.nominal, measured.rows(np.arange(10)))
-    assert found.solution.free.sum() < 60
+    assert not found.solution.free.all()  # some are frozen, and say why
     q, approach = poses(w.nominal, 100, np.random.default_rng(5))
     truth = w.T_rig_body(q, approach)
     before, after = (distance_m(found.model, x, truth, q, approach).mean() for x in (found.nominal, found.solution.x))
