@@ -9,7 +9,7 @@ demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held
 	$(BIN)/armsight demo -o demo
 
 test: $(VENV)/.armsight-test lint  ## everything that must hold
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile
 
 lint: $(VENV)/.armsight-test
 	$(BIN)/ruff check .

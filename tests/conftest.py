@@ -1,6 +1,7 @@
 """What tests share: one fixed hypothesis profile, the place of the real recordings, the firmware of this computer."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # The same examples on every machine and in every run; no database, no clock.
 settings.register_profile("ci", derandomize=True, max_examples=60, deadline=None, database=None)
 settings.load_profile("ci")
+
+# A shell's job in the background is started with interrupts ignored; tests of interrupts, and what they start, need them.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -268,6 +268,7 @@ def changed(row, **cells):
         (lambda rows: [changed(r, sigma_y_m="") for r in rows], ["line 2", "sigma_y_m is missing"]),
         (lambda rows: [changed(r, command_qw="") for r in rows], ["line 2", "command_qw is missing"]),
         (lambda rows: [changed(r, pose="") for r in rows[:1]] + rows[1:], ["line 2", "pose is empty"]),
+        (lambda rows: [rows[0][:1], *rows[1:]], ["line 2", "pose is empty"]),
         (lambda rows: [*rows, rows[3]], ["P4", "twice", "cycle 0"]),
         (lambda rows: [changed(rows[0], command_x_m=0.5), *rows[1:]], ["P1", "several commands"]),
         (lambda rows: [changed(r, x_m=1e3 * r[5]) for r in rows], ["mm from their commands", "in m"]),

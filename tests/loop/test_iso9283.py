@@ -40,6 +40,14 @@ def test_without_noise_the_figures_are_the_standards():
     np.testing.assert_allclose(figures.repeatability_turn, 3e-3, rtol=0.5)  # 30 numbers: 13 % sigma
 
 
+@pytest.mark.parametrize("n", [3, 5, 30])
+def test_the_best_value_lies_within_its_interval(n):
+    for seed in range(40):
+        figure = iso9283.pose_figures(*attained(seed, n, noise=1e-4)).repeatability
+        if figure.clean is not None:
+            assert figure.low <= figure.clean <= figure.high
+
+
 def population(cov):
     """RP of a normal scatter, by very many places."""
     at = np.random.default_rng(0).multivariate_normal(np.zeros(3), cov, 400_000)

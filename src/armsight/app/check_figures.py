@@ -11,6 +11,7 @@ from armsight.app.check_rows import Row
 from armsight.app.check_words import direction
 from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice
 from armsight.data import Array
+from armsight.loop.iso9283_path import square_to
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +25,8 @@ _VIEWS = ((0, 1, "from above"), (0, 2, "from the side"))
 
 def scatter_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | None:
     """Draw the attained places of each pose about their middle, coloured by when, and RP as a circle."""
+    from matplotlib.ticker import MaxNLocator
+
     names = list(facts.get("poses", {}))[:_MOST]
     if not names:
         return None
@@ -49,10 +52,12 @@ def scatter_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | No
             if row == 1:
                 ax.set_xlabel("x, mm")
             if column == 0:
-                ax.set_ylabel(f"{view}\n{'xyz'[j]}, mm")
+                ax.set_ylabel(f"{'xyz'[j]}, mm ({view})")
     panels[0, 0].set_xlim(-1e3 * reach, 1e3 * reach)
     panels[0, 0].set_ylim(-1e3 * reach, 1e3 * reach)
-    figure.colorbar(dots, ax=panels, label="time round", shrink=0.7)
+    bar = figure.colorbar(dots, ax=panels, label="time round", shrink=0.7)
+    bar.locator = MaxNLocator(integer=True)
+    bar.update_ticks()
     return figure
 
 
@@ -104,7 +109,7 @@ def drift_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | None
     ax.axhline(0, color="#e4e7eb", lw=0.8, zorder=0)
     ax.set_xlabel("s")
     ax.set_ylabel(f"{d['pose']} about its middle, mm")
-    ax.legend(loc="upper right", ncols=4)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4)
     return figure
 
 
@@ -123,10 +128,11 @@ def paths_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | None
         for cycle in sorted(cycles):
             chosen = [r for r in rows if r.test == "path" and (r.approach or "path") == name and r.cycle == cycle]
             off = np.array([(row.T - row.T_command)[:3, 3] for row in chosen])
+            off = (square_to(np.array([row.T_command[:3, 3] for row in chosen])) @ off[..., None])[..., 0]
             ax.plot(share, 1e3 * np.linalg.norm(off, axis=1), color=colour, lw=0.5, alpha=0.5)
     ax.set_ylim(bottom=0)
     ax.set_xlabel("of the way, %")
-    ax.set_ylabel("distance from the path, mm")
+    ax.set_ylabel("distance from the path, mm\n(thick: of the mean path)")
     ax.legend()
     return figure
 
@@ -151,7 +157,7 @@ def circle_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | Non
     for k in range(4):
         jumps = " / ".join(f"{1e3 * s[k]:+.3f}" for s in c["steps_m"])
         ax.annotate(
-            f"jump\n{jumps}", (np.radians(90 * k), -1.5 * span), ha="center", va="center", color=INK, fontsize=8
+            f"jump, mm\n{jumps}", (np.radians(90 * k), -1.5 * span), ha="center", va="center", color=INK, fontsize=8
         )
     told: list[float] = []
     for turn in c["turns"]:
@@ -164,7 +170,7 @@ def circle_figure(facts: Mapping[str, Any], rows: Sequence[Row]) -> Figure | Non
         ax.annotate(label, (at, 1.3 * span), ha="center", va="center", color=RED, fontsize=8)
     first, second = (direction(axis) for axis in c["axes"])
     ax.set_title(
-        f"radius {1e3 * c['radius_m']:.1f} mm, rings {step:g} mm apart; 0 deg is towards {first}, 90 deg towards {second}"
+        f"radius {1e3 * c['radius_m']:.1f} mm, grey rings {step:g} mm off; 0 deg is along {first}, 90 deg along {second}"
     )
     ax.legend(loc="lower left", bbox_to_anchor=(-0.35, -0.02))
     return figure

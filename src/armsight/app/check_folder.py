@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.check_paths import path_rows, turns_of
-from armsight.app.check_rows import Attained, Row
+from armsight.app.check_rows import SAME_M, Attained, Row
 from armsight.app.check_stretch import Noise, Stretch, noise_of, plain, stood, stretches_of
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import mean_pose
 from armsight.loop.iso9283 import LEAST
 
-#: Commands that differ by less are the same, m.
-_SAME_M = 1e-5
 #: A rest is judged that was seen in so many shots.
 _SHOTS = 3
 
@@ -54,7 +52,7 @@ def _rests(stretches: list[Stretch], run: set[str], noise: Noise) -> tuple[list[
     before, unseen = "the start", 0
     for stretch in stretches:
         T = stretch.wanted.Ts_base_tool[-1]
-        name = next((n for at, n in names if np.abs(at - T).max() < _SAME_M), None)
+        name = next((n for at, n in names if np.abs(at - T).max() < SAME_M), None)
         if stretch.name in run:
             before = name or plain(stretch.name)
             continue

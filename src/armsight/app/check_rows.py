@@ -19,21 +19,23 @@ from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
 TESTS = ("pose", "path", "circle")
 _TEXTS = ("test", "pose", "cycle", "approach")
 _PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-NEEDED = ("pose", *_PLACE, *(f"command_{name}" for name in _PLACE))
-#: Columns that go with each other: what stands before the names, and the names.
-_TOGETHER = (("command", _TURN), ("sigma", _PLACE), ("sigma_common", _PLACE))
+_COMMAND = tuple(f"command_{name}" for name in (*_PLACE, *_TURN))
+_SIGMA, _COMMON = (tuple(f"{kind}_{name}" for name in _PLACE) for kind in ("sigma", "sigma_common"))
+NEEDED = ("pose", *_PLACE, *_COMMAND[:3])
+#: Columns of which all or none are there.
+_TOGETHER = (_TURN, _COMMAND[3:], _SIGMA, _COMMON)
 #: An arm that is further off its commands than this is none: units or frames are mixed up.
 _FAR_M = 0.1
-#: Commands of one pose differ by rounding at most, m (and its turn's matrix).
-_SAME_M = 1e-5
+#: Commands of one place differ by rounding at most, m (and their turns' matrices).
+SAME_M = 1e-5
 _COLUMNS = (
     *_TEXTS,
     "t_s",
     *_PLACE,
     *_TURN,
-    *(f"command_{name}" for name in (*_PLACE, *_TURN)),
-    *(f"sigma_{name}" for name in _PLACE),
-    *(f"sigma_common_{name}" for name in _PLACE),
+    *_COMMAND,
+    *_SIGMA,
+    *_COMMON,
 )
 
 
@@ -130,7 +132,7 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
             )
         seen.add(what)
         apart = row.T_command - sent.setdefault(row.pose, row.T_command) if row.test == "pose" else np.zeros(1)
-        if np.abs(apart).max() > _SAME_M:
+        if np.abs(apart).max() > SAME_M:
             raise InputError(f"{file}: pose {row.pose} has several commands; give each place a name of its own")
     off_m = float(np.median([np.linalg.norm(row.T[:3, 3] - row.T_command[:3, 3]) for row in rows]))
     if off_m > _FAR_M:
@@ -155,19 +157,8 @@ def _row(where: str, cells: dict[str, str]) -> Row:
             raise InputError(f"{where}: {name} is {cell!r}, must be a number") from None
         if not np.isfinite(numbers[name]):
             raise InputError(f"{where}: {name} is {cell}, must be a finite number")
-    for name in NEEDED[1:]:
-        if name not in numbers:
-            raise InputError(f"{where}: {name} is empty")
-    if not cells["pose"]:
-        raise InputError(f"{where}: pose is empty; it needs a name")
-    for part in (_TURN, *(tuple(f"{kind}_{name}" for name in names) for kind, names in _TOGETHER)):
-        lost = [name for name in part if name not in numbers]
-        if 0 < len(lost) < len(part):
-            raise InputError(f"{where}: {lost[0]} is missing, though others of {', '.join(part)} are there")
-    for name in (f"{kind}_{name}" for kind in ("sigma", "sigma_common") for name in _PLACE):
-        if numbers.get(name, 0.0) < 0.0:
-            raise InputError(f"{where}: {name} is {numbers[name]:g}; a standard deviation is never below zero")
-    covs = [np.diag([numbers.get(f"{kind}_{name}", 0.0) ** 2 for name in _PLACE]) for kind in ("sigma", "sigma_common")]
+    _require_whole(where, cells, numbers)
+    covs = [np.diag([numbers.get(name, 0.0) ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
     return Row(
         test,
         cells["pose"],
@@ -179,6 +170,22 @@ def _row(where: str, cells: dict[str, str]) -> Row:
         covs[0],
         covs[1],
     )
+
+
+def _require_whole(where: str, cells: dict[str, str], numbers: dict[str, float]) -> None:
+    """Raise InputError where a row lacks a cell, or a standard deviation is none."""
+    if not cells.get("pose"):
+        raise InputError(f"{where}: pose is empty; it needs a name")
+    for name in NEEDED[1:]:
+        if name not in numbers:
+            raise InputError(f"{where}: {name} is empty")
+    for part in _TOGETHER:
+        lost = [name for name in part if name not in numbers]
+        if 0 < len(lost) < len(part):
+            raise InputError(f"{where}: {lost[0]} is missing, though others of {', '.join(part)} are there")
+    for name in (*_SIGMA, *_COMMON):
+        if numbers.get(name, 0.0) < 0.0:
+            raise InputError(f"{where}: {name} is {numbers[name]:g}; a standard deviation is never below zero")
 
 
 def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:

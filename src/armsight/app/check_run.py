@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.check_folder import attained_in
-from armsight.app.check_rows import TESTS, Attained, Row, Turn, read_rows
+from armsight.app.check_rows import SAME_M, TESTS, Attained, Row, Turn, read_rows
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop import iso9283
@@ -20,8 +20,6 @@ from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
 
 #: So many poses tell something of the workspace where none was attained often enough to tell of itself.
 _WIDE = 10
-#: Commands of one station that differ by less are the same, m.
-_SAME_M = 1e-5
 #: So many times must the first pose have been attained for its drift.
 _DRIFTS = 10
 
@@ -177,7 +175,7 @@ def _path(name: str, rows: list[Row]) -> dict[str, Any]:
     (first_cycle, first), *others = cycles.items()
     for cycle, group in others:
         same = [row.pose for row in group] == [row.pose for row in first]
-        if not same or np.abs(_commands(group) - _commands(first)).max() > _SAME_M:
+        if not same or np.abs(_commands(group) - _commands(first)).max() > SAME_M:
             raise InputError(
                 f"path {name}: every cycle must have the same stations, commanded to the same places and in the same "
                 f"order; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"

@@ -133,7 +133,9 @@ def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ra
     high = unit / bias * float(np.sqrt(max(high, 0.0)))
     if low <= 0:
         return Figure(raw, None, 0.0, max(high, resolvable), resolvable)
-    return Figure(raw, ratio * unit * np.sqrt(total - own), unit / bias * np.sqrt(low), high, resolvable)
+    low = unit / bias * float(np.sqrt(low))
+    # The few values' own shape, which the ratio is of, may carry the figure out of the interval.
+    return Figure(raw, min(max(ratio * unit * float(np.sqrt(total - own)), low), high), low, high, resolvable)
 
 
 def _freedom(S: Array, n: int, figure: Callable[[Array], Array]) -> tuple[float, float]:

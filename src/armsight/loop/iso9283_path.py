@@ -54,14 +54,7 @@ def path_figures(attained: Array, command: Array, cov: Array, common: Array | No
     n, stations = attained.shape[:2]
     if n < 3 or stations < 3:
         raise InputError(f"a path followed {n} times at {stations} stations; 3 of both are needed, 10 times are usual")
-    along = np.gradient(command, axis=0)
-    length = np.linalg.norm(along, axis=1)
-    if not length.all():
-        raise InputError(
-            f"at its station {np.argmin(length) + 1} the command does not go on: stations must follow each other along it"
-        )
-    along /= length[:, None]
-    across = np.eye(3) - along[:, :, None] * along[:, None]  # only what is square to the path counts
+    across = square_to(command)
     seen = (across @ (attained - command)[..., None])[..., 0]
     middle, rng = seen.mean(axis=0), np.random.default_rng(0)
     errors = mean_errors(seen, rng)
@@ -75,6 +68,22 @@ def path_figures(attained: Array, command: Array, cov: Array, common: Array | No
         _picked(RT, _chosen(seen - middle, rng)),
         np.linalg.norm(middle, axis=1),
     )
+
+
+def square_to(command: Array) -> Array:
+    """Return what takes out of offsets at stations (S, 3) of a path their part along it: (S, 3, 3).
+
+    Raises:
+        InputError: the path does not go on between stations.
+    """
+    along = np.gradient(command, axis=0)
+    length = np.linalg.norm(along, axis=1)
+    if not length.all():
+        raise InputError(
+            f"at its station {np.argmin(length) + 1} the command does not go on: stations must follow each other along it"
+        )
+    along /= length[:, None]
+    return np.asarray(np.eye(3) - along[:, :, None] * along[:, None])
 
 
 def _limits(off: Array) -> Array:
