@@ -17,6 +17,20 @@ _STRIP = 1 << 22  # places where an image's noise may begin
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rounded(grey: Radiance, noise: Radiance, sensor: tuple[float, float, float], out: Image) -> None:
+    """Write the grey levels of a part of a row."""
+    offset, read, shot = np.float32(sensor[0]), np.float32(sensor[1]), np.float32(sensor[2])
+    zero, most = np.float32(0.0), np.float32(255.0)
+    if shot > zero:
+        for u in range(out.size):
+            sigma = np.sqrt(read * read + shot * max(grey[u], zero))
+            out[u] = np.uint8(min(max(np.rint(grey[u] + offset + sigma * noise[u]), zero), most))
+    else:
+        for u in range(out.size):
+            out[u] = np.uint8(min(max(np.rint(grey[u] + offset + read * noise[u]), zero), most))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def exposed(
     still: Radiance,
     light: Radiance,
@@ -31,18 +45,15 @@ def exposed(
 
     ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.optics.Sensor`.
     """
-    offset, read, shot = np.float32(sensor[0]), np.float32(sensor[1]), np.float32(sensor[2])
-    width = out.shape[1]
-    for v in range(out.shape[0]):
-        inside = window[1] <= v < window[3]
-        for u in range(width):
-            grey = still[v, u]
-            if inside and window[0] <= u < window[2]:
-                grey = light[v - window[1], u - window[0]] * gain[v, u]
-            noise = strip[start + v * width + u]
-            sigma = np.sqrt(read * read + shot * max(grey, np.float32(0.0))) if shot > 0.0 else read
-            level = np.rint(grey + offset + sigma * noise)
-            out[v, u] = np.uint8(min(max(level, np.float32(0.0)), np.float32(255.0)))
+    (u0, v0, u1, v1), (height, width) = window, out.shape
+    for v in range(height):
+        noise = strip[start + v * width : start + (v + 1) * width]
+        if not v0 <= v < v1:
+            _rounded(still[v], noise, sensor, out[v])
+            continue
+        _rounded(still[v, :u0], noise[:u0], sensor, out[v, :u0])
+        _rounded(light[v - v0] * gain[v, u0:u1], noise[u0:u1], sensor, out[v, u0:u1])
+        _rounded(still[v, u1:], noise[u1:], sensor, out[v, u1:])
 
 
 def noise_strip(seed: int, image_size_px: tuple[int, int]) -> Radiance:

@@ -24,16 +24,16 @@ from armsight.sim import cell_rays
 from armsight.sim.cell_noise import Window, exposed
 from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, corner_rays, pixel_rays, view
 from armsight.sim.cell_solids import Solids
-from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded
-from armsight.sim.paint import SUB, Grid, Slots, paint
+from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded, spread
+from armsight.sim.paint import SUB, Grid, Slots, paint, paint_disc
 from armsight.sim.render import OUTLINE, Shutter, outline
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
 #: The lens and the light, after the shading correction that cameras do themselves.
 LENS = Optics(0.7, vignetting=0.08, light_gradient=(0.04, -0.04))
-#: Points around a pattern or a disc that bound it in the image.
-EDGE = 4 * OUTLINE
+#: Points around a pattern or a disc that bound it in the image, and by how much those around a disc are further out.
+EDGE, _OUT = 16, 1.02
 _STILL_PX = 0.05  # what moves less is painted once
 
 
@@ -102,7 +102,7 @@ def _edges(patterns: tuple[Pattern, ...]) -> Array:
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     around = []
     for pattern in patterns:
-        for line in (outline(pattern), *(disc[:2] + 1.01 * disc[2] * circle for disc in pattern.discs)):
+        for line in (outline(pattern)[:: 4 * OUTLINE // EDGE], *(d[:2] + _OUT * d[2] * circle for d in pattern.discs)):
             around.append(transform(pattern.T_body_pattern, np.column_stack([line, np.zeros(EDGE)])))
     return np.array(around)
 
@@ -157,7 +157,7 @@ class CellCamera:
     @staticmethod
     def _blur(light: Array) -> Radiance:
         """Return an image without edge pixels through the lens."""
-        return blurred(light, np.full(light.shape, -1, np.int32), np.empty((0, SUB, SUB)), LENS.psf_sigma_px)
+        return spread(light.astype(np.float32), LENS.psf_sigma_px)
 
     def image(
         self, arm: ArmSeen | None, bodies: Sequence[Placed], shutter: Shutter, strip: Radiance, start: int
@@ -277,8 +277,9 @@ class CellCamera:
                 rows = Ts[v0:v1] if len(Ts) > 1 else Ts
                 Ms = np.ascontiguousarray(np.linalg.inv(rows[:, :3, [0, 1, 3]]))
                 inner = np.clip(boxes - (u0, v0, u0, v0), 0, (u1 - u0, v1 - v0) * 2).tolist()
-                for disc, box in zip((np.zeros(0), *pattern.discs), inner, strict=True):
-                    fine, count = paint(rays, Ms, tuple(box), _grid(pattern), np.array(disc), coarse, slot, fine, count)
+                fine, count = paint(rays, Ms, tuple(inner[0]), _grid(pattern), coarse, slot, fine, count)
+                for disc, box in zip(pattern.discs, inner[1:], strict=True):
+                    fine, count = paint_disc(rays, Ms, tuple(box), np.array(disc), coarse, slot, fine, count)
                 _nearer(self._rays, Ms, tuple(inner[0]), (u0, v0), light, depth, ids, coarse, slot)
             total += np.float32(weight) * blurred(coarse, slot, fine[:count], LENS.psf_sigma_px)
         return total

@@ -291,9 +291,10 @@ def moving(
     ends, radius, albedo = capsules
     u_first, v_first, u_end, v_end = window
     p, n, axis = np.empty(3), np.empty(3), np.empty(9)
-    for k in range(radius.size):
+    for k in np.argsort(ends[:, 0, 2] + ends[:, 1, 2]):  # what is near first: it hides the rest
         a, b = ends[k, 0], ends[k, 1]
         _axis(a, b, radius[k], axis)
+        near = min(a[2], b[2]) - radius[k]
         u0, u1 = max(boxes_px[k, 0], u_first), min(boxes_px[k, 2], u_end)
         v0, v1 = max(boxes_px[k, 1], v_first), min(boxes_px[k, 3], v_end)
         for v_tile in range(v0, v1, _TILE):
@@ -307,7 +308,7 @@ def moving(
                 for v in range(v_tile, v_last):
                     for u in range(u_tile, u_last):
                         d = rays[v, u]
-                        if _side(d, a, axis) != 0:
+                        if near >= depth[v - v_first, u - u_first] or _side(d, a, axis) != 0:
                             continue
                         t = _capsule(_ORIGIN, d, a, b, radius[k])
                         if t >= depth[v - v_first, u - u_first]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numba
@@ -64,6 +65,7 @@ def _integral_of_step(x: Array, sigma: float) -> Array:
     return np.asarray(x * ndtr(x / sigma) + sigma * np.exp(-0.5 * (x / sigma) ** 2) / math.sqrt(2 * math.pi))
 
 
+@lru_cache(maxsize=16)
 def psf_taps(sigma: float, parts: int) -> Array:
     """Return how much light goes from each part of a pixel to its neighbours, in one direction.
 
@@ -89,28 +91,28 @@ def psf_taps(sigma: float, parts: int) -> Array:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _spread_parts(slot: Slots, fine: Array, taps: Array, out: Radiance) -> None:
     """Add to ``out`` what the parts of edge pixels send beyond the mean of their pixel."""
-    parts, n = taps.shape
+    n = taps.shape[1]
     radius = n // 2
     height, width = slot.shape
-    rows = np.empty((parts, n))
+    rows = np.empty((SUB, n))
     for v in range(height):
         for u in range(width):
             s = slot[v, u]
             if s < 0:
                 continue
             mean = fine[s].mean()
-            for a in range(parts):
-                rows[a, :] = 0.0
-                for b in range(parts):
-                    light = (fine[s, a, b] - mean) / (parts * parts)
-                    for c in range(n):
-                        rows[a, c] += light * taps[b, c]
+            for a in range(SUB):
+                for c in range(n):
+                    rows[a, c] = 0.0
+                    for b in range(SUB):
+                        rows[a, c] += (fine[s, a, b] - mean) / (SUB * SUB) * taps[b, c]
             c0, c1 = max(0, radius - u), min(n, width + radius - u)
             for r in range(max(0, radius - v), min(n, height + radius - v)):
-                for a in range(parts):
-                    weight = taps[a, r]
-                    for c in range(c0, c1):
-                        out[v + r - radius, u + c - radius] += np.float32(weight * rows[a, c])
+                for c in range(c0, c1):
+                    light = 0.0
+                    for a in range(SUB):
+                        light += taps[a, r] * rows[a, c]
+                    out[v + r - radius, u + c - radius] += np.float32(light)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -135,14 +137,23 @@ def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
         (H, W) light on each pixel; beyond the image's border the world is taken to go on as at the border.
     """
     _mean_of_parts(slot, fine, coarse)
-    image: Radiance = coarse.astype(np.float32)
+    image = spread(coarse.astype(np.float32), sigma)
+    if sigma > 0:
+        _spread_parts(slot, fine, psf_taps(_narrowed(sigma), SUB), image)
+    return image
+
+
+def spread(image: Radiance, sigma: float) -> Radiance:
+    """Lay the lens's blur over an image (H, W) without edge pixels; see :func:`blurred`."""
     if sigma <= 0:
         return image
-    sigma = math.sqrt(max(sigma**2 - _PARTS_VARIANCE, 0.5 * sigma**2))
-    whole = psf_taps(sigma, 1)[0]
-    image = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, whole, whole, borderType=cv2.BORDER_REPLICATE))
-    _spread_parts(slot, fine, psf_taps(sigma, SUB), image)
-    return image
+    whole = psf_taps(_narrowed(sigma), 1)[0]
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, whole, whole, borderType=cv2.BORDER_REPLICATE))
+
+
+def _narrowed(sigma: float) -> float:
+    """Return the blur that is left to lay over what is as wide as a part of a pixel already."""
+    return math.sqrt(max(sigma**2 - _PARTS_VARIANCE, 0.5 * sigma**2))
 
 
 def shaded(radiance: Radiance, optics: Optics) -> Radiance:

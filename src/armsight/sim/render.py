@@ -18,7 +18,7 @@ from armsight.data import Array, Image
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
-from armsight.sim.paint import SUB, Box, paint
+from armsight.sim.paint import SUB, Box, paint, paint_disc
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
@@ -104,11 +104,14 @@ class _Canvas:
         ends = Ts[[0, -1]] if len(Ts) > 1 else Ts
         x, y = np.array(pattern.x_edges), np.array(pattern.y_edges)
         grid = (x, y, np.pad(pattern.values, 1, constant_values=CLEAR))
-        for disc in (np.zeros(0), *pattern.discs):
-            box = self._box(ends, _circle(disc) if disc.size else outline(pattern))
+        box = self._box(ends, outline(pattern))
+        if box is not None:
+            self.fine, self.count = paint(self.rays, Ms, box, grid, self.coarse, self.slot, self.fine, self.count)
+        for disc in pattern.discs:
+            box = self._box(ends, _circle(disc))
             if box is not None:
-                self.fine, self.count = paint(
-                    self.rays, Ms, box, grid, np.array(disc), self.coarse, self.slot, self.fine, self.count
+                self.fine, self.count = paint_disc(
+                    self.rays, Ms, box, np.array(disc), self.coarse, self.slot, self.fine, self.count
                 )
 
     def _box(self, Ts: Array, points: Array) -> Box | None:

@@ -27,6 +27,8 @@ from armsight.loop.identify.observable import observed
 
 #: Candidates drawn, and places of the workspace at which the error is predicted.
 CANDIDATES, PROBES = 1500, 200
+#: Times that four times as many are drawn at most, of which those allowed become candidates.
+DRAWS = 40
 #: Links must stay this far above the base's plane, m, and parts of the arm that are not neighbours this far apart.
 FLOOR_M, APART_M = 0.02, 0.06
 #: What nothing is known of at first: base and tool, m and rad.
@@ -140,7 +142,9 @@ class Scene(NamedTuple):
 
     def allowed(self, q: Array, approach: Array) -> Mask:
         """Say which poses (N,) are free and visible."""
-        return free_of_collision(self.model, q) & self.visible(self.T_rig_body(q, approach))
+        out = self.visible(self.T_rig_body(q, approach))
+        out[out] = free_of_collision(self.model, q[out])
+        return out
 
     def seen(self, q: Array, approach: Array) -> Measured:
         """Return what would be seen without noise."""
@@ -169,11 +173,22 @@ class Scene(NamedTuple):
 
 
 def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
-    """Return joint angles, directions of approach and what would be seen, of poses that are reachable, free and visible."""
-    q = rng.uniform(*scene.limits, (4 * CANDIDATES, 6))
-    approach = rng.choice([-1.0, 1.0], q.shape)
-    rows = np.flatnonzero(scene.allowed(q, approach))[:CANDIDATES]
-    return q[rows], approach[rows], scene.seen(q[rows], approach[rows])
+    """Return joint angles, directions of approach and what would be seen, of poses that are reachable, free and visible.
+
+    They are evenly distributed over all that is; where cameras see little of what an arm reaches, more are drawn.
+    """
+    angles, sides, found = [], [], 0
+    for _ in range(DRAWS):
+        q = rng.uniform(*scene.limits, (4 * CANDIDATES, 6))
+        approach = rng.choice([-1.0, 1.0], q.shape)
+        rows = np.flatnonzero(scene.allowed(q, approach))[: CANDIDATES - found]
+        angles.append(q[rows])
+        sides.append(approach[rows])
+        found += len(rows)
+        if found == CANDIDATES:
+            break
+    q, approach = np.concatenate(angles), np.concatenate(sides)
+    return q, approach, scene.seen(q, approach)
 
 
 def free_of_collision(model: Model, q: Array) -> Mask:
@@ -181,25 +196,28 @@ def free_of_collision(model: Model, q: Array) -> Mask:
 
     Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
     """
-    out = np.zeros(len(q), bool)
-    for n, angles in enumerate(q):
-        o = model.arm.links(angles)[:, :3, 3]
-        along = (o - model.arm.T_base_0[:3, 3]) @ model.up_base
-        high = bool((along[2:] > FLOOR_M).all())
-        out[n] = high and _segments_apart(o)
+    if not len(q):
+        return np.zeros(0, bool)
+    o = np.stack([model.arm.links(angles)[:, :3, 3] for angles in q])
+    along = (o - model.arm.T_base_0[:3, 3]) @ model.up_base
+    out = np.asarray((along[:, 2:] > FLOOR_M).all(axis=1))
+    out[out] = _segments_apart(o[out])
     return out
 
 
-def _segments_apart(o: Array) -> bool:
-    """Say whether the base's column and the links from the elbow on stay apart, looked at in steps along them."""
+def _segments_apart(o: Array) -> Mask:
+    """Say whether the base's column and the links (N, 8, 3) from the elbow on stay apart, looked at in steps along them."""
     steps = np.linspace(0, 1, 9)[:, None]
-    column = o[0] + steps * (o[1] - o[0])
-    for i in range(3, len(o) - 1):
-        line = o[i] + steps * (o[i + 1] - o[i])
-        for other in (column, o[1] + steps[:5] * (o[2] - o[1])):
-            if np.linalg.norm(line[:, None] - other, axis=2).min() < APART_M:
-                return False
-    return True
+
+    def line(i: int, points: Array) -> Array:
+        return np.asarray(o[:, i, None] + points * (o[:, i + 1] - o[:, i])[:, None])
+
+    out = np.ones(len(o), bool)
+    for other in (line(0, steps), line(1, steps[:5])):
+        for i in range(3, o.shape[1] - 1):
+            between = line(i, steps)[:, :, None] - other[:, None]
+            out &= (np.einsum("nabk,nabk->nab", between, between) > APART_M**2).all(axis=(1, 2))
+    return out
 
 
 def _prior_covariance(prior: Array, free: Mask) -> Array:
