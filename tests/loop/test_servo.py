@@ -38,7 +38,7 @@ def play(cell, motion, servo, seconds, each=lambda step: None):
             ahead = motion.at(t_s + PERIOD_S)
             command = JointCommand(ahead.q, ahead.qd, np.zeros(6), PERIOD_S)
         else:
-            step = servo.step(motion, t_s, cell.estimator)
+            step = servo.step(servo.aim(motion, t_s), cell.estimator)
             each(step)
             command = step.command
         wanted = ARM.forward(motion.at(t_s + np.arange(1, ticks + 1) * TICK_S).q)
@@ -126,7 +126,8 @@ def test_without_any_vision_the_motion_is_commanded_as_it_is():
     cell.coming.clear()
     cell.advance(None, 100)
     motion = point_to_point(ARM, MIDDLE, GOAL)
-    step = PoseServo(ARM, timing(60)).step(motion, 0.3, cell.estimator, lambda q: np.full(6, 0.1))
+    servo = PoseServo(ARM, timing(60))
+    step = servo.step(servo.aim(motion, 0.3, lambda q: np.full(6, 0.1)), cell.estimator)
     ahead = motion.at(0.3 + PERIOD_S)
     assert step.mode is Mode.POTENTIOMETERS
     assert np.array_equal(step.command.q_ref, ahead.q)

@@ -30,7 +30,10 @@ class Still:
     def __init__(self, held: JointCommand) -> None:
         self._held = held
 
-    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
+    def prepare(self, t_s: float) -> None:
+        """Do nothing: it is ready."""
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return the command."""
         return self._held, "planned"
 

@@ -45,8 +45,12 @@ _Result = TypeVar("_Result")
 class Controller(Protocol):
     """Says what the joints are to do next."""
 
-    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return the command to send at a time of the board's clock, and in a word what it is based on."""
+    def prepare(self, t_s: float) -> None:
+        """Do what the next command, to be sent at a time of the board's clock, needs and no image changes."""
+        ...
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return the command that was prepared, and in a word what it is based on."""
         ...
 
 
@@ -205,10 +209,11 @@ class Loop:
             while not over():
                 self.pass_time(self._rest_of_period())
                 self._check_board()
+                controller.prepare(self.t_s)  # before an image is taken up: it has not to wait for that
                 looked = self.look() if watch else None
                 if watch:
                     self._check_cameras(begin_s)
-                command, mode = controller.command(self.t_s, self.estimator)
+                command, mode = controller.command(self.estimator)
                 self.board.send(command)
                 self.log.commands.append((self.t_s, command))
                 self.log.modes.append(mode)

@@ -9,7 +9,7 @@ import numpy as np
 from armsight.app.run_loop import PERIOD_S
 from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
-from armsight.loop.servo import PoseServo
+from armsight.loop.servo import Aim, PoseServo
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 
@@ -28,11 +28,17 @@ class Planned:
 
     def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
         self._trajectory, self._start_s, self._gravity = trajectory, start_s, gravity
+        self._next: JointCommand | None = None
 
-    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return where the joints are to be a period from now."""
+    def prepare(self, t_s: float) -> None:
+        """Find where the joints are to be a period from now."""
         ahead = self._trajectory.at(t_s + PERIOD_S - self._start_s)
-        return JointCommand(ahead.q, ahead.qd, self._gravity(ahead.q), PERIOD_S), "planned"
+        self._next = JointCommand(ahead.q, ahead.qd, self._gravity(ahead.q), PERIOD_S)
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be."""
+        assert self._next is not None
+        return self._next, "planned"
 
 
 class Sweep:
@@ -81,9 +87,14 @@ class Closed:
         self, servo: PoseServo, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]
     ) -> None:
         self._servo, self._trajectory, self._start_s, self._gravity = servo, trajectory, start_s, gravity
+        self._aim: Aim | None = None
 
-    def command(self, t_s: float, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return where the joints are to be a period from now for the tool to be right."""
-        since = t_s - self._start_s
-        step = self._servo.step(self._trajectory, since, estimator, self._gravity)
+    def prepare(self, t_s: float) -> None:
+        """Find where the tool is to be a period from now."""
+        self._aim = self._servo.aim(self._trajectory, t_s - self._start_s, self._gravity)
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be for the tool to be right."""
+        assert self._aim is not None
+        step = self._servo.step(self._aim, estimator)
         return step.command, step.mode.name.lower()

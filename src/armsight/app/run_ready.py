@@ -66,7 +66,7 @@ def rehearse(arm: Arm) -> None:
         if first % 16 == 0:
             estimator.vision(Sighting(float(t_s[first]), arm.forward(q[first]), 1e-8 * np.eye(6), 1e-8 * np.eye(6)))
         with contextlib.suppress(ArmsightError):
-            servo.step(way, float(t_s[first]), estimator)
+            servo.step(servo.aim(way, float(t_s[first])), estimator)
     estimator.smoothed(t_s[-100:])
 
 

@@ -93,6 +93,31 @@ class Timing:
 
 
 @dataclass(frozen=True, eq=False)
+class Aim(Record):
+    """What the next command is to do, as far as no sighting changes it: made ready while an image is on its way.
+
+    Attributes:
+        goal: the joints now, as the motion has them.
+        ahead: those a period from now.
+        Ts_base_tool: (2, 4, 4) where they put the tool.
+        duty: (6,) what carries the arm's weight ahead.
+        jacobian: (6, 6) at the goal.
+        U: (6, 6) of its singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
+        s: (6,).
+        Vt: (6, 6).
+    """
+
+    goal: Joints
+    ahead: Joints
+    Ts_base_tool: Array
+    duty: Array
+    jacobian: Array
+    U: Array
+    s: Array
+    Vt: Array
+
+
+@dataclass(frozen=True, eq=False)
 class ServoStep(Record):
     """One command and how it came about.
 
@@ -127,37 +152,42 @@ class PoseServo:
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
 
-    def step(
-        self,
-        motion: Trajectory,
-        t_s: float,
-        estimator: Estimator,
-        gravity: Callable[[Array], ArrayLike] = np.zeros_like,
-    ) -> ServoStep:
-        """Make the next command.
+    def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
+        """Say what the next command is to do.
 
         Args:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
-            estimator: where the tool is.
             gravity: gives the duty (6,) that carries the arm's weight at joint angles (6,), passed on.
         """
-        estimate, ahead = estimator.estimate(), motion.at(t_s + self.timing.period_s)
+        ahead = motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
         duty = checked(gravity(ahead.q), (6,), "gravity")
-        error = behind(self._arm.forward(goal.q), estimate.T_base_tool)
+        jacobian = self._arm.jacobian(goal.q)
+        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None])
+        return Aim(goal, ahead, self._arm.forward(np.stack([goal.q, ahead.q])), duty, jacobian, U, s, Vt)
+
+    def step(self, aim: Aim, estimator: Estimator) -> ServoStep:
+        """Make the next command.
+
+        Args:
+            aim: what it is to do, of this turn.
+            estimator: where the tool is.
+        """
+        estimate = estimator.estimate()
+        error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
         mode = self._mode(estimate)
-        resting = self._resting(estimate, goal, ahead)
+        resting = self._resting(estimate, aim)
         change = np.zeros(6)
         if mode is not Mode.POTENTIOMETERS:
-            last, following = self._missing(estimator, goal, ahead)
+            last, following = self._missing(estimator, aim)
             push = following - last
             if mode is Mode.VISION:
                 push += self.timing.gain * error if resting else self._follow * last
-            change = self._joints(goal.q, push)
+            change = self._joints(aim, push)
         if mode is Mode.VISION and resting:
-            change += self._crossing(estimator, goal, error)
-        return self._command(goal, ahead, change, duty, mode, error)
+            change += self._crossing(estimator, aim, error)
+        return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate) -> Mode:
         """Say what the loop may be closed on."""
@@ -167,42 +197,41 @@ class PoseServo:
             return Mode.POTENTIOMETERS
         return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
 
-    def _missing(self, estimator: Estimator, goal: Joints, ahead: Joints) -> Array:
-        """Return how far the tool would be behind (2, 6) at two goals with this correction."""
-        q, qd = np.stack([goal.q, ahead.q]), np.stack([goal.qd, ahead.qd])
-        return behind(self._arm.forward(q), estimator.tool(q + self._correction, qd))
+    def _missing(self, estimator: Estimator, aim: Aim) -> Array:
+        """Return how far the tool would be behind (2, 6) now and ahead with this correction."""
+        q, qd = np.stack([aim.goal.q, aim.ahead.q]), np.stack([aim.goal.qd, aim.ahead.qd])
+        return behind(aim.Ts_base_tool, estimator.tool(q + self._correction, qd))
 
-    def _joints(self, q: Array, error: Array) -> Array:
+    def _joints(self, aim: Aim, error: Array) -> Array:
         """Return the joint angles (6,) that make up for an error of the tool (6,).
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
         """
-        U, s, Vt = np.linalg.svd(self._arm.jacobian(q) / self._scale[:, None])
-        able = np.clip((s - SINGULAR) / (EASY - SINGULAR), 0.0, 1.0)
-        return np.asarray((able / np.maximum(s, SINGULAR) * ((error / self._scale) @ U)) @ Vt)
+        able = np.clip((aim.s - SINGULAR) / (EASY - SINGULAR), 0.0, 1.0)
+        return np.asarray((able / np.maximum(aim.s, SINGULAR) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
-    def _crossing(self, estimator: Estimator, goal: Joints, error: Array) -> Array:
+    def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
         """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
         self._lasting += self.timing.gain * (error - self._lasting)
-        wanted, J = self._joints(goal.q, self._lasting), self._arm.jacobian(goal.q)
-        worth = np.abs(wanted) * np.linalg.norm(J[:3], axis=0) > CROSS_M
+        wanted = self._joints(aim, self._lasting)
+        worth = np.abs(wanted) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
         sides = np.stack([np.zeros(6), np.where(worth, np.sign(wanted), 0.0)])
-        here, there = estimator.tool(np.stack([goal.q, goal.q]) + self._correction, sides)
-        return self._joints(goal.q, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
+        here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides)
+        return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
-    def _resting(self, estimate: ArmEstimate, goal: Joints, ahead: Joints) -> bool:
+    def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:
         """Say whether the arm has been at rest for as long as the newest sighting is old."""
-        wanted = max(np.abs(goal.qd).max(), np.abs(ahead.qd).max())
+        wanted = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
         still = bool(wanted < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
             self._lasting = np.zeros(6)
         return still and self._rest_s > estimate.vision_age_s
 
-    def _command(self, goal: Joints, ahead: Joints, change: Array, duty: Array, mode: Mode, error: Array) -> ServoStep:
+    def _command(self, aim: Aim, change: Array, mode: Mode, error: Array) -> ServoStep:
         """Return the command with a change of the correction, as far as the limits allow."""
-        arm, period_s = self._arm, self.timing.period_s
-        step = ahead.q - goal.q
+        arm, period_s, ahead = self._arm, self.timing.period_s, aim.ahead
+        step = ahead.q - aim.goal.q
         most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
         wished = np.clip(self._correction + np.clip(change, -most, most), -MOST_RAD, MOST_RAD)
         q_ref = np.clip(ahead.q + wished, arm.q_min, arm.q_max)
@@ -214,5 +243,5 @@ class PoseServo:
             *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
             *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(np.abs(wished) >= MOST_RAD)),
         ]
-        command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), duty, period_s)
+        command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), aim.duty, period_s)
         return ServoStep(command, mode, correction, error, tuple(said))

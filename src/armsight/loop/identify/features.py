@@ -19,9 +19,10 @@ from armsight.loop.identify import chain
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
-#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, and those of its track and gears.
-WAVES, RIPPLES = (1, 2), (3, 4, 5, 6, 7, 8)
-#: Fewer numbers measured than this cannot choose among the ripples' 72 coefficients without taking chance for a cause.
+#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, and those of its track and gears. A
+#: potentiometer's track swings some nine times over its travel at most, and that may be three quarters of a turn.
+WAVES, RIPPLES = (1, 2), (3, 4, 5, 6, 7, 8, 9, 10, 11, 12)
+#: Fewer numbers measured than this cannot choose among the ripples' 120 coefficients without taking chance for a cause.
 ENOUGH = 350
 #: A bearing's friction holds a link in its play against weight with up to about this lever, m: some per cent of what the
 #: links of such arms have, as bearings' friction is of the load. Over half of it the play closes.
@@ -101,11 +102,15 @@ def _weight_lever(arm: Arm, levers: Array, joint: int) -> Array:
 
 
 def _side(lever: Array, approach: Array | None, joint: int) -> Array:
-    """Return on which side of its play a link lies (N,), -1 to 1: weight's, or where that is weaker that of friction."""
+    """Return on which side of its play a link lies (N,), -1 to 1: weight's, or where that is weaker that of friction.
+
+    Near where one gives way to the other it is the mean of both sides, by how likely each is; where the side that it came
+    from is not known, it is so from there to as far on the other side.
+    """
     if np.abs(lever).max(initial=0.0) < FRICTION_M:
         return np.zeros(len(lever))  # it carries nothing: that is what ``backlash`` is for
-    pull = lever if approach is None else lever - FRICTION_M * approach[:, joint]
-    return np.asarray(pull / np.hypot(pull, 0.5 * FRICTION_M))
+    side = np.zeros(len(lever)) if approach is None else approach[:, joint]
+    return np.asarray(np.tanh((lever - FRICTION_M * side) / (FRICTION_M * (1 - 0.5 * np.abs(side)))))
 
 
 def _levers(arm: Arm, q: Array, up_base: Array) -> Array:

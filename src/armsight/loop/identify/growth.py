@@ -25,6 +25,8 @@ FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 PAYS = 1.0
 #: Parameters further from nominal than this many sigmas pay for sure: their own removal is not tried.
 SURE = 8.0
+#: Squares that are none, so that their logarithm is a number.
+_NONE = 1e-200
 #: What the placement alone is.
 PLACEMENT = ("base", "tool")
 #: Harmonics make one curve together, and links' loads one sag: it pays or does not, and priors keep it small. Each number
@@ -210,12 +212,13 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
 
 
 def _rms(losses: Array, folds: _Folds) -> float:
-    return float(np.sqrt(np.sum(losses * folds.numbers) / folds.numbers.sum()))
+    """Return the RMS of all folds: the geometric mean of theirs, which one pose that nothing explains cannot rule."""
+    return float(np.exp(0.5 * np.sum(np.log(losses + _NONE) * folds.numbers) / folds.numbers.sum()))
 
 
 def _pays(without: Array, with_it: Array, folds: _Folds) -> bool:
-    """Say whether the fall of the held-out squares is more than chance over the folds."""
-    fall = (without - with_it) * folds.numbers
+    """Say whether the fall of the held-out squares' logarithms is more than chance over the folds."""
+    fall = np.log((without + _NONE) / (with_it + _NONE)) * folds.numbers
     return bool(fall.sum() > PAYS * np.sqrt(len(fall)) * fall.std(ddof=1))
 
 

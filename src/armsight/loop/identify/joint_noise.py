@@ -60,6 +60,7 @@ def joint_noise(model: Model, solution: Solution, weighed: Measured, measured: M
     B = np.concatenate(
         [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2
     )
+    measured = with_joint_noise(model, solution.x, measured, np.zeros(6))
     place = np.arange(e.shape[1]) // 3  # the residual noise of place and of turn, one variance each
     if not model.full:
         place[:] = 0
@@ -76,12 +77,29 @@ def joint_noise(model: Model, solution: Solution, weighed: Measured, measured: M
 
 
 def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
-    """Return the poses with what the joints are off by chance in their covariance."""
-    if measured.cov is None or not sigma_rad.any():
+    """Return the poses with what the joints are off by chance in their covariance.
+
+    So is on which side of its play a joint lies where weight and friction are about as strong.
+    """
+    if measured.cov is None:
         return measured
-    _, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
-    B = by_joints(model, J) * sigma_rad
+    phi = model.feature_values(measured.q, measured.approach)
+    variance = sigma_rad**2 + _of_sides(model, x, phi)
+    if not variance.any():
+        return measured
+    _, J = model.linearised(x, measured, phi)
+    B = by_joints(model, J) * np.sqrt(variance)[:, None]
     return replace(measured, cov=measured.cov + B @ B.swapaxes(1, 2))
+
+
+def _of_sides(model: Model, x: Array, phi: Array) -> Array:
+    """Return the variance (N, 6), rad^2, of where joints lie in play that weight closes: 1 - mean^2 of a side of +-1."""
+    out = np.zeros((len(phi), 6))
+    for k, f in enumerate(model.features):
+        if f.kind == "slack":
+            half = 0.5 * x[model.causes_at + k]
+            out[:, f.joint] = half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
+    return out
 
 
 def by_joints(model: Model, J: Array) -> Array:
