@@ -210,3 +210,15 @@ def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(cell):
         assert np.array_equal(other.gravity_duty(off.home), cell.gravity_duty(off.home))
         assert other.board.configuration() == cell.board.configuration()
         assert not np.array_equal(other.poses, cell.poses)
+
+
+def test_a_cell_like_another_sees_the_same_room_at_another_rate():
+    with Workcell(seed=4, machine="host", cameras=SMALL) as one:
+        with Workcell(seed=4, machine="host", cameras="640x360@120", like=one) as other:
+            alone = Workcell(seed=4, machine="host", cameras="640x360@120")
+            with alone:
+                for cell in (other, alone):
+                    cell.advance(0.05)
+                np.testing.assert_array_equal(other.source.read().left, alone.source.read().left)
+        with pytest.raises(InputError, match="like"):
+            Workcell(seed=5, machine="host", cameras=SMALL, like=one)

@@ -84,7 +84,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
         studies: list[Study] = []
         try:
-            studies = _studies(demo, calibration, outcome, plan, study_shots, progress)
+            studies = _studies(demo, cell, calibration, outcome, plan, study_shots, progress)
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is whole, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
@@ -103,14 +103,13 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
     return finish(finished, demo.folder)
 
 
-def _cell(demo: Demo, cameras: str) -> Workcell:
-    """Return the workcell of a demo, with some cameras."""
+def _cell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcell:
+    """Return the workcell of a demo, with some cameras; those of another that differs in their rate alone."""
     believed = demo.believed
     if believed is not None:  # its tool is whatever was seen; the motions are of the one that was drawn
         believed = replace(believed, T_flange_tool=open_arm("six_r").T_flange_tool)
-    return Workcell(
-        arm=demo.arm, cameras=cameras, seed=demo.seed, machine=demo.machine, rig=demo.rig, believed=believed
-    )
+    named: dict[str, Any] = {"arm": demo.arm, "seed": demo.seed, "machine": demo.machine, "rig": demo.rig}
+    return Workcell(cameras=cameras, believed=believed, like=like, **named)
 
 
 def station_of(cell: Workcell) -> Station:
@@ -140,14 +139,20 @@ def cameras_at(cameras: str, rate_hz: float) -> str:
 
 
 def _studies(
-    demo: Demo, calibration: Calibration, outcome: Outcome, plan: MotionPlan, shots: int, progress: Progress
+    demo: Demo,
+    cell: Workcell,
+    calibration: Calibration,
+    outcome: Outcome,
+    plan: MotionPlan,
+    shots: int,
+    progress: Progress,
 ) -> list[Study]:
     """Make the studies, unless that is left out or the run ended early."""
     if not shots or outcome.closed_s is None or outcome.ended_by is not None or outcome.interrupted:
         return []
 
     def at_rate(rate_hz: float) -> Workcell:
-        return _cell(demo, cameras_at(demo.cameras, rate_hz))
+        return _cell(demo, cameras_at(demo.cameras, rate_hz), cell)
 
     found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
     return [*found, rate_study(at_rate, station_of, calibration.rig, outcome, plan, progress)]

@@ -79,7 +79,8 @@ def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = l
 
     def changed(name: str, unit: str, values: Sequence[float], errors: Callable[[float], _Errors]) -> Study:
         progress(f"study: error against {name}")
-        return _study(name, unit, values, [errors(value) for value in values])
+        with ThreadPoolExecutor(2) as both:
+            return _study(name, unit, values, list(both.map(errors, values)))
 
     def seen(**given: float) -> _Errors:
         return _static(seed, shots, **given)
@@ -147,8 +148,7 @@ def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: f
         )
         return Shot(f"{k}", *images)
 
-    with ThreadPoolExecutor(2) as both:
-        return list(both.map(shot, range(shots))), Ts
+    return [shot(k) for k in range(shots)], Ts
 
 
 def _measured(rig: StereoRig, shots: Sequence[Shot], Ts_left_body: Array) -> _Errors:
@@ -181,14 +181,18 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
     with ThreadPoolExecutor(2) as both:
         pairs = list(both.map(pair, range(len(Ts))))
     rendered = _rendered(true, seed, max(4, shots // 2), _DISTANCE, _NOISE)
+    # Drawn beforehand: what is drawn is not to depend on which calibration is done first.
+    drawn = [[rng.choice(len(pairs), size, replace=False) for _ in range(_DRAWS)] for size in sizes]
+
+    def calibrated(chosen: Array) -> _Errors:
+        rig = calibrate_boards(board, [pairs[k] for k in chosen], (_SIZE, _SIZE), models=("brown5",), flat=True).rig
+        return _measured(rig, *rendered)
+
     found = []
-    for size in sizes:
+    for size, draws in zip(sizes, drawn, strict=True):
         progress(f"study: calibrations of {size} pairs")
-        each = []
-        for _ in range(_DRAWS):
-            chosen = [pairs[k] for k in rng.choice(len(pairs), size, replace=False)]
-            rig = calibrate_boards(board, chosen, (_SIZE, _SIZE), models=("brown5",), flat=True).rig
-            each.append(_measured(rig, *rendered))
+        with ThreadPoolExecutor(2) as both:
+            each = list(both.map(calibrated, draws))
         found.append(
             _Errors(
                 np.concatenate([e.error for e in each]),

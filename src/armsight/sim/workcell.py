@@ -113,6 +113,7 @@ class Workcell:
         distance_m: float = DISTANCE_M,
         baseline_m: float = BASELINE_M,
         noise: float = 2.0,
+        like: Workcell | None = None,
     ) -> None:
         """Build a cell; a second or so.
 
@@ -127,9 +128,10 @@ class Workcell:
             distance_m: from the cameras to the body of the arm at home.
             baseline_m: between the cameras.
             noise: of the sensors, grey levels.
+            like: a cell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
 
         Raises:
-            InputError: an unknown name or a bad file.
+            InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
             DeviceError: the firmware is not there or does not answer.
         """
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
@@ -143,26 +145,34 @@ class Workcell:
         self._parts = solids(self._built_to)
         self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
         self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
-        self._stand(distance_m, noise)
+        self._room = (arm, rig, seed, baseline_m, distance_m, noise, self.timing.image_size_px, self._built_to.name)
+        self._stand(distance_m, noise, like)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD
         self.link = EmulatedLink(open_machine(machine), self.plant)
         self.board = configured(self.link, configuration(self._built_to, self._parts, self._motors))
 
-    def _stand(self, distance_m: float, noise: float) -> None:
+    def _stand(self, distance_m: float, noise: float, like: Workcell | None) -> None:
         """Screw the body to the tool and stand the cameras before it."""
+        if like is not None and like._room != self._room:
+            raise InputError(f"this cell is {self._room}, the one it is to be like is {like._room}")
         seed = self._seed
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         self._T_tool_body = mount @ exp_se3(off)
         self._T_base_rig = placed_rig(self._built_to, self._rig, mount, seed, distance_m)
-        places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
-        stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
-        with ThreadPoolExecutor(2) as pool:
-            left, right = pool.map(stand, self._rig.cameras, places)
+        if like is not None:
+            cameras = like._cameras
+        else:
+            places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
+            stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
+            with ThreadPoolExecutor(2) as pool:
+                left, right = pool.map(stand, self._rig.cameras, places)
+            cameras = left, right
+        self._cameras: tuple[CellCamera, CellCamera] = cameras
         clock = (lambda: self.t_s, self.advance)
         body = (body_patterns(), self._T_tool_body)
-        self.source = CellSource(self.plant, (left, right), self.timing, body, clock, seed)
+        self.source = CellSource(self.plant, cameras, self.timing, body, clock, seed)
 
     @property
     def t_s(self) -> float:
