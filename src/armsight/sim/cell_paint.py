@@ -59,8 +59,8 @@ def _nearer(
         for u in range(box[0], box[2]):
             if ids[v, u] == 0:
                 continue
-            d = rays[v + corner[1], u + corner[0]]
-            if (M[2, 0] * d[0] + M[2, 1] * d[1] + M[2, 2] * d[2]) * depth[v, u] < 1.0:
+            y, x = v + corner[1], u + corner[0]
+            if (M[2, 0] * rays[0, y, x] + M[2, 1] * rays[1, y, x] + M[2, 2] * rays[2, y, x]) * depth[v, u] < 1.0:
                 coarse[v, u] = behind[v, u]
                 slot[v, u] = -1
 
@@ -107,6 +107,9 @@ def _edges(patterns: tuple[Pattern, ...]) -> Array:
     return np.array(around)
 
 
+_nodes = lru_cache(np.polynomial.legendre.leggauss)
+
+
 @lru_cache(maxsize=64)
 def _grid(pattern: Pattern) -> Grid:
     """Return a pattern's cells as the painter takes them."""
@@ -146,8 +149,9 @@ class CellCamera:
         self.camera, self.T_base_camera = camera, T_base_camera
         self._sensor = sensor or Sensor()
         self._corners = corner_rays(camera)
-        self._rays = pixel_rays(self._corners)
-        self.still: View = view(camera, self._rays, T_base_camera, seed, foot, more)
+        rays = pixel_rays(self._corners)
+        self.still: View = view(camera, rays, T_base_camera, seed, foot, more)
+        self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1))
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
         self._still_grey = self._blur(self.still.light.copy()) * self._gain
@@ -226,7 +230,7 @@ class CellCamera:
             ends = body.T_camera_body @ exp_se3(np.outer((-0.5, 0.5), shutter.exposure_s * body.twist))
             before, after = (self._outlines(T[None], body.patterns) for T in ends)
             way_px = max(way_px, float(np.nan_to_num(np.abs(after - before)).max()))
-        nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
+        nodes, weights = _nodes(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
         steps = []
         for x, w in zip(nodes, weights, strict=True):
             faces = [face for body in bodies for face in self._seen(body, 0.5 * shutter.exposure_s * float(x), shutter)]
