@@ -1,6 +1,6 @@
 """One camera's images of the cell: what stands still is kept, the arm and the body are drawn where they are.
 
-The arm is cast anew within the pixels it can cover (cell_rays), at the middle of the exposure. Flat patterns (the body, a
+The arm is cast anew within the pixels it can cover (cell_links), at the middle of the exposure. Flat patterns (the body, a
 board, a card) are painted exactly over it by ``paint``, once for about every pixel they move during the exposure, and
 what of the arm is nearer stays before them. Then the lens's blur, light and vignetting, noise and rounding, as in
 ``optics``. Noise comes from a long strip drawn once, begun elsewhere for every image.
@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import exp_se3, inverse, transform
-from armsight.sim import cell_rays
+from armsight.sim import cell_links
 from armsight.sim.cell_noise import Window, exposed
 from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, corner_rays, pixel_rays, view
 from armsight.sim.cell_solids import Solids
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded, spread
-from armsight.sim.paint import SUB, Grid, Slots, paint, paint_disc
+from armsight.sim.paint import Grid, paint
+from armsight.sim.paint_disc import paint_disc
+from armsight.sim.paint_parts import SUB, Slots
 from armsight.sim.render import OUTLINE, Shutter, outline
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
@@ -191,7 +193,7 @@ class CellCamera:
         u0, v0, u1, v1 = window
         light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
-        cell_rays.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
+        cell_links.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
         seen = self._blur(light) if light.size else light.astype(np.float32)
         if crop[0] < crop[2] and crop[1] < crop[3]:
             core = self._core(crop, margin)
@@ -211,7 +213,7 @@ class CellCamera:
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
         light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
-        cell_rays.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
+        cell_links.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
         return ids
 
     def _around(self, boxes: Sequence[tuple[int, ...]], margin: int) -> Window:

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 
 from armsight.data import Array, Image
 from armsight.errors import InputError
-from armsight.sim.paint import SUB, Slots
+from armsight.sim.paint_parts import SUB, Slots
 
 Radiance = NDArray[np.float32]
 

@@ -8,24 +8,18 @@ of each is exact in area: one edge, or the rim of a disc, cuts a square in two, 
 straight within a part but for a bend that is put in by its mean); where several edges meet, a part is clipped by them
 (Sutherland and Hodgman, CACM 17(1), 1974). The parts are kept, so that the blur of the lens can be laid over what is
 really there and not over whole pixels.
-
-All compiled functions that call each other stay in this file: numba's cache on disk looks at one file's age only.
 """
 
 from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.sim.paint_parts import SUB, Box, Slots, ahead_of, half, open_parts, part, plane_row, square_of
 
-#: Parts of an edge pixel along each side.
-SUB = 4
 _VERTICES = 12  # a square cut by two pairs of lines has at most 8 corners
 
-Slots = NDArray[np.int32]
-Box = tuple[int, int, int, int]
 Grid = tuple[Array, Array, Array]
 Span = tuple[int, int, int, int]
 
@@ -131,104 +125,6 @@ def _clip(c: Array, grid: Grid, span: Span, old: float, b: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _half(c: float, u: float, v: float) -> float:
-    """Return in which share of the square with sides from -1/2 to 1/2 the plane c + u x + v y is above zero."""
-    u, v = abs(u), abs(v)
-    if u < v:
-        u, v = v, u
-    if 2 * abs(c) >= u + v:
-        return 1.0 if c > 0.0 else 0.0
-    if 2 * abs(c) <= u - v:
-        return 0.5 + c / u
-    corner = 0.5 * (u + v) - abs(c)
-    share = corner * corner / (2 * u * v)
-    return 1.0 - share if c > 0.0 else share
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _square(top: Array, bottom: Array, k: int, out: Array) -> None:
-    """Write out (4, 3), what interpolates the area between points k and k + 1 of two lines: middle, slopes, twist."""
-    for c in range(3):
-        a, b, d, e = top[c, k], top[c, k + 1], bottom[c, k], bottom[c, k + 1]
-        out[0, c] = 0.25 * (a + b + d + e)
-        out[1, c] = 0.5 * (b - a + e - d)
-        out[2, c] = 0.5 * (d - a + e - b)
-        out[3, c] = a - b - d + e
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _part(square: Array, a: int, b: int, out: Array) -> None:
-    """Write out (3, 3), middle and slopes of the part in row a and column b of a square (4, 3)."""
-    x, y = (b + 0.5) / SUB - 0.5, (a + 0.5) / SUB - 0.5
-    for c in range(3):
-        out[0, c] = square[0, c] + x * square[1, c] + y * square[2, c] + x * y * square[3, c]
-        out[1, c] = (square[1, c] + y * square[3, c]) / SUB
-        out[2, c] = (square[2, c] + x * square[3, c]) / SUB
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return the ends of the line c + u x + v y = 0 within the square of :func:`_half`; its middle where it misses."""
-    turned = abs(u) < abs(v)
-    if turned:
-        u, v = v, u
-    if 2 * abs(c) >= abs(u) + abs(v) or u == 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    x0, y0, x1, y1 = (0.5 * v - c) / u, -0.5, (-0.5 * v - c) / u, 0.5
-    if abs(x0) > 0.5:
-        x0 = 0.5 if x0 > 0.0 else -0.5
-        y0 = -(c + u * x0) / v
-    if abs(x1) > 0.5:
-        x1 = 0.5 if x1 > 0.0 else -0.5
-        y1 = -(c + u * x1) / v
-    return (y0, x0, y1, x1) if turned else (x0, y0, x1, y1)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inside_rim(at: Array, disc: Array) -> float:
-    """Return in which share of an area, its middle and slopes at (3, 3), a disc is: its rim is nearly straight there."""
-    x0, y0, radius = disc[0], disc[1], disc[2]
-    x, xu, xv = at[0, 0] - x0 * at[0, 2], at[1, 0] - x0 * at[1, 2], at[2, 0] - x0 * at[2, 2]
-    y, yu, yv = at[0, 1] - y0 * at[0, 2], at[1, 1] - y0 * at[1, 2], at[2, 1] - y0 * at[2, 2]
-    away = max(np.sqrt(x * x + y * y), 1e-3 * radius * at[0, 2])
-    u, v = radius * at[1, 2] - (x * xu + y * yu) / away, radius * at[2, 2] - (x * xv + y * yv) / away
-    c = radius * at[0, 2] - away
-    # The rim bends away from its tangent, by the mean square of the way along it within the area, over its diameter.
-    su, sv, eu, ev = _chord(c, u, v)
-    sx, sy, ex, ey = su * xu + sv * xv, su * yu + sv * yv, eu * xu + ev * xv, eu * yu + ev * yv
-    square = (sx * (sx + ex) + ex * ex + sy * (sy + ey) + ey * ey) / 3
-    return _half(c - max(square - c * c, 0.0) / (2 * away), u, v)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inside(points: Array, disc: Array, out: Array) -> None:
-    """Write out (n,), above zero where homogeneous plane points (3, n) lie in a disc: squares of distances within."""
-    for k in range(out.size):
-        x, y = points[0, k] - disc[0] * points[2, k], points[1, k] - disc[1] * points[2, k]
-        w = disc[2] * points[2, k]
-        out[k] = w * w - x * x - y * y
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _bulge(square: Array, disc: Array) -> float:
-    """Return twice by how much a place in a pixel may be further in a disc, as :func:`_inside` counts, than its corners."""
-    total = 0.0
-    for k in range(1, 3):
-        x, y = square[k, 0] - disc[0] * square[k, 2], square[k, 1] - disc[1] * square[k, 2]
-        total += 0.5 * (x * x + y * y)
-    return total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _paint_rim(square: Array, disc: Array, at: Array, parts: Array) -> None:
-    """Repaint the parts (SUB, SUB) of a pixel that a disc's rim crosses."""
-    for a in range(SUB):
-        for b in range(SUB):
-            _part(square, a, b, at)
-            parts[a, b] += _inside_rim(at, disc) * (disc[3] - parts[a, b])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paint_edge(square: Array, grid: Grid, span: Span, at: Array, parts: Array) -> None:
     """Repaint the parts (SUB, SUB) of a pixel that one edge crosses, between two columns or two rows of cells."""
     xe, ye, values = grid
@@ -237,43 +133,11 @@ def _paint_edge(square: Array, grid: Grid, span: Span, at: Array, parts: Array) 
     before, after = values[j0, i0], values[j1, i1]
     for a in range(SUB):
         for b in range(SUB):
-            _part(square, a, b, at)
+            part(square, a, b, at)
             c, u, v = at[0, axis] - edge * at[0, 2], at[1, axis] - edge * at[1, 2], at[2, axis] - edge * at[2, 2]
-            share, old = _half(c, u, v), parts[a, b]
+            share, old = half(c, u, v), parts[a, b]
             low, high = before if before >= 0.0 else old, after if after >= 0.0 else old
             parts[a, b] = low + share * (high - low)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _plane_row(rays: Array, M: Array, v: int, u0: int, out: Array) -> bool:
-    """Cast the pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; tell if all see it."""
-    least = np.inf
-    for k in range(out.shape[1]):
-        x, y, z = rays[v, u0 + k, 0], rays[v, u0 + k, 1], rays[v, u0 + k, 2]
-        for c in range(3):
-            out[c, k] = M[c, 0] * x + M[c, 1] * y + M[c, 2] * z
-        least = min(least, out[2, k])
-    return least > 0.0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _ahead(top: Array, bottom: Array, k: int) -> bool:
-    """Tell whether points k and k + 1 of two lines see the plane before them."""
-    return bool(min(min(top[2, k], top[2, k + 1]), min(bottom[2, k], bottom[2, k + 1])) > 0.0)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: int) -> tuple[Array, int, int]:
-    """Return the parts of a pixel, making them from its one value where it has none yet: parts, slot, count."""
-    if slot[v, u] >= 0:
-        return fine, slot[v, u], count
-    if count == fine.shape[0]:
-        grown = np.empty((2 * count, SUB, SUB))
-        grown[:count] = fine
-        fine = grown
-    fine[count] = coarse[v, u]
-    slot[v, u] = count
-    return fine, count, count + 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -343,15 +207,15 @@ def paint(
     for v in range(v0, v1):
         M = Ms[min(v, Ms.shape[0] - 1)]
         if v == v0 or Ms.shape[0] > 1:  # each row of a rolling shutter sees its own plane
-            ahead = _plane_row(rays, M, v, u0, bottom)
+            ahead = plane_row(rays, M, v, u0, bottom)
             _cells(bottom, xe, ye, bottom_cells)
         top, bottom, top_cells, bottom_cells = bottom, top, bottom_cells, top_cells
         all_ahead = ahead
-        ahead = _plane_row(rays, M, v + 1, u0, bottom)
+        ahead = plane_row(rays, M, v + 1, u0, bottom)
         _cells(bottom, xe, ye, bottom_cells)
         all_ahead = all_ahead and ahead
         for k in range(n):
-            if not all_ahead and not _ahead(top, bottom, k):
+            if not all_ahead and not ahead_of(top, bottom, k):
                 continue
             cell = top_cells[k]
             whole = top_cells[k + 1] == cell and bottom_cells[k] == cell and bottom_cells[k + 1] == cell
@@ -364,64 +228,11 @@ def paint(
                     coarse[v, u0 + k] = value
                     slot[v, u0 + k] = -1
                 continue
-            fine, s, count = _open_parts(v, u0 + k, coarse, slot, fine, count)
+            fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
             if span[1] - span[0] + span[3] - span[2] == 1:
-                _square(top, bottom, k, square)
+                square_of(top, bottom, k, square)
                 _paint_edge(square, grid, span, at, fine[s])
             else:
                 _part_corners(top, bottom, k, fan)
                 _paint_parts(fan, fan_cells, grid, fine[s], buffer)
-    return fine, count
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def paint_disc(
-    rays: Array, Ms: Array, box: Box, disc: Array, coarse: Array, slot: Slots, fine: Array, count: int
-) -> tuple[Array, int]:
-    """Paint a disc.
-
-    Args:
-        rays: see :func:`paint`.
-        Ms: see there.
-        box: see there.
-        disc: (4,) centre x, y, radius and value.
-        coarse: see there.
-        slot: see there.
-        fine: see there.
-        count: see there.
-
-    Returns:
-        As there.
-    """
-    u0, v0, u1, v1 = box
-    n = u1 - u0
-    if n <= 0:
-        return fine, count
-    top, bottom = np.empty((3, n + 1)), np.empty((3, n + 1))
-    inside_top, inside_bottom = np.empty(n + 1), np.empty(n + 1)
-    square, at, ahead = np.empty((4, 3)), np.empty((3, 3)), False
-    for v in range(v0, v1):
-        M = Ms[min(v, Ms.shape[0] - 1)]
-        if v == v0 or Ms.shape[0] > 1:
-            ahead = _plane_row(rays, M, v, u0, bottom)
-            _inside(bottom, disc, inside_bottom)
-        top, bottom, inside_top, inside_bottom = bottom, top, inside_bottom, inside_top
-        all_ahead = ahead
-        ahead = _plane_row(rays, M, v + 1, u0, bottom)
-        _inside(bottom, disc, inside_bottom)
-        all_ahead = all_ahead and ahead
-        _square(top, bottom, n // 2, square)
-        bulge = _bulge(square, disc)
-        for k in range(n):
-            if not all_ahead and not _ahead(top, bottom, k):
-                continue
-            low = min(min(inside_top[k], inside_top[k + 1]), min(inside_bottom[k], inside_bottom[k + 1]))
-            high = max(max(inside_top[k], inside_top[k + 1]), max(inside_bottom[k], inside_bottom[k + 1]))
-            if low > 0.0:
-                coarse[v, u0 + k] = disc[3]
-                slot[v, u0 + k] = -1
-            elif high > -bulge:
-                fine, s, count = _open_parts(v, u0 + k, coarse, slot, fine, count)
-                _square(top, bottom, k, square)
-                _paint_rim(square, disc, at, fine[s])
     return fine, count

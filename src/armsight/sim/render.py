@@ -18,7 +18,9 @@ from armsight.data import Array, Image
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
-from armsight.sim.paint import SUB, Box, paint, paint_disc
+from armsight.sim.paint import paint
+from armsight.sim.paint_disc import paint_disc
+from armsight.sim.paint_parts import SUB, Box
 from armsight.sim.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 
