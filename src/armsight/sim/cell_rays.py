@@ -1,6 +1,7 @@
 """Cast rays at capsules and boxes: what stands still around an arm looks like, without GL.
 
-Surfaces are dull: a lamp's light falls off with the cosine, and some comes from everywhere (Lambert). Capsules are met as in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end.
+Surfaces are dull: a lamp's light falls off with the cosine, and some comes from everywhere (Lambert).
+Capsules are met as in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end.
 
 All compiled functions that call each other stay in this file: numba's cache on disk looks at one file's age only.
 """
