@@ -291,3 +291,28 @@ def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp
 def test_a_motion_file_is_told_from_what_was_attained(tmp_path, capsys):
     assert said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
     refused(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
+
+
+def test_a_row_far_from_its_pose_is_named_and_the_order_of_rows_picks_nothing(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose"]
+    before = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)
+    assert not any("counts" in note for note in before["notes"])
+    after = json.loads(said(capsys, file_of(tmp_path / "b.csv", rows[::-1]), "--json").out)
+    assert (before["distance"]["from"], before["drift"]["pose"]) == ("P2", "P1")
+    assert (after["distance"]["to"], after["drift"]["pose"]) == ("P4", "P1")
+    n = next(n for n, row in enumerate(rows) if row[1] == "P3" and row[2] == 7)
+    rows[n][7] += 5e-3
+    (told,) = [
+        note
+        for note in json.loads(said(capsys, file_of(tmp_path / "c.csv", rows), "--json").out)["notes"]
+        if "counts" in note
+    ]
+    assert "P3, cycle 7: 4.93 mm" in told
+
+
+def test_turns_that_are_not_given_have_no_figures(tmp_path, capsys):
+    turns = [n for n, name in enumerate([*COLUMNS, *COMMAND]) if "q" in name]
+    for left, known in (([], (True, True)), (turns[4:], (False, True)), (turns, (False, False))):
+        rows = [["" if n in left else v for n, v in enumerate(row)] for row in rows_of() if row[0] == "pose"]
+        pose_1 = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)["poses"]["P1"]
+        assert (pose_1["AP_turn_rad"] is not None, pose_1["RP_turn_rad"] is not None) == known

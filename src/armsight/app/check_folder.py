@@ -6,14 +6,13 @@ that was commanded there, wherever else in the motion that pose comes again; a l
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from armsight.app.check_paths import path_rows, turns_of
-from armsight.app.check_rows import SAME_M, Attained, Row
+from armsight.app.check_rows import SAME_M, Attained, Row, natural
 from armsight.app.check_stretch import Noise, Stretch, noise_of, plain, stood, stretches_of
 from armsight.data import Array
 from armsight.errors import InputError
@@ -80,9 +79,4 @@ def _rests(stretches: list[Stretch], run: set[str], noise: Noise) -> tuple[list[
             notes.append(f"left out: {name} come to from {before}, too seldom ({len(came)})")
         else:
             rows += came
-    return sorted(rows, key=lambda row: (_natural(row.pose), row.t_s)), notes
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which P2 comes before P10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
+    return sorted(rows, key=lambda row: (natural(row.pose), row.t_s)), notes

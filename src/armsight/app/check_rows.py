@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -53,6 +54,8 @@ class Row(Record):
         T_command: (4, 4) commanded.
         cov: (3, 3) covariance of the place by the instrument, base's axes, m^2: what differs from row to row.
         cov_common: (3, 3) that of the instrument's constant error.
+        turned: whether the attained turn is known.
+        turn_commanded: whether the commanded one is.
     """
 
     test: str
@@ -64,6 +67,8 @@ class Row(Record):
     T_command: Array
     cov: Array
     cov_common: Array
+    turned: bool = True
+    turn_commanded: bool = True
 
 
 class Turn(NamedTuple):
@@ -169,6 +174,8 @@ def _row(where: str, cells: dict[str, str]) -> Row:
         _pose(where, numbers, "command_"),
         covs[0],
         covs[1],
+        _TURN[0] in numbers,
+        _COMMAND[3] in numbers,
     )
 
 
@@ -196,14 +203,26 @@ def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
     return pose(from_quaternion_wxyz(q / np.linalg.norm(q)), np.array([numbers[prefix + name] for name in _PLACE]))
 
 
+def natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which P2 comes before P10."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
+
+
 def rows_csv(rows: list[Row]) -> str:
     """Return rows as the CSV that they can be read from again; of a covariance its diagonal."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for row in rows:
-        numbers = [v for T in (row.T, row.T_command) for v in (*T[:3, 3], *quaternion_wxyz(T[:3, :3]))]
-        numbers += [v for cov in (row.cov, row.cov_common) for v in np.sqrt(np.diag(cov))]
-        t_s = "" if row.t_s is None else f"{row.t_s:.6f}"
-        writer.writerow([row.test, row.pose, row.cycle, row.approach, t_s, *(f"{v:.9f}" for v in numbers)])
+        cells = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
+        for T, known in ((row.T, row.turned), (row.T_command, row.turn_commanded)):
+            cells += _decimals(T[:3, 3])
+            cells += _decimals(quaternion_wxyz(T[:3, :3])) if known else [""] * len(_TURN)
+        for cov in (row.cov, row.cov_common):
+            cells += _decimals(np.sqrt(np.diag(cov)))
+        writer.writerow(cells)
     return out.getvalue()
+
+
+def _decimals(numbers: Array) -> list[str]:
+    return [f"{number:.9f}" for number in numbers]

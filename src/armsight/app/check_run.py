@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.check_folder import attained_in
-from armsight.app.check_rows import SAME_M, TESTS, Attained, Row, Turn, read_rows
+from armsight.app.check_rows import SAME_M, TESTS, Attained, Row, Turn, natural, read_rows
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop import iso9283
@@ -22,6 +22,9 @@ from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
 _WIDE = 10
 #: So many times must the first pose have been attained for its drift.
 _DRIFTS = 10
+#: Of so many rows and more one is told that lies so many times further from the middle than is usual among them: normal
+#: scatter, however long its shape, does so in one pose of 300 with eight rows, and in one of 10,000 with thirty.
+_SEVERAL, _STRAY = 8, 8.0
 
 
 def read_check(path: Path, *, closed: bool = False) -> Attained:
@@ -114,7 +117,7 @@ def _covs(rows: list[Row]) -> Array:
 def _poses(rows: list[Row], notes: list[str]) -> dict[str, Any]:
     """Return the figures of poses; what is left out is added to the notes."""
     groups = _groups(rows, lambda row: row.pose)
-    often = {name: group for name, group in groups.items() if len(group) >= iso9283.LEAST}
+    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.LEAST}
     facts: dict[str, Any] = {}
     if not often:
         mean, largest = iso9283.anywhere(_off(rows), _covs(rows), _common(rows))
@@ -123,6 +126,7 @@ def _poses(rows: list[Row], notes: list[str]) -> dict[str, Any]:
     notes += [
         f"left out: {name}, attained too seldom ({len(group)})" for name, group in groups.items() if name not in often
     ]
+    notes += [told for group in often.values() for told in _strays(group)]
     facts["poses"] = {name: _pose(group) for name, group in often.items()}
     several = {name: _ways(group) for name, group in often.items()}
     facts |= {"vAP_m": known} if (known := {name: f for name, f in several.items() if f}) else {}
@@ -138,16 +142,31 @@ def _poses(rows: list[Row], notes: list[str]) -> dict[str, Any]:
     return facts
 
 
+def _strays(rows: list[Row]) -> list[str]:
+    """Name the rows of a pose that lie far from the others."""
+    p = _places(rows)
+    away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
+    usual = float(np.median(away))
+    return [
+        f"{row.pose}, {f'cycle {row.cycle}' if row.cycle else f'row {n + 1} of it'}: {1e3 * off:.2f} mm from the middle of "
+        f"the others, which are {1e3 * usual:.2f} mm from it; it counts, unless you take it out"
+        for n, (row, off) in enumerate(zip(rows, away, strict=True))
+        if len(rows) >= _SEVERAL and off > _STRAY * usual
+    ]
+
+
 def _pose(rows: list[Row]) -> dict[str, Any]:
-    """Return AP and RP of a pose."""
+    """Return AP and RP of a pose; None for what asks for turns that are not known."""
     figures = iso9283.pose_figures(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
+    turned = all(row.turned for row in rows)
+    aimed = turned and all(row.turn_commanded for row in rows)
     return {
         "count": figures.count,
         "AP_m": figure(figures.accuracy),
         "AP_xyz_m": figures.accuracy_xyz.tolist(),
-        "AP_turn_rad": figures.accuracy_turn.tolist(),
+        "AP_turn_rad": figures.accuracy_turn.tolist() if aimed else None,
         "RP_m": figure(figures.repeatability),
-        "RP_turn_rad": figures.repeatability_turn.tolist(),
+        "RP_turn_rad": figures.repeatability_turn.tolist() if turned else None,
     }
 
 
