@@ -14,8 +14,9 @@ import pytest
 
 from armsight.app import experiment, run_calibrate
 from armsight.app.experiment import run_experiment
+from armsight.app.interrupts import uninterrupted
 from armsight.app.motion_file import QUICK, read_motions
-from armsight.app.run_beside import beside, steady, uninterrupted
+from armsight.app.run_beside import beside, steady
 from armsight.app.run_log import Log, Segment
 from armsight.app.run_loop import PERIOD_S, Loop
 from armsight.app.run_motions import Planned

@@ -6,14 +6,14 @@ an interrupt leaves is a :class:`Outcome` with everything measured until then; t
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from armsight.app.interrupts import uninterrupted
 from armsight.app.motion_file import MotionPlan
-from armsight.app.run_beside import steady, uninterrupted
+from armsight.app.run_beside import steady
 from armsight.app.run_calibrate import HandEyeRun, find_delay, find_mounting
 from armsight.app.run_log import Log, Segment
 from armsight.app.run_loop import PERIOD_S, Loop
@@ -107,7 +107,7 @@ def run_experiment(
         All that was measured, also where something ended it early.
     """
     outcome = Outcome(station.target.body)
-    with contextlib.nullcontext() if station.clock is None else steady():
+    with steady():
         _run(station, rig, plan, targets, outcome, progress, cover, close_loop)
     return outcome
 

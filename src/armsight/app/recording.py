@@ -6,21 +6,19 @@ A line is added after both images are whole on disk: whatever stops the recordin
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import errno
 import io
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import replacing
@@ -83,8 +81,10 @@ def record(
             first = first or shot
             if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
-            with _undisturbed():
+            with uninterrupted() as came:  # no shot is stored by half
                 writer.add(shot)
+            if came:
+                raise KeyboardInterrupt
             if on_shot is not None:
                 on_shot(shot)
     except KeyboardInterrupt:
@@ -94,22 +94,6 @@ def record(
     finally:
         writer.close()
     return Recording(folder, writer.shots, writer.problems, stopped, interrupted)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Hold an interrupt from the keyboard back until the block is done, so that no shot is stored by half."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread is interrupted
-        yield
-        return
-    held: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if held:
-        raise KeyboardInterrupt
 
 
 def _age_s(shot: Shot, first: Shot, started_s: float) -> float:

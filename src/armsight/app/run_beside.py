@@ -1,12 +1,10 @@
-"""What goes on beside a loop that must not pause: long work, and looking at images. And interrupts that must wait."""
+"""What goes on beside a loop that must not pause: long work, and looking at images."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
@@ -55,20 +53,6 @@ def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]]
         return done.result()
     finally:
         pool.shutdown(wait=False)
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[list[int]]:
-    """Hold an interrupt from the keyboard back; the block is handed a list that has those which came."""
-    held: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # only the main thread is interrupted
-        yield held
-        return
-    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
-    try:
-        yield held
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 class Watch:

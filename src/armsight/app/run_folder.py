@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from armsight.app.experiment import Outcome
+from armsight.app.interrupts import uninterrupted
 from armsight.app.motion_file import MotionPlan
 from armsight.app.poses import csv_text, pose_record
-from armsight.app.run_beside import uninterrupted
 from armsight.app.run_data import RunData, assembled, cut, joints_of
 from armsight.app.run_files import joint_columns, write_handeye, write_shots
 from armsight.app.run_report import FIGURES, PAGE, RunReport, write_run_report
