@@ -128,12 +128,12 @@ def correlation_figure(run: Run) -> Figure:
 
 
 def causes_figure(run: Run) -> Figure:
-    """Draw what each cause moves the tool by."""
-    parts = list(contributions(run.found, run.measured).items())[::-1]
+    """Draw what each cause moves the tool by, the largest first."""
+    parts = sorted(contributions(run.found, run.measured).items(), key=lambda part: part[1])
     figure = new_figure(0.32 * len(parts) + 1.2)
     ax = figure.subplots()
     ax.barh([kind for kind, _ in parts], [1e3 * size for _, size in parts], color=BLUE, height=0.65)
     for row, (_, size) in enumerate(parts):
         ax.text(1e3 * size, row, f" {1e3 * size:.3f}", va="center", color=INK)
-    ax.set_xlabel("RMS displacement of the tool, mm, beyond what base and tool and the causes above take up")
+    ax.set_xlabel("RMS displacement of the tool, mm, beyond what base, tool and the causes found before it take up")
     return figure

@@ -35,8 +35,8 @@ FIGURES: dict[str, tuple[Callable[[Run], Figure], str, str]] = {
     "causes": (
         causes_figure,
         "What each cause contributes",
-        "What a cause moves the tool by on these poses, in the order in which the model grew; what two causes could "
-        "explain counts for the first of them.",
+        "What a cause moves the tool by on these poses, the largest first; what two causes could explain counts for the "
+        "one that was found first.",
     ),
     "growth": (
         growth_figure,

@@ -17,10 +17,11 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.identify.corrected import Corrected
+from armsight.loop.identify.diagnose import BAD_M, BAD_RAD, check_plausible, without_tool
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.toml_write import table_text, zeros_text
-from armsight.loop.identify.validate import Errors, Validation, validate
+from armsight.loop.identify.validate import LEAST, Errors, Validation, validate
 from armsight.robot.arm import Arm
 
 #: Parts for the held-out error where nothing is given to validate with; with more poses than this one part is enough.
@@ -74,16 +75,33 @@ def run_identify(
         priors: as in :func:`identify`.
         notes: of the reading.
         progress: is told what is being done.
+
+    Raises:
+        InputError: either file's poses cannot be of this arm, or are too few.
+        CalibrationError: the poses are too alike.
     """
     found = identify(arm, measured, priors=priors, progress=progress)
     if other is not None:
-        held_out = validate(found, other)
+        held_out = _validated(found, arm, other)
         how = f"{len(other)} poses of another file" + (", base and tool placed anew" if held_out.placed_anew else "")
         poses = other.q
     else:
         held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
         how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
     return Run(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
+
+
+def _validated(found: Identified, arm: Arm, other: Measured) -> Validation:
+    """Hold the arm against another file's poses; where they fit far too badly, say what would make them fit."""
+    held_out = validate(found, other)
+    off = held_out.identified
+    turned = bool(off.angle_rad.size) and float(np.median(off.angle_rad)) > BAD_RAD
+    if len(other) >= LEAST and (turned or float(np.median(off.position_m)) > BAD_M):
+        try:
+            check_plausible(without_tool(arm), other)
+        except InputError as error:
+            raise InputError(f"the poses to validate with: {error}") from None
+    return held_out
 
 
 def _left_out(

@@ -18,7 +18,7 @@ from armsight.loop.identify.fit import Mask
 #: Candidates weighed at once: bounds the memory.
 _BATCH = 250
 #: Levels that a joint is tried at, from both sides; sweeps over all poses at most, and the part that one must win to go on.
-LEVELS, SWEEPS, LEAST_WON = 7, 10, 0.003
+LEVELS, SWEEPS, LEAST_WON = 7, 3, 0.01
 
 #: Gives the whitened Jacobians (N, M, F) of poses q (N, 6) come to from sides (N, 6), and which of them are allowed.
 #: Those of poses that are not allowed do not count, but for the first.

@@ -19,11 +19,14 @@ from armsight.loop.identify import chain
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
-#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, and those of its track and gears. A
-#: potentiometer's track swings some nine times over its travel at most, and that may be three quarters of a turn.
-WAVES, RIPPLES = (1, 2), (3, 4, 5, 6, 7, 8, 9, 10, 11, 12)
-#: Fewer numbers measured than this cannot choose among the ripples' 120 coefficients without taking chance for a cause.
-ENOUGH = 350
+#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and the
+#: fastest: a potentiometer's track swings some nine times over its travel, and that may be three quarters of a turn.
+WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
+#: Fewer numbers measured than this cannot choose among the ripples' coefficients without taking chance for a cause.
+ENOUGH = 100
+#: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before. The
+#: fastest are then left out: chosen one by one, no prior holds them where the arm was not looked at.
+PLENTY = 10
 #: A bearing's friction holds a link in its play against weight with up to about this lever, m: some per cent of what the
 #: links of such arms have, as bearings' friction is of the load. Over half of it the play closes.
 FRICTION_M = 2e-3
@@ -47,12 +50,12 @@ class Feature(NamedTuple):
     detail: tuple[int, int] = (0, 0)
 
 
-def all_features(backlash: bool, ripple: bool) -> tuple[Feature, ...]:
-    """Return every cause there is; ``backlash`` where directions of approach are known, ``ripple`` with many poses."""
+def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
+    """Return every cause there is; ``backlash`` where directions of approach are known; the ripples' harmonics."""
     found = []
     for i in range(6):
         found.append(Feature(f"gain{i + 1}", "gain", i, "rad/rad"))
-        for n in (*WAVES, *RIPPLES) if ripple else WAVES:
+        for n in (*WAVES, *ripples):
             kind = "wave" if n in WAVES else "ripple"
             found += [Feature(f"{kind}{i + 1}_{w}{n}", kind, i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
         if backlash:

@@ -206,7 +206,8 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
         if p.kind in CURVE:
             curve = [k for k, other in enumerate(model.parameters) if other.kind in CURVE and other.joint == p.joint]
             name = f"sensor curve of joint {p.joint + 1}"
-            name += "" if together[curve].any() else f", {p.name[-1]} a turn"
+            turn = p.name.removeprefix(f"{p.kind}{p.joint + 1}_")[3:]  # of "sin12" or "cos2"
+            name += "" if together[curve].any() else f", {turn} a turn"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups
 

@@ -16,7 +16,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.evidence import scaled_prior
-from armsight.loop.identify.features import approaches
+from armsight.loop.identify.features import PLENTY, approaches
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit
 from armsight.loop.identify.growth import PLACEMENT, TOGETHER, Step, grown
 from armsight.loop.identify.joint_noise import NO_CHANCE, JointNoise, joint_noise, with_joint_noise
@@ -35,8 +35,6 @@ ALIKE = 0.02
 MOST = 4000
 #: Turns of fitting everything and laying what is left to the joints.
 TURNS = 3
-#: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before.
-PLENTY = 10
 #: Correlations larger than this are told.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")

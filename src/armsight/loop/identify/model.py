@@ -15,7 +15,7 @@ from armsight.data import Array, Record
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.geometry.rotation import exp_so3, log_so3, skew
 from armsight.loop.identify import chain
-from armsight.loop.identify.features import ENOUGH, Feature, all_features, values
+from armsight.loop.identify.features import ENOUGH, FAST, PLENTY, RIPPLES, Feature, all_features, values
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
@@ -65,8 +65,12 @@ class Model(Record):
     @staticmethod
     def of(arm: Arm, measured: Measured, *, backlash: bool) -> Model:
         """Return the model that fits what was measured."""
-        enough = len(measured) * measured.size >= ENOUGH
-        return Model(arm, measured.points, measured.R_rig_body is not None, all_features(backlash, enough))
+        numbers = len(measured) * measured.size
+        fast = all_features(backlash, (*RIPPLES, *FAST) if numbers >= ENOUGH else ())
+        model = Model(arm, measured.points, measured.R_rig_body is not None, fast)
+        if numbers < PLENTY * len(model.parameters):
+            return model
+        return model.with_features(all_features(backlash, RIPPLES))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

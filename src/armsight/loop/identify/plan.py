@@ -19,14 +19,16 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.loop.identify.design import exchanged, greedy
 from armsight.loop.identify.evidence import SCALED
-from armsight.loop.identify.fit import Mask, weighted
-from armsight.loop.identify.growth import PLACEMENT
+from armsight.loop.identify.features import FAST, RIPPLES, all_features
+from armsight.loop.identify.fit import Mask, noise_cov
+from armsight.loop.identify.joint_noise import by_joints
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.observable import observed
+from armsight.loop.identify.priors import SIGMA
 
 #: Candidates drawn, and places of the workspace at which the error is predicted.
-CANDIDATES, PROBES = 1500, 200
+CANDIDATES, PROBES = 800, 200
 #: Times that four times as many are drawn at most, of which those allowed become candidates.
 DRAWS = 40
 #: Links must stay this far above the base's plane, m, and parts of the arm that are not neighbours this far apart.
@@ -37,6 +39,9 @@ UNKNOWN = 0.1
 ROOM_RAD = 0.03
 #: A prior sigma of a cause says how large it may be (a data sheet's limit); it mostly is this part of it.
 MOSTLY = 1 / 3
+#: Joints are off by chance by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Else an
+#: instrument of 0.03 mm would have a few poses tell everything.
+CHANCE_RAD = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,7 @@ def plan_poses(
     done: Measured | None = None,
     visible: Callable[[Array], NDArray[np.bool_]] = lambda T_rig_body: np.ones(len(T_rig_body), bool),
     cov: Callable[[Array], Array] | None = None,
+    floor_m: float = FLOOR_M,
     seed: int = 0,
 ) -> Plan:
     """Choose the poses that tell most.
@@ -84,13 +90,15 @@ def plan_poses(
         done: what was measured already.
         visible: says which poses T_rig_body (N, 4, 4) the cameras can see.
         cov: gives the covariance (N, M, M) of what is seen of poses T_rig_body (N, 4, 4).
+        floor_m: how far above the base's plane the links must stay, m.
         seed: of the candidates.
 
     Raises:
         InputError: fewer candidates than ``n`` can be reached and seen.
     """
     rng = np.random.default_rng(seed)
-    scene = Scene(model, x, noise, visible, cov)
+    model, x, prior = _with_curves(model, x, prior)
+    scene = Scene(model, x, noise, visible, cov, floor_m)
     q, approach, seen = _candidates(scene, rng)
     if len(q) < n:
         raise InputError(f"only {len(q)} of {CANDIDATES} poses can be reached and seen; {n} were asked for")
@@ -122,6 +130,7 @@ class Scene(NamedTuple):
         noise: sigmas of place, m, and turn, rad, beyond ``cov``.
         visible: says which poses T_rig_body (N, 4, 4) the cameras can see.
         cov: gives the covariance (N, M, M) of what is seen of them; None: ``noise`` is all.
+        floor_m: how far above the base's plane the links must stay, m.
     """
 
     model: Model
@@ -129,6 +138,7 @@ class Scene(NamedTuple):
     noise: tuple[float, float]
     visible: Callable[[Array], NDArray[np.bool_]]
     cov: Callable[[Array], Array] | None
+    floor_m: float
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -143,7 +153,7 @@ class Scene(NamedTuple):
     def allowed(self, q: Array, approach: Array) -> Mask:
         """Say which poses (N,) are free and visible."""
         out = self.visible(self.T_rig_body(q, approach))
-        out[out] = free_of_collision(self.model, q[out])
+        out[out] = free_of_collision(self.model, q[out], self.floor_m)
         return out
 
     def seen(self, q: Array, approach: Array) -> Measured:
@@ -169,7 +179,10 @@ class Scene(NamedTuple):
     def whitened(self, measured: Measured) -> Array:
         """Return the whitened Jacobians (N, M, P)."""
         phi = self.model.feature_values(measured.q, measured.approach)
-        return weighted(self.model, self.x, measured, phi, self.noise)[1]
+        J = self.model.linearised(self.x, measured, phi)[1]
+        B = CHANCE_RAD * by_joints(self.model, J)
+        C = noise_cov(measured, self.noise) + B @ B.swapaxes(1, 2)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(C), J))
 
 
 def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
@@ -191,7 +204,7 @@ def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, M
     return q, approach, scene.seen(q, approach)
 
 
-def free_of_collision(model: Model, q: Array) -> Mask:
+def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
     """Say which joint angles (N, 6) keep the arm above the base's plane and apart from itself.
 
     Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
@@ -200,7 +213,7 @@ def free_of_collision(model: Model, q: Array) -> Mask:
         return np.zeros(0, bool)
     o = np.stack([model.arm.links(angles)[:, :3, 3] for angles in q])
     along = (o - model.arm.T_base_0[:3, 3]) @ model.up_base
-    out = np.asarray((along[:, 2:] > FLOOR_M).all(axis=1))
+    out = np.asarray((along[:, 2:] > floor_m).all(axis=1))
     out[out] = _segments_apart(o[out])
     return out
 
@@ -220,16 +233,26 @@ def _segments_apart(o: Array) -> Mask:
     return out
 
 
+def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Array]:
+    """Return a model, its vector and its priors with every harmonic of the sensors' curves.
+
+    Few poses may not choose among them, but where a curve is not looked at it stays unknown, and poses must be spread.
+    """
+    backlash = any(f.kind == "backlash" for f in model.features)
+    whole = model.with_features(all_features(backlash, (*RIPPLES, *FAST)))
+    known = dict(zip(model.names, zip(x, prior, strict=True), strict=True))
+    both = np.array([known.get(p.name, (0.0, SIGMA[p.kind])) for p in whole.parameters])
+    return whole, both[:, 0], both[:, 1]
+
+
 def _prior_covariance(prior: Array, free: Mask) -> Array:
     sigma = np.where(np.isfinite(prior), prior, UNKNOWN)[free]
     return np.asarray(np.diag(sigma**2))
 
 
 def _wanted(model: Model, x: Array, seen: Measured, free: Mask, rng: np.random.Generator) -> Array:
-    """Return the derivative (PROBES * 3, F) of places in the base at poses over the workspace."""
+    """Return the derivative (PROBES * 3, F) of places in the rig at poses over the workspace."""
     rows = rng.choice(len(seen), min(PROBES, len(seen)), replace=False)
     part = seen.rows(rows)
     _, J = model.linearised(x, part, model.feature_values(part.q, part.approach))
-    J = J[:, :3].copy()
-    J[:, :, [p.kind == PLACEMENT[0] for p in model.parameters]] = 0.0  # where the base is in the rig is not the arm's
-    return J[:, :, free].reshape(-1, int(free.sum()))
+    return J[:, :3, free].reshape(-1, int(free.sum()))

@@ -109,14 +109,17 @@ def _to_the_stops(play: Play, chance: float, told: float, sides: tuple[int, int]
 
 
 def _by_parameters(found: Identified, weighed: Measured, joint: int) -> Array:
-    """Return the variance (N,), rad^2, of where a joint stood that comes from the parameters' own."""
+    """Return the variance (N,), rad^2, of where a joint stood that comes from the fitted parameters' own.
+
+    What the choice of the model moves is common to the poses, and no scatter of them.
+    """
     assert weighed.cov is not None  # for the type checker: a joint's chance is known only with it
     model = found.model
     J = model.linearised(found.solution.x, weighed, model.feature_values(weighed.q, weighed.approach))[1]
     B = by_joints(model, J)[:, :, joint]
     pull = np.linalg.solve(weighed.cov + 1e-18 * np.eye(weighed.size), B[..., None])[..., 0]
     row = np.einsum("nm,nmp->np", pull, J) / np.einsum("nm,nm->n", pull, B)[:, None]
-    return np.asarray(np.einsum("np,pq,nq->n", row, found.cov, row))
+    return np.asarray(np.einsum("np,pq,nq->n", row, found.solution.cov, row))
 
 
 def _between_stops(joint: int, stood: Array, noise: Array) -> Play:
