@@ -172,6 +172,16 @@ def test_mistakes_in_the_data_are_named_and_do_not_spoil_the_held_out_line(tmp_p
     assert told["a2"]["value"] == pytest.approx(0.2535, abs=3 * told["a2"]["sigma"])
 
 
+def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_told_why(tmp_path, capsys):
+    data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
+    rows = [line.split(",") for line in other.read_text().splitlines()]
+    for row in rows[1:]:
+        row[1] = str(-float(row[1]))
+    other.write_text("\n".join(",".join(row) for row in rows))
+    words = ("to validate with", "the sign is turned of joint 2")
+    refused(said(capsys, "--model", "six_r", "--data", data, "--validate", other), *words)
+
+
 def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
     few, there = poses_csv(tmp_path / "few.csv", n=4), tmp_path / "there"
     refused(said(capsys, "--model", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")

@@ -64,6 +64,21 @@ def test_a_rig_nearer_than_the_arms_reach_sees_every_planned_pose(away_m, points
     assert seen_by(rig, T_rig, plan.q)[1].all()
 
 
+def test_poses_that_turn_the_body_further_away_than_it_was_seen_are_not_planned():
+    rig, T_rig = rig_in_front(), T_base_rig(1.6)
+    done = done_before(rig, T_rig, 600)
+    toward = np.einsum("nji,nj->ni", done.R_rig_body, -done.p_rig[:, 0])
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    near = np.flatnonzero(toward[:, 2] > np.cos(np.radians(40)))  # seen from its +z only
+    assert len(near) >= 15
+    plan, _ = plan_from(open_arm("ur10"), done.rows(near[:15]), rig, 3, 0)
+    T, inside = seen_by(rig, T_rig, plan.q)
+    ray = np.einsum("nji,nj->ni", T[:, :3, :3], -T[:, :3, 3])
+    assert inside.all()
+    # Its mean direction is that much off +z at most, and 10 degrees more are allowed.
+    assert (ray[:, 2] / np.linalg.norm(ray, axis=1) > np.cos(np.radians(40 + 40 + 10))).all()
+
+
 def test_a_rig_that_sees_no_pose_of_the_arm_is_told():
     rig = rig_in_front()
     T_away = T_base_rig(1.1) @ pose(np.diag([-1.0, 1, -1]), np.zeros(3))

@@ -10,8 +10,9 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.fit import fit
-from armsight.loop.identify.growth import PLACEMENT
+from armsight.loop.identify.growth import PLACEMENT, _Folds, _pays
 from armsight.loop.identify.identify import contributions, identify
+from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.model_file import open_model
@@ -195,6 +196,62 @@ def test_what_is_written_is_read_as_the_same_arm(scene, tmp_path):
         arm = open_model(str(tmp_path / name))
         np.testing.assert_allclose(arm.forward(q), found.model.tool_in_base(x, q, None), atol=1e-9)
         assert arm.inverse(arm.forward(arm.home + 0.1), near=arm.home).best is not None
+
+
+def test_a_sensors_curve_with_fast_swings_is_followed():
+    """Ten swings a turn, three over the range looked at; what is left is less than half of what it moves the tool by."""
+    w, rng = worn(4, backlash=False, compliance=False), np.random.default_rng(8)
+    q, approach = poses(w.nominal, 260, rng)
+
+    def off(q):
+        return np.deg2rad(0.04) * np.sin(10 * q[:, 1] + 1)[:, None] * np.eye(6)[1]
+
+    measured = replace(w.seen(q[:60] + off(q[:60]), approach[:60], rng), q=q[:60])
+    found = identify(w.nominal, measured)
+    q, approach = q[60:], approach[60:]
+    truth = w.T_rig_body(q + off(q), approach)
+    moved = np.linalg.norm((truth - w.T_rig_body(q, approach))[:, :3, 3], axis=1)
+    assert distance_m(found.model, found.solution.x, truth, q, approach).mean() < 0.5 * moved.mean()
+
+
+def test_with_plenty_of_numbers_the_fastest_harmonics_are_left_out():
+    arm, rng = open_arm("six_r"), np.random.default_rng(2)
+    names = {}
+    for n in (10, 60, 400):
+        q = rng.uniform(-1, 1, (n, 6))
+        T = arm.forward(q)
+        names[n] = Model.of(arm, Measured(q, T[:, None, :3, 3], T[:, :3, :3]), backlash=True).names
+    assert [("ripple1_sin3" in names[n], "ripple1_sin12" in names[n]) for n in names] == [
+        (False, False),
+        (True, True),
+        (True, False),
+    ]
+
+
+def test_one_pose_that_nothing_explains_does_not_rule_which_causes_pay():
+    folds = _Folds(*(np.zeros(0) for _ in range(3)), np.full(20, 18.0), *(np.zeros(0) for _ in range(2)))
+    without, with_it = np.full(20, 4.0), np.ones(20)
+    with_it[3] = 100.0  # by the mean of squares it would cost more than it brings
+    assert with_it.mean() > without.mean()
+    assert _pays(without, with_it, folds)
+    assert not _pays(without, without * (1 + 1e-12), folds)
+
+
+def test_near_the_balance_of_weight_and_friction_the_side_is_uncertain():
+    w, n = worn(1), 2000
+    q, approach = poses(w.nominal, n, np.random.default_rng(6))
+    m = Measured(q, np.zeros((n, 1, 3)), np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 6, 6)), approach)
+    model = Model.of(w.nominal, m, backlash=True)
+    x, column = model.nominal(), model.names.index("slack5")
+    x[column] = 4e-3
+    mean = 0.5 * 4e-3 * 2 * model.feature_values(q, m.approach)[:, column - model.causes_at]
+    _, J = model.linearised(x, m, model.feature_values(q, m.approach))
+    b = J[:, :, model.names.index("offset5")]
+    along = np.einsum("ni,nij,nj->n", b, with_joint_noise(model, x, m, np.zeros(6)).cov, b) / np.sum(b**2, axis=1) ** 2
+    # A link lies at one of two stops: the mean's square and the variance add up to the stop's square.
+    np.testing.assert_allclose(along + mean**2, np.full(n, 2e-3**2), rtol=1e-6)
+    assert (along > 0.5 * 2e-3**2).any()
+    assert np.median(along) < 1e-6 * 2e-3**2
 
 
 def test_the_play_of_each_joint_is_told_or_why_it_is_not(scene):

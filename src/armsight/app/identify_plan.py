@@ -26,6 +26,8 @@ SPREAD_M, SIGMA_PX = 0.04, 0.1
 MARKERS = 6
 #: A pose is seen where its body is this far from the images' edges, px.
 MARGIN_PX = 60.0
+#: Markers are on one side of a body: it is taken to be seen as far turned away as it was seen already, and this much more.
+MORE_RAD = np.radians(10.0)
 
 
 def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, seed: int) -> tuple[Plan, Model]:
@@ -52,8 +54,14 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
         return plan_poses(model, x, prior, NOISE, n, done=done, seed=seed), model
     seen = rig
 
+    limits = None if done.R_rig_body is None else _turned_away(seen, _stacked(done))
+
     def visible(Ts: Array) -> NDArray[np.bool_]:
-        return _visible(seen, Ts)
+        out = _visible(seen, Ts)
+        if limits is not None:
+            axes, most = limits
+            out &= (_turned(seen, Ts, axes) <= most + MORE_RAD).all(axis=1)
+        return out
 
     def cov(Ts: Array) -> Array:
         return _covariance(seen, Ts, None if model.full else model.points)
@@ -71,6 +79,33 @@ def _visible(rig: StereoRig, Ts: Array) -> NDArray[np.bool_]:
         with np.errstate(invalid="ignore"):
             good &= (p[:, 2] > 0) & ((uv > low) & (uv < high)).all(axis=1)
     return good
+
+
+def _stacked(done: Measured) -> Array:
+    """Return the poses (N, 4, 4) of full poses."""
+    assert done.R_rig_body is not None  # for the type checker: the caller has looked
+    Ts = np.tile(np.eye(4), (len(done), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = done.R_rig_body, done.p_rig[:, 0]
+    return Ts
+
+
+def _to_cameras(rig: StereoRig, Ts: Array) -> Array:
+    """Return the unit vectors (N, 2, 3) from the body to both cameras, in its own axes."""
+    cameras = np.stack([np.zeros(3), rig.T_left_right[:3, 3]])
+    rays = (cameras - Ts[:, None, :3, 3]) @ Ts[:, :3, :3]
+    return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+
+
+def _turned_away(rig: StereoRig, Ts: Array) -> tuple[Array, Array]:
+    """Return the side (2, 3) from which each camera saw the body on the whole, and how far it was turned from it, rad."""
+    axes = _to_cameras(rig, Ts).mean(axis=0)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return axes, np.asarray(_turned(rig, Ts, axes).max(axis=0))
+
+
+def _turned(rig: StereoRig, Ts: Array, axes: Array) -> Array:
+    """Return how far bodies are turned (N, 2) from the sides ``axes``, rad."""
+    return np.asarray(np.arccos(np.clip(np.einsum("nci,ci->nc", _to_cameras(rig, Ts), axes), -1, 1)))
 
 
 def _in_cameras(rig: StereoRig, p_rig: Array) -> tuple[Array, Array]:

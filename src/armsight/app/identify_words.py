@@ -48,11 +48,12 @@ def text(run: Run, *, everything: bool = False) -> str:
     lines += ["", f"  {'parameter':<12} {'nominal':>16} {'identified':>16} {'sigma':>14}"]
     nominal = found.model.nominal()
     for k, p in enumerate(found.model.parameters):
-        if found.solution.free[k] and p.kind not in ("base", "tool"):
+        if found.solution.free[k] and p.kind not in ("base", "tool", *([] if everything else ["ripple"])):
             value, sigma = found.value(p.name)
             row = (value_text(p, nominal[k]), value_text(p, value), value_text(p, sigma))
             tied = "  with others (-v)" if p.name in found.reasons and not everything else ""
             lines.append(f"  {p.name:<12} {row[0]:>16} {row[1]:>16} {row[2]:>14}{tied}")
+    lines += [] if everything else _ripples(run)
     lines += ["", "play of each joint, stop to stop:"]
     lines += [f"  joint {p.joint + 1}  {_play_text(p)}" for p in plays(found, run.measured)]
     left = sum(
@@ -65,6 +66,20 @@ def text(run: Run, *, everything: bool = False) -> str:
         lines += ["", "correlations over 0.9 (more varied poses tell them apart):"]
         lines += [f"  {a} and {b}: {c:+.3f}" for a, b, c in pairs]
     return "\n".join(lines)
+
+
+def _ripples(run: Run) -> list[str]:
+    """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
+    found, lines = run.found, []
+    for i in range(6):
+        rows = [k for k, p in enumerate(found.model.parameters) if p.kind == "ripple" and p.joint == i]
+        rows = [k for k in rows if found.solution.free[k]]
+        if rows:
+            size = np.degrees(np.sqrt(np.sum(found.solution.x[rows] ** 2) / 2))
+            lines.append(
+                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a turn (-v lists them)"
+            )
+    return lines
 
 
 def _play_text(play: Play) -> str:

@@ -25,6 +25,8 @@ FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 PAYS = 1.0
 #: Parameters further from nominal than this many sigmas pay for sure: their own removal is not tried.
 SURE = 8.0
+#: A fall by less than this part is rounding's.
+ROUNDING = 1e-6
 #: Squares that are none, so that their logarithm is a number.
 _NONE = 1e-200
 #: What the placement alone is.
@@ -220,7 +222,7 @@ def _rms(losses: Array, folds: _Folds) -> float:
 def _pays(without: Array, with_it: Array, folds: _Folds) -> bool:
     """Say whether the fall of the held-out squares' logarithms is more than chance over the folds."""
     fall = np.log((without + _NONE) / (with_it + _NONE)) * folds.numbers
-    return bool(fall.sum() > PAYS * np.sqrt(len(fall)) * fall.std(ddof=1))
+    return bool(fall.sum() > max(PAYS * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
 
 
 def _pruned(
