@@ -27,7 +27,7 @@ from armsight.sim.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
 
 #: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
-_AMOUNTS = {False: (40, 30, 8), True: (20, 15, 0)}
+_AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}
 _MOTIONS = {False: CHAPTER, True: QUICK}
 
 

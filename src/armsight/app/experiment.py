@@ -143,6 +143,7 @@ def _run(
             with uninterrupted() as again:  # who presses Ctrl-C twice wants the arm stopped no less
                 _stopped(loop)
             outcome.interrupted = outcome.interrupted or bool(again)
+            loop.close_record()
 
 
 def _stopped(loop: Loop) -> None:

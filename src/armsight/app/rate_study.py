@@ -83,6 +83,7 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     last = kinds.index("circle") + 1
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
     drive(loop, part, closed_on(servo, station.gravity), closed=True, progress=lambda line: None)
+    loop.close_record()
     truth, mounting = cell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
     Ts = mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)

@@ -32,11 +32,10 @@ PERIOD_S = 0.004
 STALLED_S = 0.5
 #: Searching an image for the body takes so long at most, on a computer with much else to do, s.
 SEARCH_S = 2.0
-#: The fused track is written down so late, s: the sightings on both sides of a time have come by then. The loop does not
-#: wait for that.
-RECORD_LAG_S = 0.04
+#: The fused track is written down so late, s: the sightings on both sides of a time have come by then, though the body was
+#: hidden for half a second. The loop does not wait for that; what it knew is the live track.
+RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # so much of it at a time: cheaper than turn by turn
-_LAST_BATCHES = 32  # of readings that hold all within lag and time
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _LEAST_WAIT_S = 0.001  # for the board, though the loop is late: a board that is gone is known by waiting in vain
 _Result = TypeVar("_Result")
@@ -101,7 +100,7 @@ class Loop:
         heard = list(self.log.joints)
         self.compute(lambda: learn(heard))
         learn(self.log.joints[len(heard) :])  # what came meanwhile
-        self.estimator, self._written_s = estimator, self.t_s
+        self.estimator = estimator  # it has what was not written down yet in its memory
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
         """Return what some long work comes to. Where time passes by itself, the loop goes on meanwhile and holds the arm.
@@ -132,16 +131,27 @@ class Loop:
 
     def _record(self) -> None:
         """Write down where the tool was, as late as RECORD_LAG_S: with the sightings on both sides of a time."""
-        if self.t_s - RECORD_LAG_S - self._written_s < _RECORD_EVERY_S:
-            return
-        wanted = [s.t_s for s in self.log.joints[-_LAST_BATCHES:]]
-        t_s = np.concatenate(wanted)
-        t_s = t_s[(t_s > self._written_s) & (t_s <= self.t_s - RECORD_LAG_S)]
+        if self.t_s - RECORD_LAG_S - self._written_s >= _RECORD_EVERY_S:
+            self._write(self.t_s - RECORD_LAG_S)
+
+    def _write(self, upto_s: float) -> None:
+        """Write down where the tool was at each reading up to a time that is not written yet."""
+        parts: list[Array] = []
+        for states in reversed(self.log.joints):
+            if states.t_s[-1] <= self._written_s:
+                break
+            parts.append(states.t_s)
+        t_s = np.concatenate([*parts[::-1], np.zeros(0)])
+        t_s = t_s[(t_s > self._written_s) & (t_s <= upto_s)]
         if len(t_s):
             track = self.estimator.smoothed(t_s)
             none = np.full(len(t_s), "")
             self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
             self._written_s = float(t_s[-1])
+
+    def close_record(self) -> None:
+        """Write down where the tool was up to now: nothing more will be seen."""
+        self._write(self.t_s)
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""

@@ -44,7 +44,7 @@ for (const box of document.querySelectorAll(".zoom")) {
   box.addEventListener("dblclick", () => { k = 1; x = y = 0; show(); });
 }
 """
-_NAMES = {"fused": "fused, smoothed (40 ms later)", "live": "fused, live"}
+_NAMES = {"fused": "fused, smoothed (0.6 s later)", "live": "fused, live"}
 _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{}</div>'
 _IMG = '<img src="data:image/{};base64,{}" alt="{}" style="transform-origin:0 0" draggable="false">'
 
