@@ -84,6 +84,11 @@ def test_vision_is_right_and_potentiometers_are_not(short):
     assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=0.4e-3)
 
 
+def test_the_record_is_there_for_every_reading(short):
+    folder, _ = short
+    np.testing.assert_allclose(rows(folder, "fused")[0], rows(folder, "potentiometers")[0], rtol=0, atol=1e-6)
+
+
 def test_closing_the_loop_pays(short):
     _, summary = short
     c = summary["closed_loop"]
