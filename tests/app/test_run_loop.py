@@ -269,11 +269,12 @@ def test_an_interrupt_does_not_wait_for_what_is_being_computed():
 
 def test_what_makes_a_loop_wait_is_put_back_afterwards():
     before = sys.getswitchinterval()
-    with steady():
-        assert sys.getswitchinterval() < before
-        assert gc.get_freeze_count() > 1000
-    assert sys.getswitchinterval() == before
-    assert gc.get_freeze_count() == 0
+    for in_time in (True, False):
+        with steady(in_time=in_time):
+            assert (sys.getswitchinterval() < before) == in_time
+            assert not gc.isenabled()
+        assert sys.getswitchinterval() == before
+        assert gc.isenabled()
 
 
 def test_interrupts_are_held_back_and_told():

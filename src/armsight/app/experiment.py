@@ -107,7 +107,7 @@ def run_experiment(
         All that was measured, also where something ended it early.
     """
     outcome = Outcome(station.target.body)
-    with steady():
+    with steady(in_time=station.clock is not None):
         _run(station, rig, plan, targets, outcome, progress, cover, close_loop)
     return outcome
 
