@@ -344,3 +344,14 @@ def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_refused(scene)
     assert "prior of zero" in found.reasons["wave1_sin1"]
     with pytest.raises(InputError, match="'a9'"):
         identify(w.nominal, measured, priors={"a9": 1.0})
+
+
+@pytest.mark.parametrize(("n", "seed"), [(30, 1), (40, 0), (60, 1)])
+def test_poses_without_noise_give_the_zeros_and_little_else(n, seed):
+    arm, rng = open_arm("six_r"), np.random.default_rng(seed)
+    q = rng.uniform(-1, 1, (n, 6))
+    T = arm.forward(q + 1e-3 * np.array([0, 1, -1, 0, 1, 0]))
+    found = identify(arm, Measured(q, T[:, None, :3, 3], T[:, :3, :3]))
+    assert found.solution.free.sum() < 30
+    off = [found.value(f"offset{k}")[0] - arm.offset[k - 1] for k in (2, 3, 5)]
+    np.testing.assert_allclose(off, [1e-3, -1e-3, 1e-3], rtol=0, atol=1e-9)

@@ -42,10 +42,11 @@ def test_without_noise_the_figures_are_the_standards():
 
 @pytest.mark.parametrize("n", [3, 5, 30])
 def test_the_best_value_lies_within_its_interval(n):
-    for seed in range(40):
-        figure = iso9283.pose_figures(*attained(seed, n, noise=1e-4)).repeatability
-        if figure.clean is not None:
-            assert figure.low <= figure.clean <= figure.high
+    figures = [iso9283.pose_figures(*attained(seed, n, noise=1e-4)).repeatability for seed in range(40)]
+    told = [figure for figure in figures if figure.clean is not None]
+    assert len(told) > 5
+    for figure in told:
+        assert figure.low <= figure.clean <= figure.high
 
 
 def population(cov):

@@ -8,6 +8,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.robot.models import open_arm
 from armsight.sim.cell_body import body_patterns, body_target
 from armsight.sim.cell_camera import open_rig, placed_rig
+from armsight.sim.cell_links import moving
 from armsight.sim.cell_noise import noise_start, noise_strip
 from armsight.sim.cell_paint import LENS, ArmSeen, CellCamera
 from armsight.sim.cell_solids import row_frames, solids
@@ -147,3 +148,18 @@ def test_noise_is_as_strong_as_asked_and_another_in_every_image():
 def test_nothing_in_view_is_what_stands_still(camera):
     away = [Placed(body_patterns(), pose(np.eye(3), np.array([0.0, 0.0, -1.0])))]
     assert (camera.image(None, [], STILL, QUIET, 0) == camera.image(None, away, STILL, QUIET, 0)).all()
+
+
+def test_a_ball_is_drawn_though_no_tile_has_a_corner_in_it():
+    v, u = np.mgrid[:64, :64]
+    rays = np.stack([(u - 31.5) / 100, (v - 31.5) / 100, np.ones((64, 64))])
+    rays /= np.linalg.norm(rays, axis=0)
+    counts = []
+    for length in (0.0, 1e-3):
+        ends = np.array([[[-0.08, -0.08, 1.0], [-0.08 + length, -0.08, 1.0]]])
+        light, depth, ids = np.zeros((64, 64)), np.full((64, 64), 9.0, np.float32), np.zeros((64, 64), np.int16)
+        links = ends, np.array([0.06]), np.array([0.5])
+        moving(rays, (0, 0, 64, 64), np.array([[0, 0, 64, 64]]), links, np.array([0.0, 0.0, -1.0]), light, depth, ids)
+        counts.append(int((ids > 0).sum()))
+    assert counts[0] == pytest.approx(np.pi * 6.0**2, rel=0.05)
+    assert counts[1] == pytest.approx(counts[0], rel=0.06)

@@ -205,7 +205,7 @@ def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
 
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a key by which P2 comes before P10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def rows_csv(rows: list[Row]) -> str:

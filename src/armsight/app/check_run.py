@@ -22,9 +22,10 @@ from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
 _WIDE = 10
 #: So many times must the first pose have been attained for its drift.
 _DRIFTS = 10
-#: Of so many rows and more one is told that lies so many times further from the middle than is usual among them: normal
-#: scatter, however long its shape, does so in one pose of 300 with eight rows, and in one of 10,000 with thirty.
-_SEVERAL, _STRAY = 8, 8.0
+#: Of so many rows and more one is told that lies so many times further from the middle than half of them: normal scatter
+#: along a line, the longest there is, does so in one pose of 200 with ten rows, and in one of 30,000 with thirty. What is
+#: usual is no less than tables are rounded to, m.
+_SEVERAL, _STRAY, _LEAST_M = 10, 12.0, 1e-5
 
 
 def read_check(path: Path, *, closed: bool = False) -> Attained:
@@ -146,10 +147,10 @@ def _strays(rows: list[Row]) -> list[str]:
     """Name the rows of a pose that lie far from the others."""
     p = _places(rows)
     away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
-    usual = float(np.median(away))
+    usual = max(float(np.median(away)), _LEAST_M)
     return [
         f"{row.pose}, {f'cycle {row.cycle}' if row.cycle else f'row {n + 1} of it'}: {1e3 * off:.2f} mm from the middle of "
-        f"the others, which are {1e3 * usual:.2f} mm from it; it counts, unless you take it out"
+        f"them all, half of which are within {1e3 * usual:.2f} mm of it; it counts, unless you take it out"
         for n, (row, off) in enumerate(zip(rows, away, strict=True))
         if len(rows) >= _SEVERAL and off > _STRAY * usual
     ]

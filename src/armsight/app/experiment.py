@@ -142,8 +142,8 @@ def _run(
         if loop is not None:
             with uninterrupted() as again:  # who presses Ctrl-C twice wants the arm stopped no less
                 _stopped(loop)
+                loop.close_record()
             outcome.interrupted = outcome.interrupted or bool(again)
-            loop.close_record()
 
 
 def _stopped(loop: Loop) -> None:

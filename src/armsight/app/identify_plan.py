@@ -137,7 +137,7 @@ def _covariance(rig: StereoRig, Ts: Array, points: int | None) -> Array:
 def plan_text(plan: Plan) -> str:
     """Return what a person reads: what so many poses buy."""
     n = len(plan.q)
-    lines = ["predicted error of the arm over its workspace, RMS:"]
+    lines = ["predicted error of the tool over the workspace, RMS:"]
     for k in sorted({0, n // 4, n // 2, 3 * n // 4, n}):
         random = plan.random_for(k)
         told = (

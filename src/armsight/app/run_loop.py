@@ -151,7 +151,7 @@ class Loop:
 
     def close_record(self) -> None:
         """Write down where the tool was up to now: nothing more will be seen."""
-        self._write(self.t_s)
+        self._write(min(self.t_s, self.estimator.span_s[1]))  # an interrupt may have kept the newest from it
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""

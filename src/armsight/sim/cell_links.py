@@ -14,13 +14,14 @@ from armsight.sim.cell_rays import AMBIENT, LAMP, Light
 #: Share of the lamp's reflection in the light.
 GLOSS = 0.25
 _TILE = 16  # pixels on a side that are passed over together
+_BALL = 1e-12  # square of the length, m^2, of what has none: it has no sides
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _axis(a: Array, b: Array, radius: float, out: Array) -> None:
     """Write into out (11,) what of a capsule between a and b :func:`_side` and :func:`_row` ask for: all but the ray."""
     bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    long = max(bx * bx + by * by + bz * bz, 1e-12)  # a ball has no length
+    long = max(bx * bx + by * by + bz * bz, _BALL)
     ba = -(bx * a[0] + by * a[1] + bz * a[2])
     out[0], out[1], out[2], out[3], out[4] = bx, by, bz, long, ba
     out[5] = long * (a[0] * a[0] + a[1] * a[1] + a[2] * a[2] - radius * radius) - ba * ba
@@ -32,6 +33,8 @@ def _axis(a: Array, b: Array, radius: float, out: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _side(d: Array, a: Array, axis: Array) -> int:
     """Return on which side the unit ray d (3,) from the origin passes a cylinder without ends: 1, -1; 0 where it meets."""
+    if axis[3] <= _BALL:
+        return 0
     bd = axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2]
     B = -axis[3] * (a[0] * d[0] + a[1] * d[1] + a[2] * d[2]) - axis[4] * bd
     if (axis[3] - bd * bd) * axis[5] <= B * B:

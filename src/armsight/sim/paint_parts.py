@@ -1,6 +1,7 @@
 """What cells and discs are painted with: pixels cast on to a plane, pixels split into parts, straight cuts through squares.
 
-See ``paint``.
+See ``paint``. numba's cache on disk looks at the age of the file that calls: after a change here touch ``paint`` and
+``paint_disc``, or delete their cache.
 """
 
 from __future__ import annotations

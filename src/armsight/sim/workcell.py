@@ -145,7 +145,16 @@ class Workcell:
         self._parts = solids(self._built_to)
         self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
         self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
-        self._room = (arm, rig, seed, baseline_m, distance_m, noise, self.timing.image_size_px, self._built_to.name)
+        self._room = (
+            arm,
+            rig,
+            seed,
+            baseline_m,
+            distance_m,
+            noise,
+            self.timing.image_size_px,
+            self._built_to.table.tobytes(),
+        )
         self._stand(distance_m, noise, like)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD

@@ -26,6 +26,7 @@ LEAST, MOST = 0.01, 1.0
 #: of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The other kinds
 #: are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they give way.
 FALLEN, WIDER = 1.0, 1.5
+_ROUNDED = 1e-12
 
 
 def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
@@ -45,13 +46,14 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
     H, b = _normal(model, start, measured, free, prior)
     flat = ~np.isfinite(prior[free])
     own = np.where(flat, 1.0, prior[free])
+    still = _ROUNDED * np.eye(len(own))  # where there is no noise, nothing but rounding holds what cannot be told
 
     def cost(logs: Array) -> float:
         sigma = own * _factors(of[free], logs)
         D = np.where(flat, 0.0, sigma**-2.0)
         A = H + np.diag(D)
         scale = 1 / np.sqrt(np.diag(A))
-        factor = cho_factor(scale[:, None] * A * scale, lower=True)
+        factor = cho_factor(scale[:, None] * A * scale + still, lower=True)
         size = 2 * np.log(np.diag(factor[0])).sum() - 2 * np.log(scale).sum()
         return float(size + 2 * np.log(sigma[~flat]).sum() - b @ (scale * cho_solve(factor, scale * b)))
 

@@ -20,9 +20,9 @@ from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
 #: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and the
-#: fastest: a potentiometer's track swings some nine times over its travel, and that may be three quarters of a turn.
+#: fastest: the workcell's potentiometers swing up to nine times over their travel, which may be three quarters of a turn.
 WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
-#: Fewer numbers measured than this cannot choose among the ripples' coefficients without taking chance for a cause.
+#: Fewer numbers measured than this are not given ripples at all: their one prior would be told by chance.
 ENOUGH = 100
 #: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before. The
 #: fastest are then left out: chosen one by one, no prior holds them where the arm was not looked at.

@@ -36,6 +36,7 @@ PLACEMENT = ("base", "tool")
 CURVE = ("wave", "ripple")
 TOGETHER = (*CURVE, "sag")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
+_ROUNDED = 1e-10
 
 
 class Step(NamedTuple):
@@ -44,7 +45,7 @@ class Step(NamedTuple):
     Attributes:
         cause: what was added or, with a minus, given back.
         names: its parameters.
-        rms: held-out RMS of the weighted residuals after it.
+        rms: held-out RMS of the weighted residuals after it: the geometric mean over the folds.
     """
 
     cause: str
@@ -87,8 +88,10 @@ class _Folds(NamedTuple):
         step = -np.linalg.solve(A * scale[:, :, None] * scale[:, None], (b * scale)[..., None])[..., 0] * scale
         delta = np.broadcast_to(fixed, self.g.shape).copy()
         delta[:, rows] = step
-        squares = self.c + 2 * np.einsum("fi,fi->f", self.g, delta) + np.einsum("fi,fij,fj->f", delta, self.H, delta)
-        return np.asarray(squares / self.numbers)
+        by_slope, by_bend = 2 * np.einsum("fi,fi->f", self.g, delta), np.einsum("fi,fij,fj->f", delta, self.H, delta)
+        # Poses without noise: below this a difference of large numbers is rounding.
+        least = _ROUNDED * (self.c + np.abs(by_slope) + np.abs(by_bend))
+        return np.asarray(np.maximum(self.c + by_slope + by_bend, least) / self.numbers)
 
 
 def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:

@@ -101,7 +101,7 @@ def plan_poses(
     scene = Scene(model, x, noise, visible, cov, floor_m)
     q, approach, seen = _candidates(scene, rng)
     if len(q) < n:
-        raise InputError(f"only {len(q)} of {CANDIDATES} poses can be reached and seen; {n} were asked for")
+        raise InputError(f"only {len(q)} poses that can be reached and seen were found; {n} were asked for")
     prior = np.where([p.kind in SCALED for p in model.parameters], MOSTLY * prior, prior)
     free = observed(model, x, seen, prior, noise).possible
     P = _prior_covariance(prior, free)
