@@ -145,16 +145,8 @@ class Workcell:
         self._parts = solids(self._built_to)
         self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
         self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
-        self._room = (
-            arm,
-            rig,
-            seed,
-            baseline_m,
-            distance_m,
-            noise,
-            self.timing.image_size_px,
-            self._built_to.table.tobytes(),
-        )
+        size, table = self.timing.image_size_px, self._built_to.table.tobytes()
+        self._room = (arm, rig, seed, baseline_m, distance_m, noise, size, table)
         self._stand(distance_m, noise, like)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD
@@ -164,7 +156,8 @@ class Workcell:
     def _stand(self, distance_m: float, noise: float, like: Workcell | None) -> None:
         """Screw the body to the tool and stand the cameras before it."""
         if like is not None and like._room != self._room:
-            raise InputError(f"this cell is {self._room}, the one it is to be like is {like._room}")
+            told = f"this cell is {self._room[:-1]}, the one it is to be like is {like._room[:-1]}"
+            raise InputError(f"{told}: arm, rig, seed, distances, noise, image size and table must be the same")
         seed = self._seed
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
