@@ -9,14 +9,11 @@ what of the arm is nearer stays before them. Then the lens's blur, light and vig
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import exp_se3, inverse, transform
@@ -24,12 +21,10 @@ from armsight.sim import cell_links
 from armsight.sim.cell_noise import Window, exposed
 from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, corner_rays, pixel_rays, view
 from armsight.sim.cell_solids import Solids
-from armsight.sim.optics import Optics, Radiance, Sensor, blurred, shaded, spread
-from armsight.sim.paint import Grid, paint
-from armsight.sim.paint_disc import paint_disc
-from armsight.sim.paint_parts import SUB, Slots
+from armsight.sim.optics import Optics, Radiance, Sensor, part_taps, shaded, spread
+from armsight.sim.paint_faces import Exposure, paint_faces, palette
 from armsight.sim.render import OUTLINE, Shutter, outline
-from armsight.sim.scene import CLEAR, Pattern, Placed
+from armsight.sim.scene import Pattern, Placed
 from armsight.vision.camera import Camera
 
 #: The lens and the light, after the shading correction that cameras do themselves.
@@ -37,34 +32,6 @@ LENS = Optics(0.7, vignetting=0.08, light_gradient=(0.04, -0.04))
 #: Points around a pattern or a disc that bound it in the image, and by how much those around a disc are further out.
 EDGE, _OUT = 16, 1.02
 _STILL_PX = 0.05  # what moves less is painted once
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearer(
-    rays: Array,
-    Ms: Array,
-    box: Window,
-    corner: tuple[int, int],
-    behind: Array,
-    depth: NDArray[np.float32],
-    ids: NDArray[np.int16],
-    coarse: Array,
-    slot: Slots,
-) -> None:
-    """Put back what of the arm is nearer than a pattern that was painted over it.
-
-    ``box`` is the painted part of the window whose first column and row are ``corner``; ``behind``, ``depth`` and ``ids``
-    are what was there before, and ``Ms`` takes rays to the pattern's plane, whose third coordinate is 1 / distance.
-    """
-    for v in range(box[1], box[3]):
-        M = Ms[min(v, Ms.shape[0] - 1)]
-        for u in range(box[0], box[2]):
-            if ids[v, u] == 0:
-                continue
-            y, x = v + corner[1], u + corner[0]
-            if (M[2, 0] * rays[0, y, x] + M[2, 1] * rays[1, y, x] + M[2, 2] * rays[2, y, x]) * depth[v, u] < 1.0:
-                coarse[v, u] = behind[v, u]
-                slot[v, u] = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,23 +47,6 @@ class ArmSeen(Record):
     Ts_base_link: Array
 
 
-class _Face(NamedTuple):
-    """A pattern that faces the camera.
-
-    Attributes:
-        pattern: what it is.
-        Ts: (1 or H, 4, 4) its pose, or its pose as each row sees it.
-        boxes: (1 + K, 4) the pixels of its cells and of each disc.
-    """
-
-    pattern: Pattern
-    Ts: Array
-    boxes: Ids
-
-
-_Step = tuple[float, list[_Face]]
-
-
 @lru_cache(maxsize=64)
 def _edges(patterns: tuple[Pattern, ...]) -> Array:
     """Return points (N, EDGE, 3) around each pattern's cells, and then each of its discs, m, body frame."""
@@ -109,14 +59,19 @@ def _edges(patterns: tuple[Pattern, ...]) -> Array:
     return np.array(around)
 
 
+@lru_cache(maxsize=64)
+def _rectangles(patterns: tuple[Pattern, ...]) -> Array:
+    """Return the corners (P, 4, 4) of the patterns' cells as homogeneous columns, m, each pattern's frame."""
+    corners = np.array([outline(pattern)[::OUTLINE] for pattern in patterns])
+    return np.concatenate([corners, np.zeros_like(corners[..., :1]), np.ones_like(corners[..., :1])], axis=2).mT.copy()
+
+
 _nodes = lru_cache(np.polynomial.legendre.leggauss)
 
 
-@lru_cache(maxsize=64)
-def _grid(pattern: Pattern) -> Grid:
-    """Return a pattern's cells as the painter takes them."""
-    values = np.pad(pattern.values, 1, constant_values=CLEAR)
-    return np.array(pattern.x_edges), np.array(pattern.y_edges), values
+def _moved(body: Placed, t_s: Array) -> Array:
+    """Return a body's poses (N, 4, 4) so long (N,) after the middle of an exposure."""
+    return np.asarray(body.T_camera_body @ exp_se3(np.outer(t_s, body.twist)))
 
 
 class CellCamera:
@@ -153,17 +108,13 @@ class CellCamera:
         self._corners = corner_rays(camera)
         rays = pixel_rays(self._corners)
         self.still: View = view(camera, rays, T_base_camera, seed, foot, more)
-        self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1))
+        self._light = self.still.light.astype(np.float32)
+        self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
-        self._still_grey = self._blur(self.still.light.copy()) * self._gain
+        self._still_grey = spread(self._light, LENS.psf_sigma_px) * self._gain
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
-        self._lamp = to_lamp / np.linalg.norm(to_lamp)
-
-    @staticmethod
-    def _blur(light: Array) -> Radiance:
-        """Return an image without edge pixels through the lens."""
-        return spread(light.astype(np.float32), LENS.psf_sigma_px)
+        self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
 
     def image(
         self, arm: ArmSeen | None, bodies: Sequence[Placed], shutter: Shutter, strip: Radiance, start: int
@@ -184,20 +135,18 @@ class CellCamera:
         if arm is not None:
             ends, radius, albedo = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes = capsule_boxes(self.camera, ends, radius)
-        steps = self._steps(bodies, shutter)
+        exposure = self._exposure(bodies, shutter)
         margin = _reach(LENS.psf_sigma_px)
-        crop = self._around(
-            [tuple(face.boxes[0].tolist()) for _, faces in (steps[0], steps[-1]) for face in faces], 2 * margin
-        )
-        window = self._around([crop, *(tuple(box) for box in boxes.tolist())], 2 * margin)
+        crop = (0, 0, 0, 0) if exposure is None else self._around(exposure.shown(), 2 * margin)
+        window = self._around(np.concatenate([[crop], boxes]), 2 * margin)
         u0, v0, u1, v1 = window
-        light = self.still.light[v0:v1, u0:u1].copy()
+        light = self._light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
         cell_links.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
-        seen = self._blur(light) if light.size else light.astype(np.float32)
-        if crop[0] < crop[2] and crop[1] < crop[3]:
+        seen = spread(light, LENS.psf_sigma_px) if light.size else light
+        if exposure is not None and crop[0] < crop[2] and crop[1] < crop[3]:
             core = self._core(crop, margin)
-            painted = self._painted(steps, crop, window, (light, depth, ids))
+            painted = self._painted(exposure, crop, window, (light, depth, ids))
             seen[_part(core, window)] = painted[_part(core, crop)]
         out: Image = np.empty(self._still_grey.shape, np.uint8)
         s = self._sensor
@@ -212,83 +161,76 @@ class CellCamera:
         width, height = self.camera.image_size_px
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
-        light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
+        light, depth, ids = self._light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
         cell_links.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
         return ids
 
-    def _around(self, boxes: Sequence[tuple[int, ...]], margin: int) -> Window:
-        """Return what holds all boxes that are not empty, with a margin, within the image."""
-        full = np.array([box for box in boxes if box[0] < box[2] and box[1] < box[3]])
+    def _around(self, boxes: Ids, margin: int) -> Window:
+        """Return what holds all boxes (N, 4) that are not empty, with a margin, within the image."""
+        full = boxes[(boxes[:, :2] < boxes[:, 2:]).all(axis=1)]
         if not len(full):
             return 0, 0, 0, 0
         u0, v0 = np.maximum(full[:, :2].min(axis=0) - margin, 0)
         u1, v1 = np.minimum(full[:, 2:].max(axis=0) + margin, self.camera.image_size_px)
         return int(u0), int(v0), int(u1), int(v1)
 
-    def _steps(self, bodies: Sequence[Placed], shutter: Shutter) -> list[_Step]:
-        """Return the parts of the exposure: weight; faces, farthest first."""
-        way_px = 0.0
-        for body in bodies if shutter.exposure_s else ():
-            ends = body.T_camera_body @ exp_se3(np.outer((-0.5, 0.5), shutter.exposure_s * body.twist))
-            before, after = (self._outlines(T[None], body.patterns) for T in ends)
-            way_px = max(way_px, float(np.nan_to_num(np.abs(after - before)).max()))
+    def _exposure(self, bodies: Sequence[Placed], shutter: Shutter) -> Exposure | None:
+        """Return what is painted: all that faces the camera, with boxes in the whole image; None where nothing does."""
+        patterns = tuple(pattern for body in bodies for pattern in body.patterns)
+        if not patterns:
+            return None
+        width, height = self.camera.image_size_px
+        rolling = shutter.row_s > 0 and any(body.twist.any() for body in bodies)
+        rows_s = (np.arange(height) - (height - 1) / 2) * shutter.row_s if rolling else np.zeros(1)
+        ends_s = np.add.outer(np.array([-0.5, 0.5]) * shutter.exposure_s, rows_s[[0, -1] if rolling else [0]]).ravel()
+        uv = self._each(lambda body: self._outlines(_moved(body, ends_s), body.patterns), bodies)
+        low = np.clip(np.floor(uv.min(axis=(0, 2))) - 1, 0, (width, height))
+        high = np.clip(np.ceil(uv.max(axis=(0, 2))) + 2, 0, (width, height))
+        boxes = np.nan_to_num(np.concatenate([low, high], axis=1)).astype(np.int64)
+        begun, ended = np.split(uv, 2)
+        way_px = float(np.nan_to_num(np.abs(ended - begun)).max())
         nodes, weights = _nodes(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
-        steps = []
-        for x, w in zip(nodes, weights, strict=True):
-            faces = [face for body in bodies for face in self._seen(body, 0.5 * shutter.exposure_s * float(x), shutter)]
-            faces.sort(key=lambda face: -float(np.linalg.norm(face.Ts[0, :3, 3])))
-            steps.append((0.5 * float(w), faces))
-        return steps
+        t_s = np.add.outer(0.5 * shutter.exposure_s * nodes, rows_s)
+
+        def placed(body: Placed) -> Array:
+            Ts = _moved(body, t_s.ravel()).reshape(*t_s.shape, 4, 4)
+            on = np.array([pattern.T_body_pattern for pattern in body.patterns])
+            return np.asarray(Ts[:, None] @ on[:, None])
+
+        Ts = self._each(placed, bodies)  # (S, P, R, 4, 4)
+        # Its face is on the side that z points away from; what is behind the camera is not seen.
+        faces = ((Ts[..., :3, 2] * Ts[..., :3, 3]).sum(axis=-1) > 0).all(axis=2) & (Ts[..., 2, 3] > 0).all(axis=2)
+        order = np.argsort(np.where(faces, -np.linalg.norm(Ts[:, :, 0, :3, 3], axis=2), np.inf), axis=1, kind="stable")
+        order = np.where(np.take_along_axis(faces, order, axis=1), order, -1)
+        Ms = np.asarray(np.linalg.inv(Ts[..., :3, [0, 1, 3]]), dtype=np.float64)
+        corners = Ts[:, :, [0, -1] if rolling else [0], :3] @ _rectangles(patterns)[:, None]
+        far_m = np.linalg.norm(corners, axis=3).max(axis=(0, 2, 3))
+        return Exposure(palette(patterns), 0.5 * weights, order, Ms, far_m, boxes)
+
+    @staticmethod
+    def _each(of: Callable[[Placed], Array], bodies: Sequence[Placed]) -> Array:
+        """Return what each body gives, side by side along the second axis."""
+        found = [of(body) for body in bodies if body.patterns]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
     def _outlines(self, Ts_camera_body: Array, patterns: tuple[Pattern, ...]) -> Array:
         """Return the edges of a body's patterns in pixels, (R, N, EDGE, 2), at poses (R, 4, 4)."""
         p = transform(Ts_camera_body[:, None, None], _edges(patterns))
         return self.camera.project(p.reshape(-1, 3)).reshape(*p.shape[:3], 2)
 
-    def _seen(self, body: Placed, t_s: float, shutter: Shutter) -> list[_Face]:
-        """Return what of a body faces the camera at a time."""
-        width, height = self.camera.image_size_px
-        moving = shutter.row_s > 0 and body.twist.any()
-        rows = (np.arange(height) - (height - 1) / 2) * shutter.row_s if moving else np.zeros(1)
-        Ts_camera_body = body.T_camera_body @ exp_se3(np.outer(rows + t_s, body.twist))
-        uv = self._outlines(Ts_camera_body[[0, -1]] if moving else Ts_camera_body, body.patterns)
-        low = np.clip(np.floor(uv.min(axis=(0, 2))) - 1, 0, (width, height))
-        high = np.clip(np.ceil(uv.max(axis=(0, 2))) + 2, 0, (width, height))
-        boxes = np.nan_to_num(np.concatenate([low, high], axis=1)).astype(np.int64)
-        found, next_box = [], 0
-        for pattern in body.patterns:
-            first, next_box = next_box, next_box + 1 + len(pattern.discs)
-            Ts = Ts_camera_body @ pattern.T_body_pattern
-            # Its face is on the side that z points away from; what is behind the camera is not seen.
-            if ((Ts[:, :3, 2] * Ts[:, :3, 3]).sum(axis=1) > 0).all() and (Ts[:, 2, 3] > 0).all():
-                found.append(_Face(pattern, Ts, boxes[first:next_box]))
-        return found
-
     def _painted(
-        self,
-        steps: list[_Step],
-        crop: Window,
-        window: Window,
-        arm: tuple[Array, NDArray[np.float32], Image],
+        self, exposure: Exposure, crop: Window, window: Window, behind: tuple[Radiance, Radiance, Image]
     ) -> Radiance:
         """Return the light of the crop with the patterns painted in, through the lens, over the whole exposure."""
         u0, v0, u1, v1 = crop
-        light, depth, ids = (np.ascontiguousarray(layer[_part(crop, window)]) for layer in arm)
-        rays = np.ascontiguousarray(self._corners[v0 : v1 + 1, u0 : u1 + 1])
-        fine = np.empty((1 << 13, SUB, SUB))
-        total = np.zeros(light.shape, np.float32)
-        for weight, faces in steps:
-            coarse, slot, count = light.copy(), np.full(light.shape, -1, np.int32), 0
-            for pattern, Ts, boxes in faces:
-                rows = Ts[v0:v1] if len(Ts) > 1 else Ts
-                Ms = np.ascontiguousarray(np.linalg.inv(rows[:, :3, [0, 1, 3]]))
-                inner = np.clip(boxes - (u0, v0, u0, v0), 0, (u1 - u0, v1 - v0) * 2).tolist()
-                fine, count = paint(rays, Ms, tuple(inner[0]), _grid(pattern), coarse, slot, fine, count)
-                for disc, box in zip(pattern.discs, inner[1:], strict=True):
-                    fine, count = paint_disc(rays, Ms, tuple(box), np.array(disc), coarse, slot, fine, count)
-                _nearer(self._rays, Ms, tuple(inner[0]), (u0, v0), light, depth, ids, coarse, slot)
-            total += np.float32(weight) * blurred(coarse, slot, fine[:count], LENS.psf_sigma_px)
-        return total
+        boxes = np.clip(exposure.boxes - (u0, v0, u0, v0), 0, (u1 - u0, v1 - v0) * 2)
+        Ms = exposure.Ms
+        Ms = np.ascontiguousarray(Ms[:, :, v0:v1]) if Ms.shape[2] > 1 else Ms
+        total, edges = np.empty((v1 - v0, u1 - u0), np.float32), np.zeros((v1 - v0, u1 - u0), np.float32)
+        layers = (behind[0][_part(crop, window)], behind[1][_part(crop, window)], behind[2][_part(crop, window)])
+        shown, taps = exposure._replace(Ms=Ms, boxes=boxes), part_taps(LENS.psf_sigma_px)
+        paint_faces(self._corners, self._rays, shown, (u0, v0), layers, taps, total, edges)
+        return np.asarray(spread(total, LENS.psf_sigma_px) + edges)
 
     def _core(self, window: Window, margin: int) -> Window:
         """Return a window but for a margin where its blur did not know what is around; none at the image's border."""

@@ -160,24 +160,28 @@ class CellSource:
 
     def _rendering(self, times: ShotTimes, shutter: Shutter, number: int, held: Placed | None) -> list[Future[Image]]:
         """Begin to render both images, each in a thread of its own: they share nothing that changes."""
+        t_s = np.array([times.left_s, times.right_s])
+        frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
+        bodies = self._bodies(t_s, shutter)
         return [
-            self._pool.submit(self._image, side, t, shutter, number, held)
-            for side, t in enumerate((times.left_s, times.right_s))
+            self._pool.submit(self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held)
+            for side in range(2)
         ]
 
-    def _image(self, side: int, t_s: float, shutter: Shutter, number: int, held: Placed | None) -> Image:
+    def _image(
+        self, side: int, t_s: float, frames: Array, body: Placed, shutter: Shutter, number: int, held: Placed | None
+    ) -> Image:
         """Render one camera's image of the arm in the middle of an exposure."""
         camera = self._cameras[side]
-        bodies = [self._body(camera, t_s, shutter)]
+        bodies = [body]
         if held is not None:
             T_this_left = inverse(camera.T_base_camera) @ self._cameras[0].T_base_camera
             bodies.append(held.seen_from(T_this_left))
         if any(start <= t_s < end for start, end in self._covers):
-            bodies.append(_card(bodies[0].T_camera_body))
-        arm = ArmSeen(self._plant.parts, row_frames(self._plant.arm, self._q(np.array([t_s]))[0]))
+            bodies.append(_card(body.T_camera_body))
         # A shot that is held for the calibration draws its noise from numbers of its own.
         start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
-        return camera.image(arm, bodies, shutter, self._strip, start)
+        return camera.image(ArmSeen(self._plant.parts, frames), bodies, shutter, self._strip, start)
 
     def _q(self, t_s: Array) -> Array:
         """Return the links' true angles (N, 6) at times (N,), by a cubic through the four nearest milliseconds."""
@@ -194,25 +198,31 @@ class CellSource:
         )
         return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
 
-    def _body(self, camera: CellCamera, t_s: float, shutter: Shutter) -> Placed:
-        """Return where the body is to a camera: its mean place during the exposure of its own rows, and its velocity."""
-        T_camera_base = inverse(camera.T_base_camera)
+    def _bodies(self, t_s: Array, shutter: Shutter) -> list[Placed]:
+        """Return where the body is to each camera in an exposure about its time (2,).
+
+        That is its mean place during the exposure of its own rows, and its velocity.
+        """
+        Ts_camera_base = np.array([inverse(camera.T_base_camera) for camera in self._cameras])[:, None]
 
         def at(times: Array) -> Array:
-            return np.asarray(T_camera_base @ self._plant.arm.forward(self._q(times)) @ self._T_tool_body)
+            """Return the poses (2, N, 4, 4) at times (2, N)."""
+            Ts_base_tool = self._plant.arm.forward(self._q(times.ravel())).reshape(*times.shape, 4, 4)
+            return np.asarray(Ts_camera_base @ Ts_base_tool @ self._T_tool_body)
 
         reach = max(shutter.exposure_s, TICK_S) / 2
-        T = at(np.array([t_s]))[0]
-        rows_s = 0.0
+        rows_s = np.zeros(2)
         if shutter.row_s:  # its rows are exposed at another time than the image's middle row
-            row = camera.camera.project(T[None, :3, 3])[0, 1]
-            rows_s = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
-        Ts = at(t_s + rows_s + reach * np.array([*_NODES, -1.0, 1.0]))
-        turned = log_se3(inverse(Ts[[1, 1, 1, 3]]) @ Ts[[0, 1, 2, 4]])  # all at once: that costs most here
-        twist = turned[3] / (2 * reach)
-        shift = 0.5 * (_WEIGHTS @ turned[:3]) if shutter.exposure_s else np.zeros(6)
-        to_mean, to_row = exp_se3(np.stack([shift, -rows_s * twist]))
-        return Placed(self._patterns, Ts[1] @ to_mean @ to_row, twist)
+            for side, (camera, T) in enumerate(zip(self._cameras, at(t_s[:, None])[:, 0], strict=True)):
+                row = camera.camera.project(T[None, :3, 3])[0, 1]
+                rows_s[side] = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
+        Ts = at((t_s + rows_s)[:, None] + reach * np.array([*_NODES, -1.0, 1.0]))
+        turned = log_se3(inverse(Ts[:, [1, 1, 1, 3]]) @ Ts[:, [0, 1, 2, 4]])
+        twists = turned[:, 3] / (2 * reach)
+        shifts = 0.5 * (_WEIGHTS @ turned[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
+        to_mean, to_row = exp_se3(np.stack([shifts, -rows_s[:, None] * twists]))
+        Ts_camera_body = Ts[:, 1] @ to_mean @ to_row
+        return [Placed(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]
 
 
 def _card(T_camera_body: Array) -> Placed:

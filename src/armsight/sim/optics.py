@@ -89,39 +89,48 @@ def psf_taps(sigma: float, parts: int) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _spread_parts(slot: Slots, fine: Array, taps: Array, out: Radiance) -> None:
-    """Add to ``out`` what the parts of edge pixels send beyond the mean of their pixel."""
-    n = taps.shape[1]
-    radius = n // 2
-    height, width = slot.shape
-    rows = np.empty((SUB, n))
-    for v in range(height):
-        for u in range(width):
+def gather_parts(slot: Slots, fine: Array, taps: Radiance, weight: float, coarse: Array, across: Radiance) -> None:
+    """Give every edge pixel the mean of its parts, and spread across each line of parts what these send beyond it.
+
+    Args:
+        slot: (H, W) row of ``fine`` that holds an edge pixel's parts, -1 where there are none.
+        fine: (n, SUB, SUB) the parts.
+        taps: see :func:`part_taps`.
+        weight: of what is spread.
+        coarse: (H, W) the means are written here.
+        across: (SUB H, W + columns of taps - 1) ``weight`` times the rest is added here; its columns begin half of that
+            before the image's.
+    """
+    t0, t1, t2, t3 = taps[0], taps[1], taps[2], taps[3]
+    for v in range(slot.shape[0]):
+        for u in range(slot.shape[1]):
             s = slot[v, u]
             if s < 0:
                 continue
-            mean = fine[s].mean()
+            parts, mean = fine[s], 0.0
             for a in range(SUB):
-                for c in range(n):
-                    rows[a, c] = 0.0
-                    for b in range(SUB):
-                        rows[a, c] += (fine[s, a, b] - mean) / (SUB * SUB) * taps[b, c]
-            c0, c1 = max(0, radius - u), min(n, width + radius - u)
-            for r in range(max(0, radius - v), min(n, height + radius - v)):
-                for c in range(c0, c1):
-                    light = 0.0
-                    for a in range(SUB):
-                        light += taps[a, r] * rows[a, c]
-                    out[v + r - radius, u + c - radius] += np.float32(light)
+                mean += parts[a, 0] + parts[a, 1] + parts[a, 2] + parts[a, 3]
+            mean /= SUB * SUB
+            coarse[v, u] = mean
+            for a in range(SUB):
+                p0, p1 = np.float32(weight * (parts[a, 0] - mean)), np.float32(weight * (parts[a, 1] - mean))
+                p2, p3 = np.float32(weight * (parts[a, 2] - mean)), np.float32(weight * (parts[a, 3] - mean))
+                line = across[SUB * v + a, u : u + t0.size]
+                for c in range(t0.size):
+                    line[c] += p0 * t0[c] + p1 * t1[c] + p2 * t2[c] + p3 * t3[c]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mean_of_parts(slot: Slots, fine: Array, coarse: Array) -> None:
-    """Give every edge pixel the mean of its parts."""
-    for v in range(slot.shape[0]):
-        for u in range(slot.shape[1]):
-            if slot[v, u] >= 0:
-                coarse[v, u] = fine[slot[v, u]].mean()
+def spread_down(across: Radiance, taps: Radiance, out: Radiance) -> None:
+    """Add to an image (H, W) what :func:`gather_parts` has gathered, spread down."""
+    radius = taps.shape[1] // 2
+    for v in range(out.shape[0]):
+        row = out[v]
+        for r in range(max(v - radius, 0), min(v + radius + 1, out.shape[0])):
+            for a in range(SUB):
+                tap, line = taps[a, v - r + radius], across[SUB * r + a, radius : radius + out.shape[1]]
+                for u in range(row.size):
+                    row[u] += tap * line[u]
 
 
 def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
@@ -136,11 +145,19 @@ def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
     Returns:
         (H, W) light on each pixel; beyond the image's border the world is taken to go on as at the border.
     """
-    _mean_of_parts(slot, fine, coarse)
+    taps = part_taps(sigma)
+    across = np.zeros((SUB * slot.shape[0], slot.shape[1] + taps.shape[1] - 1), np.float32)
+    gather_parts(slot, fine, taps, 1.0, coarse, across)
     image = spread(coarse.astype(np.float32), sigma)
-    if sigma > 0:
-        _spread_parts(slot, fine, psf_taps(_narrowed(sigma), SUB), image)
+    spread_down(across, taps, image)
     return image
+
+
+@lru_cache(maxsize=16)
+def part_taps(sigma: float) -> Radiance:
+    """Return the :func:`psf_taps` of a lens for parts of edge pixels, over SUB; none gives light away without blur."""
+    taps = psf_taps(_narrowed(sigma), SUB) / SUB if sigma > 0 else np.zeros((SUB, 1))
+    return taps.astype(np.float32)
 
 
 def spread(image: Radiance, sigma: float) -> Radiance:

@@ -6,7 +6,9 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.sim.paint_parts import SUB, Box, Slots, ahead_of, half, open_parts, part, plane_row, square_of
+from armsight.sim.paint_parts import SUB, Box, Slots, ahead_of, half, open_parts, plane_row, square_of
+
+Line = tuple[float, float, float]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -28,19 +30,22 @@ def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inside_rim(at: Array, disc: Array) -> float:
-    """Return in which share of an area, its middle and slopes at (3, 3), a disc is: its rim is nearly straight there."""
-    x0, y0, radius = disc[0], disc[1], disc[2]
-    x, xu, xv = at[0, 0] - x0 * at[0, 2], at[1, 0] - x0 * at[1, 2], at[2, 0] - x0 * at[2, 2]
-    y, yu, yv = at[0, 1] - y0 * at[0, 2], at[1, 1] - y0 * at[1, 2], at[2, 1] - y0 * at[2, 2]
-    away = max(np.sqrt(x * x + y * y), 1e-3 * radius * at[0, 2])
-    u, v = radius * at[1, 2] - (x * xu + y * yu) / away, radius * at[2, 2] - (x * xv + y * yv) / away
-    c = radius * at[0, 2] - away
+def _inside_rim(x: Line, y: Line, w: Line) -> float:
+    """Return in which share of an area a disc is whose rim is nearly straight there.
+
+    Args:
+        x: offset from the disc's centre, homogeneous: in the area's middle, and its slopes across and down.
+        y: the same down.
+        w: the same of the radius.
+    """
+    away = max(np.sqrt(x[0] * x[0] + y[0] * y[0]), 1e-3 * w[0])
+    u, v = w[1] - (x[0] * x[1] + y[0] * y[1]) / away, w[2] - (x[0] * x[2] + y[0] * y[2]) / away
+    c = w[0] - away
     # The rim bends away from its tangent, by the mean square of the way along it within the area, over its diameter.
     su, sv, eu, ev = _chord(c, u, v)
-    sx, sy, ex, ey = su * xu + sv * xv, su * yu + sv * yv, eu * xu + ev * xv, eu * yu + ev * yv
-    square = (sx * (sx + ex) + ex * ex + sy * (sy + ey) + ey * ey) / 3
-    return half(c - max(square - c * c, 0.0) / (2 * away), u, v)
+    sx, sy, ex, ey = su * x[1] + sv * x[2], su * y[1] + sv * y[2], eu * x[1] + ev * x[2], eu * y[1] + ev * y[2]
+    way = (sx * (sx + ex) + ex * ex + sy * (sy + ey) + ey * ey) / 3
+    return half(c - max(way - c * c, 0.0) / (2 * away), u, v)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -63,17 +68,54 @@ def _bulge(square: Array, disc: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _paint_rim(square: Array, disc: Array, at: Array, parts: Array) -> None:
+def _about(square: Array, n: int, scale: float, offset: float) -> tuple[float, float, float, float]:
+    """Return ``scale`` times coordinate n of a pixel less ``offset`` times its last: middle, slopes, twist."""
+    return (
+        scale * square[0, n] - offset * square[0, 2],
+        scale * square[1, n] - offset * square[1, 2],
+        scale * square[2, n] - offset * square[2, 2],
+        scale * square[3, n] - offset * square[3, 2],
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint_rim(square: Array, disc: Array, parts: Array) -> None:
     """Repaint the parts (SUB, SUB) of a pixel that a disc's rim crosses."""
+    x, y, w = _about(square, 0, 1.0, disc[0]), _about(square, 1, 1.0, disc[1]), _about(square, 2, disc[2], 0.0)
+    # By how much the square of the distance within may change in half a part, at most.
+    steep = abs(w[0] * w[1] - x[0] * x[1] - y[0] * y[1]) + abs(w[0] * w[2] - x[0] * x[2] - y[0] * y[2])
+    most = (steep + 2 * (x[1] * x[1] + x[2] * x[2] + y[1] * y[1] + y[2] * y[2])) / SUB
     for a in range(SUB):
+        down = (a + 0.5) / SUB - 0.5
         for b in range(SUB):
-            part(square, a, b, at)
-            parts[a, b] += _inside_rim(at, disc) * (disc[3] - parts[a, b])
+            across = (b + 0.5) / SUB - 0.5
+            both = across * down
+            px = x[0] + across * x[1] + down * x[2] + both * x[3]
+            py = y[0] + across * y[1] + down * y[2] + both * y[3]
+            pw = w[0] + across * w[1] + down * w[2] + both * w[3]
+            inside = pw * pw - px * px - py * py
+            if inside > most:
+                parts[a, b] = disc[3]
+            elif inside > -most:
+                share = _inside_rim(
+                    (px, (x[1] + down * x[3]) / SUB, (x[2] + across * x[3]) / SUB),
+                    (py, (y[1] + down * y[3]) / SUB, (y[2] + across * y[3]) / SUB),
+                    (pw, (w[1] + down * w[3]) / SUB, (w[2] + across * w[3]) / SUB),
+                )
+                parts[a, b] += share * (disc[3] - parts[a, b])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def paint_disc(
-    rays: Array, Ms: Array, box: Box, disc: Array, coarse: Array, slot: Slots, fine: Array, count: int
+    rays: Array,
+    Ms: Array,
+    box: Box,
+    corner: tuple[int, int],
+    disc: Array,
+    coarse: Array,
+    slot: Slots,
+    fine: Array,
+    count: int,
 ) -> tuple[Array, int]:
     """Paint a disc.
 
@@ -81,6 +123,7 @@ def paint_disc(
         rays: see :func:`paint`.
         Ms: see there.
         box: see there.
+        corner: see there.
         disc: (4,) centre x, y, radius and value.
         coarse: see there.
         slot: see there.
@@ -96,15 +139,15 @@ def paint_disc(
         return fine, count
     top, bottom = np.empty((3, n + 1)), np.empty((3, n + 1))
     inside_top, inside_bottom = np.empty(n + 1), np.empty(n + 1)
-    square, at, ahead = np.empty((4, 3)), np.empty((3, 3)), False
+    square, ahead = np.empty((4, 3)), False
     for v in range(v0, v1):
         M = Ms[min(v, Ms.shape[0] - 1)]
         if v == v0 or Ms.shape[0] > 1:
-            ahead = plane_row(rays, M, v, u0, bottom)
+            ahead = plane_row(rays, M, v + corner[1], u0 + corner[0], n + 1, bottom)
             _inside(bottom, disc, inside_bottom)
         top, bottom, inside_top, inside_bottom = bottom, top, inside_bottom, inside_top
         all_ahead = ahead
-        ahead = plane_row(rays, M, v + 1, u0, bottom)
+        ahead = plane_row(rays, M, v + 1 + corner[1], u0 + corner[0], n + 1, bottom)
         _inside(bottom, disc, inside_bottom)
         all_ahead = all_ahead and ahead
         square_of(top, bottom, n // 2, square)
@@ -120,5 +163,5 @@ def paint_disc(
             elif high > -bulge:
                 fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
                 square_of(top, bottom, k, square)
-                _paint_rim(square, disc, at, fine[s])
+                _paint_rim(square, disc, fine[s])
     return fine, count

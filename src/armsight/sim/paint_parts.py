@@ -46,20 +46,10 @@ def square_of(top: Array, bottom: Array, k: int, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def part(square: Array, a: int, b: int, out: Array) -> None:
-    """Write out (3, 3), middle and slopes of the part in row a and column b of a square (4, 3)."""
-    x, y = (b + 0.5) / SUB - 0.5, (a + 0.5) / SUB - 0.5
-    for c in range(3):
-        out[0, c] = square[0, c] + x * square[1, c] + y * square[2, c] + x * y * square[3, c]
-        out[1, c] = (square[1, c] + y * square[3, c]) / SUB
-        out[2, c] = (square[2, c] + x * square[3, c]) / SUB
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def plane_row(rays: Array, M: Array, v: int, u0: int, out: Array) -> bool:
-    """Cast the pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; tell if all see it."""
+def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> bool:
+    """Cast n pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; tell if all see it."""
     least = np.inf
-    for k in range(out.shape[1]):
+    for k in range(n):
         x, y, z = rays[v, u0 + k, 0], rays[v, u0 + k, 1], rays[v, u0 + k, 2]
         for c in range(3):
             out[c, k] = M[c, 0] * x + M[c, 1] * y + M[c, 2] * z

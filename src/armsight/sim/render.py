@@ -108,12 +108,14 @@ class _Canvas:
         grid = (x, y, np.pad(pattern.values, 1, constant_values=CLEAR))
         box = self._box(ends, outline(pattern))
         if box is not None:
-            self.fine, self.count = paint(self.rays, Ms, box, grid, self.coarse, self.slot, self.fine, self.count)
+            self.fine, self.count = paint(
+                self.rays, Ms, box, (0, 0), grid, self.coarse, self.slot, self.fine, self.count
+            )
         for disc in pattern.discs:
             box = self._box(ends, _circle(disc))
             if box is not None:
                 self.fine, self.count = paint_disc(
-                    self.rays, Ms, box, np.array(disc), self.coarse, self.slot, self.fine, self.count
+                    self.rays, Ms, box, (0, 0), np.array(disc), self.coarse, self.slot, self.fine, self.count
                 )
 
     def _box(self, Ts: Array, points: Array) -> Box | None:
