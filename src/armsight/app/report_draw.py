@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DPI = 150
 WIDTH_IN = 10.0
+_PACKED = 3  # of 9: a tenth larger than with the usual 6, in half of the time
 INK, MUTED, BLUE, ORANGE, RED, EMPTY = "#1f2933", "#616e7c", "#2b6cb0", "#dd7a1f", "#b83232", "#fbe3d6"
 STYLE: dict[str, Any] = {
     "font.size": 9.0,
@@ -77,20 +78,29 @@ def new_figure(height_in: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
+def _lay_out(figure: Figure) -> None:
+    """Give everything in a figure its place, once; matplotlib would draw it all for that, and again for every file."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
 def png(figure: Figure) -> bytes:
-    """Render a figure."""
+    """Render a figure; within :func:`drawing`."""
+    _lay_out(figure)
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": _PACKED})
     return data.getvalue()
 
 
 def svg(figure: Figure) -> bytes:
-    """Render a figure as lines that stay sharp however far one zooms in."""
+    """Render a figure as lines that stay sharp however far one zooms in; within :func:`drawing`."""
+    _lay_out(figure)
     data = io.BytesIO()
     figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
     return data.getvalue()

@@ -72,16 +72,18 @@ def errors_figure(run: RunData) -> Figure | None:
         return None
     figure = new_figure(6.8)
     plots = figure.subplots(4, 1, sharex=True)
-    alone = errors(run.potentiometers, run.truth)
-    rows = _thinned(len(alone))
+    alone = run.potentiometers[_thinned(len(run.potentiometers))]
+    off = errors(alone, run.truth)
     for plot, part, factor, name in ((plots[0], slice(0, 3), _MM, "mm"), (plots[2], slice(3, 6), _DEG, "deg")):
-        size = factor * np.linalg.norm(alone[rows, part], axis=1)
-        plot.plot(run.potentiometers.t_s[rows], size, color=ORANGE, lw=1.0)
+        plot.plot(alone.t_s, factor * np.linalg.norm(off[:, part], axis=1), color=ORANGE, lw=1.0)
         plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
         plot.set_title("potentiometers through the arm's table", fontsize=9)
         plot.set_ylim(bottom=0)
+    shown = {"vision": (run.vision, BLUE), "fused": (run.fused, GREEN)}
+    thin = {name: (track[_thinned(len(track))], colour) for name, (track, colour) in shown.items() if len(track)}
+    seen = [(name, colour, track, errors(track, run.truth)) for name, (track, colour) in thin.items()]
     for plot, part, factor, name in ((plots[1], slice(0, 3), _MM, "mm"), (plots[3], slice(3, 6), _DEG, "deg")):
-        _own(plot, run, part, factor)
+        _own(plot, seen, part, factor)
         plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
     for plot in plots:
         _shade(plot, run)
@@ -93,19 +95,15 @@ def errors_figure(run: RunData) -> Figure | None:
     return figure
 
 
-def _own(plot: Axes, run: RunData, part: slice, factor: float) -> None:
-    """Draw the size of vision's and the fused estimate's errors, and the band claimed."""
-    assert run.truth is not None
-    for track, name, colour in ((run.vision, "vision", BLUE), (run.fused, "fused", GREEN)):
-        if not len(track):
-            continue
-        rows = _thinned(len(track))
-        size = factor * np.linalg.norm(errors(track, run.truth)[rows][:, part], axis=1)
+def _own(plot: Axes, seen: list[tuple[str, str, ToolTrack, Array]], part: slice, factor: float) -> None:
+    """Draw the sizes of tracks' errors, and the band that the fused one claims: names, colours, tracks, errors."""
+    for name, colour, track, error in seen:
+        size = factor * np.linalg.norm(error[:, part], axis=1)
         style = {"marker": ".", "ms": 2.0, "lw": 0.0} if name == "vision" else {"lw": 0.9}
         if name == "fused" and track.covs is not None:
-            sigma = np.sqrt(np.einsum("nii->ni", track.covs[rows])[:, part].sum(axis=1))
-            plot.fill_between(track.t_s[rows], 0.0, factor * _BAND * sigma, color=SOFT_GREEN, lw=0)
-        plot.plot(track.t_s[rows], size, color=colour, label=name, **style)
+            sigma = np.sqrt(np.einsum("nii->ni", track.covs)[:, part].sum(axis=1))
+            plot.fill_between(track.t_s, 0.0, factor * _BAND * sigma, color=SOFT_GREEN, lw=0)
+        plot.plot(track.t_s, size, color=colour, label=name, **style)
     shown = [line.get_ydata() for line in plot.get_lines()]
     high = float(np.nanpercentile(np.concatenate([np.asarray(y, float) for y in shown]), 99.8)) if shown else 1.0
     plot.set_ylim(0.0, 1.4 * high)
@@ -122,8 +120,8 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
     ):
         found = rest_errors(run, truth)
         rests.bar(np.arange(len(found)) + shift, _MM * np.array(list(found.values())), 0.38, color=colour, label=name)
-        for motion, (along_s, away_m) in path_errors(run, truth).items():
-            style = "-" if motion == next(iter(path_errors(run, truth))) else "--"
+        for number, (motion, (along_s, away_m)) in enumerate(path_errors(run, truth).items()):
+            style = "--" if number else "-"
             paths.plot(along_s, _MM * away_m, style, color=colour, lw=1.0, label=f"{motion}, {name}")
     rests.set_xticks(range(len(found)), list(found), rotation=30, ha="right", fontsize=7)
     for plot, title in ((rests, "error at rest, mm"), (paths, "distance from the path, mm")):

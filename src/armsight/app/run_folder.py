@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,16 +118,17 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], R
     """Write the tables and the summary; returns it, and what the report is to show where there is enough for one."""
     outcome, facts = finished.outcome, {**finished.facts, "wall_s": _wall_s(finished)}
     with _as_much_as_fits() as keep:
-        if outcome.log.joints:
-            keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
         keep(write_text, folder / "poses.csv", csv_text(_pose_records(finished)))
         if outcome.handeye is None:
+            if outcome.log.joints:
+                keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
             summary = _known({**facts, "ended_by": outcome.said})
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth)
+        keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_wanted))
         for name, track in _tracks(run).items():
             keep(write_track, folder, name, track)
         before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
@@ -143,17 +145,15 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], R
 def _as_much_as_fits() -> Iterator[Callable[..., None]]:
     """Write file after file, also after one that could not be written; the first such is told at the end.
 
-    The block is handed a function that calls what writes a file.
+    The block is handed a function that calls what writes a file, in a thread beside what the block goes on with.
     """
-    failed: list[InputError] = []
-
-    def keep(write: Callable[..., object], *arguments: object) -> None:
-        try:
-            write(*arguments)
-        except InputError as error:
-            failed.append(error)
-
-    yield keep
+    asked: list[Future[object]] = []
+    with ThreadPoolExecutor(1) as writer:
+        yield lambda write, *arguments: asked.append(writer.submit(write, *arguments))
+    failed = [error for each in asked if (error := each.exception()) is not None]
+    for error in failed:
+        if not isinstance(error, InputError):
+            raise error
     if failed:
         raise failed[0]
 

@@ -90,7 +90,6 @@ def write_run_report(report: RunReport, folder: Path) -> Path:
         for name, figure in _figures(report).items():
             if figure is not None:
                 files[f"{name}.png"] = png(figure)
-                figure.set_layout_engine("none")  # as it is laid out now
                 embedded[name] = _box("svg+xml", svg(figure), name) if name != "overview" else ""
     put_files(folder, {**files, PAGE: _page(report, embedded).encode()})
     return folder / PAGE
