@@ -35,14 +35,26 @@ def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _converted(said: Array, low: Array, span: Array, noise: NDArray[np.float32], steps: float, counts: Counts) -> None:
-    """Convert what wipers say (6,), rad, with noise (6, n) in steps; averages into counts (6,)."""
-    n = noise.shape[1]
+def _read(
+    shaft: Array,
+    offset: Array,
+    sines: Array,
+    low: Array,
+    span: Array,
+    noise: NDArray[np.float32],
+    row: int,
+    steps: float,
+    counts: Counts,
+) -> None:
+    """Convert what wipers say at shaft angles (1, 6), with a row of noise (N, 6, n) in steps; averages into counts (6,)."""
+    n, over = noise.shape[2], np.empty((1, 6))
+    _errors(shaft, offset, sines, low, span, over)
     for i in range(6):
-        share = LOW_SHARE + (HIGH_SHARE - LOW_SHARE) * (said[i] - low[i]) / span[i]
+        said = shaft[0, i] + over[0, i]
+        share = LOW_SHARE + (HIGH_SHARE - LOW_SHARE) * (said - low[i]) / span[i]
         total = 0.0
         for k in range(n):
-            total += min(max(np.floor(share * steps + noise[i, k] + 0.5), 0.0), steps - 1.0)
+            total += min(max(np.floor(share * steps + noise[row, i, k] + 0.5), 0.0), steps - 1.0)
         counts[i] = np.uint32(min(np.floor(total / n * (COUNTS / steps) + 0.5), COUNTS - 1.0))
 
 
@@ -84,7 +96,7 @@ class Potentiometers:
             block = self._rng.standard_normal((_BLOCK, 6, self._given.oversampling), dtype=np.float32)
             self._noise, self._next = block * np.float32(self._given.pot_noise_lsb), 0
         counts = np.empty(6, np.uint32)
-        said = shaft + self.error(shaft[None])[0]
-        _converted(said, self._low, self._span, self._noise[self._next], self._steps, counts)
+        errors = (self._offset, self._sines, self._low, self._span)
+        _read(shaft[None], *errors, self._noise, self._next, self._steps, counts)
         self._next += 1
         return counts

@@ -57,11 +57,13 @@ class ArmPlant:
         self._model = mujoco.MjModel.from_xml_string(text)
         self._data = mujoco.MjData(self._model)
         self._drives_on = False
-        self._data.qpos[:] = np.tile(model.home, 2)
+        self._qpos, self._ctrl, self._force = self._data.qpos, self._data.ctrl, self._data.actuator_force
+        self._newton_metre_per_a = self.motors.gear_ratio * self.motors.torque_constant
+        self._qpos[:] = np.tile(model.home, 2)
         mujoco.mj_step(self._model, self._data, nstep=round(_SETTLE_S / TICK_S) * SUBSTEPS)
         self._ticks = 1  # what a board's first tick, number 1, senses
         self._path = np.empty((4096, 12))
-        self._path[:2] = self._data.qpos
+        self._path[:2] = self._qpos
 
     @property
     def t_s(self) -> float:
@@ -75,9 +77,9 @@ class ArmPlant:
 
     def sense(self) -> Sensed:
         """Return what the converters read now."""
-        amperes = np.abs(self._data.actuator_force) / (self.motors.gear_ratio * self.motors.torque_constant)
+        amperes = np.abs(self._force) / self._newton_metre_per_a
         return Sensed(
-            self.pots.read(self._data.qpos[:6]),
+            self.pots.read(self._qpos[:6]),
             np.rint(1e3 * amperes).astype(np.uint32),
             self.supply_mv,
             self.stop_pressed,
@@ -87,12 +89,12 @@ class ArmPlant:
         """Let 1 ms pass with these duties (6,), -1 to 1, held; with ``drives_on`` False the brakes are closed."""
         if drives_on != self._drives_on:
             self._switch(drives_on)
-        self._data.ctrl[:] = duty if drives_on else 0.0
+        self._ctrl[:] = duty if drives_on else 0.0
         mujoco.mj_step(self._model, self._data, nstep=SUBSTEPS)
         self._ticks += 1
         if self._ticks == len(self._path):
             self._path = np.concatenate([self._path, np.empty_like(self._path)])
-        self._path[self._ticks] = self._data.qpos
+        self._path[self._ticks] = self._qpos
 
     def _switch(self, drives_on: bool) -> None:
         """Open the brakes and close the motors' circuits, or the other way round."""

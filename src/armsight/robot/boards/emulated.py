@@ -12,11 +12,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from armsight.data import Array
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.frames import (
     ANSWER,
+    ANSWER_FIELDS,
     ANSWER_MAGIC,
-    REQUEST,
+    BYTES_AT,
+    DUTY_AT,
+    JOINTS,
+    REQUEST_FIELDS,
     REQUEST_MAGIC,
     RESTART_POWER,
     RESTART_WATCHDOG,
@@ -28,6 +33,7 @@ from armsight.robot.boards.machine import Machine, Plant
 TICK_S = 0.001
 _BITS_PER_BYTE = 10
 _WRAP = 1 << 32
+_FLOAT = np.dtype("<f4")
 
 
 class Faults(Protocol):
@@ -73,13 +79,16 @@ class EmulatedLink:
         self._credit = 0.0
         self._ticks = 0
         self._to_board, self._to_host = bytearray(), bytearray()
-        self._frame: Any = np.zeros((), REQUEST)
-        self._frame["magic"], self._frame["version"] = REQUEST_MAGIC, VERSION
         self._overrun, self._restart = False, 0
-        self._duty, self._drives_on = np.zeros(6), False
+        self._duty: Array = np.zeros(JOINTS)
+        self._drives_on = False
         self._closed = False
-        #: The newest answer of the firmware (``pil_answer``): all it knows, not only what the wire carries.
-        self.answer: Any = np.zeros((), ANSWER)
+        self._reply = bytes(ANSWER.itemsize)
+
+    @property
+    def answer(self) -> Any:  # noqa: ANN401 - a structured scalar
+        """The newest answer of the firmware (``pil_answer``): all it knows, not only what the wire carries."""
+        return np.frombuffer(self._reply, ANSWER)[0]
 
     @property
     def t_s(self) -> float:
@@ -148,36 +157,38 @@ class EmulatedLink:
         return data if self._faults is None else self._faults.to_board(self._ticks, data)[:WIRE_BYTES]
 
     def _request(self) -> bytes:
-        frame, sensed, data = self._frame, self._plant.sense(), self._ride()
-        frame["tick"] = self._ticks % _WRAP
-        frame["overrun"], frame["stop_pressed"], frame["supply_mv"] = (
+        sensed, data = self._plant.sense(), self._ride()
+        request = REQUEST_FIELDS.pack(
+            REQUEST_MAGIC,
+            VERSION,
+            self._ticks % _WRAP,
+            self._restart,
             self._overrun,
             sensed.stop_pressed,
             sensed.supply_mv,
+            *sensed.counts.tolist(),
+            *sensed.current_ma.tolist(),
+            len(data),
+            data,
         )
-        frame["counts"], frame["current_ma"], frame["length"] = sensed.counts, sensed.current_ma, len(data)
-        if data:
-            frame["bytes"][: len(data)] = np.frombuffer(data, np.uint8)
-        frame["restart"] = self._restart
         self._overrun, self._restart = False, 0
-        request: bytes = frame.tobytes()
         return request
 
     def _tick(self) -> None:
         self._ticks += 1
         reply = self._machine.tick(self._request())
-        self.answer = answer = np.frombuffer(reply, ANSWER)[0] if len(reply) == ANSWER.itemsize else self.answer
-        if answer["magic"] != ANSWER_MAGIC or answer["version"] != VERSION or answer["tick"] != self._ticks % _WRAP:
+        fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0, 0, 0, 0, 0)
+        magic, version, tick, drives_on, length = fields
+        if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % _WRAP:
             raise DeviceError(
                 f"the emulated board did not answer tick {self._ticks} with a frame of version {VERSION}: its image and"
                 " this armsight do not belong together; build it anew with `armsight board build`"
             )
+        self._reply = reply
         if self._watch is not None:
             self._watch(reply)
-        outputs = answer["outputs"]
-        self._duty, self._drives_on = outputs["duty"], bool(outputs["drives_on"])
+        self._duty, self._drives_on = np.frombuffer(reply, _FLOAT, JOINTS, DUTY_AT), drives_on != 0
         self._plant.step(self._duty, self._drives_on)
-        length = int(answer["length"])
         if length:
-            said = answer["bytes"][:length].tobytes()
+            said = reply[BYTES_AT : BYTES_AT + length]
             self._to_host += said if self._faults is None else self._faults.to_host(self._ticks, said)

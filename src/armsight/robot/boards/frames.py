@@ -5,6 +5,8 @@ A test reads the headers and holds the layouts to them.
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 
 JOINTS = 6
@@ -62,3 +64,19 @@ ANSWER = np.dtype(
         ("bytes", "u1", WIRE_BYTES),
     ]
 )
+
+
+def _at(frame: np.dtype[np.void], name: str) -> int:
+    """Return where a field lies in a frame, bytes."""
+    fields = frame.fields
+    assert fields is not None
+    return int(fields[name][1])
+
+
+#: The same frames for the tick itself, where a structured array costs more than the rest: a request whole, its arrays one
+#: after the other, and of an answer what every tick needs: magic, version, tick, whether the drives are on, how many bytes.
+REQUEST_FIELDS = struct.Struct(f"<7I{JOINTS}I{JOINTS}II{WIRE_BYTES}s")
+_DRIVES_AT, _LENGTH_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "drives_on"), _at(ANSWER, "length")
+ANSWER_FIELDS = struct.Struct(f"<3I{_DRIVES_AT - 12}xI{_LENGTH_AT - _DRIVES_AT - 4}xI")
+#: Where an answer has the duties, six little-endian floats, and what is said.
+DUTY_AT, BYTES_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "duty"), _at(ANSWER, "bytes")

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Record
+from armsight.data import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Sensed(Record):
-    """What a board's converters read at the beginning of a tick.
+class Sensed(NamedTuple):
+    """What a board's converters read at the beginning of a tick; a tuple, as one is made every millisecond.
 
     Attributes:
         counts: (6,) potentiometers, 16-bit fractions of their supply, uint32.

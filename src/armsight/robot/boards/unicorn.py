@@ -19,9 +19,12 @@ _FLASH, _FLASH_BYTES = 0, 0x40000
 _RAM, _RAM_BYTES = 0x20000000, 0x10000
 _CONTROL, _CONTROL_BYTES = 0xE000E000, 0x1000  # the processor's own registers: here plain memory
 _FPU_ON = 0x40000000  # FPEXC.EN
-#: Where functions return to: the end of the flash, where nothing lies. The emulation ends there.
-_RETURN = _FLASH_BYTES - 16
 _THUMB = 1
+#: What calls a function, at the end of the flash where nothing else lies: ``blx r4; wfi; b _END``. By the procedure call
+#: standard a function leaves r4 and the stack pointer as they were, so neither has to be set again for the next tick. The
+#: wait for an interrupt ends the emulation; where it ends by an address, Unicorn translates the code there anew every time.
+_CALL, _CALLER = _FLASH_BYTES - 16, b"\xa0\x47\x30\xbf\x02\xe0"
+_END = _CALL + 12
 
 
 class UnicornMachine:
@@ -45,22 +48,24 @@ class UnicornMachine:
             raise InputError("emulated:unicorn needs unicorn: pip install 'armsight[board]'") from None
         elf = read_elf(image)
         self._error: type[Exception] = unicorn.UcError
-        self._stack, self._link = arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
+        self._stack, self._callee = arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_R4
         self._symbols, self._sizes = elf.symbols, elf.sizes
         self.uc: Any = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
         self.uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
         self.uc.mem_map(_FLASH, _FLASH_BYTES)
         self.uc.mem_map(_CONTROL, _CONTROL_BYTES)
-        # The board's RAM is memory of ours, so that frames need no call to be written or read.
+        # The board's RAM is memory of ours, so that frames need no call to be written or read. No code runs there: where it
+        # might, Unicorn looks at every store for code that it changes.
         self._ram = mmap.mmap(-1, _RAM_BYTES)
-        self.uc.mem_map_ptr(_RAM, _RAM_BYTES, unicorn.UC_PROT_ALL, np.frombuffer(self._ram, np.uint8).ctypes.data)
+        data = unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE
+        self.uc.mem_map_ptr(_RAM, _RAM_BYTES, data, np.frombuffer(self._ram, np.uint8).ctypes.data)
         for segment in elf.segments:
             self.uc.mem_write(segment.load_address, segment.data)
+        self.uc.mem_write(_CALL, _CALLER)
         self.uc.reg_write(arm_const.UC_ARM_REG_FPEXC, _FPU_ON)
-        self._stack_top = elf.symbols["stack_top"]
         self._request = self._place("pil_request_frame")
         self._answer = self._place("pil_answer_frame")
-        self._tick = self._symbols["pil_tick"] | _THUMB
+        self._called, self._tick = 0, self._symbols["pil_tick"] | _THUMB
         self._call(self._symbols["pil_boot"] | _THUMB)
 
     def tick(self, request: bytes) -> bytes:
@@ -80,8 +85,10 @@ class UnicornMachine:
 
     def _call(self, function: int) -> None:
         try:
-            self.uc.reg_write(self._stack, self._stack_top)
-            self.uc.reg_write(self._link, _RETURN | _THUMB)
-            self.uc.emu_start(function, _RETURN)
+            if function != self._called:
+                self.uc.reg_write(self._stack, self._symbols["stack_top"])
+                self.uc.reg_write(self._callee, function)
+                self._called = function
+            self.uc.emu_start(_CALL | _THUMB, _END)
         except self._error as error:
             raise DeviceError(f"the emulated board broke down: {error}") from None
