@@ -59,13 +59,6 @@ def _edges(patterns: tuple[Pattern, ...]) -> Array:
     return np.array(around)
 
 
-@lru_cache(maxsize=64)
-def _rectangles(patterns: tuple[Pattern, ...]) -> Array:
-    """Return the corners (P, 4, 4) of the patterns' cells as homogeneous columns, m, each pattern's frame."""
-    corners = np.array([outline(pattern)[::OUTLINE] for pattern in patterns])
-    return np.concatenate([corners, np.zeros_like(corners[..., :1]), np.ones_like(corners[..., :1])], axis=2).mT.copy()
-
-
 _nodes = lru_cache(np.polynomial.legendre.leggauss)
 
 
@@ -203,9 +196,7 @@ class CellCamera:
         order = np.argsort(np.where(faces, -np.linalg.norm(Ts[:, :, 0, :3, 3], axis=2), np.inf), axis=1, kind="stable")
         order = np.where(np.take_along_axis(faces, order, axis=1), order, -1)
         Ms = np.asarray(np.linalg.inv(Ts[..., :3, [0, 1, 3]]), dtype=np.float64)
-        corners = Ts[:, :, [0, -1] if rolling else [0], :3] @ _rectangles(patterns)[:, None]
-        far_m = np.linalg.norm(corners, axis=3).max(axis=(0, 2, 3))
-        return Exposure(palette(patterns), 0.5 * weights, order, Ms, far_m, boxes)
+        return Exposure(palette(patterns), 0.5 * weights, order, Ms, boxes)
 
     @staticmethod
     def _each(of: Callable[[Placed], Array], bodies: Sequence[Placed]) -> Array:

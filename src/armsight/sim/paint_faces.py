@@ -65,7 +65,6 @@ class Exposure(NamedTuple):
         order: (S, P) patterns in the order they are painted in; -1 in place of those that do not face the camera.
         Ms: (S, P, 1 or H, 3, 3) from rays to homogeneous coordinates of each pattern's plane, for all rows or for each;
             the third is 1 / depth along the ray.
-        far_m: (P,) no place of a pattern is farther from the camera, m.
         boxes: (P + K, 4) pixels that each pattern can cover, and after it each of its discs: first column, first row, end
             column, end row, counted from the crop's corner.
     """
@@ -74,7 +73,6 @@ class Exposure(NamedTuple):
     weights: Array
     order: Ids
     Ms: Array
-    far_m: Array
     boxes: Ids
 
     def shown(self) -> Ids:
@@ -84,37 +82,45 @@ class Exposure(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearness(rays: Radiance, M: Array, v: int, u: int) -> float:
+    """Return 1 / distance, 1/m, at which a pixel's ray meets a pattern's plane."""
+    return float(M[2, 0] * rays[0, v, u] + M[2, 1] * rays[1, v, u] + M[2, 2] * rays[2, v, u])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _put_back(
     rays: Radiance,
     Ms: Array,
     box: Window,
     corner: tuple[int, int],
     behind: tuple[Radiance, Radiance, Image],
+    nearest: Radiance,
     coarse: Array,
     slot: Slots,
 ) -> None:
-    """Put back what is nearer than a pattern that was painted over it."""
+    """Put back what is nearer than a pattern that was painted over it; ``nearest`` (H,) is how near that is in each row."""
     light, depth, ids = behind
-    for v in range(box[1], box[3]):
-        M = Ms[min(v, Ms.shape[0] - 1)]
-        y = v + corner[1]
-        for u in range(box[0], box[2]):
-            x = u + corner[0]
-            if ids[v, u] == 0:
-                continue
-            if (M[2, 0] * rays[0, y, x] + M[2, 1] * rays[1, y, x] + M[2, 2] * rays[2, y, x]) * depth[v, u] < 1.0:
+    u0, v0, u1, v1 = box
+    for v in range(v0, v1 if u0 < u1 else v0):
+        M, y = Ms[min(v, Ms.shape[0] - 1)], v + corner[1]
+        # It grows steadily along the row: its least is at an end.
+        if min(_nearness(rays, M, y, u0 + corner[0]), _nearness(rays, M, y, u1 - 1 + corner[0])) * nearest[v] >= 1.0:
+            continue
+        for u in range(u0, u1):
+            if ids[v, u] != 0 and _nearness(rays, M, y, u + corner[0]) * depth[v, u] < 1.0:
                 coarse[v, u] = light[v, u]
                 slot[v, u] = -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearest(depth: Radiance, ids: Image) -> float:
-    """Return how near the nearest pixel is that has an id, m."""
-    least = np.float32(np.inf)
-    for v in range(depth.shape[0]):
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+def _nearest(depth: Radiance, ids: Image, out: Radiance) -> None:
+    """Write how near the nearest pixel that has an id is in each row (H,), m."""
+    for v in range(out.size):
+        least = np.float32(np.inf)
         for u in range(depth.shape[1]):
-            least = min(least, depth[v, u] if ids[v, u] != 0 else np.float32(np.inf))
-    return float(least)
+            there = depth[v, u] if ids[v, u] != 0 else np.float32(np.inf)
+            least = there if there < least else least
+        out[v] = least
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -140,9 +146,10 @@ def paint_faces(
         total: (H, W) is written: the light on each pixel before the lens.
         edges: (H, W) is added to: what the lens adds to the blur of that, for edges lie within pixels.
     """
-    palette, weights, order, every_M, far_m, boxes = exposure
+    palette, weights, order, every_M, boxes = exposure
     light, depth, ids = behind
-    shape, count, nearest = light.shape, 0, _nearest(depth, ids)
+    shape, count, nearest = light.shape, 0, np.empty(light.shape[0], np.float32)
+    _nearest(depth, ids, nearest)
     coarse, slot, fine = np.empty(shape), np.empty(shape, np.int32), np.empty((1 << 11, SUB, SUB))
     across = np.zeros((SUB * shape[0], shape[1] + taps.shape[1] - 1), np.float32)
     total[:] = np.float32(0.0)
@@ -162,8 +169,7 @@ def paint_faces(
                 round_box = (boxes[at, 0], boxes[at, 1], boxes[at, 2], boxes[at, 3])
                 disc = palette.discs[k]
                 fine, count = paint_disc(corners, Ms, round_box, corner, disc, coarse, slot, fine, count)
-            if nearest < far_m[p]:
-                _put_back(rays, Ms, box, corner, behind, coarse, slot)
+            _put_back(rays, Ms, box, corner, behind, nearest, coarse, slot)
         gather_parts(slot, fine, taps, weights[step], coarse, across)
         for v in range(shape[0]):
             for u in range(shape[1]):
