@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,10 +98,13 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
             "board": cell.board.welcome.board,
             "machine": demo.machine,
         }
-        finished = Finished(
-            cell.model, calibration.rig, outcome, plan, _truth(cell, outcome), facts, began, studies, cell.picture()
-        )
-    return finish(finished, demo.folder)
+        truth = _truth(cell, outcome)
+        with ThreadPoolExecutor(1) as beside:
+            picture = beside.submit(cell.picture)
+            finished = Finished(
+                cell.model, calibration.rig, outcome, plan, truth, facts, began, studies, picture.result
+            )
+            return finish(finished, demo.folder)
 
 
 def _cell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcell:

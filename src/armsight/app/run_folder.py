@@ -55,7 +55,7 @@ class Finished:
         facts: what else the summary is to say, such as the seed.
         began: when it began, by ``time.perf_counter``, s.
         studies: made after it.
-        cell: (H, W, 3) BGR, the cell seen from aside; None for a real one.
+        cell: gives the cell seen from aside, (H, W, 3) BGR, waiting until it is drawn; None for a real one.
     """
 
     arm: Arm
@@ -66,7 +66,7 @@ class Finished:
     facts: Mapping[str, Any]
     began: float
     studies: Sequence[Study]
-    cell: Image | None
+    cell: Callable[[], Image] | None
 
 
 def finish(finished: Finished, folder: Path) -> dict[str, Any]:
@@ -138,7 +138,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], R
         keep(write_text, folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
         keep(write_shots, folder / _SHOTS, outcome.kept)
     shown = run if outcome.open_s is None else cut(run, outcome.open_s[0], run.t_s[-1])
-    return summary, RunReport(summary, shown, before, after, finished.studies, _picture(finished), finished.cell, notes)
+    cell = None if finished.cell is None else finished.cell()
+    return summary, RunReport(summary, shown, before, after, finished.studies, _picture(finished), cell, notes)
 
 
 @contextlib.contextmanager

@@ -22,6 +22,8 @@ PLAIN, TILES, GRAIN, PRINT = 0, 1, 2, 3
 _FAR = 1e9
 _NOTHING = np.float32(0.25)  # light from where nothing is
 _STEP = 1e-4  # a shadow's ray starts so far off its surface, m
+BUNCH = 256  # rays that are cast together
+_WIDER = 1e-6  # rad
 
 Light = NDArray[np.float32]
 
@@ -134,17 +136,53 @@ def _texture(kind: int, x: float, y: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _meet(o: Array, d: Array, boxes: Array, ends: Array, radius: Array) -> tuple[float, int, int]:
-    """Return how far along a ray the first surface is, its number (boxes, then capsules; -1 none) and a box's face."""
+def _balls(boxes: Array, ends: Array, radius: Array) -> Array:
+    """Return a ball (middle, radius) around each surface, boxes, then capsules, with room for a shadow ray's step."""
+    count = boxes.shape[0]
+    balls = np.empty((count + ends.shape[0], 4))
+    balls[:count, :3] = boxes[:, :3]
+    balls[:count, 3] = np.sqrt((boxes[:, 3:6] ** 2).sum(axis=1)) + _STEP
+    for k in range(ends.shape[0]):
+        balls[count + k, :3] = 0.5 * (ends[k, 0] + ends[k, 1])
+        balls[count + k, 3] = 0.5 * np.sqrt(((ends[k, 1] - ends[k, 0]) ** 2).sum()) + radius[k] + _STEP
+    return balls
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ahead(o: Array, ways: Array, balls: Array, keep: NDArray[np.int64]) -> int:
+    """Write to keep which balls rays from o along unit vectors (N, 3) may meet, and return how many: those in a cone."""
+    axis = ways.sum(axis=0)
+    axis /= np.sqrt((axis**2).sum())
+    narrow = 1.0
+    for j in range(ways.shape[0]):
+        narrow = min(narrow, axis[0] * ways[j, 0] + axis[1] * ways[j, 1] + axis[2] * ways[j, 2])
+    opening, count = np.arccos(narrow) + _WIDER, 0
+    for k in range(balls.shape[0]):
+        x, y, z = balls[k, 0] - o[0], balls[k, 1] - o[1], balls[k, 2] - o[2]
+        away = np.sqrt(x * x + y * y + z * z)
+        if away > balls[k, 3]:
+            cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / away
+            if np.arccos(min(max(cosine, -1.0), 1.0)) > opening + np.arcsin(balls[k, 3] / away):
+                continue
+        keep[count] = k
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _meet(
+    o: Array, d: Array, boxes: Array, ends: Array, radius: Array, keep: NDArray[np.int64]
+) -> tuple[float, int, int]:
+    """Return how far along a ray the first of the surfaces in keep is, its number (-1 none) and a box's face."""
     best, which, face = _FAR, -1, 0
-    for k in range(boxes.shape[0]):
-        t, side = _box(o, d, boxes[k])
+    for k in keep:
+        if k < boxes.shape[0]:
+            t, side = _box(o, d, boxes[k])
+        else:
+            i = k - boxes.shape[0]
+            t, side = _capsule(o, d, ends[i, 0], ends[i, 1], radius[i]), 0
         if t < best:
             best, which, face = t, k, side
-    for k in range(ends.shape[0]):
-        t = _capsule(o, d, ends[k, 0], ends[k, 1], radius[k])
-        if t < best:
-            best, which, face = t, boxes.shape[0] + k, 0
     return best, which, face
 
 
@@ -186,45 +224,55 @@ def still(
 ) -> None:
     """Cast one ray a pixel at things that stand still, with the lamp's shadows.
 
+    Rays are cast in bunches: what lies outside the cone around a bunch, from the camera or from the lamp, none of it meets.
+
     Args:
-        rays: (H, W, 3) unit rays of the pixels, camera frame.
+        rays: (N, 3) unit rays of the pixels, camera frame; those that follow each other had best be close together.
         R_base_camera: (3, 3) the camera's axes.
         p_base: (3,) where it is, m.
-        boxes: (N, BOX).
+        boxes: (M, BOX).
         capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
         lamp_base: (3,) where the lamp is, m.
-        light: (H, W) the light that comes from each pixel.
-        depth: (H, W) distance of the surface, m.
-        ids: (H, W) which surface it is: boxes, then capsules; -1 where there is none.
+        light: (N,) the light that comes from each pixel.
+        depth: (N,) distance of the surface, m.
+        ids: (N,) which surface it is: boxes, then capsules; -1 where there is none.
     """
     ends, radius, albedo = capsules
-    d, p, n, way = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for v in range(rays.shape[0]):
-        for u in range(rays.shape[1]):
-            for i in range(3):
-                d[i] = (
-                    R_base_camera[i, 0] * rays[v, u, 0]
-                    + R_base_camera[i, 1] * rays[v, u, 1]
-                    + R_base_camera[i, 2] * rays[v, u, 2]
-                )
-            t, which, face = _meet(p_base, d, boxes, ends, radius)
-            depth[v, u], ids[v, u] = t, which
+    balls, n = _balls(boxes, ends, radius), np.empty(3)
+    keep, from_lamp, to_lamp = np.empty(len(balls), np.int64), np.empty((BUNCH, 3)), np.empty(3)
+    p, far, faces = np.empty((BUNCH, 3)), np.empty(BUNCH), np.empty(BUNCH, np.int64)
+    for begin in range(0, rays.shape[0], BUNCH):
+        ways = rays[begin : begin + BUNCH] @ R_base_camera.T
+        seen, lit = keep[: _ahead(p_base, ways, balls, keep)], 0
+        for j in range(ways.shape[0]):
+            t, which, face = _meet(p_base, ways[j], boxes, ends, radius, seen)
+            depth[begin + j], ids[begin + j] = t, which
             if which < 0:
-                light[v, u] = _NOTHING
+                light[begin + j] = _NOTHING
                 continue
-            far = 0.0
+            faces[lit], far[lit] = face, 0.0
             for i in range(3):
-                p[i] = p_base[i] + t * d[i]
-                way[i] = lamp_base[i] - p[i]
-                far += way[i] * way[i]
-            factor = _surface(p, which, face, boxes, ends, radius, n)
+                p[lit, i] = p_base[i] + t * ways[j, i]
+                from_lamp[lit, i] = p[lit, i] - lamp_base[i]
+                far[lit] += from_lamp[lit, i] ** 2
+            far[lit] = np.sqrt(far[lit])
+            for i in range(3):
+                from_lamp[lit, i] /= far[lit]
+            lit += 1
+        shade = keep[: _ahead(lamp_base, from_lamp[:lit], balls, keep)] if lit else keep[:0]
+        k = 0
+        for j in range(begin, begin + ways.shape[0]):
+            which = ids[j]
+            if which < 0:
+                continue
+            factor = _surface(p[k], which, faces[k], boxes, ends, radius, n)
             own = boxes[which, 8] if which < boxes.shape[0] else albedo[which - boxes.shape[0]]
-            far = np.sqrt(far)
             cosine = 0.0
             for i in range(3):
-                way[i] /= far
-                cosine += n[i] * way[i]
-                p[i] += _STEP * n[i]
-            if cosine > 0.0 and _meet(p, way, boxes, ends, radius)[0] < far:
+                to_lamp[i] = -from_lamp[k, i]
+                cosine += n[i] * to_lamp[i]
+                p[k, i] += _STEP * n[i]
+            if cosine > 0.0 and _meet(p[k], to_lamp, boxes, ends, radius, shade)[0] < far[k]:
                 cosine = 0.0
-            light[v, u] = np.float32(own * factor * (AMBIENT + LAMP * max(cosine, 0.0)))
+            light[j] = np.float32(own * factor * (AMBIENT + LAMP * max(cosine, 0.0)))
+            k += 1

@@ -5,6 +5,8 @@ All in the base frame: x runs away from the wall, towards the cameras; z up; the
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.sim import cell_rays
-from armsight.sim.cell_rays import BOX, GRAIN, PLAIN, PRINT, TILES
+from armsight.sim.cell_rays import BOX, BUNCH, GRAIN, PLAIN, PRINT, TILES
 from armsight.sim.cell_solids import Solids
 from armsight.vision.camera import Camera
 
@@ -23,6 +25,7 @@ LAMP_BASE = np.array([1.5, -1.1, 2.2])
 #: Albedo of the links and of the joints' housings.
 LINK_ALBEDO, HOUSING_ALBEDO = 0.62, 0.30
 _EDGE = 0.02  # light that changes by more from a pixel to its neighbours is looked at more closely
+_TILE = math.isqrt(BUNCH)
 _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
@@ -132,19 +135,29 @@ def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Sol
     R, p = np.ascontiguousarray(T_base_camera[:3, :3]), np.ascontiguousarray(T_base_camera[:3, 3])
 
     def cast(some: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Image]:
-        shape = some.shape[:2]
-        out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int16))
+        out = (np.empty(len(some), np.float32), np.empty(len(some), np.float32), np.empty(len(some), np.int16))
         cell_rays.still(some, R, p, boxes, capsules, LAMP_BASE, *out)
         return out
 
-    first, depth, ids = cast(rays)
+    height, width = rays.shape[:2]
+    order = _tiled(height, width)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    first, depth, ids = (flat[place].reshape(height, width) for flat in cast(rays.reshape(-1, 3)[order]))
     square = np.ones((3, 3), np.uint8)
-    v, u = np.nonzero(cv2.dilate(first, square) - cv2.erode(first, square) > _EDGE)
+    again = (cv2.dilate(first, square) - cv2.erode(first, square) > _EDGE).ravel()
+    edges = order[again[order]]
+    v, u = np.divmod(edges, width)
     light = first.astype(np.float64)
-    light[v, u] = np.mean(
-        [cast(camera.unproject(np.stack([u + x, v + y], axis=1))[None])[0][0] for x, y in _SAMPLES], axis=0
-    )
+    light[v, u] = np.mean([cast(camera.unproject(np.stack([u + x, v + y], axis=1)))[0] for x, y in _SAMPLES], axis=0)
     return View(light, depth, ids)
+
+
+def _tiled(height: int, width: int) -> Ids:
+    """Return the pixels (H W,) of an image, row after row, in the order of small tiles: neighbours follow each other."""
+    rows = np.arange(height * width).reshape(height, width)
+    tiles = itertools.product(range(0, height, _TILE), range(0, width, _TILE))
+    return np.concatenate([rows[v : v + _TILE, u : u + _TILE].ravel() for v, u in tiles])
 
 
 def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tuple[Array, Array, Array]:
