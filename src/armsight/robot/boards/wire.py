@@ -6,7 +6,8 @@ one disturbed length does not swallow the frames behind it.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import struct
+from typing import Any, NamedTuple, Protocol, cast
 
 from armsight.firmware import dialect
 from armsight.robot.boards.link import Link
@@ -14,6 +15,9 @@ from armsight.robot.boards.link import Link
 _BAD = "BAD_DATA"
 _COUNTS = 256
 _MARKERS = (0xFD, 0xFE)  # MAVLink 2, and 1, which the parser knows as well
+_HEAD = struct.Struct("<BBBBBBBHB")  # of MAVLink 2: marker, length, flags twice, number, system, component, kind
+_CHECK = struct.Struct("<H")
+_FRAME = _HEAD.size + _CHECK.size
 
 
 class Message(Protocol):
@@ -24,6 +28,17 @@ class Message(Protocol):
         ...
 
     def __getattr__(self, name: str) -> Any: ...  # noqa: ANN401
+
+
+class _Angles(NamedTuple):
+    """A whole message of angles, as the dialect's own has it."""
+
+    tick: int
+    angle_rad: list[float]
+
+    def get_type(self) -> str:
+        """Return the message's name."""
+        return "ANGLES"
 
 
 class Wire:
@@ -37,7 +52,9 @@ class Wire:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._mav = dialect().MAVLink(link)
+        spoken = dialect()
+        self._mav, self._crc, angles = spoken.MAVLink(link), spoken.x25crc, spoken.MAVLink_angles_message
+        self._kind: tuple[int, bytes, struct.Struct] = (angles.id, bytes([angles.crc_extra]), angles.unpacker)
         self._mav.robust_parsing = True
         self._close = link.close
         self.heard = False
@@ -50,11 +67,16 @@ class Wire:
 
     def receive(self, wait_s: float) -> list[Message]:
         """Let ``wait_s`` pass and return the whole messages that came."""
-        data = self._link.read(wait_s)
-        self.heard = self.heard or bool(data)
-        found: list[Message] = []
-        message = self._mav.parse_char(data)
-        while message is not None:
+        came = self._link.read(wait_s)
+        self.heard = self.heard or bool(came)
+        mav, found = self._mav, list[Message]()
+        mav.buf += came
+        while True:
+            data = bytes(mav.buf[mav.buf_index :])
+            mav.buf, mav.buf_index = bytearray(), 0
+            message = mav.parse_char(data[self._angles(data, found) :])
+            if message is None:
+                return found
             if message.get_type() == _BAD:
                 self.broken += 1
                 if message.data[0] in _MARKERS:
@@ -62,8 +84,25 @@ class Wire:
             else:
                 self._count_frame(message.get_seq())
                 found.append(message)
-            message = self._mav.parse_char(b"")
-        return found
+
+    def _angles(self, data: bytes, found: list[Message]) -> int:
+        """Take whole frames of angles at the beginning of what came; returns where something else begins."""
+        kind, extra, fields = self._kind
+        at, whole = 0, len(data)
+        while whole - at >= _FRAME:
+            marker, length, flags, _, number, _, _, low, high = _HEAD.unpack_from(data, at)
+            end = at + _HEAD.size + length
+            if marker != _MARKERS[0] or flags or low | high << 16 != kind or end + _CHECK.size > whole:
+                break
+            if self._crc(data[at + 1 : end] + extra).crc != _CHECK.unpack_from(data, end)[0]:
+                break
+            # Zeros at a payload's end are not sent; what is longer than known is of a newer dialect.
+            payload = data[at + _HEAD.size : end].ljust(fields.size, b"\0")
+            tick, *angle_rad = fields.unpack_from(payload)
+            self._count_frame(number)
+            found.append(cast(Message, _Angles(tick, angle_rad)))
+            at = end + _CHECK.size
+        return at
 
     def close(self) -> None:
         """Let go of the link."""
