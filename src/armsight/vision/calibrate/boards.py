@@ -25,7 +25,7 @@ from armsight.vision.calibrate.choose import Search, Trial, drawn, motion_of, sh
 from armsight.vision.calibrate.heldout import residual_epipolar_rms, rig_of, scaled, unfinished
 from armsight.vision.calibrate.result import Calibration, HeldOut, Rejected
 from armsight.vision.calibrate.screen import LEAST_CORNERS, MOTION_EASE, Screened, mend_flips, robust_sigma, screen
-from armsight.vision.calibrate.start import start_board
+from armsight.vision.calibrate.start import fits, start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.markers.board import Board
 from armsight.vision.match import join, renamed
@@ -94,7 +94,9 @@ def calibrate_boards(
         # What was thrown out under a simple lens may fit the one that was chosen.
         progress(f"looking for gross errors again, under {lens}")
         with contextlib.suppress(CalibrationError):
-            again, trial_again, _ = judge.chosen(start_board(points, sizes, observations, lens).state, (lens,))
+            chosen = trial.solution.state
+            start = replace(first.state, cameras=chosen.cameras, T_left_right=chosen.T_left_right)
+            again, trial_again, _ = judge.chosen(start, (lens,))
             if len(again.observations.shot) > len(screened.observations.shot):
                 screened, trial = again, trial_again
                 tried = {**tried, lens: trial.heldout}
@@ -163,7 +165,12 @@ def _start(
 
     def attempt(pairs: list[Pair]) -> Solution:
         observations = Observations.from_shots([join(pair.left, pair.right) for pair in pairs])
-        return min((start_board(points, sizes, observations, family) for family in families), key=lambda s: s.cost)
+        found: list[Solution] = []
+        for family in families:
+            found.append(start_board(points, sizes, observations, family))
+            if fits(found[-1]):
+                break
+        return min(found, key=lambda s: s.cost)
 
     first = attempt(usable)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])

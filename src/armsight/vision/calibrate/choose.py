@@ -19,7 +19,7 @@ from armsight.vision.calibrate.heldout import cross_validate, rig_of, summary
 from armsight.vision.calibrate.motion import Motion
 from armsight.vision.calibrate.result import HeldOut, PairErrors
 from armsight.vision.calibrate.screen import Screened, noise_px
-from armsight.vision.calibrate.start import start_board
+from armsight.vision.calibrate.start import imitated, start_board
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.shape import smooth
@@ -155,8 +155,12 @@ class Search(Record):
         if state.cameras[0].model == distortion:
             return state
         if "fisheye" in (distortion, state.cameras[0].model):
-            start = start_board(self.model.points, self.sizes, self.screened.observations, distortion).state
-            return replace(start, shape=state.shape)
+            seen = self.screened.observations
+            sides = [seen.uv[seen.camera == side] for side in (0, 1)]
+            left, right = (imitated(c, distortion, uv) for c, uv in zip(state.cameras, sides, strict=True))
+            if left is not None and right is not None:
+                return replace(state, cameras=(left, right))
+            return replace(start_board(self.model.points, self.sizes, seen, distortion).state, shape=state.shape)
         cameras = []
         for camera in state.cameras:
             d = np.zeros(DISTORTION_MODELS[distortion])

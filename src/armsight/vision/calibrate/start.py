@@ -21,6 +21,12 @@ from armsight.vision.pnp import MIN_POINTS, body_poses
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)
 _STARTS_KEPT = 3
+#: So many views, spread over all, tell the focal lengths to start from.
+_TELLING_VIEWS = 12
+#: Corners that all fit so well, px RMS, leave no doubt about the minimum: wrong ones are off by whole pixels. So does a
+#: lens that imitates another one, to begin with.
+_FITS_PX, _IMITATES_PX = 0.1, 1.0
+_IMITATION_STEPS = 10
 #: Relative poses closer than this, rad or share of the distance, are one hypothesis.
 _SAME_POSE = 0.1
 _MOST_HYPOTHESES = 600
@@ -45,6 +51,7 @@ def _focal_candidates(
 ) -> list[float]:
     """Return the focal lengths, px, under which one camera's views fit best, best first."""
     views = [rows for rows in _views(observations, side) if len(rows) >= MIN_POINTS]
+    views = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), _TELLING_VIEWS)).astype(int))]
     scores = []
     for focal in _FOCAL_LADDER * max(size):
         camera = pinhole(size, focal, model)
@@ -156,9 +163,40 @@ def start_board(
         solution = _staged(plain, state, observations)
         if solution is not None and (best is None or solution.cost < best.cost):
             best = solution
+        if best is not None and fits(best):
+            break
     if best is None:
         raise CalibrationError("no start of the calibration fits the detections: are all images of the same board?")
     return best
+
+
+def fits(solution: Solution) -> bool:
+    """Whether a solution leaves no doubt that it is the right minimum: no other start needs to be tried."""
+    return float((solution.residuals_px**2).sum(axis=1).mean()) < _FITS_PX**2
+
+
+def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:
+    """Return the camera of another distortion model that sees as one does, by Gauss-Newton; None where none comes near.
+
+    Args:
+        camera: to be imitated.
+        model: the other model.
+        uv: (N, 2) where in the image, raw pixels.
+    """
+    rays = camera.unproject(uv)
+    seen = np.isfinite(rays).all(axis=1)
+    rays, uv = rays[seen], uv[seen]
+    found = Camera(camera.image_size_px, model, camera.intrinsics, np.zeros(DISTORTION_MODELS[model]))
+    for _ in range(_IMITATION_STEPS):
+        there, _, J = found.project_jacobians(rays)
+        if not np.isfinite(there).all():
+            return None
+        step = np.linalg.lstsq(J.reshape(2 * len(uv), -1), (uv - there).ravel(), rcond=None)[0]
+        if not (np.isfinite(step).all() and (found.intrinsics[:2] + step[:2] > 0).all()):
+            return None
+        found = found.with_parameters(found.parameters + step)
+    off = ((found.project(rays) - uv) ** 2).sum(axis=1).mean()
+    return found if off < _IMITATES_PX**2 else None  # NaN is no good either
 
 
 def _staged(model: Model, state: State, observations: Observations) -> Solution | None:
