@@ -19,7 +19,8 @@ def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
         u, v = v, u
     if 2 * abs(c) >= abs(u) + abs(v) or u == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    x0, y0, x1, y1 = (0.5 * v - c) / u, -0.5, (-0.5 * v - c) / u, 0.5
+    per = 1.0 / u
+    x0, y0, x1, y1 = (0.5 * v - c) * per, -0.5, (-0.5 * v - c) * per, 0.5
     if abs(x0) > 0.5:
         x0 = 0.5 if x0 > 0.0 else -0.5
         y0 = -(c + u * x0) / v
@@ -39,13 +40,14 @@ def _inside_rim(x: Line, y: Line, w: Line) -> float:
         w: the same of the radius.
     """
     away = max(np.sqrt(x[0] * x[0] + y[0] * y[0]), 1e-3 * w[0])
-    u, v = w[1] - (x[0] * x[1] + y[0] * y[1]) / away, w[2] - (x[0] * x[2] + y[0] * y[2]) / away
+    per = 1.0 / away
+    u, v = w[1] - (x[0] * x[1] + y[0] * y[1]) * per, w[2] - (x[0] * x[2] + y[0] * y[2]) * per
     c = w[0] - away
     # The rim bends away from its tangent, by the mean square of the way along it within the area, over its diameter.
     su, sv, eu, ev = _chord(c, u, v)
     sx, sy, ex, ey = su * x[1] + sv * x[2], su * y[1] + sv * y[2], eu * x[1] + ev * x[2], eu * y[1] + ev * y[2]
     way = (sx * (sx + ex) + ex * ex + sy * (sy + ey) + ey * ey) / 3
-    return half(c - max(way - c * c, 0.0) / (2 * away), u, v)
+    return half(c - 0.5 * max(way - c * c, 0.0) * per, u, v)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -79,8 +81,8 @@ def _about(square: Array, n: int, scale: float, offset: float) -> tuple[float, f
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _paint_rim(square: Array, disc: Array, parts: Array) -> None:
-    """Repaint the parts (SUB, SUB) of a pixel that a disc's rim crosses."""
+def _paint_rim(square: Array, disc: Array, fine: Array, s: int) -> None:
+    """Repaint the parts fine[s] (SUB, SUB) of a pixel that a disc's rim crosses."""
     x, y, w = _about(square, 0, 1.0, disc[0]), _about(square, 1, 1.0, disc[1]), _about(square, 2, disc[2], 0.0)
     # By how much the square of the distance within may change in half a part, at most.
     steep = abs(w[0] * w[1] - x[0] * x[1] - y[0] * y[1]) + abs(w[0] * w[2] - x[0] * x[2] - y[0] * y[2])
@@ -95,14 +97,14 @@ def _paint_rim(square: Array, disc: Array, parts: Array) -> None:
             pw = w[0] + across * w[1] + down * w[2] + both * w[3]
             inside = pw * pw - px * px - py * py
             if inside > most:
-                parts[a, b] = disc[3]
+                fine[s, a, b] = disc[3]
             elif inside > -most:
                 share = _inside_rim(
                     (px, (x[1] + down * x[3]) / SUB, (x[2] + across * x[3]) / SUB),
                     (py, (y[1] + down * y[3]) / SUB, (y[2] + across * y[3]) / SUB),
                     (pw, (w[1] + down * w[3]) / SUB, (w[2] + across * w[3]) / SUB),
                 )
-                parts[a, b] += share * (disc[3] - parts[a, b])
+                fine[s, a, b] += share * (disc[3] - fine[s, a, b])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -163,5 +165,5 @@ def paint_disc(
             elif high > -bulge:
                 fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
                 square_of(top, bottom, k, square)
-                _paint_rim(square, disc, fine[s])
+                _paint_rim(square, disc, fine, s)
     return fine, count

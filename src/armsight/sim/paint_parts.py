@@ -1,7 +1,7 @@
 """What cells and discs are painted with: pixels cast on to a plane, pixels split into parts, straight cuts through squares.
 
-See ``paint``. numba's cache on disk looks at the age of the file that calls: after a change here touch ``paint`` and
-``paint_disc``, or delete their cache.
+See ``paint``. numba's cache on disk looks at the age of the file that calls: after a change here, or in another of the
+painter's files, delete the cache of all of them.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ def open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: i
         grown = np.empty((2 * count, SUB, SUB))
         grown[:count] = fine
         fine = grown
-    fine[count] = coarse[v, u]
+    for a in range(SUB):  # numba is slow at filling such a small part of an array
+        for b in range(SUB):
+            fine[count, a, b] = coarse[v, u]
     slot[v, u] = count
     return fine, count, count + 1
