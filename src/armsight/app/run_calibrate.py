@@ -55,6 +55,8 @@ def calibrated(board_spec: str, shots: Iterable[Shot], progress: Progress) -> Ca
 def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
     """Draw joint angles (count, 6) that show the body from many sides: around given ones, near where it is seen.
 
+    They come in the order of a short way: from the first of ``around`` always on to the nearest.
+
     Args:
         arm: the nominal arm.
         around: (M, 6) joint angles at which the body is in view.
@@ -82,7 +84,10 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
             f"{arm.name} reaches {len(found)} of {_DRAWS * count} poses drawn around those of the motion, {count} are "
             "needed: choose poses further from the limits of its joints"
         )
-    return np.array(found)
+    way = [around[0]]
+    while found:
+        way.append(found.pop(int(np.argmin([np.abs(q - way[-1]).max() for q in found]))))
+    return np.array(way[1:])
 
 
 @dataclass(frozen=True, eq=False)
