@@ -28,7 +28,7 @@ from armsight.vision.shape import smooth
 #: an ordinary lens, by more.
 WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
 #: What only tells a noise or a held-out error does not follow the long valleys of the rational model to their ends.
-_ROUGHLY = 1e-6
+_ROUGHLY, _STEPS = 1e-6, 25
 #: Motion between the exposures must lower the corners' noise by this share to be believed: a fifth less is a sigma that
 #: was 1.25 times too large. Synchronised cameras lower it by a hundredth, by chance; what a lens model lacks, by a tenth.
 MOTION_WORTH = 0.2
@@ -176,7 +176,7 @@ class Search(Record):
         for _ in range(_NOISE_ROUNDS if motion is None else _MOTION_ROUNDS):
             if motion is not None:
                 model = replace(model, motion_sigmas=motion.sigmas)
-            solution = minimise(model, state, observations, sigma, least_decrease=_ROUGHLY)
+            solution = minimise(model, state, observations, sigma, max_steps=_STEPS, least_decrease=_ROUGHLY)
             state, freed = solution.state, _freed(model, solution)
             if modes:
                 posterior = np.diag(solution.cov_shared)[-modes:]
@@ -196,9 +196,8 @@ class Search(Record):
         if motion is not None:
             motion = motion.shots(rows)
             model, state = replace(model, motion_sigmas=motion.sigmas), replace(state, motions=state.motions[rows])
-        solution = minimise(
-            model, state, self.screened.observations.shots(rows), full.sigma_px, least_decrease=_ROUGHLY
-        )
+        seen = self.screened.observations.shots(rows)
+        solution = minimise(model, state, seen, full.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY)
         if motion is not None:
             motion = motion.updated(solution)[0]
         return rig_of(solution), model.body(solution.state.shape), motion

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from armsight.data import Array, Correspondences
 from armsight.errors import CalibrationError
@@ -96,8 +95,7 @@ def _pair_error(
         float(np.sqrt((gap**2).sum(axis=1).mean())),
         fit_scale(board, p),
         float(len(good)),
-        _normalised(transform(T_found, found), p, cov_p, by_rig, cov_rig),
-        _normalised(transform(T_found, found), p, cov_p, by_rig, np.zeros_like(cov_rig)),
+        *_normalised(transform(T_found, found), p, cov_p, by_rig, cov_rig),
     )
 
 
@@ -114,15 +112,27 @@ def _without_blunders(body: Array, p: Array) -> NDArray[np.bool_]:
     return good
 
 
-def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> float:
-    """RMS of a rigid fit's residuals (N, 3) over their predicted sigma: pixel noise, calibration, motion, less the fit."""
-    n, gap = len(p), p - fitted
-    G = by_rig.reshape(3 * n, -1)
-    full = block_diag(*cov) + G @ cov_rig @ G.T
+def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> tuple[float, float]:
+    """RMS of a rigid fit's residuals (N, 3) over their predicted sigma, less the fit: with the calibration, without it.
+
+    The fit takes the residuals' part along six directions Q: what is left of a covariance C is (I - QQ') C (I - QQ'). Only
+    its diagonal is needed.
+    """
+    n, gap = len(p), (p - fitted).ravel()
     A = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), -skew(fitted - fitted.mean(axis=0))], axis=2).reshape(3 * n, 6)
-    P = np.eye(3 * n) - A @ np.linalg.pinv(A)
-    variance = np.diag(P @ full @ P)
-    return float(np.sqrt((gap.ravel() ** 2 / variance).mean()))
+    Q = _range(A)
+    noisy = (cov @ Q.reshape(n, 3, -1)).reshape(3 * n, -1)  # of each point by itself
+    noise = np.einsum("nii->ni", cov).ravel() - 2 * (noisy * Q).sum(axis=1) + ((Q @ (Q.T @ noisy)) * Q).sum(axis=1)
+    G = by_rig.reshape(3 * n, -1)
+    G = G - Q @ (Q.T @ G)
+    variance = noise + ((G @ cov_rig) * G).sum(axis=1)
+    return float(np.sqrt((gap**2 / variance).mean())), float(np.sqrt((gap**2 / noise).mean()))
+
+
+def _range(A: Array) -> Array:
+    """Return orthonormal columns that span those of A (M, 6): fewer than six where points lie on a line."""
+    U, sizes, _ = np.linalg.svd(A, full_matrices=False)
+    return np.asarray(U[:, sizes > 1e-15 * sizes[0]])
 
 
 def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:
