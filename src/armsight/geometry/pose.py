@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.geometry.rotation import Array, exp_so3, log_so3, skew
+from armsight.geometry.rotation import Array, log_so3, skew
 
 
 def pose(R: Array, t: Array) -> Array:
@@ -46,9 +46,20 @@ def _left_jacobian(phi: Array) -> Array:
 
 def exp_se3(xi: Array) -> Array:
     """Turn tangent vectors (..., 6), [translation; rotation], into transforms (..., 4, 4)."""
+    phi = xi[..., 3:]
+    square = (phi * phi).sum(axis=-1)[..., None, None]
+    small = square < 1e-8
+    safe = np.where(small, 1.0, square)
+    angle = np.sqrt(safe)
+    s, c = np.sin(angle), np.cos(angle)
+    S = skew(phi)
+    SS = S @ S
+    sine = np.where(small, 1 - square / 6, s / angle)
+    cosine = np.where(small, 0.5 - square / 24, (1 - c) / safe)
+    rest = np.where(small, 1 / 6 - square / 120, (angle - s) / (safe * angle))
     T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = exp_so3(xi[..., 3:])
-    T[..., :3, 3] = (_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    T[..., :3, :3] = np.eye(3) + sine * S + cosine * SS
+    T[..., :3, 3] = xi[..., :3] + ((cosine * S + rest * SS) @ xi[..., :3, None])[..., 0]
     T[..., 3, 3] = 1.0
     return T
 

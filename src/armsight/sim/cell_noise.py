@@ -14,6 +14,7 @@ from armsight.sim.optics import Radiance
 
 Window = tuple[int, int, int, int]
 _STRIP = 1 << 22  # places where an image's noise may begin
+_STEP, _MASK = 0x9E3779B97F4A7C15, (1 << 64) - 1  # of the hash that chooses one
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -34,25 +35,27 @@ def _rounded(grey: Radiance, noise: Radiance, sensor: tuple[float, float, float]
 def exposed(
     still: Radiance,
     light: Radiance,
-    gain: Radiance,
     window: Window,
+    core: Window,
+    gain: Radiance,
     strip: Radiance,
     start: int,
     sensor: tuple[float, float, float],
     out: Image,
 ) -> None:
-    """Write grey levels: ``still`` has its gain already, ``light`` of the window has not.
+    """Write grey levels: ``still`` has its gain already, ``light`` of the window, shown in its core alone, has not.
 
     ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.optics.Sensor`.
     """
-    (u0, v0, u1, v1), (height, width) = window, out.shape
+    (u0, v0, u1, v1), (height, width) = core, out.shape
     for v in range(height):
         noise = strip[start + v * width : start + (v + 1) * width]
         if not v0 <= v < v1:
             _rounded(still[v], noise, sensor, out[v])
             continue
         _rounded(still[v, :u0], noise[:u0], sensor, out[v, :u0])
-        _rounded(light[v - v0] * gain[v, u0:u1], noise[u0:u1], sensor, out[v, u0:u1])
+        row = light[v - window[1], u0 - window[0] : u1 - window[0]]
+        _rounded(row * gain[v, u0:u1], noise[u0:u1], sensor, out[v, u0:u1])
         _rounded(still[v, u1:], noise[u1:], sensor, out[v, u1:])
 
 
@@ -63,5 +66,11 @@ def noise_strip(seed: int, image_size_px: tuple[int, int]) -> Radiance:
 
 
 def noise_start(seed: int, side: int, shot: int) -> int:
-    """Return where in the strip an image's noise begins."""
-    return int(np.random.default_rng([seed, 4, side, shot]).integers(_STRIP))
+    """Return where in the strip an image's noise begins: a hash (Steele, Lea and Flood, OOPSLA 2014, section 5)."""
+    state = 0
+    for number in (seed, side, shot):
+        state = (state + number + _STEP) & _MASK
+        state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+        state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & _MASK
+        state ^= state >> 31
+    return state % _STRIP

@@ -143,10 +143,8 @@ class CellCamera:
             seen[_part(core, window)] = painted[_part(core, crop)]
         out: Image = np.empty(self._still_grey.shape, np.uint8)
         s = self._sensor
-        core = self._core(window, margin)
-        light_core = np.ascontiguousarray(seen[_part(core, window)])
-        noises = (s.offset, s.read_noise, s.shot_noise)
-        exposed(self._still_grey, light_core, self._gain, core, strip, start, noises, out)
+        core, noises = self._core(window, margin), (s.offset, s.read_noise, s.shot_noise)
+        exposed(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
         return out
 
     def arm_ids(self, arm: ArmSeen) -> Image:
@@ -177,11 +175,10 @@ class CellCamera:
         rows_s = (np.arange(height) - (height - 1) / 2) * shutter.row_s if rolling else np.zeros(1)
         ends_s = np.add.outer(np.array([-0.5, 0.5]) * shutter.exposure_s, rows_s[[0, -1] if rolling else [0]]).ravel()
         uv = self._each(lambda body: self._outlines(_moved(body, ends_s), body.patterns), bodies)
-        low = np.clip(np.floor(uv.min(axis=(0, 2))) - 1, 0, (width, height))
-        high = np.clip(np.ceil(uv.max(axis=(0, 2))) + 2, 0, (width, height))
-        boxes = np.nan_to_num(np.concatenate([low, high], axis=1)).astype(np.int64)
-        begun, ended = np.split(uv, 2)
-        way_px = float(np.nan_to_num(np.abs(ended - begun)).max())
+        bounds = np.concatenate([np.floor(uv.min(axis=(0, 2))) - 1, np.ceil(uv.max(axis=(0, 2))) + 2], axis=1)
+        # What is behind the camera has no number there, and so no place in the image.
+        boxes = np.fmax(np.fmin(bounds, (width, height, width, height)), 0.0).astype(np.int64)
+        way_px = float(np.fmax.reduce(np.abs(uv[len(uv) // 2 :] - uv[: len(uv) // 2]), axis=None, initial=0.0))
         nodes, weights = _nodes(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
         t_s = np.add.outer(0.5 * shutter.exposure_s * nodes, rows_s)
 
