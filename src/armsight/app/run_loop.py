@@ -23,6 +23,7 @@ from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
+from armsight.loop.estimators.smoothing import Stretch
 from armsight.robot.boards.codes import State
 from armsight.vision.follow import Follower
 
@@ -36,6 +37,7 @@ SEARCH_S = 2.0
 #: hidden for half a second. The loop does not wait for that; what it knew is the live track.
 RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # so much of it at a time: cheaper than turn by turn
+_WRITE_EVERY_S = 0.1  # and so much is reckoned at a time, after a command is on its way: cheaper still
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _LEAST_WAIT_S = 0.001  # for the board, though the loop is late: a board that is gone is known by waiting in vain
 _Result = TypeVar("_Result")
@@ -76,7 +78,11 @@ class Loop:
         self.t_s = 0.0
         self._shot_s = -np.inf
         self._skew = Skew(follower.rig, station.sync_s)
-        self._written_s = -np.inf
+        # Of the record: up to when it is noted what was heard around each reading, up to when it is written down, what is
+        # between the two, and the first batch of readings that is not all noted.
+        self._noted_s = self._written_s = -np.inf
+        self._noted: list[Stretch] = []
+        self._first = 0
         self._watch = Watch(self._measured, PERIOD_S)
         self._expected: Array | None = None  # where a lost body should be in the shot that is looked at
         # Of the host's clock, s: when the next turn is due, and when the shot that is looked at was taken up.
@@ -100,6 +106,7 @@ class Loop:
         heard = list(self.log.joints)
         self.compute(lambda: learn(heard))
         learn(self.log.joints[len(heard) :])  # what came meanwhile
+        self._write()
         self.estimator = estimator  # it has what was not written down yet in its memory
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
@@ -130,28 +137,37 @@ class Loop:
         self._record()
 
     def _record(self) -> None:
-        """Write down where the tool was, as late as RECORD_LAG_S: with the sightings on both sides of a time."""
-        if self.t_s - RECORD_LAG_S - self._written_s >= _RECORD_EVERY_S:
-            self._write(self.t_s - RECORD_LAG_S)
+        """Note where the tool was, as late as RECORD_LAG_S: with the sightings on both sides of a time."""
+        if self.t_s - RECORD_LAG_S - self._noted_s >= _RECORD_EVERY_S:
+            self._note(self.t_s - RECORD_LAG_S)
 
-    def _write(self, upto_s: float) -> None:
-        """Write down where the tool was at each reading up to a time that is not written yet."""
-        parts: list[Array] = []
-        for states in reversed(self.log.joints):
-            if states.t_s[-1] <= self._written_s:
+    def _note(self, upto_s: float) -> None:
+        """Note what was heard around each reading up to a time that is not noted yet."""
+        joints, parts = self.log.joints, list[Array]()
+        for k in range(self._first, len(joints)):
+            if joints[k].t_s[0] > upto_s:
                 break
-            parts.append(states.t_s)
-        t_s = np.concatenate([*parts[::-1], np.zeros(0)])
-        t_s = t_s[(t_s > self._written_s) & (t_s <= upto_s)]
+            parts.append(joints[k].t_s)
+            if joints[k].t_s[-1] <= upto_s:
+                self._first = k + 1
+        t_s = np.concatenate([*parts, np.zeros(0)])
+        t_s = t_s[(t_s > self._noted_s) & (t_s <= upto_s)]
         if len(t_s):
-            track = self.estimator.smoothed(t_s)
-            none = np.full(len(t_s), "")
+            self._noted += self.estimator.stretches(t_s)
+            self._noted_s = float(t_s[-1])
+
+    def _write(self) -> None:
+        """Write down where the tool was at the readings that are noted."""
+        if self._noted:
+            track = self.estimator.blended(self._noted)
+            none = np.full(len(track), "")
             self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
-            self._written_s = float(t_s[-1])
+            self._noted, self._written_s = [], self._noted_s
 
     def close_record(self) -> None:
         """Write down where the tool was up to now: nothing more will be seen."""
-        self._write(min(self.t_s, self.estimator.span_s[1]))  # an interrupt may have kept the newest from it
+        self._note(min(self.t_s, self.estimator.span_s[1]))  # an interrupt may have kept the newest from it
+        self._write()
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
@@ -232,6 +248,8 @@ class Loop:
                     if self.mounting is not None:  # before, no command knew what was seen
                         self.log.latency_s.append(time.perf_counter() - began)
                     self.on_shot(shot, result)
+                if self._noted_s - self._written_s >= _WRITE_EVERY_S:
+                    self._write()
         finally:
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
 

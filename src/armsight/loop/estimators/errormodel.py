@@ -61,14 +61,15 @@ class ErrorModel:
     """
 
     def __init__(self, arm: Arm, prior: Prior, sigma_delay_s: float) -> None:
-        self._arm, self._prior, self.sigmas = arm, prior, prior.sigmas(sigma_delay_s)
+        self._table, self._prior, self.sigmas = arm.table, prior, prior.sigmas(sigma_delay_s)
         sides = prior.flip_rad, prior.flip_float_rad
         self._forgets = np.array([prior.rest_travel_rad, prior.pose_travel_rad, prior.creep_rad, *sides])
 
     def poses(self, x: Array, q: Array, unseen: Array) -> tuple[Array, Array]:
         """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE); x may be one for all."""
-        Ts, Hs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, SIZE))
-        armerror.poses_and_derivatives(self._arm.table, np.broadcast_to(x, (len(q), SIZE)).copy(), q, unseen, Ts, Hs)
+        Ts, Hs, xs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, SIZE)), np.empty((len(q), SIZE))
+        xs[:] = x
+        armerror.poses_and_derivatives(self._table, xs, q, unseen, Ts, Hs)
         return Ts, Hs
 
     def moved(self, state: State, joints: Smoothed, t_s: Array, *, learning: float = 1.0) -> Step:
@@ -76,10 +77,20 @@ class ErrorModel:
 
         Changes of side leave the joints ``learning`` times as uncertain as they are.
         """
-        kept, added = np.ones((len(t_s), SIZE)), np.zeros((len(t_s), SIZE))
-        come = (np.asarray(t_s, dtype=float) - state.t_s, joints.travel - state.travel, joints.flips - state.flips)
-        _forget(*come, self.sigmas, self._forgets, learning, kept, added)
+        time_s = np.asarray(t_s, dtype=float) - state.t_s
+        return self.carried(time_s, joints.travel - state.travel, joints.flips - state.flips, learning=learning)
+
+    def carried(self, time_s: Array, travel: Array, flips: Array, *, learning: float = 1.0) -> Step:
+        """Return the same for times (N,), how far joints (N, 6) and how far sides (N, 2, 6) have come."""
+        kept, added = np.ones((len(time_s), SIZE)), np.zeros((len(time_s), SIZE))
+        _forget(time_s, travel, flips, self.sigmas, self._forgets, learning, kept, added)
         return Step(kept, added)
+
+    def covariances(self, state: State, step: Step, Hs: Array, joints: Smoothed) -> Array:
+        """Return the covariances (N, 6, 6) of poses that a state tells, a step on, without what all sightings share."""
+        own = np.empty((len(Hs), 6, 6))
+        _covariances(Hs, step.kept, step.added, state.P, joints.variance, self._prior.reading_rad**2, own)
+        return own
 
     def reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
         """Return the covariances (N, 6, 6) of poses from the readings' noise."""
@@ -112,6 +123,40 @@ def _forget(
         for k in range(POSE, POSE + 6):
             kept[n, k] = math.exp(-whole / pose_travel)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _covariances(Hs: Array, kept: Array, added: Array, P: Array, variance: Array, reading: float, own: Array) -> None:
+    """Write H (K P K + A) H' + r J V J' into own (N, 6, 6): Hs (N, 6, SIZE), kept, added (N, SIZE), variance (N, 6).
+
+    A has the rest and the pose alone (:func:`_forget`), J are the columns of the joints, r is a reading's variance.
+    """
+    by, moved = np.empty((SIZE, 6)), np.empty((6, SIZE))
+    for n in range(len(Hs)):
+        H = Hs[n]
+        moved[:], own[n] = 0.0, 0.0
+        for k in range(SIZE):
+            for row in range(6):
+                by[k, row] = H[row, k] * kept[n, k]
+        for row in range(6):
+            for k in range(SIZE):
+                factor = by[k, row]
+                if factor != 0.0:
+                    for j in range(SIZE):
+                        moved[row, j] += factor * P[k, j]
+        for k in range(SIZE):
+            for row in range(6):
+                for column in range(6):
+                    own[n, row, column] += moved[row, k] * by[k, column]
+        for k in range(REST, POSE + 6):
+            for row in range(6):
+                for column in range(6):
+                    own[n, row, column] += H[row, k] * added[n, k] * H[column, k]
+        for i in range(6):
+            k = 6 * i + 5  # as ZEROS has it
+            for row in range(6):
+                for column in range(6):
+                    own[n, row, column] += reading * H[row, k] * variance[n, i] * H[column, k]
 
 
 def shared(sighting: Sighting | None, Ts: Array) -> Array:

@@ -10,18 +10,18 @@ shared covariance is added to what comes out (Schmidt, 1966: considered, not est
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from armsight.data import Array, JointStates
-from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step, shared
+from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
+from armsight.loop.estimators.smoothing import Stretch, blended, by_state, stretches
 from armsight.robot.arm import Arm
 
 #: A sighting less likely than this is an outlier.
@@ -38,8 +38,6 @@ OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
-#: Joints that came no further than this between two sightings stood still, rad.
-STILL_RAD = 1e-5
 #: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
 WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
 #: The diagonal of a covariance, and the rows of what motion makes it forget: the rest and, next to it, the pose.
@@ -126,7 +124,8 @@ class KalmanEstimator:
         if t_s is not None:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
-            self._newest = self._tracked(np.array([self.span_s[1]]), *self._now())[0]
+            newest = np.array([self.span_s[1]])
+            self._newest = by_state(self._model, self._states[-1], newest, *self._now())[0]
         return self._newest
 
     def _now(self) -> tuple[Smoothed, Step]:
@@ -140,50 +139,23 @@ class KalmanEstimator:
     def track(self, t_s: Array) -> Track:
         """Return where the tool is at (N,) times."""
         joints = self._readings.at(np.asarray(t_s, dtype=float))
-        return self._tracked(t_s, joints, self._model.moved(self._states[-1], joints, t_s))
-
-    def _tracked(self, t_s: Array, joints: Smoothed, step: Step) -> Track:
         state = self._states[-1]
-        Ts, Hs = self._model.poses(state.x * step.kept, joints.q, joints.unseen)
-        by_state = Hs * step.kept[:, None, :]
-        own = (by_state.reshape(-1, SIZE) @ state.P).reshape(Hs.shape) @ np.swapaxes(by_state, 1, 2)
-        own += (Hs * step.added[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
-        age = t_s - state.t_s
-        return Track(t_s, Ts, own + shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+        return by_state(self._model, state, t_s, joints, self._model.moved(state, joints, t_s))
 
     def smoothed(self, t_s: Array) -> Track:
         """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
 
-        Between two sightings the model after each is carried to the time in between; the two are blended by how far the
-        joints had come. Times newer than the newest sighting are as in :meth:`track`.
+        Times newer than the newest sighting are as in :meth:`track`.
         """
-        ends = [state for state in self._states if state.sighting is not None]
-        at = np.searchsorted([state.t_s for state in ends], t_s)
-        parts = [self._between(ends, int(k), t_s[at == k]) for k in np.unique(at)]
-        return Track(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Track)))
+        return self.blended(self.stretches(t_s))
 
-    def _between(self, ends: list[State], k: int, t_s: Array) -> Track:
-        """Return where the tool was between the sightings k - 1 and k."""
-        if k == len(ends) or k == 0:
-            return self.track(t_s)
-        joints, (before, after) = self._readings.at(t_s), ends[k - 1 : k + 1]
-        come = np.abs(joints.travel - before.travel).sum(axis=1)
-        whole = float(np.abs(after.travel - before.travel).sum())
-        times = (t_s - before.t_s) / max(after.t_s - before.t_s, 1e-9)
-        share = np.clip(come / whole if whole > STILL_RAD else times, 0.0, 1.0)
-        ahead = self._model.moved(before, joints, t_s)
-        back = self._model.moved(
-            after._replace(travel=2 * joints.travel - after.travel, flips=2 * joints.flips - after.flips), joints, t_s
-        )
-        Ts, Hs = self._model.poses(before.x * ahead.kept, joints.q, joints.unseen)
-        Ts_after, _ = self._model.poses(after.x * back.kept, joints.q, joints.unseen)
-        Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
-        ends_own = [(Hs.reshape(-1, SIZE) @ end.P).reshape(Hs.shape) @ np.swapaxes(Hs, 1, 2) for end in (before, after)]
-        own = ends_own[0] + share[:, None, None] * (ends_own[1] - ends_own[0])
-        # Known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
-        bridge = np.minimum(ahead.added, back.added)
-        own += (Hs * bridge[:, None, :]) @ np.swapaxes(Hs, 1, 2) + self._model.reading_noise(Hs, joints)
-        return Track(t_s, Ts, own + shared(after.sighting, Ts), own, joints.q, joints.qd, t_s - before.t_s)
+    def stretches(self, t_s: Array) -> list[Stretch]:
+        """Return times (N,), rising, with what was heard around them up to now: for :meth:`blended`, soon after."""
+        return stretches(self._states, t_s)
+
+    def blended(self, parts: list[Stretch]) -> Track:
+        """Return where the tool was at the times of stretches as :meth:`smoothed` does; many cost little more than one."""
+        return blended(self._model, self._readings, parts)
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""

@@ -117,11 +117,16 @@ def _smooth(
     sigma: float,
     qs: Array,
     qds: Array,
-    hysteresis: Array,
-) -> Array:
-    """Write the joints at times (N,) into qs, qds (N, 6) and hysteresis (N, 8, 6); return the variances (N, 6)."""
-    variance, motion = np.empty((len(at), 6)), np.empty((3, 6))
+    variance: Array,
+    unseen: Array,
+    travel: Array,
+    flips: Array,
+) -> bool:
+    """Write the joints at times (N,) into the parts of a :class:`Smoothed`; return whether all are within those kept."""
+    motion = np.empty((3, 6))
     for n in range(len(at)):
+        if not t[first] <= at[n] <= t[first + count - 1]:
+            return False
         low, high = window(t, first, count, at[n], SPAN_S)
         variance[n] = fit(t, q, low, high, at[n], motion)
         qs[n], qds[n] = motion[0], motion[1]
@@ -129,8 +134,47 @@ def _smooth(
         if high - low > 4 * PARABOLA:
             _rest(q, low, high, sigma, qs[n], qds[n], variance[n])
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
-        hysteresis[n] = memory[k]
-    return variance
+        for i in range(6):
+            unseen[n, 0, i], unseen[n, 1, i], unseen[n, 2, i] = memory[k, 2, i], -memory[k, 4, i], memory[k, 7, i]
+            travel[n, i] = memory[k, 0, i]
+            flips[n, 0, i], flips[n, 1, i] = memory[k, 1, i], memory[k, 6, i]
+    return True
+
+
+@_kernel
+def _take_on(
+    t: Array,
+    q: Array,
+    memory: Array,
+    first: int,
+    settled: int,
+    begin: int,
+    end: int,
+    dead: float,
+    gap: Array,
+    table: Array,
+    points: Array,
+    beside: Array,
+    still: float,
+) -> int:
+    """Reckon on over new rows begin to end; return the row up to which the links' floating will not change any more."""
+    _take(t, q, memory, first, begin, end, dead, gap)
+    # The newest rows are smoothed by what came before them alone; as more comes, they are gone through again.
+    float_on(t, q, memory[:, 4:], first, settled, end, table, points, beside, still, gap)
+    return max(int(np.searchsorted(t[:end], t[end - 1] - 0.5 * SPAN_S)), settled)
+
+
+@_kernel
+def _in_order(t: Array, q: Array, begin: int, end: int, before: float) -> bool:
+    """Say whether rows begin to end are numbers and their times rise from the one before."""
+    for k in range(begin, end):
+        if not before < t[k] < np.inf:
+            return False
+        before = t[k]
+        for i in range(6):
+            if not abs(q[k, i]) < np.inf:
+                return False
+    return True
 
 
 class Readings:
@@ -173,32 +217,32 @@ class Readings:
         Raises:
             InputError: wrong shapes, NaN, or times that do not rise.
         """
-        t = checked(states.t_s, (None,), "JointStates.t_s")
-        q = checked(states.q, (len(t), 6), "JointStates.q")
-        before = self._t[self._first + self._count - 1] if self._count else -np.inf
-        if len(t) and not (np.diff(t, prepend=before) > 0).all():
-            raise InputError("potentiometer readings must come in order of time; the times given do not rise")
+        t, q = np.asarray(states.t_s, dtype=float), np.asarray(states.q, dtype=float)
+        if t.ndim != 1 or q.shape != (len(t), 6):
+            checked(t, (None,), "JointStates.t_s")
+            checked(q, (len(t), 6), "JointStates.q")
         half = _ROWS // 2
         for part in range(0, len(t), half):
             self._append(t[part : part + half], q[part : part + half])
 
     def _append(self, t: Array, q: Array) -> None:
         end = self._first + self._count
+        before = self._t[end - 1] if self._count else -np.inf
         if end + len(t) > _ROWS:
             keep = max(int(np.searchsorted(self._t[:end], self._t[end - 1] - KEPT_S)), end - _ROWS // 2)
             for memory in (self._t, self._q, self._memory):
                 memory[: end - keep] = memory[keep:end].copy()
             self._first, self._count, end, self._settled = 0, end - keep, end - keep, max(self._settled - keep, 0)
-        self._t[end : end + len(t)], self._q[end : end + len(t)] = t, q
+        begin, end = end, end + len(t)
+        self._t[begin:end], self._q[begin:end] = t, q
+        if not _in_order(self._t, self._q, begin, end, before):
+            checked(t, (None,), "JointStates.t_s")
+            checked(q, (len(t), 6), "JointStates.q")
+            raise InputError("potentiometer readings must come in order of time; the times given do not rise")
         self._count += len(t)
         # Only the very first row starts the hysteresis; later ones carry on from the row before.
-        begin, end = end, end + len(t)
-        _take(self._t, self._q, self._memory, self._first, begin, end, self._dead, self._gap)
-        # The newest rows are smoothed by what came before them alone; as more comes, they are gone through again.
-        links = self._table, self._points, self._beside
-        floating, rows = self._memory[:, 4:], (self._first, self._settled, end)
-        float_on(self._t, self._q, floating, *rows, *links, self._still, self._gap)
-        self._settled = max(int(np.searchsorted(self._t[:end], self._t[end - 1] - 0.5 * SPAN_S)), self._settled)
+        rows, links = (self._first, self._settled, begin, end), (self._table, self._points, self._beside)
+        self._settled = _take_on(self._t, self._q, self._memory, *rows, self._dead, self._gap, *links, self._still)
 
     def at(self, t_s: Array) -> Smoothed:
         """Return the joints at (N,) times within those kept.
@@ -207,19 +251,19 @@ class Readings:
             InputError: not within them.
         """
         oldest, newest = self.span_s
-        if len(t_s) and not (t_s.min() >= oldest and t_s.max() <= newest):
+        at, n = np.array(t_s, dtype=float), len(t_s)
+        joints = Smoothed(
+            np.empty((n, 6)),
+            np.empty((n, 6)),
+            np.empty((n, 6)),
+            np.empty((n, 3, 6)),
+            np.empty((n, 6)),
+            np.empty((n, 2, 6)),
+        )
+        kept = (self._t, self._q, self._memory, self._first, self._count)
+        if not _smooth(*kept, at, self._sigma, *joints):
             raise InputError(
-                f"times {t_s.min():.4f} to {t_s.max():.4f} s were asked for; readings are kept from {oldest:.4f} to "
+                f"times {at.min():.4f} to {at.max():.4f} s were asked for; readings are kept from {oldest:.4f} to "
                 f"{newest:.4f} s"
             )
-        qs, qds, hysteresis = np.empty((len(t_s), 6)), np.empty((len(t_s), 6)), np.empty((len(t_s), 8, 6))
-        kept = (self._t, self._q, self._memory, self._first, self._count)
-        variance = _smooth(*kept, t_s, self._sigma, qs, qds, hysteresis)
-        return Smoothed(
-            qs,
-            qds,
-            variance,
-            np.stack([hysteresis[:, 2], -hysteresis[:, 4], hysteresis[:, 7]], axis=1),
-            hysteresis[:, 0],
-            hysteresis[:, [1, 6]],
-        )
+        return joints

@@ -1,0 +1,158 @@
+"""Where the tool was, with the sightings after a time heard, too: for the record.
+
+In: states of the filter right after sightings, the readings. Out: poses with covariances. Between two sightings the model
+after each is carried to the time in between; the two are blended by how far the joints had come. Many stretches between
+sightings are reckoned at once: that costs little more than one.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array, Ids
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.loop.estimators.armerror import SIZE
+from armsight.loop.estimators.errormodel import ErrorModel, State, Step, shared
+from armsight.loop.estimators.estimator import Track
+from armsight.loop.estimators.readings import Readings, Smoothed
+
+#: Joints that came no further than this between two sightings stood still, rad.
+STILL_RAD = 1e-5
+
+
+class Stretch(NamedTuple):
+    """Times between two sightings.
+
+    Attributes:
+        t_s: (N,) the times, rising, s.
+        before: the filter after the sighting before them; its newest state where there is none after them, or none before.
+        after: the filter after the sighting after them; None where there is none, or none before.
+    """
+
+    t_s: Array
+    before: State
+    after: State | None
+
+
+def stretches(states: list[State], t_s: Array) -> list[Stretch]:
+    """Return times (N,), rising, by the sightings around them.
+
+    Args:
+        states: the filter's, oldest first.
+        t_s: the times, s.
+    """
+    ends = [state for state in states if state.sighting is not None]
+    at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Stretch]()
+    for k in np.unique(at).tolist():
+        inner = 0 < k < len(ends)
+        found.append(Stretch(t_s[at == k], ends[k - 1] if inner else states[-1], ends[k] if inner else None))
+    return found
+
+
+def blended(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Track:
+    """Return where the tool was at the times of stretches, in their order.
+
+    Args:
+        model: the arm's.
+        readings: the potentiometers', which must still be kept.
+        parts: the stretches, one at least.
+    """
+    tracks: list[Track] = []
+    for inner, some in groupby(_merged(parts), lambda part: part.after is not None):
+        if inner:
+            tracks.append(_between(model, readings, list(some)))
+        else:
+            tracks += [_alone(model, readings, part) for part in some]
+    if len(tracks) == 1:
+        return tracks[0]
+    return Track(*(np.concatenate(column) for column in zip(*map(_columns, tracks), strict=True)))
+
+
+def _merged(parts: list[Stretch]) -> list[Stretch]:
+    """Return stretches that follow each other between the same sightings as one."""
+    merged: list[Stretch] = []
+    for _, some in groupby(parts, lambda part: (id(part.before), id(part.after))):
+        same = list(some)
+        merged.append(same[0]._replace(t_s=np.concatenate([part.t_s for part in same])))
+    return merged
+
+
+def by_state(model: ErrorModel, state: State, t_s: Array, joints: Smoothed, step: Step) -> Track:
+    """Return where the tool is at times (N,), s, by one state, a step on."""
+    Ts, Hs = model.poses(state.x * step.kept, joints.q, joints.unseen)
+    own, age = model.covariances(state, step, Hs, joints), t_s - state.t_s
+    return Track(t_s, Ts, own + shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+
+
+def _alone(model: ErrorModel, readings: Readings, part: Stretch) -> Track:
+    joints = readings.at(part.t_s)
+    return by_state(model, part.before, part.t_s, joints, model.moved(part.before, joints, part.t_s))
+
+
+def _columns(track: Track) -> tuple[Array, ...]:
+    """Return the fields of a track in their order."""
+    own = track.covs, track.covs_own
+    return (track.t_s, track.Ts_base_tool, *own, track.q, track.qd, track.vision_age_s)
+
+
+def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Track:
+    """Return where the tool was in stretches with a sighting before and after each."""
+    t_s = np.concatenate([part.t_s for part in parts])
+    rows = np.repeat(np.arange(len(parts)), [len(part.t_s) for part in parts])
+    joints = readings.at(t_s)
+    before, after = _ends([part.before for part in parts]), _ends([part.after for part in parts if part.after])
+    ahead = model.carried(t_s - before.t_s[rows], *_come(before, joints, rows))
+    back = model.carried(t_s - after.t_s[rows], *(-come for come in _come(after, joints, rows)))
+    Ts, Hs = model.poses(before.x[rows] * ahead.kept, joints.q, joints.unseen)
+    Ts_after, _ = model.poses(after.x[rows] * back.kept, joints.q, joints.unseen)
+    share = _share(t_s, joints, before, after, rows)
+    Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
+    own, common, turned = np.empty((len(t_s), 6, 6)), np.empty((len(t_s), 6, 6)), np.swapaxes(Hs, 1, 2)
+    edges = np.searchsorted(rows, np.arange(len(parts) + 1)).tolist()
+    for k, part in enumerate(parts):
+        some = slice(edges[k], edges[k + 1])
+        H = Hs[some].reshape(-1, SIZE)
+        first, last = ((H @ P).reshape(-1, 6, SIZE) for P in (before.P[k], after.P[k]))
+        own[some] = (first + share[some, None, None] * (last - first)) @ turned[some]
+        common[some] = shared(None if part.after is None else part.after.sighting, Ts[some])
+    # Known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
+    bridge = np.minimum(ahead.added, back.added)
+    own += (Hs * bridge[:, None, :]) @ turned + model.reading_noise(Hs, joints)
+    return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - before.t_s[rows])
+
+
+class _Ends(NamedTuple):
+    """The ends of K stretches: times (K,), states (K, SIZE), their covariances, travel (K, 6), flips (K, 2, 6)."""
+
+    t_s: Array
+    x: Array
+    P: list[Array]
+    travel: Array
+    flips: Array
+
+
+def _ends(states: list[State]) -> _Ends:
+    return _Ends(
+        np.array([state.t_s for state in states]),
+        np.array([state.x for state in states]),
+        [state.P for state in states],
+        np.array([state.travel for state in states]),
+        np.array([state.flips for state in states]),
+    )
+
+
+def _come(ends: _Ends, joints: Smoothed, rows: Ids) -> tuple[Array, Array]:
+    """Return how far joints (N, 6) and sides (N, 2, 6) had come since the ends of their rows (N,)."""
+    return joints.travel - ends.travel[rows], joints.flips - ends.flips[rows]
+
+
+def _share(t_s: Array, joints: Smoothed, before: _Ends, after: _Ends, rows: Ids) -> Array:
+    """Return how far (N,) the joints had come on their way between two sightings; in time, where they stood."""
+    come = np.abs(joints.travel - before.travel[rows]).sum(axis=1)
+    whole = np.abs(after.travel - before.travel).sum(axis=1)[rows]
+    times = (t_s - before.t_s[rows]) / np.maximum(after.t_s - before.t_s, 1e-9)[rows]
+    moving = whole > STILL_RAD
+    return np.asarray(np.clip(np.where(moving, come / np.where(moving, whole, 1.0), times), 0.0, 1.0))
