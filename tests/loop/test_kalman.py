@@ -205,13 +205,21 @@ def test_the_bench_wanders_as_it_says():
 def test_for_the_record_the_sightings_that_follow_are_heard_too():
     rng = np.random.default_rng(14)
     shaft, seen_all, Ts = sightings(rng, seconds=1.9)
-    estimator, now, later = fed(shaft), [], []
+    estimator, now, later, noted = fed(shaft), [], [], []
     estimator.vision(seen_all[0])
     for a, b in pairwise(seen_all):
         t_s = np.arange(round(a.t_s / TICK_S) + 1, round(b.t_s / TICK_S)) * TICK_S
         now.append(estimator.track(t_s))
+        noted += estimator.stretches(t_s[:3])  # as no sighting came after them yet
         estimator.vision(b)
         later.append(estimator.smoothed(t_s))
+        noted += estimator.stretches(t_s[3:])
+    # Reckoned later, all at once: the same, whatever was heard since.
+    late, parts = estimator.blended(noted), (slice(3), slice(3, None))
+    for field in ("t_s", "Ts_base_tool", "covs", "covs_own", "q", "qd", "vision_age_s"):
+        pairs = [both for pair in zip(now, later, strict=True) for both in zip(pair, parts, strict=True)]
+        at_once = [getattr(track, field)[rows] for track, rows in pairs]
+        assert getattr(late, field) == pytest.approx(np.concatenate(at_once), rel=1e-12, abs=1e-16)
     rows = np.rint(np.concatenate([track.t_s for track in now]) / TICK_S).astype(int)
     apart = [distance_mm(np.concatenate([track.Ts_base_tool for track in way]), Ts[rows]) for way in (now, later)]
     assert rms(apart[1][300:]) < rms(apart[0][300:])

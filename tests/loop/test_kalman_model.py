@@ -9,6 +9,8 @@ from arm_bench import ARM, MIDDLE, drawn, loads, product, small
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, BASIS, COMPLIANCE, FLOAT, LINEARITY, POSE, REST, SIZE, Prior
+from armsight.loop.estimators.errormodel import ErrorModel, State, chi_square
+from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.models import MODELS
 from asserts import numeric_jacobian
 
@@ -116,3 +118,33 @@ def test_half_a_turn_is_not_taken_for_none():
     found = np.empty(6)
     armerror.tangent(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), found)
     assert np.linalg.norm(found[3:]) == pytest.approx(np.pi)
+
+
+def test_covariances_are_those_of_the_matrices():
+    rng = np.random.default_rng(5)
+    model, n = ErrorModel(ARM, Prior(), 2e-4), 4
+    root = 1e-3 * rng.normal(size=(SIZE, SIZE))
+    state = State(0.0, np.zeros(SIZE), root @ root.T, np.zeros(6), np.zeros((2, 6)), None)
+    joints = Smoothed(
+        rng.uniform(-1, 1, (n, 6)),
+        np.zeros((n, 6)),
+        rng.uniform(0, 1, (n, 6)),
+        rng.uniform(-1, 1, (n, 3, 6)),
+        rng.uniform(0, 1, (n, 6)),
+        rng.uniform(0, 1, (n, 2, 6)),
+    )
+    step = model.moved(state, joints, np.arange(n) * 1e-3)
+    _, Hs = model.poses(state.x, joints.q, joints.unseen)
+    for n, own in enumerate(model.covariances(state, step, Hs, joints)):
+        moved = np.diag(step.kept[n]) @ state.P @ np.diag(step.kept[n]) + np.diag(step.added[n])
+        wanted = Hs[n] @ moved @ Hs[n].T + model.reading_noise(Hs, joints)[n]
+        assert np.abs(own - wanted).max() < 1e-13 * np.abs(wanted).max()
+
+
+def test_chi_square_is_that_of_the_inverse():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        root, z = rng.normal(size=(6, 8)), rng.normal(size=6)
+        S = root @ root.T
+        assert chi_square(S, z) == pytest.approx(z @ np.linalg.solve(S, z), rel=1e-12 * np.linalg.cond(S))
+    assert np.isnan(chi_square(-np.eye(6), np.ones(6)))

@@ -9,6 +9,7 @@ arm is singular. Gain, its margin, and what happens when vision is lost: docs/lo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -191,7 +192,11 @@ class PoseServo:
 
     def _mode(self, estimate: ArmEstimate) -> Mode:
         """Say what the loop may be closed on."""
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.cov_own[:3, :3])[-1]))
+        cov = estimate.cov_own[:3, :3]
+        # The greatest variance is not above the sum of three; only where that is too much is it worth looking for.
+        sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
+        if sigma_m > MOST_SIGMA_M:
+            sigma_m = math.sqrt(np.linalg.eigvalsh(cov)[-1])
         usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one sighting may be missed
         if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MOST_SIGMA_M:
             return Mode.POTENTIOMETERS
@@ -207,7 +212,7 @@ class PoseServo:
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
         """
-        able = np.clip((aim.s - SINGULAR) / (EASY - SINGULAR), 0.0, 1.0)
+        able = _within(0.0, (aim.s - SINGULAR) / (EASY - SINGULAR), 1.0)
         return np.asarray((able / np.maximum(aim.s, SINGULAR) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
@@ -233,15 +238,23 @@ class PoseServo:
         arm, period_s, ahead = self._arm, self.timing.period_s, aim.ahead
         step = ahead.q - aim.goal.q
         most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
-        wished = np.clip(self._correction + np.clip(change, -most, most), -MOST_RAD, MOST_RAD)
-        q_ref = np.clip(ahead.q + wished, arm.q_min, arm.q_max)
+        wished = _within(-MOST_RAD, self._correction + _within(-most, change, most), MOST_RAD)
+        q_ref = _within(arm.q_min, ahead.q + wished, arm.q_max)
         held = q_ref != ahead.q + wished
         correction = q_ref - ahead.q
-        qd_ref = np.clip(ahead.qd + (correction - self._correction) / period_s, -arm.qd_max, arm.qd_max)
+        qd_ref = _within(-arm.qd_max, ahead.qd + (correction - self._correction) / period_s, arm.qd_max)
         self._correction, self._goal = correction, ahead
-        said = [
-            *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
-            *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(np.abs(wished) >= MOST_RAD)),
-        ]
+        far = np.abs(wished) >= MOST_RAD
+        said: tuple[str, ...] = ()
+        if held.any() or far.any():
+            said = (
+                *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
+                *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(far)),
+            )
         command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), aim.duty, period_s)
-        return ServoStep(command, mode, correction, error, tuple(said))
+        return ServoStep(command, mode, correction, error, said)
+
+
+def _within(low: Array | float, x: Array, high: Array | float) -> Array:
+    """Return numbers held within bounds; ``np.clip`` takes several times as long for six of them."""
+    return np.asarray(np.minimum(np.maximum(x, low), high))

@@ -4,6 +4,7 @@ import ctypes
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from armsight import firmware
@@ -96,3 +97,18 @@ def test_numbers_are_the_headers():
     assert re.search(rf"FRAME_BYTES {frames.WIRE_BYTES}u", FRAMES)
     assert re.search(rf"RESTART_POWER = {frames.RESTART_POWER}, RESTART_WATCHDOG = {frames.RESTART_WATCHDOG}", FRAMES)
     assert re.search(rf"CONFIG_VERSION {configuration.CONFIG_VERSION}u", CONFIG_H)
+
+
+def test_what_a_tick_packs_and_reads_is_laid_out_alike():
+    rng = np.random.default_rng(0)
+    numbers, said = rng.integers(0, 2**32, 20).tolist(), rng.bytes(512)
+    request = np.frombuffer(frames.REQUEST_FIELDS.pack(*numbers, said), frames.REQUEST)[0]
+    assert np.hstack([request[name] for name in frames.REQUEST.names[:-1]]).tolist() == numbers
+    assert request["bytes"].tobytes() == said
+    packed = rng.bytes(frames.ANSWER.itemsize)
+    answer = np.frombuffer(packed, frames.ANSWER)[0]
+    outputs = answer["outputs"]
+    told = [answer["magic"], answer["version"], answer["tick"], outputs["drives_on"], answer["length"]]
+    assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == told
+    assert packed[frames.DUTY_AT : frames.DUTY_AT + 24] == outputs["duty"].tobytes()
+    assert packed[frames.BYTES_AT :] == answer["bytes"].tobytes()

@@ -159,6 +159,32 @@ def _covariances(Hs: Array, kept: Array, added: Array, P: Array, variance: Array
                     own[n, row, column] += reading * H[row, k] * variance[n, i] * H[column, k]
 
 
+@numba.njit(cache=True, error_model="numpy")
+def symmetric(P: Array) -> None:
+    """Put the mean of a covariance (N, N) and its transpose in its place."""
+    for i in range(len(P)):
+        for j in range(i):
+            P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def chi_square(S: Array, z: Array) -> float:
+    """Return z' S^-1 z of an innovation (6,) with covariance (6, 6), by Cholesky's factors; NaN where S is none."""
+    L, y, total = np.zeros((6, 6)), np.empty(6), 0.0
+    for i in range(6):
+        for j in range(i + 1):
+            rest = S[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+        y[i] = z[i]
+        for k in range(i):
+            y[i] -= L[i, k] * y[k]
+        y[i] /= L[i, i]
+        total += y[i] * y[i]
+    return total
+
+
 def shared(sighting: Sighting | None, Ts: Array) -> Array:
     """Return what all sightings share, (N, 6, 6), seen in the axes of poses (N, 4, 4)."""
     if sighting is None:

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step
+from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step, chi_square, symmetric
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Stretch, blended, by_state, stretches
@@ -73,6 +73,7 @@ class KalmanEstimator:
         self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), *nowhere, None)]
         self._waiting: list[Sighting] = []
         self._outliers: list[Array] = []
+        self._told = True  # whether the readings know how wide the backlash is, as far as that is known
         # At the newest reading, until something is heard: the joints and what came of the state, and the tool.
         self._here: tuple[Smoothed, Step] | None = None
         self._newest: ArmEstimate | None = None
@@ -85,6 +86,9 @@ class KalmanEstimator:
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
         self._newest = self._here = None
+        if not self._told:  # not when it was seen: a command waits for that
+            self._told = True
+            self._readings.set_backlash(self._backlash())
         self._readings.add(states)
         if self._waiting:
             waiting, self._waiting = self._waiting, []
@@ -114,7 +118,7 @@ class KalmanEstimator:
             again, _ = self._take(self._states[-1], state.sighting) if state.sighting is not None else (None, verdict)
             if again is not None:
                 self._states.append(again)
-        self._readings.set_backlash(self._backlash())
+        self._told = False
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return verdict
@@ -206,12 +210,14 @@ class KalmanEstimator:
         P[:, FORGETS] *= step.kept[0, FORGETS]
         P[DIAGONAL] += step.added[0]
         z, H, R = first = self._innovation(x, joints, sighting)
-        verdict = self._judge(z, H @ P @ H.T + R + sighting.cov_common)
+        PHt = P @ H.T
+        verdict = self._judge(z, H @ PHt + R + sighting.cov_common)
         if verdict is Verdict.OUTLIER:
             return None, verdict
         if verdict is Verdict.REOPENED:
             P[DIAGONAL] += _OPENED
-        x, P = self._update(x, P, joints, sighting, first)
+            PHt = P @ H.T
+        x, P = self._update(x, P, joints, sighting, first, PHt)
         return State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
 
     def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
@@ -227,12 +233,26 @@ class KalmanEstimator:
         return z, H, R
 
     def _update(
-        self, x: Array, P: Array, joints: Smoothed, sighting: Sighting, first: tuple[Array, Array, Array]
+        self,
+        x: Array,
+        P: Array,
+        joints: Smoothed,
+        sighting: Sighting,
+        first: tuple[Array, Array, Array],
+        PHt: Array,
     ) -> tuple[Array, Array]:
-        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993), from a first look."""
+        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993), from a first look.
+
+        Args:
+            x: the state.
+            P: its covariance, which is taken for the result.
+            joints: at the sighting.
+            sighting: what was seen.
+            first: innovation, derivative and noise at x.
+            PHt: the product of P and the derivative's transpose.
+        """
         (z, H, R), change = first, np.zeros(SIZE)
         for left in range(ITERATIONS, 0, -1):
-            PHt = P @ H.T
             K = np.linalg.solve(H @ PHt + R, PHt.T).T
             last, change = change, K @ z
             if left == 1 or np.abs(change - last).max() < SETTLED:
@@ -240,17 +260,19 @@ class KalmanEstimator:
             z, H, R = self._innovation(x + change, joints, sighting)
             # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
             z += H[:, :DELAY] @ change[:DELAY]
-        P = P - K @ PHt.T
-        return x + change, (P + P.T) / 2
+            PHt = P @ H.T
+        P -= K @ PHt.T
+        symmetric(P)
+        return x + change, P
 
     def _judge(self, z: Array, S: Array) -> Verdict:
         """Say whether an innovation is to be believed."""
-        if z @ np.linalg.solve(S, z) < _GATE:
+        if chi_square(S, z) < _GATE:
             self._outliers = []
             return Verdict.USED
         if self._outliers:
             apart = z - self._outliers[-1]
-            if apart @ np.linalg.solve(S, apart) > _GATE:
+            if chi_square(S, apart) > _GATE:
                 self._outliers = []
         self._outliers.append(z)
         if len(self._outliers) < STUBBORN:

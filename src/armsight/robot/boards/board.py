@@ -7,6 +7,7 @@ one it refused, so that the fate of each is known. Time passes only in :meth:`Bo
 
 from __future__ import annotations
 
+import math
 import zlib
 from typing import Self
 
@@ -186,10 +187,11 @@ def _six(name: str, values: Array) -> list[float]:
     numbers = np.asarray(values, dtype=float)
     if numbers.shape != (JOINTS,):
         raise InputError(f"{name} is of shape {numbers.shape}; six numbers are needed")
-    if not np.isfinite(numbers).all():
+    six: list[float] = numbers.tolist()
+    if not all(map(math.isfinite, six)):
         joint = int(np.argmin(np.isfinite(numbers)))
         raise InputError(f"{name} of joint {joint + 1} is {numbers[joint]}; it must be finite")
-    return list(numbers)
+    return six
 
 
 def _older(sequence: int, other: int) -> bool:
