@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log
 from armsight.app.run_data import RunData
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 GREEN, SOFT_BLUE, SOFT_GREEN = "#2f7d4f", "#cfe3f5", "#cfe8d8"
 _MM, _DEG = 1e3, float(np.degrees(1.0))
-_BAND = float(norm.ppf(0.975))
+_BAND = float(ndtri(0.975))
 _POINTS = 4000  # of a line in a figure: more cannot be seen
 
 

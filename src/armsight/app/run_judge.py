@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.app.run_data import RunData
 from armsight.app.run_tracks import ToolTrack, errors
@@ -48,7 +48,7 @@ def track_figures(track: ToolTrack, truth: ToolTrack) -> dict[str, Any]:
             "position_sigma_rms_m": rms(np.sqrt(variance[:, :3].sum(axis=1))),
             "orientation_sigma_rms_rad": rms(np.sqrt(variance[:, 3:].sum(axis=1))),
             "nees_mean": float(nees.mean()),
-            "inside_95_share": float((nees <= chi2.ppf(0.95, 6)).mean()),
+            "inside_95_share": float((nees <= chdtri(6, 0.05)).mean()),
         }
     return found
 

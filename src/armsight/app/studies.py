@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
@@ -116,8 +116,8 @@ def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Error
         unit,
         np.array(values, float),
         np.sqrt(squares),
-        np.sqrt(squares * freedom / chi2.ppf(0.975, freedom)),
-        np.sqrt(squares * freedom / chi2.ppf(0.025, freedom)),
+        np.sqrt(squares * freedom / chdtri(freedom, 0.025)),
+        np.sqrt(squares * freedom / chdtri(freedom, 0.975)),
         np.sqrt([e.variance.mean() if len(e.variance) else np.nan for e in found]),
         np.array([e.missed for e in found]),
     )
@@ -208,7 +208,7 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
     study = _study("calibration size", "pairs of the board", sizes, found)
     # The shots of one calibration err together: its draws are what is counted.
     freedom = 3.0 * _DRAWS
-    wide = study.position_rms_m * np.sqrt(freedom / chi2.ppf([[0.975], [0.025]], freedom))
+    wide = study.position_rms_m * np.sqrt(freedom / chdtri(freedom, [[0.025], [0.975]]))
     return Study(
         study.name, study.unit, study.values, study.position_rms_m, wide[0], wide[1], study.predicted_m, study.missed
     )

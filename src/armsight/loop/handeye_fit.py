@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.geometry.pose import exp_se3, inverse, log_se3
@@ -149,7 +149,7 @@ def fit(poses: Poses, start: tuple[Array, Array], share: Share) -> Fit:
     for _ in range(8):
         e, _, carry = residuals(poses, Z, X)
         far = _squares(e, covariances(poses, carry, sigma))
-        keep = far < chi2.isf(CHANCE, 6)
+        keep = far < chdtri(6, CHANCE)
         if keep.sum() < max(3, len(keep) // 2):  # no half can be a mistake: then the sigmas are what is wrong
             keep = far <= np.sort(far)[max(3, len(keep) // 2) - 1]
         part = poses.rows(keep)
@@ -186,7 +186,7 @@ def _shared(place: float, turn: float, share: Share) -> Sigmas:
 def _robust_sigma(poses: Poses, Z: Array, X: Array, share: Share) -> Sigmas:
     """Return sigmas along one axis from the median residual, which mistakes do not reach."""
     e, _, _ = residuals(poses, Z, X)
-    middle = np.sqrt(chi2.median(3))
+    middle = np.sqrt(chdtri(3, 0.5))
     place, turn = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
     return _shared(max(place, LEAST_SIGMA), max(turn, LEAST_SIGMA), share)
 

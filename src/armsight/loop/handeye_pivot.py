@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
@@ -60,8 +60,8 @@ def calibrate_pivot(Ts: ArrayLike) -> Pivot:
     for _ in range(ROUNDS):
         x, H = _solved(poses[used])
         e = _residuals(poses, x)
-        scale = float(np.median(np.sum(e**2, axis=1)) / chi2.median(3))
-        sane = np.sum(e**2, axis=1) <= chi2.isf(CHANCE, 3) * max(scale, 1e-18)
+        scale = float(np.median(np.sum(e**2, axis=1)) / chdtri(3, 0.5))
+        sane = np.sum(e**2, axis=1) <= chdtri(3, CHANCE) * max(scale, 1e-18)
         if (sane == used).all() or sane.sum() < LEAST:
             break
         used = sane

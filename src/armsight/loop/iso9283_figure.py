@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm, t
+from scipy.special import chdtri, ndtri, stdtrit
 
 from armsight.data import Array
 
 #: Intervals hold the true figure so often; what is called resolvable is so by chance in half of the rest.
 INSIDE = 0.95
 _LOW, HIGH = (1 - INSIDE) / 2, (1 + INSIDE) / 2
-WIDE = float(norm.ppf(HIGH))
+WIDE = float(ndtri(HIGH))
 #: Errors that are drawn.
 DRAWS = 1000
 
@@ -78,7 +78,7 @@ def mean_errors(values: Array, rng: np.random.Generator) -> Array:
     n = len(values)
     if n < 2:
         return np.zeros((DRAWS, *values.shape[1:]))
-    wider = float(t.ppf(HIGH, n - 1)) / WIDE
+    wider = float(stdtrit(n - 1, HIGH)) / WIDE
     weights = rng.normal(0, wider / np.sqrt(n * (n - 1)), (DRAWS, n))
     return np.asarray(np.tensordot(weights, values - values.mean(axis=0), axes=1))
 
@@ -94,7 +94,7 @@ def group_errors(within: Array, counts: Array, rng: np.random.Generator) -> Arra
     freedom = len(within) - len(counts)
     if freedom < 1:
         return np.zeros((DRAWS, len(counts), 3))
-    wider = float(t.ppf(HIGH, freedom)) / WIDE
+    wider = float(stdtrit(freedom, HIGH)) / WIDE
     weights = rng.normal(0, wider / np.sqrt(freedom), (DRAWS, len(counts), len(within)))
     return np.asarray(weights @ within / np.sqrt(counts)[:, None])
 
@@ -122,11 +122,11 @@ def scatter(S: Array, noise: Array, n: int, figure: Callable[[Array], Array], ra
     total, own = float(np.trace(S)), float(np.trace(noise))
     raw = ratio * float(figure(S))
     alone = (n - 1) * own**2 / max(float(np.trace(noise @ noise)), 1e-300)
-    resolvable = float(figure(noise)) * np.sqrt(float(chi2.ppf(HIGH, alone)) / alone - 1) if own > 0 else 0.0
+    resolvable = float(figure(noise)) * np.sqrt(float(chdtri(alone, 1 - HIGH)) / alone - 1) if own > 0 else 0.0
     if total <= 0:  # rows all alike: rounded, or copied; they show less than the noise would
         return Figure(raw, None if own > 0 else 0.0, 0.0, resolvable, resolvable)
     freedom, bias = _freedom(S, n, figure)
-    low, high = (total * freedom / float(chi2.ppf(p, freedom)) - own for p in (HIGH, _LOW))
+    low, high = (total * freedom / float(chdtri(freedom, 1 - p)) - own for p in (HIGH, _LOW))
     left = _positive(S - noise)
     left = left if np.any(left) else S  # of nothing left the shape is not known
     unit = float(figure(left)) / np.sqrt(float(np.trace(left)))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, t
+from scipy.special import chdtri, stdtrit
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -240,8 +240,8 @@ def _play(steps: Array, variances: Array) -> Figure:
     """
     value, freedom = float(steps.mean()), steps.size - 1
     apart = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
-    if freedom and apart > chi2.ppf(HIGH, freedom):
-        sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(t.ppf(HIGH, freedom))
+    if freedom and apart > chdtri(freedom, 1 - HIGH):
+        sigma, wide = float(steps.std(ddof=1)) / np.sqrt(steps.size), float(stdtrit(freedom, HIGH))
     else:
         sigma, wide = float(np.sqrt(variances.sum())) / steps.size, WIDE
     resolvable = wide * sigma

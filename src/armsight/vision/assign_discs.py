@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
 from armsight.geometry.pose import exp_se3
@@ -22,7 +22,7 @@ from armsight.vision.rig import StereoRig
 
 #: A detection beyond this quantile of the chi-square distribution of its distance is of something else.
 GATE_QUANTILE = 1.0 - 1e-5
-_GATE_ONE, _GATE_BOTH = (float(chi2.ppf(GATE_QUANTILE, n)) for n in (2, 4))
+_GATE_ONE, _GATE_BOTH = (float(chdtri(n, 1 - GATE_QUANTILE)) for n in (2, 4))
 _NONE = np.zeros(0, np.int64)
 #: Rows of the left and of the right camera's discs that may be one disc of the body.
 Claim = tuple[Ids, Ids]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,8 +105,9 @@ def _normal(
     cost = float((c2 * np.log1p(d2 / c2)).sum() if robust else d2.sum())
     cost += float(prior @ shape**2) + float((still * state.motions**2).sum())
     root = np.sqrt(weight)[:, None]
-    A = (root[..., None] * W) @ J_shared[:, :, free]
-    B = (root[..., None] * W) @ J_shot
+    A, B = J_shared if free.all() else J_shared[:, :, free], J_shot
+    for J in (A, B):
+        _weigh(root[..., None] * W, J)
     arrow = Arrow.of(A, B, r * root, observations.shot, observations.shot_count, cost)
     H_shots, g_shots = np.array(arrow.H_shots), np.array(arrow.g_shots)
     if len(still):
@@ -113,6 +115,16 @@ def _normal(
         g_shots[:, 6:] -= still * state.motions
     H_shared, g_shared = arrow.H_shared + np.diag(prior[free]), arrow.g_shared - (prior * shape)[free]
     return replace(arrow, H_shared=H_shared, g_shared=g_shared, H_shots=H_shots, g_shots=g_shots), residuals
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _weigh(W: Array, J: Array) -> None:
+    """Replace matrices J (N, 2, K) by W @ J for W (N, 2, 2), where they stand."""
+    for n in range(J.shape[0]):
+        for k in range(J.shape[2]):
+            u, v = J[n, 0, k], J[n, 1, k]
+            J[n, 0, k] = W[n, 0, 0] * u + W[n, 0, 1] * v
+            J[n, 1, k] = W[n, 1, 0] * u + W[n, 1, 1] * v
 
 
 def _prior(model: Model, count: int) -> Array:

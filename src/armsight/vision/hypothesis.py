@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.pose import exp_se3, transform
@@ -113,7 +113,7 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
     """Chi-square beyond which a fit is none."""
-    return float(chi2.ppf(FIT_QUANTILE, freedom))
+    return float(chdtri(freedom, 1 - FIT_QUANTILE))
 
 
 def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, Body, Points
 from armsight.geometry.rigid import fit_rigid, fit_scale
@@ -94,4 +94,4 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
 @lru_cache(maxsize=256)
 def misfit_limit(freedom: int) -> float:
     """Sum of squares beyond which residuals are a misfit, not chance."""
-    return float(chi2.ppf(_MISFIT_QUANTILE, freedom)) if freedom > 0 else np.inf
+    return float(chdtri(freedom, 1 - _MISFIT_QUANTILE)) if freedom > 0 else np.inf

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.geometry.pose import transform
@@ -26,7 +26,7 @@ from armsight.vision.rig import StereoRig
 #: A detection whose whitened squared distance from a robust fit is beyond this share of the chi-square distribution is
 #: no detection of the body.
 OUTLIER_QUANTILE = 1.0 - 1e-5
-_LIMIT, _MEDIAN = float(chi2.ppf(OUTLIER_QUANTILE, 2)), float(chi2.ppf(0.5, 2))
+_LIMIT, _MEDIAN = float(chdtri(2, 1 - OUTLIER_QUANTILE)), float(chdtri(2, 0.5))
 #: A shot in which less than this share of the detections agrees with one pose is missed.
 _AGREEING = 0.5
 #: With this many matched points the rigid fit alone is a safe start; with fewer, every pose that one camera allows is

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,6 +115,45 @@ class Model(Record):
         return np.asarray(self.points + np.tensordot(shape, self.modes, axes=1))
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _fill(
+    rows: NDArray[np.intp],
+    start: int,
+    J_k: Array,
+    rig: int,
+    by_rig: Array,
+    turned: Array,
+    points: Ids,
+    modes: Array,
+    J: Array,
+) -> None:
+    """Write one camera's rows of the derivative J (N, 2, Q), zero before, by the shared parameters.
+
+    Args:
+        rows: (n,) which rows.
+        start: column of the camera's first parameter.
+        J_k: (n, 2, c) derivative by the camera's parameters.
+        rig: column of the relative pose.
+        by_rig: (n, 2, 6) derivative by it; (0, 2, 6) for the left camera.
+        turned: (n, 2, 3) derivative by the body's points.
+        points: (n,) which points.
+        modes: (M, 3, K) the shape's modes by point.
+        J: to be written.
+    """
+    for n in range(rows.size):
+        mode = modes[points[n]]
+        for i in range(2):
+            row = J[rows[n], i]
+            for k in range(J_k.shape[2]):
+                row[start + k] = J_k[n, i, k]
+            if by_rig.shape[0]:
+                for k in range(6):
+                    row[rig + k] = by_rig[n, i, k]
+            x, y, z = turned[n, i, 0], turned[n, i, 1], turned[n, i, 2]
+            for k in range(mode.shape[1]):
+                row[rig + 6 + k] = x * mode[0, k] + y * mode[1, k] + z * mode[2, k]
+
+
 def predict(model: Model, state: State, observations: Observations) -> tuple[Array, Array, Array]:
     """Project every observation and differentiate.
 
@@ -132,6 +172,7 @@ def predict(model: Model, state: State, observations: Observations) -> tuple[Arr
     uv = np.empty((len(observations.shot), 2))
     J_shared, J_shot = np.zeros((len(uv), 2, count)), np.zeros((len(uv), 2, 12 if len(state.motions) else 6))
     body, middle = model.body(state.shape), model.points.mean(axis=0)
+    modes = np.ascontiguousarray(model.modes.transpose(1, 2, 0))
     T_right_left = inverse(state.T_left_right)
     for side, camera in enumerate(state.cameras):
         rows = observations.camera == side
@@ -153,13 +194,8 @@ def predict(model: Model, state: State, observations: Observations) -> tuple[Arr
             by_turn = -turned @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
             J_shot[rows, :, 6:] = np.concatenate([by_body, by_turn], axis=2)
         start = 0 if side == 0 else sizes[0]
-        block = np.zeros((len(points), 2, count))
-        block[:, :, start : start + sizes[side]] = J_k
-        if side == 1:
-            block[:, :, n_cameras : n_cameras + 6] = np.concatenate([-J_p, J_p @ skew(p)], axis=2)
-        if len(model.modes):
-            block[:, :, n_cameras + 6 :] = turned @ model.modes[:, points].transpose(1, 2, 0)
-        J_shared[rows] = block
+        by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
+        _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, turned, points, modes, J_shared)
     return uv, J_shared, J_shot
 
 

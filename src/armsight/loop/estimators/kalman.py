@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
@@ -42,7 +42,7 @@ MOVES_RAD_S = 1e-3
 WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
 #: The diagonal of a covariance, and the rows of what motion makes it forget: the rest and, next to it, the pose.
 DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
-_GATE = float(chi2.isf(CHANCE, 6))
+_GATE = float(chdtri(6, CHANCE))
 
 
 def _opened() -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.loop.identify.measured import Measured
@@ -192,7 +192,7 @@ def _taken(H: Array, free: Mask, prior: Array) -> float:
 
 def _robust_noise(e: Array) -> tuple[float, float]:
     """Return sigmas along one axis from median residuals."""
-    middle = np.sqrt(chi2.median(3))
+    middle = np.sqrt(chdtri(3, 0.5))
     places = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
     turn = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0
     return max(float(np.median(np.linalg.norm(places, axis=1)) / middle), LEAST_NOISE), max(turn, LEAST_NOISE)
@@ -231,5 +231,5 @@ def squares(measured: Measured, e: Array, noise: tuple[float, float]) -> Array:
 def _sane(measured: Measured, e: Array, noise: tuple[float, float]) -> Mask:
     """Say which poses are no mistakes, by the scale of the median."""
     far = squares(measured, e, noise)
-    scale = max(float(np.median(far)) / chi2.median(measured.size), 1e-300)
-    return np.asarray(far / scale < chi2.isf(CHANCE, measured.size))
+    scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
+    return np.asarray(far / scale < chdtri(measured.size, CHANCE))

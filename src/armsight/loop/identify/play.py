@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from armsight.data import Array
 from armsight.loop.identify.identify import Identified
@@ -102,7 +102,7 @@ def _to_the_stops(play: Play, chance: float, told: float, sides: tuple[int, int]
         told: how well a single pose tells it, rad.
         sides: how many poses came to it from either side; one or none on a side tell nothing of its scatter.
     """
-    furthest = sum(float(norm.ppf((n - 0.375) / (n + 0.25))) for n in sides if n > 1)
+    furthest = sum(float(ndtri((n - 0.375) / (n + 0.25))) for n in sides if n > 1)
     short, most = furthest * float(np.sqrt(max(chance**2 - told**2, 0.0))), furthest * chance
     variance = play.sigma_rad**2 + most**2 / 3 + (most - short) ** 2
     return play._replace(value_rad=play.value_rad + short, sigma_rad=float(np.sqrt(variance)))
@@ -134,8 +134,8 @@ def _between_stops(joint: int, stood: Array, noise: Array) -> Play:
     def cost(at: Array) -> float:
         middle, half, stops = at[0], np.exp(at[1]), 1 / (1 + np.exp(-at[2]))  # the share that lies at a stop
         left, right = (middle - half - stood) / noise, (middle + half - stood) / noise
-        between = (norm.cdf(right) - norm.cdf(left)) / (2 * half)
-        ends = (norm.pdf(left) + norm.pdf(right)) / (2 * noise)
+        between = (ndtr(right) - ndtr(left)) / (2 * half)
+        ends = (np.exp(-0.5 * left**2) + np.exp(-0.5 * right**2)) / np.sqrt(2 * np.pi) / (2 * noise)
         return -float(np.log(stops * ends + (1 - stops) * between + 1e-12 / noise).sum())
 
     extent = float(np.ptp(stood))
