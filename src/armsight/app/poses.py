@@ -13,7 +13,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.geometry.rotation import quaternion_wxyz, roll_pitch_yaw
@@ -67,8 +66,9 @@ def pose_record(name: str, t_s: float | None, body: Body, result: PoseEstimate |
 
 def left_axes(T_left_body: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """Turn a covariance of the right tangent into one along the left camera's axes."""
-    turn = block_diag(T_left_body[:3, :3], T_left_body[:3, :3])
-    return np.asarray(turn @ cov @ turn.T)
+    R = T_left_body[:3, :3]
+    blocks = cov.reshape(2, 3, 2, 3).swapaxes(1, 2)
+    return np.asarray((R @ blocks @ R.T).swapaxes(1, 2).reshape(6, 6))
 
 
 def _finite(value: float) -> float | None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
+from armsight.geometry.pose import transform
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_turn, first_frame, store
 from armsight.robot.kinematics.trig import sincos
@@ -123,9 +124,7 @@ def weight_torque(arm: Arm, parts: Solids, q: Array) -> Array:
 def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
     """Return the inertia (6,), kg m^2, of all that each joint turns, as points, at angles q (6,), rad."""
     Ts, out = row_frames(arm, q), np.zeros(6)
-    centres = np.array(
-        [Ts[k, :3, :3] @ c + Ts[k, :3, 3] for k, c in zip(parts.link, parts.ends.mean(axis=1), strict=True)]
-    )
+    centres = transform(Ts[parts.link], parts.ends.mean(axis=1))
     for i in range(6):
         beyond = parts.link > i
         r = centres[beyond] - Ts[i + 1, :3, 3]
