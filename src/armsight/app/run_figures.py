@@ -32,11 +32,10 @@ def joints_figure(run: RunData) -> Figure:
         plot.plot(run.t_s[rows], _DEG * run.q_wanted[rows, joint], color=ORANGE, lw=2.4, label="reference")
         plot.plot(run.t_s[rows], _DEG * run.q[rows, joint], color=BLUE, lw=0.9, label="potentiometer")
         plot.set_ylabel(f"joint {joint + 1}, deg")
-        _shade(plot, run)
-        if joint == 0:
-            plot.legend(fontsize=7, ncols=2, loc="best")
+        _shade(plot, run, named=joint in (0, 3))
         if joint in (2, 5):
             plot.set_xlabel("time, s")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=7, ncols=2, loc="outside upper left")
     return figure
 
 
@@ -53,6 +52,8 @@ def path_figure(run: RunData) -> Figure:
     for track, name, colour, width, marker in drawn:
         if track is None or not len(track):
             continue
+        if track is run.truth and len(run.fused):  # not where it was before
+            track = track[track.t_s >= run.fused.t_s[0]]
         p = _MM * track.Ts_base_tool[_thinned(len(track)), :3, 3]
         if marker == ".":
             axes.plot(*p.T, marker, color=colour, ms=2.5, label=name)
@@ -86,7 +87,7 @@ def errors_figure(run: RunData) -> Figure | None:
         _own(plot, seen, part, factor)
         plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
     for plot in plots:
-        _shade(plot, run)
+        _shade(plot, run, named=plot is plots[0])
     plots[1].set_title(
         "vision and fused; shaded: at least 95% of the fused estimate's errors are to lie below", fontsize=9
     )
@@ -163,23 +164,25 @@ def latency_figure(run: RunData) -> Figure | None:
     return figure
 
 
-def _shade(plot: Axes, run: RunData) -> None:
-    """Shade the rests, and mark where the loop is closed."""
+def _shade(plot: Axes, run: RunData, *, named: bool) -> None:
+    """Shade the rests, and mark where the loop is closed; say so above the plot where that is wanted."""
     for segment in run.segments:
         if segment.phase == "rest":
             plot.axvspan(segment.begin_s, segment.end_s, color="#f0f2f5", lw=0, zorder=0)
     closed = [s.begin_s for s in run.segments if s.closed]
     if closed and not run.segments[0].closed:
         plot.axvline(min(closed), color=MUTED, lw=0.8, ls=":")
-        plot.annotate(
-            "loop closed",
-            (min(closed), 1.0),
-            (3, -8),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            fontsize=6,
-            color=MUTED,
-        )
+        if named:
+            plot.annotate(
+                "loop closed",
+                (min(closed), 1.0),
+                (0, 2),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                ha="center",
+                fontsize=6,
+                color=MUTED,
+            )
 
 
 def _thinned(count: int) -> Array:
