@@ -8,7 +8,18 @@ from arm_bench import ARM, MIDDLE, drawn, loads, product, small
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import BACKLASH, BASIS, COMPLIANCE, FLOAT, LINEARITY, POSE, REST, SIZE, Prior
+from armsight.loop.estimators.armerror import (
+    BACKLASH,
+    BASIS,
+    COMPLIANCE,
+    FLOAT,
+    LINEARITY,
+    POSE,
+    READING,
+    REST,
+    SIZE,
+    Prior,
+)
 from armsight.loop.estimators.errormodel import ErrorModel, State, chi_square
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.models import MODELS
@@ -63,8 +74,10 @@ def test_off_by_as_much_as_arms_are_the_derivative_is_off_by_as_little():
 
 def test_it_is_a_slow_arm_with_the_same_errors():
     rng = np.random.default_rng(3)
+    sigmas = Prior().sigmas(0.0)
+    sigmas[READING:POSE] = 1e-4  # what smoothing leaves of the readings' noise: no amount of the prior
     x, q, unseen = (
-        rng.normal(size=SIZE) * Prior().sigmas(0.0),
+        rng.normal(size=SIZE) * sigmas,
         rng.uniform(-1, 1, 6) + MIDDLE,
         rng.uniform(-1, 1, (3, 6)),
     )
@@ -75,7 +88,7 @@ def test_it_is_a_slow_arm_with_the_same_errors():
         for k in (1, 2, 3):
             joints[i] += c[2 * k - 1] * np.sin(k * q[i]) + c[2 * k] * np.cos(k * q[i])
     joints += -unseen[0] * x[BACKLASH:FLOAT] / 2 - unseen[1] * x[FLOAT:COMPLIANCE] / 2
-    joints += x[COMPLIANCE:REST] * (loads(q[None])[0] + unseen[2]) + x[REST:POSE]
+    joints += x[COMPLIANCE:REST] * (loads(q[None])[0] + unseen[2]) + x[REST:READING] + x[READING:POSE]
     T = product(joints[None], [small(x[6 * i : 6 * i + 6]) for i in range(7)])[0] @ small(x[POSE : POSE + 6])
     found, _ = evaluated(ARM, x, q, unseen)
     # Half the product of the last motion's turn (3 sigma: 5e-4) and shift (3e-4) is left out; nothing else is.
@@ -89,7 +102,7 @@ def test_offsets_are_what_the_joints_are_beyond_their_readings():
     armerror.offsets_by(ARM.table, q, unseen, B)
     moved = x.copy()
     moved[LINEARITY:POSE] = 0
-    moved[REST:POSE] = B @ x  # all of it told as rest instead
+    moved[REST:READING] = B @ x  # all of it told as rest instead
     assert np.allclose(evaluated(ARM, moved, q, unseen)[0], evaluated(ARM, x, q, unseen)[0], atol=1e-14)
 
 
@@ -124,20 +137,21 @@ def test_covariances_are_those_of_the_matrices():
     rng = np.random.default_rng(5)
     model, n = ErrorModel(ARM, Prior(), 2e-4), 4
     root = 1e-3 * rng.normal(size=(SIZE, SIZE))
-    state = State(0.0, np.zeros(SIZE), root @ root.T, np.zeros(6), np.zeros((2, 6)), None)
     joints = Smoothed(
         rng.uniform(-1, 1, (n, 6)),
         np.zeros((n, 6)),
-        rng.uniform(0, 1, (n, 6)),
+        rng.uniform(0.1, 1, (n, 6)),
+        rng.uniform(0.01, 0.1, (n, 6)),
         rng.uniform(-1, 1, (n, 3, 6)),
         rng.uniform(0, 1, (n, 6)),
         rng.uniform(0, 1, (n, 2, 6)),
     )
+    state = State(0.0, np.zeros(SIZE), root @ root.T, Smoothed(*(part[:1] for part in joints)), None)
     step = model.moved(state, joints, np.arange(n) * 1e-3)
     _, Hs = model.poses(state.x, joints.q, joints.unseen)
-    for n, own in enumerate(model.covariances(state, step, Hs, joints)):
+    for n, own in enumerate(model.covariances(state, step, Hs)):
         moved = np.diag(step.kept[n]) @ state.P @ np.diag(step.kept[n]) + np.diag(step.added[n])
-        wanted = Hs[n] @ moved @ Hs[n].T + model.reading_noise(Hs, joints)[n]
+        wanted = Hs[n] @ moved @ Hs[n].T
         assert np.abs(own - wanted).max() < 1e-13 * np.abs(wanted).max()
 
 

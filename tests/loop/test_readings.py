@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from arm_bench import ARM, states
 
-from armsight.loop.estimators.parabola import SPAN_S
+from armsight.loop.estimators.parabola import LONG_SPAN_S, SPAN_S
 from armsight.loop.estimators.readings import GAP_RAD, KEPT_S, STILL_SPAN_S, Readings
 
 SIGMA = 3e-4
@@ -47,6 +47,36 @@ def test_the_variance_left_is_what_is_left(back_s, speed):
     # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2); a mean of M has 1/M.
     assert said.max() < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
     assert said[still] == pytest.approx(1 / (STILL_SPAN_S * 1000), rel=0.02)
+
+
+@pytest.mark.parametrize(("speed", "at_s"), [(0.0, 0.6), (0.5, 0.6)], ids=["standing", "moving"])
+def test_what_is_left_of_the_noise_lasts_as_long_as_is_said(speed, at_s):
+    """The integral of its correlation over all lags is that of a Gauss-Markov process with this time constant: twice it."""
+    rng = np.random.default_rng(12)
+    lags = np.arange(-400, 401) * 1e-3
+    products, said = np.zeros(len(lags)), []
+    for _ in range(60):
+        readings, _ = filled(lambda t: speed * t, 1.2, SIGMA, SIGMA * rng.normal(size=(1200, 6)))
+        out = readings.at(at_s + lags)
+        off = out.q - speed * (at_s + lags)[:, None]
+        products += off @ off[len(lags) // 2]
+        said.append(out.lasts_s[len(lags) // 2])
+    whole = products.sum() * 1e-3 / products[len(lags) // 2]
+    # A sum over 0.8 s of 360 draws that last for L: their mean product scatters by sqrt(0.8 / 2 L / 360) of the integral.
+    lasts = float(np.mean(said))
+    assert whole / 2 == pytest.approx(lasts, rel=4 * np.sqrt(0.8 / (2 * lasts) / 360) + 0.05)
+    assert lasts == pytest.approx(
+        0.15 if speed == 0 else LONG_SPAN_S / 4.5, rel=0.05
+    )  # half of 0.3 s; 4/9 of 0.098 s / 2
+
+
+def test_a_joint_that_drifts_is_averaged_where_its_readings_lie_around_the_time():
+    rng = np.random.default_rng(13)
+    # 1 mrad/s: in 0.3 s as much as the noise of one reading.
+    readings, _ = filled(lambda t: 1e-3 * t, 1.0, SIGMA, SIGMA * rng.normal(size=(1000, 6)))
+    out = readings.at(np.array([0.5]))
+    assert (out.variance < 2 / (STILL_SPAN_S * 1000)).all()
+    assert np.abs(out.q[0] - 0.5e-3).max() < 4 * SIGMA / np.sqrt(STILL_SPAN_S * 1000)
 
 
 def test_a_joint_that_begins_to_move_is_not_averaged_over_its_rest():

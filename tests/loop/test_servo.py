@@ -48,20 +48,23 @@ def play(cell, motion, servo, seconds, each=lambda step: None):
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_without_swinging(rate_hz):
-    cell = cell_of(21, rate_hz)
-    servo = PoseServo(ARM, timing(rate_hz))
     there, back = point_to_point(ARM, MIDDLE, GOAL), point_to_point(ARM, GOAL, MIDDLE)
-    settle_s = 4 * servo.timing.period_s / servo.timing.gain + 1.0
-    alone = play(cell, there, None, there.duration_s + 0.5)
-    closing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, settle_s)
-    path = play(cell, back, servo, back.duration_s + settle_s)
-    moving = round(back.duration_s / TICK_S)
-    before, after = rms(alone[-100:]), rms([rms(closing[-100:]), rms(path[-100:])])
-    assert after <= min(0.15, before / 10)
-    assert rms(path[:moving]) <= rms(alone[: round(there.duration_s / TICK_S)]) / 3
-    # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, 0.15 mm.
-    for rest in (closing, path[moving + 200 :]):
-        assert (rest - np.minimum.accumulate(rest)).max() < 0.15
+    before, after = [], []
+    for seed in (21, 32):
+        cell = cell_of(seed, rate_hz)
+        servo = PoseServo(ARM, timing(rate_hz))
+        settle_s = 4 * servo.timing.period_s / servo.timing.gain + 1.0
+        alone = play(cell, there, None, there.duration_s + 0.5)
+        closing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, settle_s)
+        path = play(cell, back, servo, back.duration_s + settle_s)
+        moving = round(back.duration_s / TICK_S)
+        before.append(rms(alone[-100:]))
+        after += [rms(closing[-100:]), rms(path[-100:])]
+        assert rms(path[:moving]) <= rms(alone[: round(there.duration_s / TICK_S)]) / 3
+        # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, 0.15 mm.
+        for rest in (closing, path[moving + 200 :]):
+            assert (rest - np.minimum.accumulate(rest)).max() < 0.15
+    assert rms(after) <= min(0.15, rms(before) / 10)
 
 
 @pytest.mark.parametrize("loose", [0.0, 1.0], ids=["tight gears", "loose gears"])

@@ -7,11 +7,12 @@ The true pose is modelled as
 with E_i = exp(e_i) a small motion of every link's frame (lengths, twists and zeros that differ from the table, and how the
 arm stands and holds its tool), d_i what its potentiometer does not say
 
-    d_i = c_i . b(q_i) - s_i w_i / 2 - f_i v_i / 2 + k_i (g_i(q) + h_i) + r_i
+    d_i = c_i . b(q_i) - s_i w_i / 2 - f_i v_i / 2 + k_i (g_i(q) + h_i) + r_i + n_i
 
 (b: linearity, a line and harmonics; w_i: backlash, s_i its side if friction decides on that; v_i and f_i: the same if
 weight and inertia do; k_i: compliance, g_i the gravity torque of a unit load, h_i that of its inertia; r_i: the rest, that
-forgets itself as the joint moves), and x what no joint explains, forgetting itself likewise. The derivatives are by the
+forgets itself as the joint moves; n_i: noise that smoothing left in its readings), and x what no joint explains, forgetting
+itself likewise. The derivatives are by the
 right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_tool_frame) e (Sola, "A micro Lie theory",
 2018, eq. 31).
 """
@@ -32,10 +33,11 @@ from armsight.robot.kinematics.trig import sincos
 HARMONICS = 3
 #: Functions of one joint's linearity.
 BASIS = 1 + 2 * HARMONICS
-#: Where the parts stand in the vector: the seven frames' tangents, linearity, backlash, compliance, rest, x, delay.
+#: Where the parts stand in the vector: the seven frames' tangents, linearity, backlash (two widths), compliance, rest,
+#: readings' noise, x, delay.
 LINKS, LINEARITY = 0, 42
 BACKLASH = LINEARITY + 6 * BASIS
-FLOAT, COMPLIANCE, REST, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 6))
+FLOAT, COMPLIANCE, REST, READING, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 7))
 SIZE = DELAY + 1
 #: Zeros of the joints: the turn about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
@@ -103,7 +105,8 @@ class Prior:
         links[ZEROS] = np.hypot(links[ZEROS], self.zero_rad)
         harmonics = np.repeat(self.harmonic_rad / np.arange(1, HARMONICS + 1) ** 1.5, 2)
         linearity = np.tile(np.append(self.gain, harmonics), 6)
-        joints = np.repeat([self.backlash_rad, self.float_rad, self.compliance, self.rest_rad], 6)
+        # What is left of the readings' noise depends on the readings at hand.
+        joints = np.repeat([self.backlash_rad, self.float_rad, self.compliance, self.rest_rad, 0.0], 6)
         rest = np.repeat([self.pose_m, self.pose_rad], 3)
         return np.concatenate([links, linearity, joints, rest, [sigma_delay_s]])
 
@@ -166,7 +169,7 @@ def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
             B[i, at + 1 + 2 * k], B[i, at + 2 + 2 * k] = sk, ck
             sk, ck = sk * c + ck * s, ck * c - sk * s
         B[i, BACKLASH + i], B[i, FLOAT + i] = -0.5 * unseen[0, i], -0.5 * unseen[1, i]
-        B[i, COMPLIANCE + i], B[i, REST + i] = g[i] + unseen[2, i], 1.0
+        B[i, COMPLIANCE + i], B[i, REST + i], B[i, READING + i] = g[i] + unseen[2, i], 1.0, 1.0
 
 
 @_kernel
@@ -212,7 +215,7 @@ def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Arra
             J = table[6 * i + 5] * H[row, 6 * i + 5]
             for k in range(LINEARITY + BASIS * i, LINEARITY + BASIS * (i + 1)):
                 H[row, k] = J * B[i, k]
-            for k in (BACKLASH + i, FLOAT + i, COMPLIANCE + i, REST + i):
+            for k in (BACKLASH + i, FLOAT + i, COMPLIANCE + i, REST + i, READING + i):
                 H[row, k] = J * B[i, k]
     _store_moved(F, x[POSE : POSE + 6], T)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import POSE, REST, SIZE, ZEROS, Prior
+from armsight.loop.estimators.armerror import BACKLASH, COMPLIANCE, FLOAT, POSE, READING, REST, SIZE, ZEROS, Prior
 from armsight.loop.estimators.estimator import Sighting
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.arm import Arm
@@ -25,19 +25,24 @@ LONGEST_CREEP_S = 4.0
 #: second early or late would be taken for a narrower backlash else.
 LEARNING = 6.0
 
+#: What is thrown open when vision insists, as after a bump: how the arm stands and holds its tool, and the joints' zeros.
+OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
+#: Of the vector the noise that smoothing left in the readings (6,).
+NOISE = slice(READING, POSE)
+_LEAST = 1e-9  # of a share
+
 
 class State(NamedTuple):
     """The filter right after a sighting, or before the first.
 
-    ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``, ``travel`` (6,), ``flips`` (2, 6):
-    when that was and how far the joints had come; ``sighting``: what went in last.
+    ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
+    readings smoothed them then, N = 1; ``sighting``: what went in last.
     """
 
     t_s: float
     x: Array
     P: Array
-    travel: Array
-    flips: Array
+    joints: Smoothed
     sighting: Sighting | None
 
 
@@ -46,6 +51,44 @@ class Step(NamedTuple):
 
     kept: Array
     added: Array
+
+
+def _opened() -> Array:
+    """Return the variances (SIZE,) that are added where all is thrown open."""
+    sigmas = np.zeros(SIZE)
+    sigmas[:6] = sigmas[36:42] = np.repeat([OPEN_M, OPEN_RAD], 3)
+    sigmas[ZEROS] = OPEN_RAD
+    return np.asarray(sigmas**2)
+
+
+OPENED = _opened()
+
+
+def smoothed_anew(state: State, then: Smoothed) -> State:
+    """Return a state as it is when the readings about its time are smoothed anew: where the joints were has not changed.
+
+    What is smoothed otherwise had another noise; links that were elsewhere in their play were off by another rest.
+    """
+    x = state.x.copy()
+    x[NOISE] += state.joints.q[0] - then.q[0]
+    friction, floats, lever = state.joints.unseen[0] - then.unseen[0]
+    x[REST:READING] -= 0.5 * (friction * x[BACKLASH:FLOAT] + floats * x[FLOAT:COMPLIANCE])
+    x[REST:READING] += lever * x[COMPLIANCE:REST]
+    return state._replace(x=x, joints=then)
+
+
+def bridged(before: Array, after: Array, ahead: Step, back: Step) -> tuple[Array, Array]:
+    """Return the readings' noise (N, 6) between the states before and after (N, SIZE), and what is added to variances.
+
+    The noise is held by both ends, as a Gauss-Markov process is: its mean there, and what is left of its variance. The
+    rest is known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
+    """
+    near, far = ahead.kept[:, NOISE] ** 2, back.kept[:, NOISE] ** 2
+    whole = np.maximum(1.0 - near * far, _LEAST)
+    noise = (before * ahead.kept)[:, NOISE] * (1.0 - far) + (after * back.kept)[:, NOISE] * (1.0 - near)
+    bridge = np.minimum(ahead.added, back.added)
+    bridge[:, NOISE] = np.maximum(ahead.added, back.added)[:, NOISE] * (1.0 - np.maximum(near, far)) / whole
+    return noise / whole, bridge
 
 
 class ErrorModel:
@@ -63,7 +106,8 @@ class ErrorModel:
     def __init__(self, arm: Arm, prior: Prior, sigma_delay_s: float) -> None:
         self._table, self._prior, self.sigmas = arm.table, prior, prior.sigmas(sigma_delay_s)
         sides = prior.flip_rad, prior.flip_float_rad
-        self._forgets = np.array([prior.rest_travel_rad, prior.pose_travel_rad, prior.creep_rad, *sides])
+        travels = prior.rest_travel_rad, prior.pose_travel_rad
+        self._forgets = np.array([*travels, prior.creep_rad, *sides, prior.reading_rad])
 
     def poses(self, x: Array, q: Array, unseen: Array) -> tuple[Array, Array]:
         """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, SIZE); x may be one for all."""
@@ -77,25 +121,33 @@ class ErrorModel:
 
         Changes of side leave the joints ``learning`` times as uncertain as they are.
         """
-        time_s = np.asarray(t_s, dtype=float) - state.t_s
-        return self.carried(time_s, joints.travel - state.travel, joints.flips - state.flips, learning=learning)
+        then = state.joints
+        come = joints.travel - then.travel, joints.flips - then.flips, np.repeat(then.variance, len(t_s), axis=0)
+        return self.carried(np.asarray(t_s, dtype=float) - state.t_s, *come, joints, learning=learning)
 
-    def carried(self, time_s: Array, travel: Array, flips: Array, *, learning: float = 1.0) -> Step:
-        """Return the same for times (N,), how far joints (N, 6) and how far sides (N, 2, 6) have come."""
+    def carried(
+        self, time_s: Array, travel: Array, flips: Array, was: Array, joints: Smoothed, *, learning: float = 1.0
+    ) -> Step:
+        """Return the same for times (N,), and how far joints (N, 6) and sides (N, 2, 6) have come.
+
+        Args:
+            time_s: (N,) since a state, s.
+            travel: (N, 6) of the joints meanwhile, rad.
+            flips: (N, 2, 6) of the sides.
+            was: (N, 6) what was left of a reading's variance at the state.
+            joints: at the times.
+            learning: as above.
+        """
         kept, added = np.ones((len(time_s), SIZE)), np.zeros((len(time_s), SIZE))
-        _forget(time_s, travel, flips, self.sigmas, self._forgets, learning, kept, added)
+        noise = joints.variance, joints.lasts_s, was
+        _forget(time_s, travel, flips, *noise, self.sigmas, self._forgets, learning, kept, added)
         return Step(kept, added)
 
-    def covariances(self, state: State, step: Step, Hs: Array, joints: Smoothed) -> Array:
+    def covariances(self, state: State, step: Step, Hs: Array) -> Array:
         """Return the covariances (N, 6, 6) of poses that a state tells, a step on, without what all sightings share."""
         own = np.empty((len(Hs), 6, 6))
-        _covariances(Hs, step.kept, step.added, state.P, joints.variance, self._prior.reading_rad**2, own)
+        _covariances(Hs, step.kept, step.added, state.P, own)
         return own
-
-    def reading_noise(self, Hs: Array, joints: Smoothed) -> Array:
-        """Return the covariances (N, 6, 6) of poses from the readings' noise."""
-        J = Hs[:, :, ZEROS]
-        return np.asarray(self._prior.reading_rad**2 * (J * joints.variance[:, None, :]) @ np.swapaxes(J, 1, 2))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -103,14 +155,20 @@ def _forget(
     time: Array,
     travel: Array,
     flips: Array,
+    variance: Array,
+    lasts: Array,
+    was: Array,
     sigmas: Array,
     forgets: Array,
     learning: float,
     kept: Array,
     added: Array,
 ) -> None:
-    """Write into kept and added (N, SIZE), ones and zeros before, what times (N,), travel (N, 6) and flips (N, 2, 6) do."""
-    rest_travel, pose_travel, creep, flip, flip_float = forgets
+    """Write into kept and added (N, SIZE), ones and zeros before, what times (N,), travel (N, 6) and flips (N, 2, 6) do.
+
+    Of the readings' noise: ``variance`` and ``lasts`` (N, 6) as in ``Smoothed``, ``was`` (N, 6) the variance at the state.
+    """
+    rest_travel, pose_travel, creep, flip, flip_float, reading = forgets
     for n in range(len(time)):
         whole, crept = 0.0, creep**2 * min(abs(time[n]), LONGEST_CREEP_S)
         for i in range(6):
@@ -120,16 +178,20 @@ def _forget(
             # A whole change of side moves it from -1 to 1.
             flipped = flip**2 * max(flips[n, 0, i], 0.0) + flip_float**2 * max(flips[n, 1, i], 0.0)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + crept + 0.5 * learning**2 * flipped
+            # Of two means of the same readings the one of more has the share of the other's noise that it has of readings.
+            share, k = min(variance[n, i] / was[n, i], 1.0), READING + i
+            kept[n, k] = share * math.exp(-abs(time[n]) / lasts[n, i])
+            added[n, k] = reading**2 * max(variance[n, i] - kept[n, k] ** 2 * was[n, i], 0.0)
         for k in range(POSE, POSE + 6):
             kept[n, k] = math.exp(-whole / pose_travel)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _covariances(Hs: Array, kept: Array, added: Array, P: Array, variance: Array, reading: float, own: Array) -> None:
-    """Write H (K P K + A) H' + r J V J' into own (N, 6, 6): Hs (N, 6, SIZE), kept, added (N, SIZE), variance (N, 6).
+def _covariances(Hs: Array, kept: Array, added: Array, P: Array, own: Array) -> None:
+    """Write H (K P K + A) H' into own (N, 6, 6): Hs (N, 6, SIZE), kept, added (N, SIZE).
 
-    A has the rest and the pose alone (:func:`_forget`), J are the columns of the joints, r is a reading's variance.
+    A has the rest, the readings' noise and the pose alone (:func:`_forget`).
     """
     by, moved = np.empty((SIZE, 6)), np.empty((6, SIZE))
     for n in range(len(Hs)):
@@ -152,11 +214,6 @@ def _covariances(Hs: Array, kept: Array, added: Array, P: Array, variance: Array
             for row in range(6):
                 for column in range(6):
                     own[n, row, column] += H[row, k] * added[n, k] * H[column, k]
-        for i in range(6):
-            k = 6 * i + 5  # as ZEROS has it
-            for row in range(6):
-                for column in range(6):
-                    own[n, row, column] += reading * H[row, k] * variance[n, i] * H[column, k]
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.estimators.parabola import SPAN_S, fit, window
+from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_turn, first_frame
 from armsight.robot.kinematics.trig import sincos
@@ -212,7 +212,7 @@ def float_on(
     """
     motion, place, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
     for k in range(max(begin, first + 1), end):
-        low, high = window(t, first, end - first, t[k], SPAN_S)
+        low, high = window(t, first, end - first, t[k], span(t[k], t[end - 1]))
         fit(t, q, low, high, t[k], motion)
         before, now = memory[k - 1], memory[k]
         place[:], speed[:] = before[0] * half, before[1] * half

@@ -18,10 +18,10 @@ from scipy.special import chdtri
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.errormodel import LEARNING, ErrorModel, State, Step, chi_square, symmetric
+from armsight.loop.estimators.errormodel import LEARNING, NOISE, OPENED, ErrorModel, State, Step, chi_square, symmetric
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
-from armsight.loop.estimators.smoothing import Stretch, blended, by_state, stretches
+from armsight.loop.estimators.smoothing import Stretch, anew, blended, by_state, stretches
 from armsight.robot.arm import Arm
 
 #: A sighting less likely than this is an outlier.
@@ -32,28 +32,16 @@ STUBBORN = 6
 HISTORY_S = 1.0
 #: Sightings newer than the readings that are kept waiting.
 MOST_WAITING = 16
-#: What is thrown open when vision insists, as after a bump: how the arm stands and holds its tool, and the joints' zeros.
-OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 #: Linearisations per sighting at most, and the change (m, rad) that ends them: it leaves about its square.
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
 #: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
 WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
-#: The diagonal of a covariance, and the rows of what motion makes it forget: the rest and, next to it, the pose.
+#: The diagonal of a covariance, and the rows of what is forgotten: the rest, the readings' noise and the pose.
+#: They stand side by side.
 DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
 _GATE = float(chdtri(6, CHANCE))
-
-
-def _opened() -> Array:
-    """Return the variances (SIZE,) that are added where all is thrown open."""
-    sigmas = np.zeros(SIZE)
-    sigmas[:6] = sigmas[36:42] = np.repeat([OPEN_M, OPEN_RAD], 3)
-    sigmas[ZEROS] = OPEN_RAD
-    return np.asarray(sigmas**2)
-
-
-_OPENED = _opened()
 
 
 class KalmanEstimator:
@@ -69,13 +57,14 @@ class KalmanEstimator:
         self._arm, self._prior, self._delay = arm, prior or Prior(), delay
         self._readings = Readings(self._prior.reading_rad, arm)
         self._model = ErrorModel(arm, self._prior, delay.sigma_s)
-        nowhere = np.zeros(6), np.zeros((2, 6))
-        self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), *nowhere, None)]
+        none, ones = np.zeros((1, 6)), np.ones((1, 6))
+        nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, 6)), none, np.zeros((1, 2, 6)))
+        self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
         self._waiting: list[Sighting] = []
         self._outliers: list[Array] = []
         self._told = True  # whether the readings know how wide the backlash is, as far as that is known
-        # At the newest reading, until something is heard: the joints and what came of the state, and the tool.
-        self._here: tuple[Smoothed, Step] | None = None
+        # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
+        self._here: tuple[State, Smoothed, Step] | None = None
         self._newest: ArmEstimate | None = None
 
     @property
@@ -128,23 +117,25 @@ class KalmanEstimator:
         if t_s is not None:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
-            newest = np.array([self.span_s[1]])
-            self._newest = by_state(self._model, self._states[-1], newest, *self._now())[0]
+            state, joints, step = self._now()
+            self._newest = by_state(self._model, state, np.array([self.span_s[1]]), joints, step)[0]
         return self._newest
 
-    def _now(self) -> tuple[Smoothed, Step]:
-        """Return the joints at the newest reading, and what moved since the newest sighting."""
+    def _now(self) -> tuple[State, Smoothed, Step]:
+        """Return the state after the newest sighting, the joints at the newest reading, and what moved meanwhile."""
         if self._here is None:
-            newest = np.array([self.span_s[1]])
-            joints = self._readings.at(newest)
-            self._here = joints, self._model.moved(self._states[-1], joints, newest)
+            self._here = self._since(np.array([self.span_s[1]]))
         return self._here
+
+    def _since(self, t_s: Array) -> tuple[State, Smoothed, Step]:
+        """Return the same at (N,) times."""
+        joints, (state,) = self._readings.at(t_s), anew(self._readings, self._states[-1:])
+        return state, joints, self._model.moved(state, joints, t_s)
 
     def track(self, t_s: Array) -> Track:
         """Return where the tool is at (N,) times."""
-        joints = self._readings.at(np.asarray(t_s, dtype=float))
-        state = self._states[-1]
-        return by_state(self._model, state, t_s, joints, self._model.moved(state, joints, t_s))
+        state, joints, step = self._since(np.asarray(t_s, dtype=float))
+        return by_state(self._model, state, t_s, joints, step)
 
     def smoothed(self, t_s: Array) -> Track:
         """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
@@ -163,18 +154,21 @@ class KalmanEstimator:
 
     def tool(self, q: Array, qd: Array) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
-        (now, step), state = self._now(), self._states[-1]
+        state, now, step = self._now()
         unseen = np.repeat(now.unseen, len(q), axis=0)
         unseen[:, 0] = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.unseen[:, 0])
-        return self._model.poses(state.x * step.kept, q, unseen)[0]
+        x = state.x * step.kept
+        x[:, NOISE] = 0.0  # noise of what was read, not of what might be
+        return self._model.poses(x, q, unseen)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
-        (now, step), state = self._now(), self._states[-1]
+        state, now, step = self._now()
         x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
         by = np.empty((6, SIZE))
         armerror.offsets_by(self._arm.table, now.q[0], now.unseen[0], by)
         by[np.arange(6), ZEROS] = self._arm.direction
+        by[:, NOISE] = 0.0  # of the arm, not of the moment
         sigma = np.sqrt(np.diag(P))
         return Learned(
             by @ x,
@@ -203,7 +197,7 @@ class KalmanEstimator:
     def _take(self, before: State, sighting: Sighting) -> tuple[State | None, Verdict]:
         """Return the state after a sighting, None where it is an outlier."""
         t_s = max(self._seen_s(sighting, before), before.t_s)
-        joints = self._readings.at(np.array([t_s]))
+        joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         x, P = before.x * step.kept[0], before.P.copy()
         P[FORGETS] *= step.kept[0, FORGETS, None]
@@ -215,10 +209,10 @@ class KalmanEstimator:
         if verdict is Verdict.OUTLIER:
             return None, verdict
         if verdict is Verdict.REOPENED:
-            P[DIAGONAL] += _OPENED
+            P[DIAGONAL] += OPENED
             PHt = P @ H.T
         x, P = self._update(x, P, joints, sighting, first, PHt)
-        return State(t_s, x, P, joints.travel[0], joints.flips[0], sighting), verdict
+        return State(t_s, x, P, joints, sighting), verdict
 
     def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
         """Return how far a sighting is from the model (6,), its derivative (6, SIZE) by x, and the noise (6, 6)."""
@@ -226,8 +220,7 @@ class KalmanEstimator:
         H = Hs[0]
         velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
         H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
-        R = sighting.cov_noise + self._model.reading_noise(Hs, joints)[0]
-        R += self._delay.jitter_s**2 * np.outer(velocity, velocity)
+        R = sighting.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
         z = np.empty(6)
         armerror.tangent(Ts[0], sighting.T_base_tool, z)
         return z, H, R

@@ -13,6 +13,9 @@ from armsight.data import Array
 #: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
 #: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
 SPAN_S = 0.049
+#: Where as many follow as went before it is up to this, s: a centred parabola is not led astray by jerk. Of accelerations
+#: that leaves a sixth of the noise, and of what passes between two sightings, which hold the rest, a third.
+LONG_SPAN_S = 2 * SPAN_S
 #: Fewest readings for a parabola; fewer are averaged.
 PARABOLA = 5
 
@@ -20,11 +23,17 @@ _kernel = numba.njit(cache=True, error_model="numpy")
 
 
 @_kernel
-def window(t: Array, first: int, count: int, at: float, span: float) -> tuple[int, int]:
+def span(at: float, newest: float) -> float:
+    """Return the time, s, within which readings tell of a time when the newest is of another, s."""
+    return min(max(2 * (newest - at), SPAN_S), LONG_SPAN_S)
+
+
+@_kernel
+def window(t: Array, first: int, count: int, at: float, length: float) -> tuple[int, int]:
     """Return the rows of a span of time around a time, s: around it as far as there are any, else before or after."""
     last = first + count - 1
-    late = min(max(at + 0.5 * span, t[first] + span), t[last])
-    low = first + np.searchsorted(t[first : last + 1], late - span)
+    late = min(max(at + 0.5 * length, t[first] + length), t[last])
+    low = first + np.searchsorted(t[first : last + 1], late - length)
     high = first + np.searchsorted(t[first : last + 1], late, side="right") - 1
     return min(low, high), high
 

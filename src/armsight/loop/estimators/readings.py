@@ -1,10 +1,10 @@
 """The potentiometers' readings of the last seconds: smoothed, with speeds, and with what hysteresis depends on.
 
-In: JointStates. Out: joint angles and speeds at any time kept, and the variance that smoothing leaves of a reading's noise.
-At a time t a parabola is laid through the readings of up to ``SPAN_S`` around it, or before it where it is the newest
-(``parabola``). Beside each reading stands how far every joint has travelled and on which side of its backlash it should be,
-twice: if friction decides on that, the play operator (Krasnosel'skii and Pokrovskii, "Systems with hysteresis", 1989),
-behind a dead zone that the readings' noise does not cross; if weight and inertia do, where its link floats (``floating``).
+In: JointStates. Out: joint angles and speeds at any time kept, and what smoothing leaves of a reading's noise. At a time t
+a parabola is laid through the readings around it, or before it where it is the newest (``parabola``). Beside each reading
+stands how far every joint has travelled and on which side of its backlash it should be, twice: if friction decides on it,
+the play operator (Krasnosel'skii and Pokrovskii, "Systems with hysteresis", 1989), behind a dead zone that the readings'
+noise does not cross; if weight and inertia do, where its link floats (``floating``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.loop.estimators.floating import float_on, masses
-from armsight.loop.estimators.parabola import PARABOLA, SPAN_S, fit, window
+from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
 from armsight.robot.arm import Arm
 
 #: A joint that shows no motion within this time around (or, where it is the newest, before) a time stands still there, s,
@@ -40,6 +40,8 @@ GAP_RAD = np.deg2rad(0.2)
 LEAST_GAP_RAD = np.deg2rad(0.05)
 #: What counts as motion of an arm, in standard deviations of a speed; while it stands, its links do.
 _STILL = 4.0
+#: So often links float anew through the rows that are not settled yet, s.
+_AGAIN_S = 0.012
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
@@ -54,6 +56,7 @@ class Smoothed(NamedTuple):
         q: (N, 6) angles, rad.
         qd: (N, 6) speeds, rad/s.
         variance: (N, 6) what is left of a reading's variance.
+        lasts_s: (N, 6) how long what is left of the noise lasts, s: the time constant of its correlation.
         unseen: (N, 3, 6) on what hangs where the links are beyond their shafts. First the side of the backlash if friction
             decides on it, -1 to 1: 1 when the joint came up from below; then if weight and inertia do; then the lever of
             what inertia does to a unit load, m.
@@ -64,6 +67,7 @@ class Smoothed(NamedTuple):
     q: Array
     qd: Array
     variance: Array
+    lasts_s: Array
     unseen: Array
     travel: Array
     flips: Array
@@ -92,18 +96,26 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 
 
 @_kernel
-def _rest(q: Array, low: int, high: int, sigma: float, angles: Array, speeds: Array, variance: Array) -> None:
-    """Put the means of rows low to high in the place of fitted angles (6,) of joints that stand still meanwhile."""
+def _rest(
+    t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array
+) -> None:
+    """Put the means of rows low to high in the place of fitted angles (6,) of joints that stand still meanwhile.
+
+    Of joints that drift a little, too, as far as the rows lie around the time: there drift does not move the mean.
+    """
     half, n = (high - low + 1) // 2, high - low + 1
+    aside = abs(2 * at - t[low] - t[high]) / (t[high] - t[low])
     for i in range(6):
         early = late = 0.0
         for k in range(half):
             early += q[low + k, i]
             late += q[high - k, i]
-        mean, drift = (early + late) / (2 * half), abs(late - early) / half
-        moves = drift > _MOTION * sigma * math.sqrt(2.0 / half)
-        if not moves and abs(angles[i] - mean) < _MOTION * sigma * math.sqrt(variance[i]):
-            angles[i], speeds[i], variance[i] = mean, 0.0, 1.0 / n
+        mean, drift = (early + late) / (2 * half), (late - early) / half
+        noise = _MOTION * sigma * math.sqrt(2.0 / half)
+        stands = abs(drift) * aside <= noise and abs(drift) <= max(noise, sigma)
+        if stands and abs(angles[i] - mean) < _MOTION * sigma * math.sqrt(variance[i]):
+            angles[i], variance[i] = mean, 1.0 / n
+            speeds[i] = 2 * drift / (t[high] - t[low]) if abs(drift) > noise else 0.0
 
 
 @_kernel
@@ -118,21 +130,25 @@ def _smooth(
     qs: Array,
     qds: Array,
     variance: Array,
+    lasts: Array,
     unseen: Array,
     travel: Array,
     flips: Array,
 ) -> bool:
     """Write the joints at times (N,) into the parts of a :class:`Smoothed`; return whether all are within those kept."""
-    motion = np.empty((3, 6))
+    motion, newest = np.empty((3, 6)), t[first + count - 1]
     for n in range(len(at)):
-        if not t[first] <= at[n] <= t[first + count - 1]:
+        if not t[first] <= at[n] <= newest:
             return False
-        low, high = window(t, first, count, at[n], SPAN_S)
+        low, high = window(t, first, count, at[n], span(at[n], newest))
         variance[n] = fit(t, q, low, high, at[n], motion)
         qs[n], qds[n] = motion[0], motion[1]
+        period = (t[high] - t[low]) / max(high - low, 1)
         low, high = window(t, first, count, at[n], STILL_SPAN_S)
         if high - low > 4 * PARABOLA:
-            _rest(q, low, high, sigma, qs[n], qds[n], variance[n])
+            _rest(t, q, low, high, at[n], sigma, qs[n], qds[n], variance[n])
+        # The correlation's integral over all lags is, of any weights w that sum to one, the period over the sum of w^2.
+        lasts[n] = 0.5 * period / variance[n]
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
         for i in range(6):
             unseen[n, 0, i], unseen[n, 1, i], unseen[n, 2, i] = memory[k, 2, i], -memory[k, 4, i], memory[k, 7, i]
@@ -157,11 +173,10 @@ def _take_on(
     beside: Array,
     still: float,
 ) -> int:
-    """Reckon on over new rows begin to end; return the row up to which the links' floating will not change any more."""
+    """Reckon on over new rows begin to end, the floating from row ``settled`` on; return where it may still change."""
     _take(t, q, memory, first, begin, end, dead, gap)
-    # The newest rows are smoothed by what came before them alone; as more comes, they are gone through again.
     float_on(t, q, memory[:, 4:], first, settled, end, table, points, beside, still, gap)
-    return max(int(np.searchsorted(t[:end], t[end - 1] - 0.5 * SPAN_S)), settled)
+    return max(int(np.searchsorted(t[:end], t[end - 1] - 0.5 * LONG_SPAN_S)), settled)
 
 
 @_kernel
@@ -192,6 +207,7 @@ class Readings:
         # Beside each reading: travel, flips, side, place behind the dead zone; then what ``floating`` writes.
         self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 8, 6))
         self._first = self._count = self._settled = 0
+        self._gone_s = -np.inf
         # The variance that a parabola leaves of its slope at its end is 192/(N SPAN^2).
         self._still = float(_STILL * sigma_rad * np.sqrt(192 / (SPAN_S * 1000)) / SPAN_S)
         self._table, (self._points, self._beside) = arm.table, masses(arm)
@@ -241,8 +257,13 @@ class Readings:
             raise InputError("potentiometer readings must come in order of time; the times given do not rise")
         self._count += len(t)
         # Only the very first row starts the hysteresis; later ones carry on from the row before.
-        rows, links = (self._first, self._settled, begin, end), (self._table, self._points, self._beside)
-        self._settled = _take_on(self._t, self._q, self._memory, *rows, self._dead, self._gap, *links, self._still)
+        # The newest rows are smoothed by what came before them alone; when more has come, they are gone through again.
+        again = self._t[end - 1] - self._gone_s >= _AGAIN_S
+        rows = self._first, self._settled if again else begin, begin, end
+        links = self._table, self._points, self._beside
+        settled = _take_on(self._t, self._q, self._memory, *rows, self._dead, self._gap, *links, self._still)
+        if again:
+            self._gone_s, self._settled = self._t[end - 1], settled
 
     def at(self, t_s: Array) -> Smoothed:
         """Return the joints at (N,) times within those kept.
@@ -253,6 +274,7 @@ class Readings:
         oldest, newest = self.span_s
         at, n = np.array(t_s, dtype=float), len(t_s)
         joints = Smoothed(
+            np.empty((n, 6)),
             np.empty((n, 6)),
             np.empty((n, 6)),
             np.empty((n, 6)),

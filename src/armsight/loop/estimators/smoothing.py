@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Array, Ids
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators.armerror import SIZE
-from armsight.loop.estimators.errormodel import ErrorModel, State, Step, shared
+from armsight.loop.estimators.errormodel import NOISE, ErrorModel, State, Step, bridged, shared, smoothed_anew
 from armsight.loop.estimators.estimator import Track
 from armsight.loop.estimators.readings import Readings, Smoothed
 
@@ -80,16 +80,27 @@ def _merged(parts: list[Stretch]) -> list[Stretch]:
     return merged
 
 
+def anew(readings: Readings, states: list[State]) -> list[State]:
+    """Return states as they are by the readings that have come since, as far as those about their times are kept."""
+    oldest, _ = readings.span_s
+    kept = [state.t_s >= oldest for state in states]
+    if not any(kept):
+        return states
+    then = readings.at(np.array([state.t_s for state, there in zip(states, kept, strict=True) if there]))
+    rows = iter([Smoothed(*(part[k : k + 1] for part in then)) for k in range(len(then.q))])
+    return [smoothed_anew(state, next(rows)) if there else state for state, there in zip(states, kept, strict=True)]
+
+
 def by_state(model: ErrorModel, state: State, t_s: Array, joints: Smoothed, step: Step) -> Track:
     """Return where the tool is at times (N,), s, by one state, a step on."""
     Ts, Hs = model.poses(state.x * step.kept, joints.q, joints.unseen)
-    own, age = model.covariances(state, step, Hs, joints), t_s - state.t_s
+    own, age = model.covariances(state, step, Hs), t_s - state.t_s
     return Track(t_s, Ts, own + shared(state.sighting, Ts), own, joints.q, joints.qd, age)
 
 
 def _alone(model: ErrorModel, readings: Readings, part: Stretch) -> Track:
-    joints = readings.at(part.t_s)
-    return by_state(model, part.before, part.t_s, joints, model.moved(part.before, joints, part.t_s))
+    joints, (before,) = readings.at(part.t_s), anew(readings, [part.before])
+    return by_state(model, before, part.t_s, joints, model.moved(before, joints, part.t_s))
 
 
 def _columns(track: Track) -> tuple[Array, ...]:
@@ -103,11 +114,16 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Tra
     t_s = np.concatenate([part.t_s for part in parts])
     rows = np.repeat(np.arange(len(parts)), [len(part.t_s) for part in parts])
     joints = readings.at(t_s)
-    before, after = _ends([part.before for part in parts]), _ends([part.after for part in parts if part.after])
-    ahead = model.carried(t_s - before.t_s[rows], *_come(before, joints, rows))
-    back = model.carried(t_s - after.t_s[rows], *(-come for come in _come(after, joints, rows)))
-    Ts, Hs = model.poses(before.x[rows] * ahead.kept, joints.q, joints.unseen)
-    Ts_after, _ = model.poses(after.x[rows] * back.kept, joints.q, joints.unseen)
+    before = _ends(anew(readings, [part.before for part in parts]))
+    after = _ends(anew(readings, [part.after for part in parts if part.after]))
+    ahead = model.carried(t_s - before.t_s[rows], *_come(before, joints, rows), before.variance[rows], joints)
+    travel, flips = _come(after, joints, rows)
+    back = model.carried(t_s - after.t_s[rows], -travel, -flips, after.variance[rows], joints)
+    x, x_after = before.x[rows] * ahead.kept, after.x[rows] * back.kept
+    noise, bridge = bridged(before.x[rows], after.x[rows], ahead, back)
+    x[:, NOISE] = x_after[:, NOISE] = noise
+    Ts, Hs = model.poses(x, joints.q, joints.unseen)
+    Ts_after, _ = model.poses(x_after, joints.q, joints.unseen)
     share = _share(t_s, joints, before, after, rows)
     Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
     own, common, turned = np.empty((len(t_s), 6, 6)), np.empty((len(t_s), 6, 6)), np.swapaxes(Hs, 1, 2)
@@ -118,20 +134,19 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Tra
         first, last = ((H @ P).reshape(-1, 6, SIZE) for P in (before.P[k], after.P[k]))
         own[some] = (first + share[some, None, None] * (last - first)) @ turned[some]
         common[some] = shared(None if part.after is None else part.after.sighting, Ts[some])
-    # Known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
-    bridge = np.minimum(ahead.added, back.added)
-    own += (Hs * bridge[:, None, :]) @ turned + model.reading_noise(Hs, joints)
+    own += (Hs * bridge[:, None, :]) @ turned
     return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - before.t_s[rows])
 
 
 class _Ends(NamedTuple):
-    """The ends of K stretches: times (K,), states (K, SIZE), their covariances, travel (K, 6), flips (K, 2, 6)."""
+    """The ends of K stretches: times (K,), states (K, SIZE), covariances, travel, flips (K, 2, 6), variances (K, 6)."""
 
     t_s: Array
     x: Array
     P: list[Array]
     travel: Array
     flips: Array
+    variance: Array
 
 
 def _ends(states: list[State]) -> _Ends:
@@ -139,9 +154,12 @@ def _ends(states: list[State]) -> _Ends:
         np.array([state.t_s for state in states]),
         np.array([state.x for state in states]),
         [state.P for state in states],
-        np.array([state.travel for state in states]),
-        np.array([state.flips for state in states]),
+        *(np.concatenate(part) for part in zip(*(_far(state.joints) for state in states), strict=True)),
     )
+
+
+def _far(joints: Smoothed) -> tuple[Array, Array, Array]:
+    return joints.travel, joints.flips, joints.variance
 
 
 def _come(ends: _Ends, joints: Smoothed, rows: Ids) -> tuple[Array, Array]:
