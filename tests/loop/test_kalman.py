@@ -275,3 +275,17 @@ def test_what_a_sighting_told_stays_as_its_readings_are_smoothed_anew():
         # Joints are where they were but for the slope of linearity and sag, some 0.01, over what smoothing moved them by.
         moved_mm = distance_mm(then.Ts_base_tool, now.Ts_base_tool)[0]
         assert moved_mm < 0.01 * np.abs(now.q - then.q).sum() * 1e3
+
+
+def test_a_delay_that_is_not_to_be_learned_stays_and_counts():
+    rng = np.random.default_rng(17)
+    delay = Delay(0.03, 3e-4, 1e-4)
+    estimator = KalmanEstimator(ARM, delay=delay, learns_delay=False)
+    track, Ts = run(rng, estimator, worn(rng), legs(rng, 4.0), late_s=0.0303, jitter_s=1e-4)
+    learned = estimator.learned().delay
+    assert (learned.delay_s, learned.sigma_s) == pytest.approx((0.03, 3e-4), rel=1e-12)
+    fast = int(np.argmax(np.linalg.norm(np.diff(Ts[2000:, :3, 3], axis=0), axis=1))) + 2000
+    speed = (Ts[fast + 1] - Ts[fast - 1])[:3, 3] / (2 * TICK_S)
+    way = Ts[fast][:3, :3].T @ speed / np.linalg.norm(speed)
+    assert way @ track.covs[fast, :3, :3] @ way > (3e-4 * np.linalg.norm(speed)) ** 2
+    assert np.linalg.eigvalsh(track.covs_own).min() > 0

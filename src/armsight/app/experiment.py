@@ -184,7 +184,7 @@ def _prepare(
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
     back = point_to_point(arm, middle, plan.start)
     there = Segment("calibration", "to the start", "joints", False, trajectory=back)
-    loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay))
+    loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))
     loop.run(Planned(back, loop.t_s, gravity), back.duration_s + 0.5, there)
 
 

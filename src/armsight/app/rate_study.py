@@ -74,7 +74,10 @@ def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, 
     station.board.enable()
     log = Log()
     loop = Loop(
-        station, Follower(rig, station.target), log, KalmanEstimator(station.arm, prior=PRIOR, delay=outcome.delay)
+        station,
+        Follower(rig, station.target),
+        log,
+        KalmanEstimator(station.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
     )
     loop.mounting = outcome.handeye.mounting
     servo = PoseServo(station.arm, timing(station, outcome.delay))

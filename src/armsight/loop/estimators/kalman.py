@@ -50,11 +50,13 @@ class KalmanEstimator:
     Args:
         arm: the arm, as its table says it is.
         prior: how far it may be off.
-        delay: how late the camera's stamps are; its sigma says how far the filter may correct it.
+        delay: how late the camera's stamps are.
+        learns_delay: whether the delay is corrected, as far as its sigma allows, or left as it is and its sigma reckoned
+            with: then what is not modelled of the play cannot be taken for it.
     """
 
-    def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
-        self._arm, self._prior, self._delay = arm, prior or Prior(), delay
+    def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
+        self._arm, self._prior, self._delay, self._learns_delay = arm, prior or Prior(), delay, learns_delay
         self._readings = Readings(self._prior.reading_rad, arm)
         self._model = ErrorModel(arm, self._prior, delay.sigma_s)
         none, ones = np.zeros((1, 6)), np.ones((1, 6))
@@ -247,6 +249,8 @@ class KalmanEstimator:
         (z, H, R), change = first, np.zeros(SIZE)
         for left in range(ITERATIONS, 0, -1):
             K = np.linalg.solve(H @ PHt + R, PHt.T).T
+            if not self._learns_delay:
+                K[DELAY] = 0.0
             last, change = change, K @ z
             if left == 1 or np.abs(change - last).max() < SETTLED:
                 break
@@ -255,6 +259,8 @@ class KalmanEstimator:
             z += H[:, :DELAY] @ change[:DELAY]
             PHt = P @ H.T
         P -= K @ PHt.T
+        if not self._learns_delay:  # its row is as it was, its column is right
+            P[DELAY] = P[:, DELAY]
         symmetric(P)
         return x + change, P
 
