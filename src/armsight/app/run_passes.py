@@ -10,7 +10,7 @@ from armsight.app.run_loop import Controller, Loop
 from armsight.app.run_motions import Closed, Planned
 from armsight.data import Array
 from armsight.loop.servo import PoseServo
-from armsight.robot.trajectories import Trajectory
+from armsight.robot.trajectories import Tabled, Trajectory
 
 #: Without a loop to settle the arm need not stand longer, s.
 OPEN_REST_S = 0.5
@@ -43,7 +43,7 @@ def drive(
     phase = "closed_loop" if closed else "open_loop"
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
-        controller = control(motion.trajectory, loop.t_s)
+        controller = control(Tabled(motion.trajectory), loop.t_s)
         segment = Segment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)

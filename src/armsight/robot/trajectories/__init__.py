@@ -8,6 +8,7 @@ from armsight.robot.trajectories.circle import arc, circle
 from armsight.robot.trajectories.line import line
 from armsight.robot.trajectories.point_to_point import point_to_point
 from armsight.robot.trajectories.resolved_rate import resolved_rate
+from armsight.robot.trajectories.tabled import Tabled
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory
 from armsight.robot.trajectories.waypoints import waypoints
 
@@ -15,6 +16,7 @@ __all__ = [
     "TRAJECTORIES",
     "Joints",
     "MotionRefused",
+    "Tabled",
     "Trajectory",
     "arc",
     "circle",
