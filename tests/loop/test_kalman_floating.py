@@ -105,6 +105,22 @@ def test_where_nothing_presses_friction_decides(way):
     assert (side_of(way * 0.05 * t, rows) * way > 0.99).all()
 
 
+@pytest.mark.parametrize("way", [-1, 1])
+def test_a_loose_link_stays_where_it_is_while_its_shaft_creeps(way):
+    t = np.arange(4000) * TICK_S
+    far = np.radians(0.05)
+    shaft = 0.05 * np.clip(t, 0.0, 1.0) + way * far * np.clip(t - 1.5, 0.0, 1.0)
+    before, after = side_of(shaft, np.array([1450, 2900]))
+    assert after - before == pytest.approx(way * 2 * far / GAP_RAD, abs=0.02)
+
+
+def test_loose_is_what_no_weight_turns():
+    readings = Readings(1e-9, ARM)
+    loose = readings.loose(MIDDLE)
+    assert loose[0]  # upright
+    assert not loose[1]  # it carries the arm
+
+
 class Floating(TrueArm):
     """An arm whose link 1 coasts in its backlash; the others have none."""
 

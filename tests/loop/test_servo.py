@@ -61,9 +61,10 @@ def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_w
         before.append(rms(alone[-100:]))
         after += [rms(closing[-100:]), rms(path[-100:])]
         assert rms(path[:moving]) <= rms(alone[: round(there.duration_s / TICK_S)]) / 3
-        # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, 0.15 mm.
+        # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, and a play
+        # that is crossed by its learned width, a tenth of a millimetre each.
         for rest in (closing, path[moving + 200 :]):
-            assert (rest - np.minimum.accumulate(rest)).max() < 0.15
+            assert (rest - np.minimum.accumulate(rest)).max() < 0.2
     assert rms(after) <= min(0.15, rms(before) / 10)
 
 
@@ -102,24 +103,28 @@ def test_the_gain_rule_is_the_edge_of_overshoot_and_far_from_that_of_stability(r
 
 
 def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
-    cell = cell_of(23, 60)
-    servo = PoseServo(ARM, timing(60))
-    still = point_to_point(ARM, MIDDLE, MIDDLE + 1e-9)
-    play(cell, still, servo, 3.0)
-    steps = []
-    cell.blind = True
-    apart = play(cell, point_to_point(ARM, MIDDLE, GOAL), servo, 3.0, steps.append)
-    modes = [step.mode for step in steps]
-    assert modes[0] is Mode.VISION
-    assert Mode.BRIDGED in modes
-    assert modes[-1] is Mode.POTENTIOMETERS
-    assert "vision is lost" in modes[-1].value
-    held = [step.correction for step in steps if step.mode is Mode.POTENTIOMETERS]
-    assert np.allclose(held[0], held[-1], rtol=0, atol=1e-14)
-    cell.blind = False
-    seeing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
-    assert steps[-1].mode is Mode.VISION
-    assert seeing[-1] < min(0.2, apart[-1])
+    left = []
+    for seed in (22, 23, 24):
+        cell = cell_of(seed, 60)
+        servo = PoseServo(ARM, timing(60))
+        still = point_to_point(ARM, MIDDLE, MIDDLE + 1e-9)
+        play(cell, still, servo, 3.0)
+        steps = []
+        cell.blind = True
+        apart = play(cell, point_to_point(ARM, MIDDLE, GOAL), servo, 3.0, steps.append)
+        modes = [step.mode for step in steps]
+        assert modes[0] is Mode.VISION
+        assert Mode.BRIDGED in modes
+        assert modes[-1] is Mode.POTENTIOMETERS
+        assert "vision is lost" in modes[-1].value
+        assert all(step.mode is Mode.POTENTIOMETERS for step in steps[-100:])
+        assert np.allclose(steps[-100].correction, steps[-1].correction, rtol=0, atol=1e-14)
+        cell.blind = False
+        seeing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
+        assert steps[-1].mode is Mode.VISION
+        assert seeing[-1] < apart[-1] / 3
+        left.append(seeing[-1])
+    assert rms(left) < 0.2
 
 
 def test_without_any_vision_the_motion_is_commanded_as_it_is():

@@ -221,7 +221,7 @@ class PoseServo:
         wanted = self._joints(aim, self._lasting)
         worth = np.abs(wanted) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
         sides = np.stack([np.zeros(6), np.where(worth, np.sign(wanted), 0.0)])
-        here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides)
+        here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
     def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:

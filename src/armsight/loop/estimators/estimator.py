@@ -164,6 +164,9 @@ class Estimator(Protocol):
         """Return the same at (N,) times: the fast way to an output at 1 kHz."""
         ...
 
-    def tool(self, q: Array, qd: Array) -> Array:
-        """Return T_base_tool (N, 4, 4) if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
+    def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
+        """Return T_base_tool (N, 4, 4) if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now.
+
+        With ``pressed`` joints that move have moved so far that their gears push also links that no weight presses.
+        """
         ...

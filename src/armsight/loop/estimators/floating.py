@@ -181,6 +181,15 @@ def _step(
 
 
 @_kernel
+def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> None:
+    """Write 1 where the bearing of a link holds it against its weight at angles q (6,), else 0, out (6,)."""
+    M, tau, none = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6)
+    _dynamics(table, points, beside[0], q, none, none, M, tau)
+    for i in range(6):
+        out[i] = 1.0 if abs(tau[0, i]) <= beside[1, i] else 0.0
+
+
+@_kernel
 def float_on(
     t: Array,
     q: Array,
@@ -207,18 +216,31 @@ def float_on(
         table: of the arm.
         points: what stands for its links (K, 5).
         beside: what each joint has beside them (3, 6).
-        still: an arm none of whose joints is faster stands, and so do its links, rad/s.
+        still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
+            it is while its shaft creeps.
         gap: (6,) the play, rad.
     """
     motion, place, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
-    for k in range(max(begin, first + 1), end):
+    free, stood, was = np.empty(6), False, np.empty(6)
+    begin = max(begin, first + 1)
+    for k in range(begin - 1, end):
+        was[:] = motion[0]
         low, high = window(t, first, end - first, t[k], span(t[k], t[end - 1]))
         fit(t, q, low, high, t[k], motion)
+        stands = np.abs(motion[1]).max() <= still
+        if stands and not stood:  # as long as it stands its weight presses the same links
+            loose(table, points, beside, motion[0], free)
+            was[:] = motion[0]
+        stood = stands
+        if k < begin:
+            continue
         before, now = memory[k - 1], memory[k]
         place[:], speed[:] = before[0] * half, before[1] * half
-        if np.abs(motion[1]).max() > still:
-            _step(table, points, beside, motion, min(t[k] - t[k - 1], _LONGEST_STEP_S), half, place, speed, now[3])
-        else:
+        if stands:
+            for i in range(6):
+                place[i] = min(max(place[i] - free[i] * (motion[0, i] - was[i]), -half[i]), half[i])
             speed[:], now[3] = 0.0, 0.0
+        else:
+            _step(table, points, beside, motion, min(t[k] - t[k - 1], _LONGEST_STEP_S), half, place, speed, now[3])
         now[0], now[1] = place / half, speed / half
         now[2] = before[2] + np.abs(now[0] - before[0])

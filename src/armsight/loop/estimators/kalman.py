@@ -154,11 +154,14 @@ class KalmanEstimator:
         """Return where the tool was at the times of stretches as :meth:`smoothed` does; many cost little more than one."""
         return blended(self._model, self._readings, parts)
 
-    def tool(self, q: Array, qd: Array) -> Array:
+    def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
         """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
         state, now, step = self._now()
         unseen = np.repeat(now.unseen, len(q), axis=0)
-        unseen[:, 0] = np.where(np.abs(qd) > MOVES_RAD_S, np.sign(qd), now.unseen[:, 0])
+        moves = np.abs(qd) > MOVES_RAD_S
+        unseen[:, 0] = np.where(moves, np.sign(qd), now.unseen[:, 0])
+        if pressed:
+            unseen[:, 1] = np.where(moves & self._readings.loose(now.q[0]), np.sign(qd), now.unseen[:, 1])
         x = state.x * step.kept
         x[:, NOISE] = 0.0  # noise of what was read, not of what might be
         return self._model.poses(x, q, unseen)[0]

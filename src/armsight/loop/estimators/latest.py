@@ -57,6 +57,6 @@ class LatestEstimator:
         )
         return Track(alone.t_s, Ts, covs, covs_own, alone.q, alone.qd, age)
 
-    def tool(self, q: Array, qd: Array) -> Array:
+    def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
         """Return T_base_tool if the potentiometers were to read q (N, 6): the table's, moved as the newest sighting was."""
         return np.asarray(self._arm.forward(q) @ self._offset)

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.loop.estimators.floating import float_on, masses
+from armsight.loop.estimators.floating import float_on, loose, masses
 from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
 from armsight.robot.arm import Arm
 
@@ -222,6 +223,12 @@ class Readings:
         if not self._count:
             raise InputError("the estimator has no potentiometer readings yet; give it joints() first")
         return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
+
+    def loose(self, q: Array) -> NDArray[np.bool_]:
+        """Return which links (6,) stay where they are in their play, for no weight presses them, at angles (6,), rad."""
+        out = np.empty(6)
+        loose(self._table, self._points, self._beside, q, out)
+        return out > 0.0
 
     def set_backlash(self, width_rad: Array) -> None:
         """Say how wide the backlash of each joint is (6,), rad, for the readings from here on."""
