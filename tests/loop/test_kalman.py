@@ -136,6 +136,18 @@ def test_order_of_arrival_does_not_matter():
     assert np.allclose(a.cov, b.cov, rtol=1e-6, atol=1e-14)
 
 
+@pytest.mark.parametrize("period_s", [0.1, TICK_S])
+def test_readings_far_apart_and_sightings_of_one_time_leave_numbers(period_s):
+    estimator, T = kalman(), ARM.forward(MIDDLE)
+    estimator.joints(states(np.arange(12) * period_s, np.tile(MIDDLE, (12, 1))))
+    sighting = Sighting(10 * period_s, T, 1e-8 * np.eye(6), np.zeros((6, 6)))
+    assert [estimator.vision(sighting) for _ in range(3)] == [Verdict.USED] * 3
+    for estimate in (estimator.estimate(), estimator.estimate(10 * period_s)):
+        assert np.isfinite(estimate.T_base_tool).all()
+        assert np.isfinite(estimate.cov).all()
+    assert np.isfinite(estimator.smoothed(np.array([10.0 * period_s])).covs).all()
+
+
 def test_a_sighting_older_than_what_is_kept_comes_too_late_and_one_from_the_future_waits():
     shaft, seen_all, _ = sightings(np.random.default_rng(4))
     estimator = kalman()

@@ -49,8 +49,7 @@ def play(cell, motion, servo, seconds, each=lambda step: None):
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_without_swinging(rate_hz):
     there, back = point_to_point(ARM, MIDDLE, GOAL), point_to_point(ARM, GOAL, MIDDLE)
-    before, after = [], []
-    for seed in (31, 32):
+    for seed in (21, 31, 32):
         cell = cell_of(seed, rate_hz)
         servo = PoseServo(ARM, timing(rate_hz))
         settle_s = 4 * servo.timing.period_s / servo.timing.gain + 1.0
@@ -58,14 +57,13 @@ def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_w
         closing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, settle_s)
         path = play(cell, back, servo, back.duration_s + settle_s)
         moving = round(back.duration_s / TICK_S)
-        before.append(rms(alone[-100:]))
-        after += [rms(closing[-100:]), rms(path[-100:])]
+        before, after = rms(alone[-100:]), rms([rms(closing[-100:]), rms(path[-100:])])
+        assert after <= min(0.15, before / 10)
         assert rms(path[:moving]) <= rms(alone[: round(there.duration_s / TICK_S)]) / 3
         # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, and a play
         # that is crossed by its learned width, a tenth of a millimetre each.
         for rest in (closing, path[moving + 200 :]):
             assert (rest - np.minimum.accumulate(rest)).max() < 0.2
-    assert rms(after) <= min(0.15, rms(before) / 10)
 
 
 @pytest.mark.parametrize("loose", [0.0, 1.0], ids=["tight gears", "loose gears"])
@@ -117,8 +115,10 @@ def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
         assert Mode.BRIDGED in modes
         assert modes[-1] is Mode.POTENTIOMETERS
         assert "vision is lost" in modes[-1].value
-        assert all(step.mode is Mode.POTENTIOMETERS for step in steps[-100:])
-        assert np.allclose(steps[-100].correction, steps[-1].correction, rtol=0, atol=1e-14)
+        lost = len(modes) - next(n for n, mode in enumerate(modes[::-1]) if mode is not Mode.POTENTIOMETERS)
+        held = np.array([step.correction for step in steps[lost:]])
+        assert len(held) > 100
+        assert np.allclose(held, held[0], rtol=0, atol=1e-14)
         cell.blind = False
         seeing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
         assert steps[-1].mode is Mode.VISION

@@ -40,6 +40,13 @@ def test_at_its_samples_it_is_exact_and_beyond_its_ends_it_stands(name):
     assert np.array_equal(tabled.at(-1.0).q, motion.at(0.0).q)
 
 
+def test_a_motion_to_where_it_begins_stands():
+    motion = point_to_point(ARM, HERE, HERE)
+    assert motion.duration_s == 0.0
+    for t_s in (-1.0, 0.0, 0.002, 1.0):
+        assert np.array_equal(Tabled(motion).at(t_s).q, HERE)
+
+
 def test_a_time_that_is_none_is_refused():
     with pytest.raises(InputError, match="t_s is nan"):
         Tabled(MOTIONS["joints"]).at(float("nan"))

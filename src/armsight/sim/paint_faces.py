@@ -103,7 +103,7 @@ def _put_back(
     u0, v0, u1, v1 = box
     for v in range(v0, v1 if u0 < u1 else v0):
         M, y = Ms[min(v, Ms.shape[0] - 1)], v + corner[1]
-        # It grows steadily along the row: its least is at an end.
+        # It has no least within the row: that is at an end.
         if min(_nearness(rays, M, y, u0 + corner[0]), _nearness(rays, M, y, u1 - 1 + corner[0])) * nearest[v] >= 1.0:
             continue
         for u in range(u0, u1):

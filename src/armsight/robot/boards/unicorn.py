@@ -91,4 +91,5 @@ class UnicornMachine:
                 self._called = function
             self.uc.emu_start(_CALL | _THUMB, _END)
         except self._error as error:
+            self._called = 0  # where the stack stands is not known
             raise DeviceError(f"the emulated board broke down: {error}") from None

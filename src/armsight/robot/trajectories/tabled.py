@@ -26,7 +26,8 @@ class Tabled:
             motion: the trajectory.
         """
         self.duration_s = motion.duration_s
-        self._t_s = np.append(np.arange(0.0, self.duration_s - 1e-9, STEP_S), self.duration_s)
+        last = max(self.duration_s, STEP_S)  # a motion that takes no time stands
+        self._t_s = np.append(np.arange(0.0, last - 1e-9, STEP_S), last)
         q, qd, qdd = motion.at(self._t_s)
         h = np.diff(self._t_s)[:, None]
         rise = q[1:] - q[:-1] - h * qd[:-1] - 0.5 * h**2 * qdd[:-1]
