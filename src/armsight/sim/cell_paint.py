@@ -101,11 +101,10 @@ class CellCamera:
         self._corners = corner_rays(camera)
         rays = pixel_rays(self._corners)
         self.still: View = view(camera, rays, T_base_camera, seed, foot, more)
-        self._light = self.still.light.astype(np.float32)
         self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
-        self._still_grey = spread(self._light, LENS.psf_sigma_px) * self._gain
+        self._still_grey = spread(self.still.light, LENS.psf_sigma_px) * self._gain
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
         self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
 
@@ -133,7 +132,7 @@ class CellCamera:
         crop = (0, 0, 0, 0) if exposure is None else self._around(exposure.shown(), 2 * margin)
         window = self._around(np.concatenate([[crop], boxes]), 2 * margin)
         u0, v0, u1, v1 = window
-        light = self._light[v0:v1, u0:u1].copy()
+        light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
         cell_links.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
         seen = spread(light, LENS.psf_sigma_px) if light.size else light
@@ -152,7 +151,7 @@ class CellCamera:
         width, height = self.camera.image_size_px
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
-        light, depth, ids = self._light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
+        light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
         cell_links.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
         return ids
 

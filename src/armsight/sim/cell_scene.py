@@ -34,12 +34,12 @@ class View(Record):
     """What stands still before a camera.
 
     Attributes:
-        light: (H, W) light on each pixel, float64, before the lens.
+        light: (H, W) light on each pixel before the lens.
         depth: (H, W) distance of the surface, m.
         ids: (H, W) which surface it is.
     """
 
-    light: Array
+    light: NDArray[np.float32]
     depth: NDArray[np.float32]
     ids: Image
 
@@ -143,12 +143,11 @@ def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Sol
     order = _tiled(height, width)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    first, depth, ids = (flat[place].reshape(height, width) for flat in cast(rays.reshape(-1, 3)[order]))
+    light, depth, ids = (flat[place].reshape(height, width) for flat in cast(rays.reshape(-1, 3)[order]))
     square = np.ones((3, 3), np.uint8)
-    again = (cv2.dilate(first, square) - cv2.erode(first, square) > _EDGE).ravel()
+    again = (cv2.dilate(light, square) - cv2.erode(light, square) > _EDGE).ravel()
     edges = order[again[order]]
     v, u = np.divmod(edges, width)
-    light = first.astype(np.float64)
     light[v, u] = np.mean([cast(camera.unproject(np.stack([u + x, v + y], axis=1)))[0] for x, y in _SAMPLES], axis=0)
     return View(light, depth, ids)
 

@@ -282,15 +282,8 @@ class Readings:
         """
         oldest, newest = self.span_s
         at, n = np.array(t_s, dtype=float), len(t_s)
-        joints = Smoothed(
-            np.empty((n, 6)),
-            np.empty((n, 6)),
-            np.empty((n, 6)),
-            np.empty((n, 6)),
-            np.empty((n, 3, 6)),
-            np.empty((n, 6)),
-            np.empty((n, 2, 6)),
-        )
+        shapes = (6,), (6,), (6,), (6,), (3, 6), (6,), (2, 6)
+        joints = Smoothed(*(np.empty((n, *shape)) for shape in shapes))
         kept = (self._t, self._q, self._memory, self._first, self._count)
         if not _smooth(*kept, at, self._sigma, *joints):
             raise InputError(
