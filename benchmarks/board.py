@@ -34,7 +34,7 @@ import test_firmware_pid as pid_tests  # noqa: E402
 
 from armsight import firmware  # noqa: E402
 from armsight.app.board_bench import Bench  # noqa: E402
-from armsight.app.board_scenarios import DRIVEN  # noqa: E402
+from armsight.app.board.scenarios import DRIVEN
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
 from armsight.firmware.stack import stack_use  # noqa: E402

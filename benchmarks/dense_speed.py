@@ -103,7 +103,7 @@ def memory(folder: Path) -> dict[str, Any]:
             cv2.imwrite(path, image)
         for name in ("block", "scanline", "semiglobal"):
             out = str(Path(room) / "out")
-            begin = "from armsight.app.cli.main import main; main()"
+            begin = "from armsight.app.main import main; main()"
             line = [sys.executable, "-c", begin, "dense", "--rectified", "--method", name, "-o", out]
             line += ["--max-disparity", str(COUNT), *paths]
             settings = {"NUMBA_CACHE_DIR": str(Path(room) / name), "NUMBA_NUM_THREADS": "2"}

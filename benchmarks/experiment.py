@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.demo import Demo, run_demo
+from armsight.app.demo.demo import Demo, run_demo
 
 #: Figure -> where it stands in the summary, its factor and unit, and what it must be at most (None: told only).
 FIGURES = {

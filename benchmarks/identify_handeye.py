@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
-from armsight.loop.handeye import calibrate_handeye
-from armsight.loop.handeye_streams import PoseStream, calibrate_streams
+from armsight.loop.handeye.handeye import calibrate_handeye
+from armsight.loop.handeye.streams import PoseStream, calibrate_streams
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
 

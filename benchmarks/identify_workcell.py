@@ -21,7 +21,7 @@ from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import plan_poses
-from armsight.loop.identify.play import plays
+from armsight.loop.identify.backlash import plays
 from armsight.loop.identify.priors import prior_sigma
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
@@ -29,11 +29,11 @@ from armsight.robot.boards.machines import open_machine
 from armsight.robot.boards.opening import configured
 from armsight.robot.models import open_arm
 from armsight.robot.trajectories import point_to_point
-from armsight.sim.cell_arm import drawn, imperfections
-from armsight.sim.cell_board import configuration, gravity_duty
-from armsight.sim.cell_motors import chosen
+from armsight.sim.workcell.arm import drawn, imperfections
+from armsight.sim.workcell.board import configuration, gravity_duty
+from armsight.sim.workcell.motors import chosen
 from armsight.sim.cell_solids import solids
-from armsight.sim.plant import ArmPlant
+from armsight.sim.workcell.plant import ArmPlant
 
 POSES, PLANNED, UNSEEN, REACH_RAD, HIGH_M = 60, 30, 200, 0.9, 0.1
 BACK_RAD, CREEP_S, SETTLE_S, LOOK_S, PERIOD_S = np.radians(0.6), 1.5, 0.3, 0.1, 0.004

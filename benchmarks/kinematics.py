@@ -32,7 +32,7 @@ import numba  # noqa: E402
 import numpy as np  # noqa: E402
 import peers  # noqa: E402
 
-from armsight.robot.kinematics import chain, inverse, lanes  # noqa: E402
+from armsight.robot.kinematics import chain, inverse, batch as lanes
 from armsight.robot.kinematics.rows import MOST, WIDTH  # noqa: E402
 from armsight.robot.models import MODELS  # noqa: E402
 

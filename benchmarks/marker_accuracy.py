@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from armsight.data import Discs, Missed
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from disc_bound import picture_bound
 from disc_images import WIDTH, Picture, disc_picture, exposed
 from disc_surround import ITEMS, TEXTURES, clutter, one_kind
@@ -247,7 +247,7 @@ def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
     targets = (target, disc_target(False))
     no_identify = lacking("identify")
     if no_identify is None:
-        from armsight.vision.identify import identify
+        from armsight.vision.discs.identify import identify
     for label, number, loose in (("", pairs, 0), (", 12 loose discs of the plate's size in each", pairs // 5, 12)):
         rng, discs, poses = np.random.default_rng(seed + 2 + loose), 0, 0
         for _ in range(number):

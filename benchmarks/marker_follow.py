@@ -12,7 +12,7 @@ from armsight import measure
 from armsight.data import Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import exposed
 from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, parallel_rig, views
@@ -34,7 +34,7 @@ class Following:
         self.way = "searched"
         self._rig, self._target, self._count, self.follower = rig, opened(target), 0, None
         if lacking("follow") is None:
-            from armsight.vision.follow import Follower
+            from armsight.vision.follow.follower import Follower
 
             self.follower = Follower(rig, self._target)
 

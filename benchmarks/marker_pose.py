@@ -12,11 +12,11 @@ from armsight import measure
 from armsight.data import Missed, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.optics import Optics, Sensor
-from armsight.sim.render import render_pair
-from armsight.sim.scene import Placed, plate
-from armsight.vision.conic import project_discs
-from armsight.vision.markers.disc import DiscTarget
+from armsight.sim.render.optics import Optics, Sensor
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import Placed, plate
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import add_region, closed_border, exposed
 from marker_plate import (

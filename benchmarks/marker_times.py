@@ -9,7 +9,7 @@ import numpy as np
 
 from armsight.data import Missed
 from armsight.geometry.pose import inverse, log_se3, pose
-from armsight.vision.follow_kernel import look
+from armsight.vision.follow.kernel import look
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 from disc_images import disc_picture

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 from armsight.data import Missed, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.optics import Sensor, exposed
-from armsight.sim.render import radiance, render_pair
-from armsight.sim.scene import Placed, chessboard
+from armsight.sim.render.optics import Sensor, exposed
+from armsight.sim.render.render import radiance, render_pair
+from armsight.sim.render.scene import Placed, chessboard
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board

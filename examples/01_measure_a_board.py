@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from armsight import Missed, measure, open_source, open_target
-from armsight.sim.bench import BOARD, demo_recording
+from armsight.sim.example_rig import BOARD, demo_recording
 
 
 def main(folder: Path) -> None:

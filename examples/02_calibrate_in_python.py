@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from armsight import Pair, calibrate_boards, open_board, open_source
-from armsight.sim.bench import BOARD, demo_recording
+from armsight.sim.example_rig import BOARD, demo_recording
 from armsight.vision.image import grey
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from armsight import Follower, Missed, Shot, open_target
 from armsight.geometry.pose import exp_se3, pose
-from armsight.sim.background import plain
-from armsight.sim.bench import bench_rig
-from armsight.sim.render import Placed, render_pair
-from armsight.sim.scene import plate
+from armsight.sim.render.background import plain
+from armsight.sim.example_rig import bench_rig
+from armsight.sim.render.render import Placed, render_pair
+from armsight.sim.render.scene import plate
 
 SHOTS, RATE_HZ = 12, 60.0
 COVERED = range(5, 8)

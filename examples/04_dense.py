@@ -10,13 +10,13 @@ import numpy as np
 from armsight import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.bench import bench_rig
-from armsight.sim.solid import box, see, with_noise
+from armsight.sim.example_rig import bench_rig
+from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.methods import open_method
-from armsight.vision.dense.standard import match_pair
-from armsight.vision.locate_cloud import Surface, locate_cloud
+from armsight.vision.dense.rectified import match_pair
+from armsight.vision.dense.registration import Surface, locate_cloud
 
 BOX_M = np.array([0.20, 0.15, 0.12])
 T_TRUE = pose(exp_so3(np.array([0.5, 0.6, 0.2])), np.array([0.05, 0.0, 0.8]))

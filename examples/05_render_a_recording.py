@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from armsight import Pair, calibrate_boards, open_board, open_source
-from armsight.sim.bench import BOARD, demo_recording
+from armsight.sim.example_rig import BOARD, demo_recording
 
 
 def main(folder: Path) -> None:

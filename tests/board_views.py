@@ -6,8 +6,8 @@ import numpy as np
 
 from armsight.data import Detections
 from armsight.geometry.pose import inverse, log_se3
-from armsight.sim.bench import bench_rig, board_poses
-from armsight.sim.scene import chessboard
+from armsight.sim.example_rig import bench_rig, board_poses
+from armsight.sim.render.scene import chessboard
 from armsight.vision.calibrate.boards import Pair
 from armsight.vision.markers.board import open_board
 from views import both_pixels

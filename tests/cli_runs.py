@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from armsight.app.cli.main import main
+from armsight.app.main import main
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from armsight.data import Body, Discs
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.conic import project_discs
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 SIZE = (1280, 720)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.chapter import VergingRig
+from armsight.vision.closed_form import VergingRig
 from armsight.vision.rig import StereoRig
 
 SIZE = (1280, 720)

@@ -106,7 +106,7 @@ def test_the_checker_finds_a_planted_violation(tmp_path, file, text, said):
     [
         ("vision/markers/a.py", "from armsight.vision.rig import StereoRig\nfrom ..rig import StereoRig"),
         ("vision/a.py", "from armsight.data import Shot\nfrom armsight.geometry.pose import pose\nimport cv2"),
-        ("app/cli/a.py", "import armsight.sim.render\nfrom armsight.loop import servo"),
+        ("app/cli/a.py", "import armsight.sim.render.render\nfrom armsight.loop import servo"),
         ("geometry/a.py", "import numpy\nfrom scipy import linalg\nimport math"),
         ("sim/a.py", "from armsight.robot import arm\nfrom armsight.vision import rig"),
     ],

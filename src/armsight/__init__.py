@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.camera import Camera
-    from armsight.vision.follow import Follower
+    from armsight.vision.follow.follower import Follower
     from armsight.vision.markers.board import open_board
     from armsight.vision.markers.targets import open_body, open_target
     from armsight.vision.measure import measure
@@ -54,7 +54,7 @@ _HOME = {
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
-    "Follower": "armsight.vision.follow",
+    "Follower": "armsight.vision.follow.follower",
     "open_arm": "armsight.robot.models",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),

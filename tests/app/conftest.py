@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from armsight.sim.bench import demo_recording
+from armsight.sim.example_rig import demo_recording
 from armsight.sim.recording import Truth
 from cli_runs import Said, run
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.errors import DeviceError
 from armsight.robot.boards.opening import configured
-from armsight.sim.workcell import Workcell
+from armsight.sim.workcell.workcell import Workcell
 
 #: The host's clock when the board's is 0, s; by how much it is faster; how far stamps are off, s.
 OFFSET_S, DRIFT, JITTER_S = 12345.678, 50e-6, 2e-4

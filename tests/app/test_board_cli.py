@@ -6,9 +6,9 @@ import stat
 
 import pytest
 
-from armsight.app import board_selftest
-from armsight.app.board_flash import FLASHED, PROGRAMMERS
-from armsight.app.board_scenarios import AT_REST, DRIVEN
+from armsight.app.board import selftest as board_selftest
+from armsight.app.board.flash import FLASHED, PROGRAMMERS
+from armsight.app.board.scenarios import AT_REST, DRIVEN
 from armsight.firmware import build, host_library
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.host import HostMachine
@@ -92,7 +92,7 @@ def test_monitor_shows_faults(armsight, monkeypatch):
             super().__init__()
             self.supply_mv = 4000
 
-    monkeypatch.setattr("armsight.app.cli.board.JointPlant", Broken)
+    monkeypatch.setattr("armsight.app.board.command.JointPlant", Broken)
     said = armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1", "--json")
     assert said.lines[0]["faults"] == [{"fault": Fault.SUPPLY_LOW.name, "joint": None}]
     assert "SUPPLY_LOW" in armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1").out
@@ -167,7 +167,7 @@ def programmers(tmp_path, monkeypatch, stm32f4):
             )
             program.chmod(program.stat().st_mode | stat.S_IXUSR)
         monkeypatch.setenv("PATH", str(folder) + os.pathsep + os.environ["PATH"])
-        monkeypatch.setattr("armsight.app.board_flash.which", lambda name: name if name in names else None)
+        monkeypatch.setattr("armsight.app.board.flash.which", lambda name: name if name in names else None)
 
     return install
 

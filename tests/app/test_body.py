@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app import body_draw
-from armsight.app.body_judge import judge
+from armsight.app.body import draw as body_draw
+from armsight.app.body.check import judge
 from armsight.app.body_swaps import TOLD
 from armsight.data import Discs, Missed
 from armsight.geometry.pose import inverse, transform
-from armsight.vision.conic import project_discs
-from armsight.vision.foresight import plain_rig, view
-from armsight.vision.identify import identify
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.discs.predict import plain_rig, view
+from armsight.vision.discs.identify import identify
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from cli_runs import refused
@@ -414,9 +414,9 @@ def test_a_drawing_that_fails_leaves_nothing_behind(armsight, tmp_path, full_dis
 
 
 def test_the_command_ends_with_its_code():
-    run = subprocess.run([sys.executable, "-m", "armsight.app.cli.main"], capture_output=True, text=True, check=False)
+    run = subprocess.run([sys.executable, "-m", "armsight.app.main"], capture_output=True, text=True, check=False)
     assert run.returncode == 0
-    code = "from armsight.app.cli.main import main; main()"
+    code = "from armsight.app.main import main; main()"
     arguments = [sys.executable, "-c", code, "body", "check", str(PLATE), "--json", "--distance", "5"]
     run = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert run.returncode == 1

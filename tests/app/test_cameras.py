@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from armsight.app.cli import cameras
-from armsight.app.cli.main import main
+from armsight.app.cameras import command as cameras
+from armsight.app.main import main
 
 # Filled in C with <linux/videodev2.h> and dumped: (hex of the head, length); the rest is zeros.
 CAPTURE_NODE = (

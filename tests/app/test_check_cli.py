@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from armsight.app.motion_file import read_motions
+from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
 from armsight.robot.models import open_arm
-from armsight.sim.workcell import Workcell
+from armsight.sim.workcell.workcell import Workcell
 from cli_runs import Said, refused, run
 
 COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.cli import calibrate as command
+from armsight.app.calibrate import command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import listening, refused
@@ -246,7 +246,7 @@ with mock.patch("{module}.{name}", told):
     ("module", "name", "wait"),
     [
         # Asleep, too: an interrupt that falls into numba's loading of compiled code ends the process (docs/limits.md).
-        ("armsight.app.cli.calibrate", "calibrate_boards", "time.sleep(60)"),
+        ("armsight.app.calibrate.command", "calibrate_boards", "time.sleep(60)"),
         ("armsight.vision.sources.pairs", "read_image", "time.sleep(60)"),
         ("armsight.files", "os.replace", "time.sleep(60)"),
     ],

@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from armsight.app.poses import CSV_COLUMNS
+from armsight.app.measure.poses import CSV_COLUMNS
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.vision.markers.bodies import save_body_csv
 from armsight.vision.markers.targets import open_body
@@ -30,7 +30,7 @@ KEYS = {
 def measured(bench, tmp_path_factory):
     """The arm's recording measured once, as a program reads it: JSON lines and the CSV."""
     out = tmp_path_factory.mktemp("measured") / "poses.csv"
-    script = "from armsight.app.cli.main import main; main()"
+    script = "from armsight.app.main import main; main()"
     arguments = ["measure", bench.rig, "--target", bench.plate, "--source", bench.folder / "arm", "--json", "-o", out]
     done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app import demo
-from armsight.app.cli import demo as command
-from armsight.app.demo import Demo, run_demo
+from armsight.app.demo import demo
+from armsight.app.demo import command
+from armsight.app.demo.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
-from armsight.sim.cell_camera import open_timing
-from armsight.sim.workcell import Workcell
+from armsight.sim.workcell.cameras import open_timing
+from armsight.sim.workcell.workcell import Workcell
 from cli_runs import refused
 
 SHORT = """

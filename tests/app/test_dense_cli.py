@@ -8,8 +8,8 @@ import pytest
 
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.bench import bench_rig
-from armsight.sim.solid import box, see, with_noise
+from armsight.sim.example_rig import bench_rig
+from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense.methods import METHODS
 from armsight.vision.dense.pfm import read_pfm
 from armsight.vision.rig import StereoRig

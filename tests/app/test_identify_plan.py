@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from identify_files import poses_csv
 
-from armsight.app.identify_plan import plan_from
+from armsight.app.identify.plan import plan_from
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.identify.measured import Measured

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armsight.app.motion_file import CHAPTER, read_motions
+from armsight.app.run.motion_file import CHAPTER, read_motions
 from armsight.errors import InputError
 from armsight.robot.models import open_arm
 

@@ -12,18 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app import page, report
-from armsight.app.report import FIGURES, report_folder, write_report
-from armsight.app.report_draw import drawing, nice, plain, png
-from armsight.app.report_figures import (
-    MOST_BARS,
-    STANDS_OUT,
-    coverage_figure,
-    grid_counts,
-    mean_residuals,
-    pairs_figure,
-)
-from armsight.app.report_judge import advice, verdict
+from armsight.app.report import page
+from armsight.app.calibrate import report
+from armsight.app.calibrate.report import FIGURES, report_folder, write_report
+from armsight.app.report.plotting import (drawing, nice, plain, png)
+from armsight.app.calibrate.figures import (MOST_BARS, STANDS_OUT, coverage_figure, grid_counts, mean_residuals, pairs_figure)
+from armsight.app.calibrate.assessment import advice, verdict
 from armsight.app.report_maps import round_steps
 from armsight.app.report_tables import pose_table
 from armsight.app.report_volume import predicted_sigmas, volume_slice

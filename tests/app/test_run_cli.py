@@ -7,9 +7,9 @@ import signal
 import numpy as np
 import pytest
 
-from armsight.app import run_calibrate
-from armsight.app.cli import run as command
-from armsight.sim.workcell import Workcell
+from armsight.app.run import calibrate as run_calibrate
+from armsight.app.run import command
+from armsight.sim.workcell.workcell import Workcell
 from cli_runs import refused
 
 MOTION = """

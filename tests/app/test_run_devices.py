@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from pty_cell import SILENT_TICKS, HostStamped, PtyCell
 
-from armsight.app import run_calibrate
-from armsight.app.cli import run as command
-from armsight.app.run_loop import Loop
-from armsight.app.run_station import HostClock
+from armsight.app.run import calibrate as run_calibrate
+from armsight.app.run import command
+from armsight.app.run.loop import Loop
+from armsight.app.run.setup import HostClock
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.opening import open_board

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.motion_file import QUICK, read_motions
+from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.app.run_ready import enable, rehearse, require_start
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError

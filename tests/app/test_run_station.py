@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from armsight.app.run_station import DRIFT, HostClock, LiveShots
+from armsight.app.run.setup import DRIFT, HostClock, LiveShots
 from armsight.data import Shot
 from armsight.errors import DeviceError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from armsight.app.run_judge import path_distances, spread, track_figures
+from armsight.app.run.metrics import path_distances, spread, track_figures
 from armsight.app.run_tracks import ToolTrack, errors, write_track
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from armsight.app import studies
-from armsight.app.studies import vision_studies
+from armsight.app.demo import studies
+from armsight.app.demo.studies import vision_studies
 
 SHOTS = 3
 

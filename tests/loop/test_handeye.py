@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop import handeye_start
-from armsight.loop.handeye import calibrate_handeye
+from armsight.loop.handeye.handeye import calibrate_handeye
 from armsight.loop.handeye_fit import Poses, adjoint, residuals
 from asserts import assert_jacobian
 

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse
-from armsight.loop.handeye_pivot import calibrate_pivot
-from armsight.loop.handeye_streams import PoseStream, calibrate_streams, coarse_offset
+from armsight.loop.handeye.pivot import calibrate_pivot
+from armsight.loop.handeye.streams import PoseStream, calibrate_streams, coarse_offset
 
 OFFSET_S = 0.3217
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armsight.loop.identify.play import Play, _to_the_stops
+from armsight.loop.identify.backlash import Play, _to_the_stops
 
 
 @pytest.mark.parametrize("sides", [(30, 30), (50, 10), (59, 1)])

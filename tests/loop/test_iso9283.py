@@ -4,9 +4,9 @@ from scipy.stats import chi2, t
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose
-from armsight.loop import iso9283
-from armsight.loop.iso9283_path import circle_figures, path_figures, plane_axes
-from armsight.loop.iso9283_plan import CLEAR_RAD, CUBES_M, plan_check
+from armsight.loop.iso9283 import poses as iso9283
+from armsight.loop.iso9283.paths import circle_figures, path_figures, plane_axes
+from armsight.loop.iso9283.plan import CLEAR_RAD, CUBES_M, plan_check
 from armsight.robot.models import open_arm
 
 ARM_M = np.array([2e-4, 1e-4, 0.5e-4])

@@ -5,9 +5,9 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.robot.models import open_arm
-from armsight.sim.cell_arm import PRESETS, drawn, imperfections
-from armsight.sim.cell_board import configuration
-from armsight.sim.cell_motors import chosen
+from armsight.sim.workcell.arm import PRESETS, drawn, imperfections
+from armsight.sim.workcell.board import configuration
+from armsight.sim.workcell.motors import chosen
 from armsight.sim.cell_solids import solids
 
 MODEL = open_arm("six_r")

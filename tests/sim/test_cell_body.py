@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from armsight.geometry.pose import transform
-from armsight.sim.cell_body import body_patterns, body_target, body_text
+from armsight.sim.workcell.body import body_patterns, body_target, body_text
 from armsight.vision.markers.targets import load_body_toml
 from cli_runs import run
 

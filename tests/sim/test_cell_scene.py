@@ -3,7 +3,7 @@
 import numpy as np
 
 from armsight.robot.models import open_arm
-from armsight.sim import cell_rays
+from armsight.sim.workcell import raycast as cell_rays
 from armsight.sim.cell_scene import LAMP_BASE, corner_rays, furniture, pixel_rays, view
 from armsight.sim.cell_solids import solids
 from armsight.vision.camera import Camera

@@ -7,8 +7,8 @@ from render_oracle import brute, displacement_px
 
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.render import Shutter, radiance
-from armsight.sim.scene import Pattern, Placed, plate
+from armsight.sim.render.render import Shutter, radiance
+from armsight.sim.render.scene import Pattern, Placed, plate
 from armsight.vision.camera import Camera
 
 #: The issue's bound on a displaced centre, and one grey level of a sensor of unit gain.

@@ -10,7 +10,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import State
 from armsight.robot.trajectories import point_to_point
-from armsight.sim.workcell import Workcell
+from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.markers.board import open_board
 
 pytestmark = pytest.mark.usefixtures("host_firmware")

@@ -6,7 +6,7 @@ import pytest
 from armsight.data import Correspondences, Discs, Missed
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.assign_discs import assign
+from armsight.vision.discs.assign import assign
 from armsight.vision.expected import expect
 from disc_views import PLATE, SIGMA, discs_of, hd_rig, someplace, views
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.vision.camera import Camera
-from armsight.vision.conic import project_discs
+from armsight.vision.discs.bias import project_discs
 from asserts import assert_jacobian
 
 LENSES = {

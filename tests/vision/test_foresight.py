@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.sim.bench import bench_rig
-from armsight.vision.foresight import look_direction, plain_rig, pose_covariance, separation, view
-from armsight.vision.markers.relabel import relabelings
+from armsight.sim.example_rig import bench_rig
+from armsight.vision.discs.predict import (look_direction, plain_rig, pose_covariance, separation, view)
+from armsight.vision.discs.symmetry import relabelings
 from armsight.vision.posefit import Sightings, fit_pose
 from armsight.vision.rig import StereoRig
 

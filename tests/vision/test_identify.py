@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from armsight.data import Discs, Missed, Rejected
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.identify import ERROR_ODDS, Identified, identify
+from armsight.vision.discs.identify import ERROR_ODDS, Identified, identify
 from disc_views import PLATE, discs_of, hd_rig, someplace, views
 
 SIX = discs_of([[0, 0, 0], [0.06, 0, 0], [0.06, 0.05, 0], [-0.02, 0.07, 0], [0.03, -0.04, 0.02], [-0.05, 0.02, 0.03]])

@@ -8,11 +8,11 @@ from scipy.stats import chi2
 
 from armsight.data import Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
-from armsight.sim import background
-from armsight.sim.bench import PLATE_M, tag_plate
-from armsight.sim.optics import Optics
-from armsight.sim.render import render_pair
-from armsight.sim.scene import Placed, plate
+from armsight.sim.render import background
+from armsight.sim.example_rig import PLATE_M, tag_plate
+from armsight.sim.render.optics import Optics
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import Placed, plate
 from armsight.vision.markers.targets import Composite, open_target
 from armsight.vision.measure import measure
 from disc_views import PLATE, hd_rig, someplace

@@ -7,7 +7,7 @@ import pytest
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.bench import bench_rig
+from armsight.sim.example_rig import bench_rig
 from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, ordinary_rig
 from views import both_pixels

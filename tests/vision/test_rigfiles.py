@@ -13,7 +13,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from armsight.app.cli.rig import command
+from armsight.app.rig.command import command
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import exp_so3

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.app.body_verdict import Finding, Outlook
+from armsight.app.body.finding import Finding, Outlook
 from armsight.app.body_words import axis_words
 from armsight.data import Array
 from armsight.geometry.rotation import skew
-from armsight.vision.foresight import FACING, look_direction, view
+from armsight.vision.discs.predict import FACING, look_direction, view
 from armsight.vision.markers.body_check import on_one_line
 from armsight.vision.markers.body_layout import Layout
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter in an image that can be used, px.

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import transform
-from armsight.sim.scene import CLEAR, Pattern, aprilgrid, charuco, chessboard, circle_grid, tag
-from armsight.vision.foresight import face_axes, look_direction
+from armsight.sim.render.scene import (CLEAR, Pattern, aprilgrid, charuco, chessboard, circle_grid, tag)
+from armsight.vision.discs.predict import face_axes, look_direction
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.body_layout import Layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 
 #: A bright disc's dark surround reaches to so many radii; where another marker is in the way, to fewer.
 RING, RING_MIN = 2.0, 1.5

@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
 from armsight.app.body_faults import SURROUND
-from armsight.app.body_verdict import Finding, Swap
+from armsight.app.body.finding import Finding, Swap
 from armsight.app.body_words import pair_words, swap_words
 from armsight.data import Array, Ids
 from armsight.vision.disc_view import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
-from armsight.vision.foresight import FACING, look_direction, separation
+from armsight.vision.discs.predict import FACING, look_direction, separation
 from armsight.vision.markers.body_check import on_one_line
-from armsight.vision.markers.disc import DiscTarget
-from armsight.vision.markers.relabel import Relabeling, flat, other_side, relabelings
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.discs.symmetry import (Relabeling, flat, other_side, relabelings)
 from armsight.vision.rig import StereoRig
 
 #: A wrong reading is told from the right one where it misses by so many standard deviations: the odds of a million that

@@ -8,7 +8,7 @@ import numpy as np
 
 from armsight.data import Array, Body
 from armsight.vision.markers.body_layout import Layout
-from armsight.vision.markers.relabel import Relabeling
+from armsight.vision.discs.symmetry import Relabeling
 
 #: Within this angle a direction is called by the name of an axis, cosine.
 _ALONG = float(np.cos(np.radians(8.0)))

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from armsight.app.check_rows import Row
+from armsight.app.check.rows import Row
 from armsight.app.check_words import direction
-from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice
+from armsight.app.report.plotting import (BLUE, INK, MUTED, ORANGE, RED, new_figure, nice)
 from armsight.data import Array
-from armsight.loop.iso9283_path import square_to
+from armsight.loop.iso9283.paths import square_to
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.check_rows import Row, Turn
+from armsight.app.check.rows import Row, Turn
 from armsight.app.check_stretch import Noise, Stretch, plain
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.geometry.pose import pose
-from armsight.loop.iso9283 import LEAST
-from armsight.loop.iso9283_path import plane_axes
+from armsight.loop.iso9283.poses import LEAST
+from armsight.loop.iso9283.paths import plane_axes
 
 #: Paths that begin, pass and end nearer to each other are one, m.
 _SAME_M = 1e-4

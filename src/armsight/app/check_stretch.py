@@ -19,7 +19,7 @@ from armsight.app.run_tracks import ToolTrack, read_track
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text
-from armsight.loop.iso9283 import LEAST
+from armsight.loop.iso9283.poses import LEAST
 
 #: An arm that stands is judged by the end of its rest, s.
 WINDOW_S = 0.3

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
-from armsight.vision.dense.judge import Truth
+from armsight.vision.dense.evaluate import Truth
 from armsight.vision.dense.method import FILLED, MEASURED, NOTHING, OCCLUDED, Disparity
 
 _BAR_PX, _MARGIN_PX, _CAPTION_PX = 18, 62, 26

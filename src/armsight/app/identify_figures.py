@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.identify_run import Run
-from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, new_figure
+from armsight.app.identify.run import Run
+from armsight.app.report.plotting import (BLUE, INK, MUTED, ORANGE, new_figure)
 from armsight.data import Array
 from armsight.loop.identify.identify import contributions
 

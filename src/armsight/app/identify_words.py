@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.app.identify_run import Run
+from armsight.app.identify.run import Run
 from armsight.loop.identify.identify import contributions
 from armsight.loop.identify.model import Parameter
-from armsight.loop.identify.play import Play, plays
+from armsight.loop.identify.backlash import Play, plays
 
 
 def headline(run: Run) -> str:

@@ -8,20 +8,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.app.experiment import PRIOR, Outcome, Progress, timing
-from armsight.app.motion_file import MotionPlan
+from armsight.app.run.experiment import (PRIOR, Outcome, Progress, timing)
+from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run_data import RunData, assembled
-from armsight.app.run_judge import track_figures
-from armsight.app.run_log import Log
-from armsight.app.run_loop import Loop
+from armsight.app.run.metrics import track_figures
+from armsight.app.run.record import Log
+from armsight.app.run.loop import Loop
 from armsight.app.run_passes import closed_on, drive
-from armsight.app.run_station import Station
-from armsight.app.studies import Study
+from armsight.app.run.setup import Station
+from armsight.app.demo.studies import Study
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import KalmanEstimator
 from armsight.loop.servo import PoseServo
-from armsight.sim.workcell import Workcell
-from armsight.vision.follow import Follower
+from armsight.sim.workcell.workcell import Workcell
+from armsight.vision.follow.follower import Follower
 from armsight.vision.rig import StereoRig
 
 RATES_HZ = (4.0, 15.0, 30.0, 60.0, 120.0)

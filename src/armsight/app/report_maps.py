@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import griddata
 
-from armsight.app.report_draw import INK, MUTED, WIDTH_IN, arrows, new_figure, nice
-from armsight.app.report_judge import HELD_M, board_drawing
+from armsight.app.report.plotting import (INK, MUTED, WIDTH_IN, arrows, new_figure, nice)
+from armsight.app.calibrate.assessment import HELD_M, board_drawing
 from armsight.app.report_volume import SHARES, Slice, board_points, volume_slice
 from armsight.data import Array
 from armsight.vision.calibrate.result import Calibration

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from armsight.app.report_figures import MOST_BARS, OUTSTANDING, STANDS_OUT
-from armsight.app.report_judge import advice, target, verdict
+from armsight.app.calibrate.figures import MOST_BARS, OUTSTANDING, STANDS_OUT
+from armsight.app.calibrate.assessment import advice, target, verdict
 from armsight.app.report_tables import (
     bullets,
     cameras_table,

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.report_draw import plain
-from armsight.app.report_judge import judged, target
+from armsight.app.report.plotting import plain
+from armsight.app.calibrate.assessment import judged, target
 from armsight.app.report_volume import SHARES, board_points, corner_variance_px2, predicted_sigmas
 from armsight.data import Array
 from armsight.geometry.pose import exp_se3

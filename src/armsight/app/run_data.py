@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.run_log import Log, Segment
+from armsight.app.run.record import Log, Segment
 from armsight.app.run_skew import APART_S
 from armsight.app.run_tracks import ToolTrack
 from armsight.data import Array, PoseEstimate, Record

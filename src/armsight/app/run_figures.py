@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtri
 
-from armsight.app.report_draw import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log
+from armsight.app.report.plotting import (BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log)
 from armsight.app.run_data import RunData
-from armsight.app.run_judge import judge, path_errors, rest_errors
+from armsight.app.run.metrics import judge, path_errors, rest_errors
 from armsight.app.run_tracks import ToolTrack, errors
 from armsight.data import Array
 

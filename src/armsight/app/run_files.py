@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.poses import UPPER, left_axes
-from armsight.app.recording import record
-from armsight.app.run_calibrate import HandEyeRun
+from armsight.app.measure.poses import UPPER, left_axes
+from armsight.app.record.recording import record
+from armsight.app.run.calibrate import HandEyeRun
 from armsight.data import Array, Shot
 from armsight.errors import InputError
 from armsight.files import write_text

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.report_draw import BLUE, ORANGE, new_figure, plain_log
+from armsight.app.report.plotting import (BLUE, ORANGE, new_figure, plain_log)
 from armsight.app.run_data import RunData
 from armsight.app.run_figures import GREEN
-from armsight.app.run_judge import judge, rest_errors
+from armsight.app.run.metrics import judge, rest_errors
 from armsight.app.run_tracks import errors
 from armsight.data import Image
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from armsight.app.motion_file import MotionPlan
-from armsight.app.run_log import Segment
-from armsight.app.run_loop import Controller, Loop
-from armsight.app.run_motions import Closed, Planned
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import Segment
+from armsight.app.run.loop import Controller, Loop
+from armsight.app.run.controllers import Closed, Planned
 from armsight.data import Array
 from armsight.loop.servo import PoseServo
 from armsight.robot.trajectories import Tabled, Trajectory

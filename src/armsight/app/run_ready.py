@@ -6,9 +6,9 @@ import contextlib
 
 import numpy as np
 
-from armsight.app.motion_file import MotionPlan
-from armsight.app.run_loop import PERIOD_S
-from armsight.app.run_station import Station
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.loop import PERIOD_S
+from armsight.app.run.setup import Station
 from armsight.data import Array, JointStates
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Sighting

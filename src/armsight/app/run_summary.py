@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.experiment import Outcome
-from armsight.app.motion_file import MotionPlan
+from armsight.app.run.experiment import Outcome
+from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run_data import RunData
-from armsight.app.run_judge import judge, path_errors, rest_errors, rms, singular, spread, track_figures
+from armsight.app.run.metrics import (judge, path_errors, rest_errors, rms, singular, spread, track_figures)
 from armsight.app.run_tracks import ToolTrack
-from armsight.app.studies import Study
+from armsight.app.demo.studies import Study
 from armsight.robot.arm import Arm
 
 

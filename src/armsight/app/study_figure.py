@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.report_draw import BLUE, MUTED, new_figure
-from armsight.app.studies import Study
+from armsight.app.report.plotting import BLUE, MUTED, new_figure
+from armsight.app.demo.studies import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from armsight.data import SIDES, Array, Body, Dropped, PoseEstimate, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.expected import expect
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 

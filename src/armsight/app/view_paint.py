@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.report_draw import plain
+from armsight.app.report.plotting import plain
 from armsight.data import Array
 
 Canvas = NDArray[np.uint8]

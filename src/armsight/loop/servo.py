@@ -23,7 +23,7 @@ from armsight.geometry.check import checked
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
-from armsight.robot.trajectories.walk import behind
+from armsight.robot.trajectories.lookahead import behind
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
 MOST_SIGMA_M = 1e-3

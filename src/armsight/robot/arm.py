@@ -20,7 +20,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 from armsight.robot.arm_nearby import untilted
 from armsight.robot.checks import DEGREES, angle_refusal, angles_of, near_angles, pose_refusal, poses_of
-from armsight.robot.kinematics import chain, inverse, lanes
+from armsight.robot.kinematics import chain, inverse, batch as lanes
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
 from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised

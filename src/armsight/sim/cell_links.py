@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array, Ids, Image
-from armsight.sim.cell_rays import AMBIENT, LAMP, Light
+from armsight.sim.workcell.raycast import AMBIENT, LAMP, Light
 
 #: Share of the lamp's reflection in the light.
 GLOSS = 0.25

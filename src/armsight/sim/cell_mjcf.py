@@ -15,7 +15,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.table import BASE, TOOL, link
-from armsight.sim.cell_motors import Motors
+from armsight.sim.workcell.motors import Motors
 from armsight.sim.cell_solids import GRAVITY_M_S2, Solids
 
 #: MuJoCo's own steps in a millisecond: the stiffest wrist swings at up to 3000 rad/s.

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from armsight.data import Image
-from armsight.sim.optics import Radiance
+from armsight.sim.render.optics import Radiance
 
 Window = tuple[int, int, int, int]
 _STRIP = 1 << 22  # places where an image's noise may begin
@@ -45,7 +45,7 @@ def exposed(
 ) -> None:
     """Write grey levels: ``still`` has its gain already, ``light`` of the window, shown in its core alone, has not.
 
-    ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.optics.Sensor`.
+    ``sensor`` is offset, read_noise and shot_noise, see :class:`~armsight.sim.render.optics.Sensor`.
     """
     (u0, v0, u1, v1), (height, width) = core, out.shape
     for v in range(height):

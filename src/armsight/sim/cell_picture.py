@@ -6,14 +6,14 @@ import numpy as np
 
 from armsight.data import Array, Image
 from armsight.geometry.pose import inverse, pose
-from armsight.sim.cell_paint import ArmSeen, CellCamera
-from armsight.sim.cell_rays import PLAIN
+from armsight.sim.workcell.images import ArmSeen, CellCamera
+from armsight.sim.workcell.raycast import PLAIN
 from armsight.sim.cell_scene import block, furniture
 from armsight.sim.cell_solids import row_frames
-from armsight.sim.optics import Sensor
-from armsight.sim.plant import ArmPlant
-from armsight.sim.render import Shutter
-from armsight.sim.scene import Pattern, Placed
+from armsight.sim.render.optics import Sensor
+from armsight.sim.workcell.plant import ArmPlant
+from armsight.sim.render.render import Shutter
+from armsight.sim.render.scene import Pattern, Placed
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 

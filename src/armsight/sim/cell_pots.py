@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.sim.cell_arm import TrueArm
+from armsight.sim.workcell.arm import TrueArm
 
 #: Shares of the supply at the ends of the travel.
 LOW_SHARE, HIGH_SHARE = 0.05, 0.95

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import inverse, transform
-from armsight.sim import cell_rays
-from armsight.sim.cell_rays import BOX, BUNCH, GRAIN, PLAIN, PRINT, TILES
+from armsight.sim.workcell import raycast as cell_rays
+from armsight.sim.workcell.raycast import (BOX, BUNCH, GRAIN, PLAIN, PRINT, TILES)
 from armsight.sim.cell_solids import Solids
 from armsight.vision.camera import Camera
 

@@ -10,14 +10,14 @@ import numpy as np
 from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
-from armsight.sim.cell_camera import ShotTimes, Timing, shot_times
+from armsight.sim.workcell.cameras import ShotTimes, Timing, shot_times
 from armsight.sim.cell_noise import noise_start, noise_strip
-from armsight.sim.cell_paint import ArmSeen, CellCamera
+from armsight.sim.workcell.images import ArmSeen, CellCamera
 from armsight.sim.cell_scene import arm_capsules, capsule_boxes
 from armsight.sim.cell_solids import row_frames
-from armsight.sim.plant import TICK_S, ArmPlant
-from armsight.sim.render import Shutter, outline
-from armsight.sim.scene import Pattern, Placed, plate
+from armsight.sim.workcell.plant import TICK_S, ArmPlant
+from armsight.sim.render.render import Shutter, outline
+from armsight.sim.render.scene import Pattern, Placed, plate
 
 #: The body is within so far of its origin, m.
 _BODY_M = 0.12

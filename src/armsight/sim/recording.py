@@ -21,10 +21,10 @@ from armsight.data import SIDES, Array, Image, Record
 from armsight.errors import InputError
 from armsight.files import read_text, replacing, write_text
 from armsight.geometry.check import checked
-from armsight.sim.background import BACKGROUNDS
-from armsight.sim.optics import Optics, Sensor
-from armsight.sim.render import Shutter, render_pair
-from armsight.sim.scene import Pattern, Placed
+from armsight.sim.render.background import BACKGROUNDS
+from armsight.sim.render.optics import Optics, Sensor
+from armsight.sim.render.render import Shutter, render_pair
+from armsight.sim.render.scene import Pattern, Placed
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.folder import COLUMNS, INDEX
 

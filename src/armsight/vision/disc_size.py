@@ -11,7 +11,7 @@ from itertools import permutations
 import numpy as np
 
 from armsight.data import Array, Discs
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.match import GATE_PX, epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import midpoints

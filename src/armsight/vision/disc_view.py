@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from armsight.data import Array, Discs, Ids, Record
 from armsight.vision.expected import Expected
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: An ellipse may be this much longer or shorter than the disc would look, beyond so many standard deviations of its rim.

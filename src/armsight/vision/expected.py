@@ -1,6 +1,6 @@
 """What both cameras should see of a body's discs where the body is at a given pose, and the bias of their centres.
 
-An ellipse's centre is not the image of its disc's centre (:mod:`~armsight.vision.conic`). The difference depends on how
+An ellipse's centre is not the image of its disc's centre (:mod:`~armsight.vision.discs.bias`). The difference depends on how
 the disc is turned, so it is known once the pose is. Of a disc whose normal nobody gave only the size of it is known: the
 centre seems to move by -(r^2 / z) times the part of the optical axis e that lies in the disc, e - (n e) n, which over all
 directions n has the second moments 1/15 across e and 8/15 along it.
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from armsight.data import Array, Correspondences, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.vision.conic import project_discs
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A disc turned further away than this cosine is not found, and its back is not seen.

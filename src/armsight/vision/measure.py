@@ -14,7 +14,7 @@ from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
 from armsight.vision.image import grey
 from armsight.vision.locate import locate
-from armsight.vision.locate_discs import locate_composite
+from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.match import gate, join, match

@@ -10,12 +10,12 @@ import numpy as np
 
 from armsight.data import Correspondences, Detections, Discs, Shot
 from armsight.vision.expected import LEAST_FACING, expect
-from armsight.vision.foresight import view
-from armsight.vision.locate_discs import locate_composite, locate_discs
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.discs.predict import view
+from armsight.vision.discs.locate import locate_composite, locate_discs
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.measure import measure
-from armsight.vision.pairing import DEPTHS_M
+from armsight.vision.discs.pairing import DEPTHS_M
 from armsight.vision.rig import StereoRig
 
 #: Where the body is put, in sizes of it from the cameras; and how well its discs are known, px.

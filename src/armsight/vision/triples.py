@@ -1,6 +1,6 @@
 """Three pairs of discs whose distances are those of three discs of the body: where the body may be.
 
-Every pair of discs (:mod:`~armsight.vision.pairing`) with every name that fits it is a node; two nodes are joined where
+Every pair of discs (:mod:`~armsight.vision.discs.pairing`) with every name that fits it is a node; two nodes are joined where
 their distance is that of the two discs on the body, within what noise and calibration allow; every triangle of nodes
 gives a pose by a rigid fit.
 """
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from armsight.data import Array, Ids, Record
 from armsight.vision.disc_view import DiscView
-from armsight.vision.pairing import Pairs
+from armsight.vision.discs.pairing import Pairs
 
 #: Distances that differ by more standard deviations than this are different.
 DISTANCE_SIGMAS = 4.5

@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from armsight.app.board_scenarios import DRIVEN
-from armsight.app.board_selftest import run_scenario
+from armsight.app.board.scenarios import DRIVEN
+from armsight.app.board.selftest import run_scenario
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.robot.boards import qemu

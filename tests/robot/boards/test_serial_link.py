@@ -13,7 +13,7 @@ import pytest
 import serial
 from board_rigs import PtyBoard, hold, keep_on
 
-from armsight.app.board_selftest import selftest
+from armsight.app.board.selftest import selftest
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.opening import open_board

@@ -7,9 +7,9 @@ import numpy as np
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.solid import box, see, with_noise
+from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.camera import Camera
-from armsight.vision.dense.judge import Truth, seen_by_right
+from armsight.vision.dense.evaluate import Truth, seen_by_right
 
 
 def texture(height, width, rng, grain=2.0):

@@ -6,7 +6,7 @@ import pytest
 from dense_scenes import layers
 
 from armsight.errors import InputError
-from armsight.vision.dense.judge import Truth, judge, seen_by_right
+from armsight.vision.dense.evaluate import Truth, judge, seen_by_right
 from armsight.vision.dense.middlebury import find_scenes, load_scene
 from armsight.vision.dense.pfm import read_pfm, write_pfm
 

@@ -7,7 +7,7 @@ from dense_scenes import layers, rendered
 
 from armsight.errors import InputError
 from armsight.vision.dense.block import Block
-from armsight.vision.dense.judge import judge
+from armsight.vision.dense.evaluate import judge
 from armsight.vision.dense.method import MEASURED, OCCLUDED, Search
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.opencv import OpenCV

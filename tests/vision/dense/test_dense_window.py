@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense import lanes
+from armsight.vision.dense import simd as lanes
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.window import RAW_MAX

@@ -11,8 +11,8 @@ from supersampled import board, expose, paint, picture, project, view
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.render import render
-from armsight.sim.scene import Placed, chessboard
+from armsight.sim.render.render import render
+from armsight.sim.render.scene import Placed, chessboard
 from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, open_board

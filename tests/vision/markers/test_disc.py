@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armsight.vision.markers.disc_fit import REASONS
+from armsight.vision.markers.disc.fit import REASONS
 from disc_painter import grey, outline, share
 from disc_views import discs_of
 

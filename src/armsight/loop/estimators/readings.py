@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.loop.estimators.floating import float_on, loose, masses
+from armsight.loop.estimators.backlash_dynamics import float_on, loose, masses
 from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
 from armsight.robot.arm import Arm
 

@@ -19,7 +19,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.handeye_start import kronecker
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.place import linear_placement, turn_between
+from armsight.loop.identify.placement import linear_placement, turn_between
 from armsight.loop.identify.priors import SIGMA
 from armsight.loop.identify.read import TURNS, AnglesMeasured, turned
 from armsight.robot.arm import Arm

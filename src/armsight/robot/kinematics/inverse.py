@@ -15,7 +15,7 @@ from armsight.data import Array, Ids
 from armsight.robot.kinematics.chain import Frame, after, before, tool_frame
 from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
 from armsight.robot.kinematics.descent import WORK, descend, pose_error
-from armsight.robot.kinematics.lanes import errors, frames, thetas
+from armsight.robot.kinematics.batch import errors, frames, thetas
 from armsight.robot.kinematics.rigid import rigid
 from armsight.robot.kinematics.rows import (
     ANGLE,

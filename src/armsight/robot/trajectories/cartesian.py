@@ -15,7 +15,7 @@ from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, ti
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped, pieces
-from armsight.robot.trajectories.walk import Obstacle, Walk, derivatives, refined, walk
+from armsight.robot.trajectories.lookahead import (Obstacle, Walk, derivatives, refined, walk)
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

@@ -19,7 +19,7 @@ from armsight.robot.trajectories.law import CLOSE, SCALES, SHAPES, Law, along, b
 from armsight.robot.trajectories.limits import ROUNDING, stretches
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, check_times, clamped
-from armsight.robot.trajectories.walk import Walk
+from armsight.robot.trajectories.lookahead import Walk
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

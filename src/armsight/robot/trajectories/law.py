@@ -20,7 +20,7 @@ from armsight.errors import InputError
 from armsight.robot.trajectories.limits import ROUNDING, stretches, worst
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_times
-from armsight.robot.trajectories.walk import Walk, columns
+from armsight.robot.trajectories.lookahead import Walk, columns
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

@@ -29,7 +29,7 @@ from armsight.robot.trajectories.trajectory import (
     check_duration,
     clamped,
 )
-from armsight.robot.trajectories.walk import behind
+from armsight.robot.trajectories.lookahead import behind
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

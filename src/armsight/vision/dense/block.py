@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.finish import Trust, finished
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.strips import on_strips
 from armsight.vision.dense.support import COSTS, SUPPORTS, match_planes

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Image, Record
 from armsight.errors import InputError
 from armsight.files import read_text
-from armsight.vision.dense.judge import Truth, seen_by_right
+from armsight.vision.dense.evaluate import Truth, seen_by_right
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.pfm import read_pfm
 from armsight.vision.dense.tiff import read_tiff

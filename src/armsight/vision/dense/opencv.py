@@ -9,7 +9,7 @@ import numpy as np
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.finish import Trust, finished
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.winner import Found, Singles
 

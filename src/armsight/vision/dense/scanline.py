@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.vision.dense.cost import BLOCK, ONE, Bytes, Pair, prepare, raw_row, smooth_row
-from armsight.vision.dense.finish import Trust, finished
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.rows import seen, vote
 from armsight.vision.dense.strips import on_strips

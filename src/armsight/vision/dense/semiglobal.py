@@ -16,7 +16,7 @@ import numpy as np
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.vision.dense.cost import BLOCK, Bytes, Pair, prepare, raw_row, smooth_row
-from armsight.vision.dense.finish import Trust, finished
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.paths import ADD, RUN_UP, WRITE, Work, cost_base, forward, leftward, make_work
 from armsight.vision.dense.strips import on_strips

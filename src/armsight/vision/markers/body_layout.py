@@ -13,7 +13,7 @@ from armsight.errors import InputError
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.body_check import check_points
 from armsight.vision.markers.body_file import read_body_file
-from armsight.vision.markers.disc import DiscTarget
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.tag import TagTarget
 
 KINDS = ("disc", "tag", "board")

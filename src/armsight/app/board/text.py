@@ -1,0 +1,143 @@
+"""What a board is and does, as JSON-ready facts in SI units and as lines to read, in degrees."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from armsight import firmware
+from armsight.app.board.selftest import Selftest
+from armsight.data import Array, JointStates
+from armsight.errors import InputError
+from armsight.files import read_text
+from armsight.firmware.elf import read_elf
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource, State
+from armsight.robot.boards.configuration import GAIN_RANGES, JOINTS, Configuration
+from armsight.robot.boards.reports import Welcome
+
+_SOURCES = {
+    ConfigSource.NEWEST: "its newest configuration",
+    ConfigSource.OLDER: "the one good copy of its configuration, as the other is empty or broken",
+    ConfigSource.FACTORY: "factory values, as none is stored: it cannot be enabled",
+}
+
+
+def package_facts() -> dict[str, Any]:
+    """Return what armsight's own build is."""
+    elf = read_elf(firmware.image())
+    about = json.loads(read_text(firmware.BUILT / "build.json"))
+    return {
+        "board": "pil",
+        "compiler": about["compiler"],
+        "image": str(firmware.image()),
+        "pieces": [],
+        "flash_bytes": elf.flash_bytes,
+        "ram_bytes": elf.ram_bytes,
+        "hard_float": elf.hard_float,
+    }
+
+
+def built_text(facts: Mapping[str, Any]) -> str:
+    """Return what was built, in lines."""
+    float_text = "hardware" if facts["hard_float"] else "software"
+    lines = [
+        f"{facts['image']}: {facts['board']}, by {facts['compiler']}, flash {facts['flash_bytes']} bytes,"
+        f" RAM {facts['ram_bytes']} bytes, {float_text} floating point"
+    ]
+    return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in facts["pieces"]])
+
+
+def welcome_text(welcome: Welcome) -> str:
+    """Return who a board is, in a line."""
+    return (
+        f"board {welcome.board}, firmware {welcome.firmware}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud,"
+        f" runs on {_SOURCES[welcome.config_source]}"
+    )
+
+
+def status_facts(board: Board, states: JointStates) -> dict[str, Any]:
+    """Return how a board is: its state, faults, newest angles and counters."""
+    status = board.status
+    return {
+        "t_s": round(status.t_s, 3),
+        "state": status.state.name,
+        "faults": [{"fault": f.fault.name, "joint": None if f.joint is None else f.joint + 1} for f in status.faults],
+        "q_rad": [round(float(q), 5) for q in states.q[-1]] if len(states.q) else None,
+        "duty": [round(float(duty), 4) for duty in board.joints.duty],
+        "supply_v": status.supply_v,
+        "readings": len(states.t_s),
+        "crc_errors": status.crc_errors,
+        "lost_bytes": status.lost_bytes,
+        "overrun_bytes": status.overrun_bytes,
+        "broken_messages": board.broken_messages,
+    }
+
+
+def status_text(facts: Mapping[str, Any]) -> str:
+    """Return how a board is, in a line."""
+    faults = ", ".join(f["fault"] + (f" joint {f['joint']}" if f["joint"] else "") for f in facts["faults"])
+    q = facts["q_rad"]
+    angles = " ".join(f"{np.degrees(each):7.2f}" for each in q) + " deg" if q else "no readings"
+    state = STATE_TEXTS[State[facts["state"]]].split(":")[0]
+    line = f"{facts['t_s']:8.2f} s  {state:14} {angles}  {facts['supply_v']:5.2f} V"
+    return f"{line}  {faults}" if faults else line
+
+
+def gains_facts(values: Array) -> dict[str, Any]:
+    """Return gains (6, 6), a list a joint by the gain's name."""
+    return {name: [float(np.float32(each)) for each in values[:, k]] for k, name in enumerate(GAIN_RANGES)}
+
+
+def gains_text(values: Array) -> str:
+    """Return gains (6, 6) as a table."""
+    lines = ["joint" + "".join(f"{name:>21}" for name in GAIN_RANGES)]
+    lines += [f"{joint + 1:5}" + "".join(f"{value:21.6g}" for value in row) for joint, row in enumerate(values)]
+    return "\n".join(lines)
+
+
+def changed_gains(values: Array, changes: Sequence[str]) -> Array:
+    """Return gains (6, 6) with changes of the form ``JOINT:NAME=VALUE``; JOINT is 1 to 6 or ``all``.
+
+    Raises:
+        InputError: a change is not of this form.
+    """
+    changed, names = values.copy(), list(GAIN_RANGES)
+    for change in changes:
+        joint, _, rest = change.partition(":")
+        name, _, text = rest.partition("=")
+        known = (*(str(j + 1) for j in range(JOINTS)), "all")
+        if joint not in known or name not in names:
+            raise InputError(f"{change!r}: JOINT:NAME=VALUE is needed, JOINT 1 to 6 or all, NAME {', '.join(names)}")
+        try:
+            value = float(text)
+        except ValueError:
+            raise InputError(f"{change!r}: {text!r} is no number") from None
+        changed[slice(None) if joint == "all" else int(joint) - 1, names.index(name)] = value
+    return changed
+
+
+def with_gains(config: Configuration, values: Array) -> Configuration:
+    """Return a configuration with other gains (6, 6)."""
+    changed = config.copy()
+    for k, name in enumerate(GAIN_RANGES):
+        changed["joint"]["gains"][name] = values[:, k]
+    return changed
+
+
+def selftest_text(result: Selftest) -> str:
+    """Return what a self-test found, in lines."""
+    lines = [
+        f"{name:14} {'failed' if each.problems else 'passed'}  {(each.trace_sha256 or '')[:16]}".rstrip()
+        for name, each in result.scenarios.items()
+    ]
+    lines.append(f"{result.ticks_per_s:.0f} ticks/s, {result.ticks_per_s / 1000:.1f} times real time")
+    if result.elf["flash_bytes"] is not None:
+        float_text = "hardware" if result.elf["hard_float"] else "software"
+        lines.append(
+            f"flash {result.elf['flash_bytes']}, RAM {result.elf['ram_bytes']} bytes, {float_text} floating point"
+        )
+    return "\n".join(lines)

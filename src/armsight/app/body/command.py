@@ -1,0 +1,242 @@
+"""``armsight body``: is a body file's geometry good, and its markers on paper."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from typing import Any
+
+import click
+import numpy as np
+
+from armsight.app.body.draw import PAPERS, draw_body
+from armsight.app.body.check import judge, sigma_px
+from armsight.app.body_swaps import TOLD
+from armsight.app.body.finding import Outlook, Verdict
+from armsight.app.body_words import swap_words
+from armsight.errors import InputError
+from armsight.files import check_writable
+from armsight.vision.discs.predict import plain_rig
+from armsight.vision.markers.body_layout import Layout, read_layout
+from armsight.vision.rig import StereoRig
+
+#: More distances between discs than this are printed by the closest pairs only.
+_DISTANCES = 15
+
+
+@click.group()
+def command() -> None:
+    """Check a body file's geometry before the body is built, and print its markers to scale.
+
+    The form of a body file: docs/targets.md.
+    """
+
+
+@command.command()
+@click.argument("path", metavar="BODY.toml")
+@click.option("--rig", "rig_path", metavar="RIG.json", help="The cameras; without it, two HD cameras as stated.")
+@click.option(
+    "--distance",
+    "distances",
+    multiple=True,
+    type=float,
+    metavar="M",
+    help="Distance from the cameras, m; may be repeated. 0.6, 0.8 and 1.2 by default.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.pass_context
+def check(context: click.Context, path: str, rig_path: str | None, distances: tuple[float, ...], as_json: bool) -> None:
+    """Say whether a body can be told from its discs, how well it fixes a pose, and what to change.
+
+    Exit code 0: usable at every distance; 1: ambiguous or unusable at one of them; 2: no body file.
+    """
+    for distance in distances:
+        if not 0.01 <= distance <= 100:
+            raise InputError(f"--distance {distance:g}: expected metres, between 0.01 and 100")
+    layout = read_layout(path)
+    rig = plain_rig() if rig_path is None else StereoRig.load(rig_path)
+    verdict = judge(layout, rig, tuple(sorted(set(distances))) or (0.6, 0.8, 1.2))
+    cameras = _cameras(rig, rig_path)
+    if as_json:
+        click.echo(json.dumps(_facts(path, layout, rig, cameras, verdict), allow_nan=False))
+    else:
+        click.echo("\n".join(_lines(path, layout, cameras, verdict)))
+    context.exit(0 if verdict.word == "usable" else 1)
+
+
+@command.command()
+@click.argument("path", metavar="BODY.toml")
+@click.option("-o", "--output", required=True, metavar="OUT", help="The drawing: .pdf, .svg or .png.")
+@click.option("--paper", default="a4", show_default=True, type=click.Choice(list(PAPERS), case_sensitive=False))
+@click.option("--dpi", default=600, show_default=True, type=click.IntRange(72, 2400), help="Pixels an inch of a .png.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def draw(path: str, output: str, paper: str, dpi: int, as_json: bool) -> None:
+    """Draw a body's markers to scale: print at 100%, measure the bar, glue.
+
+    One page for each plane of the body; .svg and .png have a file for each.
+    """
+    check_writable(output, apart_from=(path,))
+    drawn = draw_body(path, output, paper=paper.lower(), dpi=dpi)
+    for note in drawn.notes:
+        click.echo(f"note: {note}", err=True)
+    if as_json:
+        pages = [{"normal": page.normal.tolist(), "markers": page.names} for page in drawn.pages]
+        click.echo(json.dumps({"body": path, "files": drawn.files, "paper": paper.lower(), "pages": pages}))
+        return
+    for number, page in enumerate(drawn.pages, start=1):
+        click.echo(f"page {number}: {', '.join(page.names)}")
+    click.echo(f"written to {', '.join(drawn.files)}; print at 100%, not fitted to the page, and measure the bar")
+
+
+def _cameras(rig: StereoRig, path: str | None) -> str:
+    """Say which cameras the figures are for."""
+    (width, height), f = rig.left.image_size_px, rig.left.intrinsics[0]
+    name = "two perfect cameras" if path is None else path
+    uncertain = "" if path is None or rig.cov.any() else ", its calibration taken as perfect"
+    return (
+        f"{name}, {width}x{height} px, f {f:.0f} px, {rig.baseline_m:.3g} m apart, places known to {sigma_px(rig):.2g} px"
+        f"{uncertain}"
+    )
+
+
+def _distances(layout: Layout) -> list[tuple[str, str, float]]:
+    """Return all distances between discs, m, the shortest first."""
+    if layout.discs is None:
+        return []
+    p, names = layout.discs.body.points, layout.discs.body.point_names
+    i, j = np.triu_indices(len(p), 1)
+    lengths = np.linalg.norm(p[j] - p[i], axis=1)
+    return [(names[i[k]], names[j[k]], float(lengths[k])) for k in np.argsort(lengths, kind="stable")]
+
+
+def _closest(distances: list[tuple[str, str, float]]) -> list[str]:
+    """Say which distances between discs are closest to each other."""
+    gaps = [(b[2] - a[2], a, b) for a, b in pairwise(distances)]
+    return [
+        f"{a[0]}-{a[1]} and {b[0]}-{b[1]} differ by {1e3 * gap:.2f} mm"
+        for gap, a, b in sorted(gaps, key=lambda g: g[0])[:3]
+    ]
+
+
+def _lines(path: str, layout: Layout, cameras: str, verdict: Verdict) -> list[str]:
+    """Return the verdict as lines for people: mm, degrees, px."""
+    count = {
+        "disc": layout.disc_count,
+        "tag": 0 if layout.tags is None else len(layout.tags.tags),
+        "board": 0 if layout.boards is None else len(layout.boards.boards),
+    }
+    kinds = ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in count.items() if n)
+    size = np.ptp(layout.body.points, axis=0) * 1e3
+    lines = [f"{path}: {layout.name}: {kinds}; {' x '.join(f'{s:.1f}' for s in size)} mm", f"verdict: {verdict.word}"]
+    lines += [f"unique: {_unique(layout, verdict)}"]
+    if distances := _distances(layout):
+        if len(distances) <= _DISTANCES:
+            lines.append("distances, mm: " + ", ".join(f"{a}-{b} {1e3 * d:.2f}" for a, b, d in distances))
+        if len(distances) > 1:
+            lines.append("closest: " + "; ".join(_closest(distances)))
+    lines += ["", f"expected sigma: {cameras}; the body faces them", *_table(verdict), ""]
+    word = {"bad": "bad ", "weak": "weak", "note": "note"}
+    for finding in sorted(verdict.findings, key=lambda f: list(word).index(f.grade)):
+        if finding.text:
+            lines.append(f"{word[finding.grade]}  {finding.text}")
+        if finding.change:
+            lines.append(f"      change: {finding.change}")
+    return lines
+
+
+def _unique(layout: Layout, verdict: Verdict) -> str:
+    """Say whether the body can be told, in one line."""
+    if layout.coded:
+        return "yes, where a tag or a board is in view"
+    if any(f.grade == "bad" and f.kind == "ambiguous" for f in verdict.findings):
+        return "no"
+    unseen = all(np.isnan(one.cov).any() for one in verdict.outlooks)
+    if unseen or any(f.kind in ("view", "overlap") for f in verdict.findings):
+        return "not judged"
+    if any(f.kind == "behind" for f in verdict.findings):
+        return "yes, by distances and normals"
+    return "yes, by distances"
+
+
+def _table(verdict: Verdict) -> list[str]:
+    """Return the expected sigma at each distance."""
+    rows = [("distance", "across", "depth", "tilt", "about sight", "disc across")]
+    for one in verdict.outlooks:
+        if np.isnan(one.cov).any():
+            rows.append((f"{one.distance_m:g} m", "no pose", "", "", "", _pixels(one)))
+            continue
+        (across, depth), (tilt, roll) = one.position_mm, one.turn_deg
+        rows.append(
+            (
+                f"{one.distance_m:g} m",
+                f"{across:.3f} mm",
+                f"{depth:.3f} mm",
+                f"{tilt:.4f} deg",
+                f"{roll:.4f} deg",
+                _pixels(one),
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return [
+        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def _pixels(one: Outlook) -> str:
+    """Return the discs' diameters in the image."""
+    low, high = one.disc_px
+    if np.isnan(low):
+        return ""
+    return f"{low:.1f} px" if high - low < 0.05 else f"{low:.1f} to {high:.1f} px"
+
+
+def _facts(path: str, layout: Layout, rig: StereoRig, cameras: str, verdict: Verdict) -> dict[str, Any]:
+    """Return the verdict as one JSON object."""
+    swaps = [
+        {
+            "seen": [layout.body.point_names[i] for i in swap.relabeling.seen],
+            "taken_for": [layout.body.point_names[i] for i in swap.relabeling.taken_for],
+            "words": swap_words(swap.relabeling, layout.body.point_names),
+            "off_mm": 1e3 * swap.relabeling.off_m,
+            "from_behind": swap.behind,
+            "settled_by_normals": swap.by_side,
+            "told_apart_sigmas": [_number(sigmas) for sigmas in swap.told],
+            "told_apart": not bool((swap.told < TOLD).any()),
+        }
+        for swap in verdict.swaps
+    ]
+    return {
+        "body": path,
+        "name": layout.name,
+        "verdict": verdict.word,
+        "cameras": cameras,
+        "sigma_px": sigma_px(rig),
+        "points": len(layout.body.points),
+        "discs": layout.disc_count,
+        "coded": layout.coded,
+        "distances_mm": [{"from": a, "to": b, "mm": 1e3 * d} for a, b, d in _distances(layout)],
+        "swaps": swaps,
+        "expected": [_expected(one) for one in verdict.outlooks],
+        "findings": [
+            {"grade": f.grade, "kind": f.kind, "text": f.text or None, "change": f.change or None}
+            for f in verdict.findings
+        ],
+    }
+
+
+def _expected(one: Outlook) -> dict[str, Any]:
+    """Return the expected sigma at a distance as JSON."""
+    (across, depth), (tilt, roll) = one.position_mm, one.turn_deg
+    return {
+        "distance_m": one.distance_m,
+        "sigma_across_mm": _number(across),
+        "sigma_depth_mm": _number(depth),
+        "sigma_tilt_deg": _number(tilt),
+        "sigma_about_sight_deg": _number(roll),
+        "disc_px": None if np.isnan(one.disc_px).any() else one.disc_px.tolist(),
+    }
+
+
+def _number(value: float) -> float | None:
+    """Return a number, or None where it is none or infinite: JSON knows neither."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,287 @@
+"""A body's markers on paper, to scale: ``armsight body draw``.
+
+A page is a figure of the paper's size whose only axes cover it and count millimetres from its upper left corner.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from armsight.app.body_sheet import Mark, Page, pages
+from armsight.app.report.plotting import drawing, plain
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import replacing
+from armsight.vision.markers.body_layout import read_layout
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Paper -> width and height, mm. "fit" is as large as the drawing needs.
+PAPERS = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+    "fit": (np.inf, np.inf),
+}
+#: White edge that printers need, height of what stands below the drawing, and the least width of that, mm.
+_EDGE, _FOOT, _FOOT_WIDTH = 10.0, 30.0, 130.0
+_BAR = 100.0
+_ARROW = 8.0
+_TEXT, _SMALL = 3.2, 2.4  # height of letters, mm
+_POINT = 25.4 / 72
+_MOST_PIXELS = 150_000_000
+_PLAIN: dict[str, Any] = {"linewidth": 0.0, "antialiased": True, "snap": False}
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn(Record):
+    """What was drawn.
+
+    Attributes:
+        files: the files written.
+        pages: what is on each page.
+        notes: what should be said about it.
+    """
+
+    files: tuple[str, ...]
+    pages: tuple[Page, ...]
+    notes: tuple[str, ...]
+
+
+def draw_body(path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600) -> Drawn:
+    """Draw a body's markers to scale.
+
+    Args:
+        path: the TOML body file.
+        output: .pdf (a page for each plane), .svg or .png (a file for each, numbered from the second on).
+        paper: a key of PAPERS; turned where that fits better.
+        dpi: pixels an inch of a .png.
+
+    Raises:
+        InputError: no body file, an unknown suffix, a plane that does not fit the paper, matplotlib is missing, or the
+            file cannot be written.
+    """
+    suffix = Path(output).suffix.lower()
+    if suffix not in _SAVERS:
+        raise InputError(f"{output}: a drawing is a {', '.join(_SAVERS)} file, by its suffix")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError('drawing a body needs matplotlib, which is not installed: pip install "armsight[report]"')
+    layout = read_layout(path)
+    sheets, notes = pages(path, layout)
+    sizes = [_paper(path, page, paper) for page in sheets]
+    if suffix == ".png":
+        _check_pixels(output, sizes, dpi)
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+    foot = f"{plain(Path(path).name)}   sha256 {digest}"
+    with drawing():
+        figures = []
+        for number, (page, size) in enumerate(zip(sheets, sizes, strict=True), start=1):
+            head = plain(layout.name) + (f", plane {number} of {len(sheets)}" if len(sheets) > 1 else "")
+            figures.append(_figure(page, size, head, foot))
+        files = _SAVERS[suffix](figures, Path(output), dpi)
+    return Drawn(tuple(str(file) for file in files), sheets, tuple(notes))
+
+
+def _content(page: Page) -> Array:
+    """Return (2, 2) low and high corner of what is on a page, names included, mm."""
+    boxes = np.array([mark.box for mark in page.marks])
+    names = [0.6 * _TEXT * len(plain(mark.name, 24)) / 2 for mark in page.marks]
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    middle = boxes[:, :, 0].mean(axis=1)
+    low[0], high[0] = min(low[0], (middle - names).min()), max(high[0], (middle + names).max())
+    return np.array([low - 2 * _TEXT, high + 2 * _TEXT])
+
+
+def _paper(path: str | Path, page: Page, paper: str) -> tuple[float, float]:
+    """Return the width and height of the paper, upright or turned, mm."""
+    low, high = _content(page)
+    needed = high - low + [2 * _EDGE, 2 * _EDGE + _FOOT]
+    needed[0] = max(needed[0], _FOOT_WIDTH + 2 * _EDGE)
+    if paper == "fit":
+        return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
+    larger = [name for name, size in PAPERS.items() if name != "fit" and _turned(size, needed) is not None]
+    size = _turned(PAPERS[paper], needed)
+    if size is None:
+        hint = f"--paper {larger[0]}, or " if larger else ""
+        raise InputError(
+            f"{path}: the plane of {', '.join(page.names[:3])} needs {needed[0]:.0f} x {needed[1]:.0f} mm of paper, and "
+            f"{paper} is {PAPERS[paper][0]:g} x {PAPERS[paper][1]:g} mm: take {hint}--paper fit for a plotter or for a "
+            "program that prints posters on several sheets"
+        )
+    return size
+
+
+def _turned(size: tuple[float, float], needed: Array) -> tuple[float, float] | None:
+    """Return a paper's size upright or, where that does not fit, turned; None where neither does."""
+    return next((s for s in (size, size[::-1]) if needed[0] <= s[0] and needed[1] <= s[1]), None)
+
+
+def _check_pixels(output: str | Path, sizes: list[tuple[float, float]], dpi: int) -> None:
+    """Raise InputError where an image would be too large to hold."""
+    most = max(width * height for width, height in sizes) * (dpi / 25.4) ** 2
+    if most > _MOST_PIXELS:
+        allowed = int(dpi * np.sqrt(_MOST_PIXELS / most))
+        raise InputError(
+            f"{output}: {most / 1e6:.0f} million pixels are too many: take --dpi {allowed} or less, or a .pdf or .svg"
+        )
+
+
+def _figure(page: Page, size: tuple[float, float], head: str, foot: str) -> Figure:
+    """Draw one page."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = size
+    figure = Figure(figsize=(width / 25.4, height / 25.4))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.set_xlim(0.0, width)
+    axes.set_ylim(height, 0.0)
+    low, high = _content(page)
+    room = np.array([width, height - _FOOT])
+    shift = (room - (high - low)) / 2 - low
+    for mark in page.marks:
+        _surround(axes, mark, shift)
+    for mark in page.marks:
+        _print(axes, mark, shift)
+    taken = [mark.box + shift for mark in page.marks]
+    at = shift
+    if not _free(np.array([at - 5.0, at + 17.0]), taken) or (at < _EDGE).any() or (at > room - _EDGE).any():
+        at = np.array([width - _EDGE - 14.0, height - _EDGE - 9.0])
+    taken.append(np.array([at - 5.0, at + 17.0]))
+    _arrows(axes, page, at, "" if at is shift else "body's axes")
+    for mark in page.marks:
+        _name(axes, mark, shift, taken)
+    seen = f"seen from ({', '.join(f'{c + 0.0:.3g}' for c in page.normal.round(6))})"
+    _footer(axes, height, [f"{head}, {seen}", foot])
+    return figure
+
+
+def _surround(axes: Axes, mark: Mark, shift: Array) -> None:
+    """Draw the dark surround of a bright disc."""
+    from matplotlib.patches import Circle, Rectangle
+
+    if not mark.reach:
+        return
+    x, y = mark.circles[0, :2] + shift
+    side = 2 * mark.reach
+    if mark.square:
+        axes.add_patch(Rectangle((x - mark.reach, y - mark.reach), side, side, facecolor="black", **_PLAIN))
+    else:
+        axes.add_patch(Circle((x, y), mark.reach, facecolor="black", **_PLAIN))
+
+
+def _print(axes: Axes, mark: Mark, shift: Array) -> None:
+    """Draw a marker: its discs, and its dark cells as one path, so that no seam shows between them."""
+    from matplotlib.patches import Circle, PathPatch
+    from matplotlib.path import Path as Outline
+
+    for x, y, radius in mark.circles:
+        axes.add_patch(
+            Circle((x + shift[0], y + shift[1]), radius, facecolor="black" if mark.dark else "white", **_PLAIN)
+        )
+    if len(mark.polygons):
+        corners = np.concatenate([mark.polygons, mark.polygons[:, :1]], axis=1) + shift
+        codes = np.tile([Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY], len(corners))
+        axes.add_patch(PathPatch(Outline(corners.reshape(-1, 2), codes), facecolor="black", **_PLAIN))
+
+
+def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:
+    """Write a marker's name beside it, where nothing else is."""
+    low, high = mark.box + shift
+    name = plain(mark.name, 24)
+    half = np.array([0.3 * _TEXT * len(name), 0.6 * _TEXT])
+    middle, beyond = (low + high) / 2, (high - low) / 2 + half + 1.0
+    places = [middle + beyond * step for step in np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])]
+    at = next((p for p in places if _free(np.array([p - half, p + half]), taken)), places[0])
+    taken.append(np.array([at - half, at + half]))
+    _write(axes, at, name, _TEXT, ha="center", va="center")
+
+
+def _free(box: Array, taken: list[Array]) -> bool:
+    """Whether a box (2, 2) touches none of others."""
+    return not any((box[0] < other[1]).all() and (box[1] > other[0]).all() for other in taken)
+
+
+def _write(axes: Axes, at: Array, text: str, height_mm: float, **more: str) -> None:
+    """Write text of a height; a dollar sign is a dollar sign."""
+    style: Any = {"fontsize": height_mm / _POINT / 0.72, "color": "black", "parse_math": False, **more}
+    axes.text(float(at[0]), float(at[1]), text, **style)
+
+
+def _arrows(axes: Axes, page: Page, at: Array, title: str) -> None:
+    """Draw the body's axes as seen on the page."""
+    on_page = page.axes.T
+    away = []
+    for k, letter in enumerate("xyz"):
+        along = on_page[:2, k]
+        if np.linalg.norm(along) > 0.2:
+            end = at + _ARROW * along
+            line: Any = {"arrowstyle": "-|>", "color": "black", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
+            axes.annotate("", xy=tuple(end), xytext=tuple(at), arrowprops=line)
+            _write(axes, at + (_ARROW + 2.5) * along, letter, _SMALL, ha="center", va="center")
+        if abs(on_page[2, k]) > 0.2:
+            away.append(f"{letter} {'into' if on_page[2, k] > 0 else 'out of'} the page")
+    words = ", ".join([*([title] if title else []), *away])
+    beside = np.array([-_ARROW - 4.5, 0.0]) if title else np.array([-2.0, -1.5])
+    _write(axes, at + beside, words, _SMALL, ha="right" if title else "left", va="center" if title else "bottom")
+
+
+def _footer(axes: Axes, height: float, lines: list[str]) -> None:
+    """Draw the bar that checks the printer, and what this is."""
+    x, y = _EDGE, height - _EDGE - 12.0
+    axes.plot([x, x + _BAR], [y, y], color="black", lw=0.8, solid_capstyle="butt")
+    for mm in range(0, int(_BAR) + 1, 10):
+        tall = 3.0 if mm % 50 == 0 else 1.8
+        axes.plot([x + mm, x + mm], [y, y - tall], color="black", lw=0.6, solid_capstyle="butt")
+    _write(axes, np.array([x, y - 4.0]), "this bar is 100 mm long: print at 100%, then measure it", _SMALL, va="bottom")
+    for row, line in enumerate(lines):
+        _write(axes, np.array([x, y + 5.0 + 4.5 * row]), line, _SMALL, va="center")
+
+
+def _save_pdf(figures: list[Figure], output: Path, dpi: int) -> list[Path]:
+    """Write one file of all pages."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    nothing: dict[str, Any] = {"CreationDate": None, "Creator": "armsight", "Producer": None}
+    with replacing(output, "wb") as file, PdfPages(file, metadata=nothing) as book:
+        for figure in figures:
+            book.savefig(figure, dpi=dpi)
+    return [output]
+
+
+def _save_each(kind: str, metadata: dict[str, Any]) -> Callable[[list[Figure], Path, int], list[Path]]:
+    """Return what writes a file for each page: all of them, or none."""
+
+    def save(figures: list[Figure], output: Path, dpi: int) -> list[Path]:
+        files = [output, *(output.with_stem(f"{output.stem}-{n}") for n in range(2, len(figures) + 1))]
+        with contextlib.ExitStack() as stack:
+            opened: list[IO[Any]] = [stack.enter_context(replacing(file, "wb")) for file in files]
+            for figure, file in zip(figures, opened, strict=True):
+                figure.savefig(file, format=kind, dpi=dpi, metadata=metadata)
+        return files
+
+    return save
+
+
+_SAVERS: dict[str, Callable[[list[Figure], Path, int], list[Path]]] = {
+    ".pdf": _save_pdf,
+    ".svg": _save_each("svg", {"Date": None}),
+    ".png": _save_each("png", {"Software": None}),
+}

@@ -1,0 +1,170 @@
+"""The figures of a calibration's report about its images and pairs: coverage, residuals, held-out errors.
+
+Every function takes the calibration and returns a matplotlib Figure.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from armsight.app.report.plotting import (BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain)
+from armsight.data import SIDES, Array
+from armsight.vision.calibrate.result import Calibration
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Cells of the coverage map along the longer side of the image, and of the mean residuals.
+COVERAGE_CELLS, MEAN_CELLS = 16, 9
+#: A cell's mean residual is drawn from so many corners on, and stands out beyond so many of its standard errors.
+_LEAST_IN_CELL, STANDS_OUT = 5, 4.0
+#: The typical longer residual is drawn as long as this share of the image's width.
+_ARROW_SHARE = 0.035
+#: More pairs than this are not drawn one by one: the worst are.
+MOST_BARS = 60
+#: More residuals than this are not drawn one by one: a random choice is.
+MOST_ARROWS = 3000
+_MOST_LETTERS = 50
+#: A pair whose error is this many times the median stands out.
+OUTSTANDING = 2.5
+
+
+def corners(calibration: Calibration, side: int) -> tuple[Array, Array]:
+    """Return (N, 2) places of one camera's corners and (N, 2) their residuals, px."""
+    rows = calibration.observations.camera == side
+    return calibration.observations.uv[rows], calibration.solution.residuals_px[rows]
+
+
+def grid_counts(calibration: Calibration, side: int, cells: int = COVERAGE_CELLS) -> tuple[Array, Array, Array]:
+    """Count one camera's corners in square cells: (R, C) counts, (C + 1,) u and (R + 1,) v edges, px."""
+    size = np.array(calibration.rig.cameras[side].image_size_px)
+    columns, rows = np.maximum(np.round(cells * size / size.max()).astype(int), 2)
+    edges_u, edges_v = np.linspace(-0.5, size[0] - 0.5, columns + 1), np.linspace(-0.5, size[1] - 0.5, rows + 1)
+    uv, _ = corners(calibration, side)
+    counts, _, _ = np.histogram2d(uv[:, 1], uv[:, 0], bins=(edges_v, edges_u))
+    return counts, edges_u, edges_v
+
+
+def _image_axes(axes: Axes, calibration: Calibration, side: int, title: str) -> None:
+    """Make axes the frame of one camera's image."""
+    width, height = calibration.rig.cameras[side].image_size_px
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=title)
+    axes.set_xlabel("u, px")
+    axes.set_ylabel("v, px" if side == 0 else "")
+    axes.spines[["top", "right"]].set_visible(True)
+
+
+def _tall(calibration: Calibration) -> float:
+    """Height of two images side by side at the report's width, inches."""
+    return 0.46 * WIDTH_IN * max(h / w for w, h in (camera.image_size_px for camera in calibration.rig.cameras))
+
+
+def coverage_figure(calibration: Calibration) -> Figure:
+    """Where the corners were in both images, coloured by count; empty cells stand out."""
+    figure = new_figure(_tall(calibration) + 0.7)
+    panels = figure.subplots(1, 2)
+    grids = [grid_counts(calibration, side) for side in (0, 1)]
+    most = max(counts.max() for counts, _, _ in grids)
+    for side, (axes, (counts, u, v)) in enumerate(zip(panels, grids, strict=True)):
+        empty = 100 * float((counts == 0).mean())
+        _image_axes(axes, calibration, side, f"{SIDES[side]} image: {empty:.0f}% of the cells are empty")
+        axes.set_facecolor(EMPTY)
+        axes.patch.set(hatch="////", edgecolor="#e9a57f")
+        shown = np.ma.masked_equal(counts, 0)
+        mesh = axes.pcolormesh(
+            u, v, shown, cmap="GnBu", vmin=-0.15 * most, vmax=most, edgecolors="white", linewidth=0.6
+        )
+        uv, _ = corners(calibration, side)
+        axes.plot(*uv.T, ".", color=INK, markersize=1.2, alpha=0.45)
+    bar = figure.colorbar(mesh, ax=panels, label="points in a cell", shrink=0.8, aspect=25)
+    bar.ax.set_ylim(1, max(most, 2))
+    bar.outline.set_visible(False)
+    return figure
+
+
+def mean_residuals(calibration: Calibration, side: int) -> tuple[Array, Array, Array]:
+    """Average one camera's residuals over cells.
+
+    Returns:
+        (C, 2) mean places, px; (C, 2) mean residuals, px; (C,) their length over their standard error.
+    """
+    uv, residuals = corners(calibration, side)
+    _, edges_u, edges_v = grid_counts(calibration, side, MEAN_CELLS)
+    cell = np.digitize(uv[:, 0], edges_u) * (len(edges_v) + 1) + np.digitize(uv[:, 1], edges_v)
+    rows = [np.flatnonzero(cell == k) for k in np.unique(cell)]
+    rows = [r for r in rows if len(r) >= _LEAST_IN_CELL]
+    mean = np.array([residuals[r].mean(axis=0) for r in rows]).reshape(-1, 2)
+    error = np.array([np.sqrt(residuals[r].var(axis=0, ddof=1).sum() / len(r)) for r in rows])
+    length = np.linalg.norm(mean, axis=1)
+    return np.array([uv[r].mean(axis=0) for r in rows]).reshape(-1, 2), mean, length / np.maximum(error, 1e-12)
+
+
+def residuals_figure(calibration: Calibration) -> Figure:
+    """Residual vectors over both images: every corner above, the mean of every region below, both enlarged."""
+    figure = new_figure(2 * _tall(calibration) + 1.6)
+    panels = figure.subplots(2, 2)
+    every = [corners(calibration, side) for side in (0, 1)]
+    means = [mean_residuals(calibration, side) for side in (0, 1)]
+    enlarged = _enlargement(calibration, [residuals for _, residuals in every], _ARROW_SHARE)
+    enlarged_mean = _enlargement(calibration, [mean for _, mean, _ in means], 2 * _ARROW_SHARE)
+    for side, name in enumerate(SIDES):
+        uv, residuals = every[side]
+        rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
+        shown = np.random.default_rng(0).permutation(len(uv))[:MOST_ARROWS]
+        which = "every point" if len(shown) == len(uv) else f"{MOST_ARROWS} points"
+        _image_axes(panels[0, side], calibration, side, f"{name}, {which}, x{enlarged:g} (RMS {rms:.3f} px)")
+        arrows(panels[0, side], uv[shown], residuals[shown], enlarged, BLUE, 0.0016, "px", 0.045)
+        uv, mean, errors = means[side]
+        out = errors > STANDS_OUT
+        title = f"{name}, regional mean, x{enlarged_mean:g} ({out.sum()} of {len(out)} stand out)"
+        _image_axes(panels[1, side], calibration, side, title)
+        colours = [RED if o else MUTED for o in out]
+        panels[1, side].scatter(*uv.T, s=6, c=colours, linewidths=0)
+        arrows(panels[1, side], uv, mean, enlarged_mean, colours, 0.004, "px", 0.045)
+    return figure
+
+
+def _enlargement(calibration: Calibration, vectors: list[Array], share: float) -> float:
+    """Return the round factor under which the longer vectors, px, are drawn as long as a share of the left image."""
+    lengths = np.linalg.norm(np.concatenate(vectors), axis=1)
+    usual = max(float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0, 1e-9)
+    return nice(share * calibration.rig.left.image_size_px[0] / usual)
+
+
+def pairs_figure(calibration: Calibration) -> Figure:
+    """Held-out errors of every pair, one bar each; pairs that were not used are named with their reason."""
+    errors = calibration.errors
+    order = np.sort(np.argsort(-errors.rigid_m)[:MOST_BARS])
+    names = [plain(calibration.pairs[int(errors.pair[k])], 28) for k in order]
+    rejected = calibration.rejected[: max(MOST_BARS // 3, MOST_BARS - len(order))]
+    count = len(names) + len(rejected)
+    figure = new_figure(1.1 + 0.19 * count)
+    panels = figure.subplots(1, 2, sharey=True)
+    values = (errors.epipolar_px, 1e3 * errors.rigid_m)
+    means = (calibration.heldout.epipolar_rms_px, 1e3 * calibration.heldout.rigid_rms_m)
+    labels = ("epipolar error, px", "rigid error, mm")
+    for axes, value, mean, label in zip(panels, values, means, labels, strict=True):
+        usual = float(np.median(value))
+        colours = [ORANGE if v > OUTSTANDING * usual else BLUE for v in value[order]]
+        axes.barh(range(len(names)), value[order], color=colours, height=0.7)
+        axes.plot([mean, mean], [-0.6, len(names) - 0.4], color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.set_xlim(0, 1.06 * max(value.max(), mean))
+        axes.set_title(f"held-out {label} (dashed: RMS of all, {mean:.3g})")
+        axes.tick_params(axis="y", length=0)
+        axes.grid(axis="x", color="#e4e7eb", linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.spines["left"].set_visible(False)
+    for k, pair in enumerate(rejected, start=len(names)):
+        for axes in panels:
+            axes.axhspan(k - 0.45, k + 0.45, color=EMPTY, linewidth=0)
+        transform = panels[0].get_yaxis_transform()
+        reason = "not used: " + textwrap.shorten(plain(pair.reason, 500), _MOST_LETTERS, placeholder=" ...")
+        panels[0].text(0.01, k, reason, va="center", transform=transform, color=RED, fontsize=8, parse_math=False)
+    names += [plain(pair.pair, 28) for pair in rejected]
+    panels[0].set_yticks(range(count), names, parse_math=False)
+    panels[0].set_ylim(count - 0.4, -0.6)
+    return figure

@@ -1,0 +1,214 @@
+"""The chapter's summary, measured: how the error goes with distance, baseline, resolution, noise and calibration.
+
+Each study renders the tool's body before a rig, one thing changed at a time, measures it with the same line as ever, and
+holds the error against the truth and against what the covariance foretold. The rate of vision in the loop is studied in
+the workcell (``experiment``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import chdtri
+
+from armsight.data import Array, PoseEstimate, Record, Shot
+from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.render.background import plain
+from armsight.sim.example_rig import bench_rig, board_poses
+from armsight.sim.workcell.body import body_patterns, body_target
+from armsight.sim.render.optics import Sensor
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import Placed, chessboard
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.markers.board import open_board
+from armsight.vision.measure import measure
+from armsight.vision.rig import StereoRig
+
+_BOARD = "chessboard:9x6:25mm"
+_TILT = np.radians(30.0)
+_SIZE, _FOCAL, _BASELINE, _DISTANCE, _NOISE = (1280, 720), 900.0, 0.2, 0.8, 2.0
+_DRAWS = 3  # calibrations of each size
+
+
+@dataclass(frozen=True, eq=False)
+class Study(Record):
+    """How the error goes with one thing.
+
+    Attributes:
+        name: what is changed.
+        unit: of it.
+        values: (N,) what it was.
+        position_rms_m: (N,) measured error of the position.
+        low_m: (N,) lower end of its 95% interval, from the number of shots.
+        high_m: (N,) upper end.
+        predicted_m: (N,) what the covariance foretold.
+        missed: (N,) shots without a pose.
+    """
+
+    name: str
+    unit: str
+    values: Array
+    position_rms_m: Array
+    low_m: Array
+    high_m: Array
+    predicted_m: Array
+    missed: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors(Record):
+    """Errors (N, 3) of positions, m, the traces (N,) of their covariances, and how many shots gave none."""
+
+    error: Array
+    variance: Array
+    missed: int
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What the body at rest is seen with, by an exactly known rig."""
+
+    distance_m: float = _DISTANCE
+    baseline_m: float = _BASELINE
+    width: int = _SIZE[0]
+    noise: float = _NOISE
+
+
+def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = lambda line: None) -> list[Study]:
+    """Make the five studies of vision.
+
+    Args:
+        seed: of poses and noise.
+        shots: rendered for each value.
+        progress: called with a line about what is being done.
+    """
+
+    def changed(name: str, unit: str, values: Sequence[float], errors: Callable[[float], _Errors]) -> Study:
+        progress(f"study: error against {name}")
+        with ThreadPoolExecutor(2) as both:
+            return _study(name, unit, values, list(both.map(errors, values)))
+
+    @lru_cache  # what is usual is a value of three studies
+    def seen(setup: _Setup) -> _Errors:
+        rig = _rig(setup.width, setup.baseline_m)
+        return _measured(rig, *_rendered(rig, seed, shots, setup.distance_m, setup.noise))
+
+    return [
+        changed("distance", "m", (0.5, 0.7, 0.9, 1.2, 1.6), lambda v: seen(_Setup(distance_m=v))),
+        changed("baseline", "m", (0.05, 0.1, 0.2, 0.4), lambda v: seen(_Setup(baseline_m=v))),
+        changed("image width", "px", (640, 960, 1280, 1920), lambda v: seen(_Setup(width=int(v)))),
+        changed("pixel noise", "grey levels", (1.0, 2.0, 5.0, 10.0), lambda v: seen(_Setup(noise=v))),
+        _calibration_study(seed, shots, progress),
+    ]
+
+
+def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Errors]) -> Study:
+    """Bring the errors at each value together; the interval counts three coordinates of unequal size as two."""
+    squares = np.array([(e.error**2).sum(axis=1).mean() if len(e.error) else np.nan for e in found])
+    freedom = np.array([max(2 * len(e.error), 1) for e in found])
+    return Study(
+        name,
+        unit,
+        np.array(values, float),
+        np.sqrt(squares),
+        np.sqrt(squares * freedom / chdtri(freedom, 0.025)),
+        np.sqrt(squares * freedom / chdtri(freedom, 0.975)),
+        np.sqrt([e.variance.mean() if len(e.variance) else np.nan for e in found]),
+        np.array([e.missed for e in found]),
+    )
+
+
+@lru_cache
+def _usual(width: int) -> StereoRig:
+    """Return the true rig with images so wide; the same cameras each time, so that their rays are found once."""
+    size = (width, width * 9 // 16)
+    return bench_rig(size, focal_px=_FOCAL * width / _SIZE[0], baseline_m=_BASELINE, convergence_deg=0.0)
+
+
+def _rig(width: int = _SIZE[0], baseline_m: float = _BASELINE) -> StereoRig:
+    """Return the true rig."""
+    return replace(_usual(width), T_left_right=bench_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right)
+
+
+def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: float) -> tuple[list[Shot], Array]:
+    """Render shots of the body near the middle of the view; the same seed gives the same tilts and places."""
+    rng = np.random.default_rng([seed, 7])
+    across = rng.uniform(-1, 1, (shots, 3)) * (0.12, 0.06, 0.05)
+    turns = rng.uniform(-1, 1, (shots, 3)) * _TILT
+    middle = np.array([rig.baseline_m / 2, 0.0, distance_m])
+    Ts = np.array([pose(exp_so3(turn), middle + distance_m * shift) for turn, shift in zip(turns, across, strict=True)])
+    behind = tuple(plain(camera.image_size_px, rng) for camera in rig.cameras)
+    patterns = body_patterns()
+
+    def shot(k: int) -> Shot:
+        own = np.random.default_rng([seed, 8, k])
+        placed = [Placed(patterns, Ts[k])]
+        images = render_pair(
+            rig.cameras, rig.T_left_right, placed, (behind[0], behind[1]), sensor=Sensor(read_noise=noise), rng=own
+        )
+        return Shot(f"{k}", *images)
+
+    return [shot(k) for k in range(shots)], Ts
+
+
+def _measured(rig: StereoRig, shots: Sequence[Shot], Ts_left_body: Array) -> _Errors:
+    """Measure shots and hold them against the truth."""
+    target = body_target()
+    error, variance = [], []
+    for shot, T in zip(shots, Ts_left_body, strict=True):
+        result = measure(rig, target, shot)
+        if isinstance(result, PoseEstimate):
+            error.append(log_se3(inverse(result.T_left_body) @ T)[:3])
+            variance.append(float(np.trace(result.cov[:3, :3])))
+    return _Errors(np.array(error).reshape(-1, 3), np.array(variance), len(shots) - len(error))
+
+
+def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -> Study:
+    """Calibrate with more and more pairs of a board, several times each, and measure the same shots with each rig."""
+    sizes, true, board = (4, 8, 16, 32), _rig(), open_board(_BOARD)
+    rng = np.random.default_rng([seed, 9])
+    pattern = chessboard(9, 6, 0.025)
+    Ts = board_poses(rng, true, pattern, max(sizes) * 2)
+    grey = (0.4, 0.4)
+    progress("study: boards for calibrations of several sizes")
+
+    def pair(k: int) -> Pair:
+        images = render_pair(
+            true.cameras, true.T_left_right, [Placed((pattern,), Ts[k])], grey, rng=np.random.default_rng([seed, 10, k])
+        )
+        return Pair(f"{k}", board.detect(images[0]), board.detect(images[1]))
+
+    with ThreadPoolExecutor(2) as both:
+        pairs = list(both.map(pair, range(len(Ts))))
+    rendered = _rendered(true, seed, max(4, shots // 2), _DISTANCE, _NOISE)
+    # Drawn beforehand: what is drawn is not to depend on which calibration is done first.
+    drawn = [[rng.choice(len(pairs), size, replace=False) for _ in range(_DRAWS)] for size in sizes]
+
+    def calibrated(chosen: Array) -> _Errors:
+        rig = calibrate_boards(board, [pairs[k] for k in chosen], (_SIZE, _SIZE), models=("brown5",), flat=True).rig
+        return _measured(rig, *rendered)
+
+    found = []
+    for size, draws in zip(sizes, drawn, strict=True):
+        progress(f"study: calibrations of {size} pairs")
+        with ThreadPoolExecutor(2) as both:
+            each = list(both.map(calibrated, draws))
+        found.append(
+            _Errors(
+                np.concatenate([e.error for e in each]),
+                np.concatenate([e.variance for e in each]),
+                sum(e.missed for e in each),
+            )
+        )
+    study = _study("calibration size", "pairs of the board", sizes, found)
+    # The shots of one calibration err together: its draws are what is counted.
+    freedom = 3.0 * _DRAWS
+    wide = study.position_rms_m * np.sqrt(freedom / chdtri(freedom, [[0.025], [0.975]]))
+    return Study(
+        study.name, study.unit, study.values, study.position_rms_m, wide[0], wide[1], study.predicted_m, study.missed
+    )

@@ -1,0 +1,164 @@
+"""The evaluation of dense methods: one line a scene and method, averages, table, CSV and error maps."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.dense.files import write_png
+from armsight.app.dense_picture import paint_disparity, paint_errors
+from armsight.files import write_text
+from armsight.vision.dense.evaluate import Judgement, judge
+from armsight.vision.dense.methods import open_method
+from armsight.vision.dense.middlebury import Scene
+from armsight.vision.dense.rectified import plain_grey
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a method reached on a scene.
+
+    Attributes:
+        scene: its name.
+        method: its name.
+        weight: the scene's, in averages.
+        all_pixels: judged over all pixels with a truth.
+        nonocc: over those that both cameras see.
+        measured: over those that the method measured, of the ones both cameras see.
+        density_percent: share of the pixels with a truth that was measured, not filled.
+        within_percent: share of the measured ones both cameras see whose error is below 1.96 sigma.
+        seconds: of the second of two runs, on the clock.
+        rate: millions of pixels times disparities a second.
+    """
+
+    scene: str
+    method: str
+    weight: float
+    all_pixels: Judgement
+    nonocc: Judgement
+    measured: Judgement
+    density_percent: float
+    within_percent: float
+    seconds: float
+    rate: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line by names."""
+        sets = {"all": self.all_pixels, "nonocc": self.nonocc, "measured_nonocc": self.measured}
+        return {
+            "scene": self.scene,
+            "method": self.method,
+            "weight": self.weight,
+            **{name: judgement.to_json() for name, judgement in sets.items()},
+            "density_percent": self.density_percent,
+            "within_95_percent": self.within_percent,
+            "seconds": self.seconds,
+            "mpx_disparities_per_s": self.rate,
+        }
+
+
+def evaluate_scene(scene: Scene, name: str, out: Path | None) -> Line:
+    """Match a scene by a method and judge it; with a folder, paint where it is wrong."""
+    method, truth = open_method(name), scene.truth
+    left, right = plain_grey(scene.left, "left"), plain_grey(scene.right, "right")
+    method.match(left, right, scene.search)  # once before the clock runs: what is compiled, is compiled now
+    begun = time.perf_counter()
+    result = method.match(left, right, scene.search)
+    seconds = time.perf_counter() - begun
+    if out is not None:
+        write_png(out / f"{scene.name}_{name}_errors.png", paint_errors(result.disparity, truth))
+        write_png(out / f"{scene.name}_{name}.png", paint_disparity(result))
+    sure = result.measured & truth.seen & truth.known
+    off = np.abs(result.disparity - truth.disparity)[sure]
+    within = 100 * float(np.mean(off <= 1.96 * result.sigma_px[sure])) if off.size else float("nan")
+    return Line(
+        scene.name,
+        name,
+        scene.weight,
+        judge(result.disparity, truth, truth.known),
+        judge(result.disparity, truth, truth.seen),
+        judge(result.disparity, truth, sure),
+        100 * float(result.measured[truth.known].mean()),
+        within,
+        seconds,
+        left.size * scene.search.count / seconds / 1e6,
+    )
+
+
+def averages(lines: list[Line]) -> dict[str, dict[str, float]]:
+    """Return each method's bad shares (%) over all pixels and both-seen ones, averaged over scenes with their weights."""
+    found: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(line.method for line in lines):
+        mine = [line for line in lines if line.method == name]
+        weights = [line.weight for line in mine]
+        found[name] = {
+            f"{kind}_{key}": float(np.average([line.to_json()[kind][key] for line in mine], weights=weights))
+            for kind in ("all", "nonocc")
+            for key in mine[0].all_pixels.to_json()
+            if key != "pixels"
+        }
+    return found
+
+
+def evaluation_json(lines: list[Line]) -> dict[str, Any]:
+    """Return an evaluation as one object; numbers that are not there are null."""
+    whole = {"scenes": [line.to_json() for line in lines], "weighted_average": averages(lines)}
+    cleaned: dict[str, Any] = _cleaned(whole)
+    return cleaned
+
+
+def _cleaned(value: Any) -> Any:  # noqa: ANN401
+    """Return JSON with null in place of NaN."""
+    if isinstance(value, dict):
+        return {key: _cleaned(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_cleaned(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def table_text(lines: list[Line]) -> str:
+    """Return a table for people: shares in %, errors in px, over all pixels / those both cameras see."""
+    titles = ("bad-0.5", "bad-1", "bad-2", "bad-4", "mean", "RMS", "A50", "A90", "A95", "A99")
+    head = f"{'scene':<12}{'method':<12}" + "".join(f"{t:>14}" for t in titles)
+    text = [head + f"{'density':>9}{'within':>8}{'s':>8}{'Mpx*d/s':>9}"]
+    for line in lines:
+        a, b = (_numbers(j) for j in (line.all_pixels, line.nonocc))
+        cells = "".join(f"{x:>7.2f}/{y:<6.2f}" for x, y in zip(a, b, strict=True))
+        text.append(
+            f"{line.scene:<12}{line.method:<12}{cells}{line.density_percent:>8.1f}%{line.within_percent:>7.1f}%"
+            f"{line.seconds:>8.3f}{line.rate:>9.0f}"
+        )
+    for name, means in averages(lines).items():
+        keys = [key.removeprefix("all_") for key in means if key.startswith("all_")]
+        cells = "".join(f"{means['all_' + k]:>7.2f}/{means['nonocc_' + k]:<6.2f}" for k in keys)
+        text.append(f"{'(average)':<12}{name:<12}{cells}")
+    text.append(
+        "all pixels with a truth / those both cameras see, gaps filled; within: measured ones inside 1.96 sigma"
+    )
+    return "\n".join(text)
+
+
+def _numbers(judgement: Judgement) -> list[float]:
+    """Return a judgement's figures in the table's order."""
+    return [*judgement.bad_percent, judgement.average_px, judgement.rms_px, *judgement.quantiles_px]
+
+
+def write_evaluation(out: Path, lines: list[Line]) -> None:
+    """Write table.csv: one row a scene and method."""
+    text = io.StringIO()
+    rows = []
+    for line in lines:
+        flat = dict(line.to_json())
+        for kind in ("all", "nonocc", "measured_nonocc"):
+            flat.update({f"{kind}_{key}": value for key, value in flat.pop(kind).items()})
+        rows.append(flat)
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(out / "table.csv", text.getvalue())

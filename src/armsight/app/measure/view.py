@@ -1,0 +1,154 @@
+"""``armsight measure --view``: a folder of annotated pictures, one a shot, and the strip chart of the run.
+
+Every picture is put in place whole as soon as its shot is measured; nothing of a shot is kept but its record, which the
+caller has. A long run gets a picture of every shot that was missed, searched or jumped, and of every few others.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from armsight.app.report.plotting import require_matplotlib
+from armsight.app.measure.chart import chart
+from armsight.app.measure.picture import draw_shot
+from armsight.app.view_marks import marks_of
+from armsight.app.view_words import header
+from armsight.data import Body, Missed, PoseEstimate, Shot
+from armsight.errors import InputError
+from armsight.files import replacing
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.rig import StereoRig
+
+CHART, PREFIX = "run.png", "view-"
+#: A run of more shots than this does not get a picture of each; nor of each odd one where so many are odd.
+EACH_UP_TO, ODD_UP_TO = 60, 500
+_LONGEST_NAME = 50  # a file system's 255 bytes hold that many letters of any script
+
+
+def view_folder(directory: str | Path) -> Path:
+    """Make sure that a run can be drawn, before it is measured.
+
+    Args:
+        directory: the folder of the pictures; made with its parents where it does not exist.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: matplotlib is missing, or the folder cannot be made or written to.
+    """
+    try:
+        require_matplotlib()
+    except InputError:
+        raise InputError(
+            '--view draws a chart with matplotlib, which is not installed: pip install "armsight[report]"'
+        ) from None
+    folder = Path(directory).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: no pictures can be written here: {error.strerror}; give a folder") from None
+    return folder
+
+
+class View:
+    """Draws a run, shot after shot."""
+
+    def __init__(
+        self, folder: Path, rig: StereoRig, body: Body, discs: DiscTarget | None = None, total: int | None = None
+    ) -> None:
+        """Begin a run.
+
+        Args:
+            folder: as :func:`view_folder` returned it; pictures of an earlier run are replaced shot by shot.
+            rig: the calibrated pair.
+            body: what is measured; points of discs come last.
+            discs: its plain discs, None where it has none.
+            total: how many shots there will be, None where that is not known.
+        """
+        self.folder, self.rig, self.body, self.discs = folder, rig, body, discs
+        self._every = None if total is None else -(-total // EACH_UP_TO)
+        self._shots = self._odd = 0
+        self._written: set[str] = set()
+        self._earlier: set[str] | None = None
+
+    def add(self, shot: Shot, result: PoseEstimate | Missed, record: Mapping[str, Any]) -> None:
+        """Draw a shot, or leave it out of a long run.
+
+        Args:
+            shot: the images; a detection's shot has none.
+            result: what was measured in it.
+            record: the same as ``measure --json`` prints it.
+
+        Raises:
+            InputError: the picture cannot be written.
+        """
+        if self._earlier is None:
+            self._earlier = {path.name for path in self.folder.glob(f"{PREFIX}*.png")}
+        number, odd = self._shots, _is_odd(record)
+        step = _step(number, EACH_UP_TO) if self._every is None else self._every
+        wanted = number % step == 0 or (odd and self._odd % _step(self._odd, ODD_UP_TO) == 0)
+        self._shots += 1
+        self._odd += odd
+        if not wanted:
+            return
+        marks = marks_of(self.rig, self.body, self.discs, result) if isinstance(result, PoseEstimate) else None
+        sizes = self.rig.left.image_size_px, self.rig.right.image_size_px
+        problem = result.reason if isinstance(result, Missed) else None
+        canvas = draw_shot(header(record), problem, (shot.left, shot.right), sizes, marks)
+        self._put(self._file_name(shot.name), cv2.imencode(".png", canvas)[1].tobytes())
+
+    def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
+        """Draw the chart of the run so far; a run without a shot has none.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        if records:
+            self._put(CHART, chart(records))
+
+    def summary(self) -> str:
+        """Say which shots were drawn, and whether pictures of an earlier run are left."""
+        drawn = len(self._written - {CHART})
+        said = f"{CHART} and pictures of {drawn} of {self._shots} shots are in {self.folder}"
+        if drawn < self._shots:
+            kind = "every one" if self._odd <= ODD_UP_TO else "many"
+            often = (
+                f"one in {self._every} of the others" if self._every else "fewer and fewer of the others as it went on"
+            )
+            said += f": {kind} that was missed, searched or jumped, and {often}"
+        old = len((self._earlier or set()) - self._written)
+        return said + (f"; of an earlier run there are left: {old}" if old else "")
+
+    def _file_name(self, shot: str) -> str:
+        """Return a name of its own for a shot's picture, of characters that any file system takes."""
+        stem = PREFIX + re.sub(r"[^\w.-]", "_", shot)[-_LONGEST_NAME:]
+        name, again = f"{stem}.png", 1
+        while name in self._written:
+            again += 1
+            name = f"{stem}~{again}.png"
+        return name
+
+    def _put(self, name: str, data: bytes) -> None:
+        """Put a file in place, whole."""
+        with replacing(self.folder / name, "wb") as file:
+            file.write(data)
+        self._written.add(name)
+
+
+def _is_odd(record: Mapping[str, Any]) -> bool:
+    """Whether a shot is one to look at: missed, searched for in the whole image, or with a jump."""
+    return record["status"] != "ok" or record.get("way") == "searched" or bool(record.get("jump"))
+
+
+def _step(number: int, most: int) -> int:
+    """Return that every so manieth is drawn: each of the first ``most``, then every 2nd, 4th, 8th in twice the number."""
+    return 1 << (number // most).bit_length()

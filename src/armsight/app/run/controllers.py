@@ -1,0 +1,100 @@
+"""Controllers that follow what was planned, and nothing else: potentiometers alone, as the chapter has it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from armsight.app.run.loop import PERIOD_S
+from armsight.data import Array, JointCommand
+from armsight.loop.estimators import Estimator
+from armsight.loop.servo import Aim, PoseServo
+from armsight.robot.arm import Arm
+from armsight.robot.trajectories import Joints, Trajectory
+
+#: A joint that lifts the tool by so much, m per rad, carries weight.
+LOADED_M = 0.15
+
+
+class Planned:
+    """Sends a trajectory to the board as it was planned; stands at its end.
+
+    Args:
+        trajectory: joint angles over time.
+        start_s: when it begins, board's clock.
+        gravity: gives the duty that carries the arm at joint angles.
+    """
+
+    def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
+        self._trajectory, self._start_s, self._gravity = trajectory, start_s, gravity
+        self._next: JointCommand | None = None
+
+    def prepare(self, t_s: float) -> None:
+        """Find where the joints are to be a period from now."""
+        ahead = self._trajectory.at(t_s + PERIOD_S - self._start_s)
+        self._next = JointCommand(ahead.q, ahead.qd, self._gravity(ahead.q), PERIOD_S)
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be."""
+        assert self._next is not None
+        return self._next, "planned"
+
+
+class Sweep:
+    """Joints to and fro with changing speed: the motion that tells how late the cameras are. A trajectory.
+
+    Only joints that carry weight move: their backlash stays closed. One that carries none lags by its play whenever it is
+    turned round, which looks like a delay: 0.1 degree at 30 degrees a second are 3 ms.
+
+    Args:
+        arm: the nominal arm, its base upright.
+        q_middle: (6,) about which they move, rad; there it begins and ends.
+        reach_rad: how far.
+        duration_s: of the whole.
+    """
+
+    def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, *, duration_s: float) -> None:
+        self.duration_s, self._middle = duration_s, q_middle
+        lifts = np.abs(arm.jacobian(q_middle)[2])  # of the tool by each joint, m/rad
+        self._reach = reach_rad * (lifts > LOADED_M)
+        self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0])
+
+    def at(self, t_s: float | Array) -> Joints:
+        """Return the joints ``t_s`` seconds after the start."""
+        t = np.clip(np.asarray(t_s, float), 0.0, self.duration_s)[..., None]
+        x = np.pi * t / self.duration_s
+        window, window_d = np.sin(x) ** 2, np.pi / self.duration_s * np.sin(2 * x)
+        window_dd = 2 * (np.pi / self.duration_s) ** 2 * np.cos(2 * x)
+        s, c, w = np.sin(self._rates * t), np.cos(self._rates * t), self._rates
+        q = self._middle + self._reach * window * s
+        qd = self._reach * (window_d * s + window * w * c)
+        qdd = self._reach * (window_dd * s + 2 * window_d * w * c - window * w**2 * s)
+        return Joints(q, qd, qdd)
+
+
+class Closed:
+    """Sends a trajectory corrected by what vision sees.
+
+    Args:
+        servo: the outer loop; one for all motions, as it carries its correction over.
+        trajectory: joint angles over time.
+        start_s: when it begins, board's clock.
+        gravity: gives the duty that carries the arm at joint angles.
+    """
+
+    def __init__(
+        self, servo: PoseServo, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]
+    ) -> None:
+        self._servo, self._trajectory, self._start_s, self._gravity = servo, trajectory, start_s, gravity
+        self._aim: Aim | None = None
+
+    def prepare(self, t_s: float) -> None:
+        """Find where the tool is to be a period from now."""
+        self._aim = self._servo.aim(self._trajectory, t_s - self._start_s, self._gravity)
+
+    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
+        """Return where the joints are to be for the tool to be right."""
+        assert self._aim is not None
+        step = self._servo.step(self._aim, estimator)
+        return step.command, step.mode.name.lower()

@@ -1,0 +1,156 @@
+"""A motion file (TOML) becomes motions that are known to be possible before the first step; docs/run.md has the keys."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import read_text
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3, from_roll_pitch_yaw
+from armsight.robot.arm import Arm
+from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
+
+#: The chapter's motion: home to five poses and back, a line, a circle.
+CHAPTER = Path(__file__).with_name("default_motion.toml")
+#: Less of it.
+QUICK = Path(__file__).with_name("quick_motion.toml")
+_REST_S = 2.0
+_MOST = 1e9  # of any number; NaN is not below it
+#: Kind -> its own keys and how many numbers each has; those in the second place must be there.
+_KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
+    "joints": ({"q_deg": 6}, ("q_deg",)),
+    "home": ({}, ()),
+    "line": ({"by_mm": 3, "turn_deg": 3, "to_mm": 3, "roll_pitch_yaw_deg": 3}, ()),
+    "circle": ({"center_mm": 3, "axis": 3, "angle_deg": 1}, ("center_mm", "axis")),
+}
+_COMMON = {"kind": 0, "name": 0, "duration_s": 1, "rest_s": 1}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(Record):
+    """One motion of a run.
+
+    Attributes:
+        name: what it is called, unique in the run.
+        kind: joints, home, line or circle.
+        trajectory: joint angles over time.
+        rest_s: how long the arm stands at its end.
+    """
+
+    name: str
+    kind: str
+    trajectory: Trajectory
+    rest_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan(Record):
+    """The motions of a run.
+
+    Attributes:
+        start: (6,) joint angles before the first, rad.
+        motions: one after the other, each from where the one before ends.
+    """
+
+    start: Array
+    motions: tuple[Motion, ...]
+
+
+def read_motions(arm: Arm, path: str | Path = CHAPTER) -> MotionPlan:
+    """Read a motion file and plan all of it.
+
+    Args:
+        arm: the nominal arm.
+        path: the file.
+
+    Raises:
+        InputError: the file cannot be read, a key or a number is not allowed, or a motion cannot be made; the message
+            names the file and the motion.
+    """
+    try:
+        document = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from None
+    start = _numbers(f"{path}", document.pop("start_deg", np.degrees(arm.home).tolist()), "start_deg", 6)
+    entries = document.pop("motion", None)
+    if document:
+        raise InputError(f"{path}: unknown key {next(iter(document))!r}; known are start_deg and [[motion]]")
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise InputError(f"{path}: no motion; give each as a table [[motion]] with a kind: {', '.join(_KINDS)}")
+    q_start = q = np.radians(start)
+    motions: list[Motion] = []
+    for number, entry in enumerate(entries, start=1):
+        where = f"{path}: motion {number}"
+        motions.append(_motion(where, arm, q, dict(entry), [m.name for m in motions], number))
+        q = motions[-1].trajectory.at(motions[-1].trajectory.duration_s).q
+    return MotionPlan(q_start, tuple(motions))
+
+
+def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> Motion:
+    """Plan one motion."""
+    kind = entry.get("kind")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise InputError(f"{where}: kind is {kind!r}; known are {', '.join(_KINDS)}")
+    keys, needed = _KINDS[kind]
+    known = {**_COMMON, **keys}
+    for key in entry:
+        if key not in known:
+            raise InputError(f"{where} ({kind}): unknown key {key!r}; known are {', '.join(known)}")
+    for key in needed:
+        if key not in entry:
+            raise InputError(f"{where} ({kind}): {key} is missing")
+    values = {key: _numbers(where, entry[key], key, size) for key, size in known.items() if size and key in entry}
+    name = entry.get("name", f"{kind} {number}")
+    if not isinstance(name, str) or not name or name in names:
+        raise InputError(f"{where}: name is {name!r}; every motion needs a name of its own")
+    duration = float(values["duration_s"][0]) if "duration_s" in values else None
+    rest = float(values["rest_s"][0]) if "rest_s" in values else _REST_S
+    if not 0.0 <= rest <= 60.0:
+        raise InputError(f"{where}: rest_s is {rest:g}; it must be 0 to 60")
+    try:
+        trajectory = _planned(where, kind, arm, q, values, duration)
+    except InputError as error:
+        raise InputError(f"{where} ({name}): {error}" if where not in str(error) else str(error)) from None
+    return Motion(name, kind, trajectory, rest)
+
+
+def _planned(
+    where: str, kind: str, arm: Arm, q: Array, values: dict[str, Array], duration_s: float | None
+) -> Trajectory:
+    """Plan the motion of a kind from joint angles q."""
+    if kind in ("joints", "home"):
+        goal = arm.home if kind == "home" else np.radians(values["q_deg"])
+        return point_to_point(arm, q, goal, duration_s=duration_s)
+    if kind == "line":
+        return line(arm, q, _line_goal(where, arm.forward(q), values), duration_s=duration_s)
+    angle = float(np.radians(values["angle_deg"][0])) if "angle_deg" in values else 2 * np.pi
+    return circle(arm, q, 1e-3 * values["center_mm"], values["axis"], angle, duration_s=duration_s)
+
+
+def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Array:
+    """Return where a line ends: a step from where the tool is, or a place."""
+    if ("by_mm" in values) == ("to_mm" in values):
+        raise InputError(f"{where} (line): give either by_mm, a step in the base frame, or to_mm, a place in it")
+    if "by_mm" in values:
+        turn = exp_so3(np.radians(values.get("turn_deg", np.zeros(3))))
+        return pose(turn @ T_base_tool[:3, :3], T_base_tool[:3, 3] + 1e-3 * values["by_mm"])
+    R = T_base_tool[:3, :3]
+    if "roll_pitch_yaw_deg" in values:
+        R = from_roll_pitch_yaw(*np.radians(values["roll_pitch_yaw_deg"]))
+    return pose(R, 1e-3 * values["to_mm"])
+
+
+def _numbers(where: str, value: object, key: str, size: int) -> Array:
+    """Return the numbers of a key."""
+    listed = value if isinstance(value, list) else [value]
+    good = all(isinstance(n, int | float) and not isinstance(n, bool) and abs(n) < _MOST for n in listed)
+    if not good or len(listed) != size or isinstance(value, list) != (size > 1):
+        raise InputError(f"{where}: {key} must be {f'{size} numbers' if size > 1 else 'a number'}, got {value!r}")
+    return np.array(listed, dtype=float)

@@ -1,0 +1,241 @@
+"""A bench to record on: a rig of two cameras, poses of a board for its calibration, a path of a target to measure.
+
+Poses are drawn from a seed and kept when the whole pattern is in view of both cameras at a readable slant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import write_text
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.recording import Look, Truth, record, shot_names
+from armsight.sim.render.render import OUTLINE, Shutter, outline
+from armsight.sim.render.scene import (Pattern, chessboard, marker_bits, plate, tag)
+from armsight.vision.camera import Camera
+from armsight.vision.rig import StereoRig
+
+_TRIES = 400  # for one pose before giving up
+_SLANT_MAX = np.radians(62.0)  # beyond it a board is hard to read
+_MARGIN_PX = 4.0
+
+BOARD = "chessboard:9x6:25mm"
+EXPOSURE = Shutter(exposure_s=0.002)
+#: The demo's end-effector: a dark plate (m) with four AprilTags, their side (m) and middles (m).
+PLATE_M = (0.120, 0.095)
+TAG_FAMILY, TAG_M = "tag36h11", 0.032
+TAG_MIDDLES_M = ((-0.034, -0.024), (0.034, -0.024), (0.034, 0.024), (-0.034, 0.024))
+
+
+def bench_rig(
+    image_size_px: tuple[int, int] = (1280, 720),
+    focal_px: float = 900.0,
+    baseline_m: float = 0.2,
+    convergence_deg: float = 8.0,
+    model: str = "brown5",
+) -> StereoRig:
+    """Return two slightly different cameras side by side that look at the same place.
+
+    Args:
+        image_size_px: (width, height) of both.
+        focal_px: about both focal lengths.
+        baseline_m: distance between the cameras.
+        convergence_deg: by how much the right camera is turned towards the left one's axis.
+        model: distortion model: none, brown4, brown5 or fisheye.
+    """
+    coefficients = {
+        "none": (),
+        "brown4": (-0.12, 0.06, 0.0006, -0.0004),
+        "brown5": (-0.12, 0.06, 0.0006, -0.0004, -0.01),
+        "fisheye": (0.02, -0.008, 0.003, -0.001),
+    }
+    if model not in coefficients:
+        raise InputError(f"a bench's cameras are {', '.join(coefficients)}, not {model!r}")
+    width, height = image_size_px
+    fx, fy, cx, cy = focal_px, 1.001 * focal_px, (width - 1) / 2, (height - 1) / 2
+    distortion = np.array(coefficients[model])
+    left = Camera(image_size_px, model, np.array([fx, fy, cx + 4.3, cy - 2.8]), distortion)
+    right = Camera(image_size_px, model, np.array([1.004 * fx, 1.005 * fy, cx - 3.1, cy + 5.4]), 0.93 * distortion)
+    aside = np.array([1.0, 0.015, 0.01])
+    T_left_right = pose(
+        exp_so3(np.array([0.006, -np.radians(convergence_deg), 0.004])), baseline_m * aside / np.linalg.norm(aside)
+    )
+    count = left.parameters.size + right.parameters.size + 6
+    return StereoRig(left, right, T_left_right, np.zeros((count, count)), 0.0, {"source": "armsight.sim.example_rig"})
+
+
+def in_view(rig: StereoRig, T_left_pattern: Array, pattern: Pattern) -> bool:
+    """Tell whether both cameras see all of a pattern, at a readable slant."""
+    p_pattern = np.column_stack([outline(pattern), np.zeros(4 * OUTLINE)])
+    T_right_left = inverse(rig.T_left_right)
+    for camera, T in ((rig.left, T_left_pattern), (rig.right, T_right_left @ T_left_pattern)):
+        p = transform(T, p_pattern)
+        uv = camera.project(p)
+        away = p / np.linalg.norm(p, axis=1, keepdims=True)
+        high = np.array(camera.image_size_px) - 1 - _MARGIN_PX
+        # Where a distortion polynomial folds back, a point far outside is projected inside: its ray tells.
+        seen = (uv >= _MARGIN_PX).all() and (uv <= high).all() and np.abs(camera.unproject(uv) - away).max() < 1e-6
+        if not seen or (away @ T[:3, 2]).min() < np.cos(_SLANT_MAX):
+            return False
+    return True
+
+
+def _between(rig: StereoRig, distance_m: float) -> Array:
+    """Return the point (3,) between both optical axes at a distance from the cameras, m, left camera's frame."""
+    ahead = np.array([0.0, 0.0, distance_m, 1.0])
+    return np.asarray(0.5 * (ahead[:3] + (rig.T_left_right @ ahead)[:3]))
+
+
+def board_poses(
+    rng: np.random.Generator,
+    rig: StereoRig,
+    pattern: Pattern,
+    count: int,
+    *,
+    fill: tuple[float, float] = (0.45, 1.1),
+    tilt_deg: float = 45.0,
+) -> Array:
+    """Draw poses of a board that calibrate a rig well: all over both images, near and far, tilted all ways.
+
+    Args:
+        rng: source of the draws.
+        rig: the cameras.
+        pattern: the board.
+        count: how many poses.
+        fill: smallest and largest share of the image's height that the board's diagonal takes when it faces the camera.
+        tilt_deg: largest tilt.
+
+    Returns:
+        (count, 4, 4) poses of the board's body in the left camera's frame, m, each in full view of both cameras.
+
+    Raises:
+        InputError: no such pose was found.
+    """
+    width, height = rig.left.image_size_px
+    corners = outline(pattern)
+    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    p_middle = np.append((corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0)
+    cells = rng.permutation(count)
+    poses = []
+    for n in range(count):
+        for attempt in range(_TRIES):
+            # The image is cut into 4 x 3 places that take turns; where one cannot be had, the next best is nearer in.
+            cell = np.array([cells[n] % 4, cells[n] // 4 % 3])
+            uv = (cell + rng.uniform(0, 1, 2)) / (4, 3) * (width, height)
+            distance = float(rig.left.intrinsics[0] * diagonal / (rng.uniform(*fill) * height))
+            side = n % 2
+            p = transform(rig.T_left_right if side else np.eye(4), distance * rig.cameras[side].unproject(uv[None])[0])
+            p += attempt / _TRIES * (_between(rig, distance) - p)
+            about, tilt = rng.uniform(0, 2 * np.pi), np.radians(tilt_deg) * np.sqrt(rng.uniform(0, 1))
+            R = exp_so3(np.array([0.0, 0.0, rng.uniform(-0.4, 0.4)])) @ exp_so3(
+                tilt * np.array([np.cos(about), np.sin(about), 0.0])
+            )
+            T_left_pattern = pose(R, p - R @ p_middle)
+            if in_view(rig, T_left_pattern, pattern):
+                poses.append(T_left_pattern @ inverse(pattern.T_body_pattern))
+                break
+        else:
+            raise InputError(
+                "no pose of the board is in full view of both cameras: it is too large, or they look apart"
+            )
+    return np.array(poses)
+
+
+def path(
+    rig: StereoRig, patterns: Sequence[Pattern], times_s: Array, *, distance_m: float = 0.5, speed: float = 1.0
+) -> tuple[Array, Array]:
+    """Return a smooth path of a target through the volume that both cameras see.
+
+    Args:
+        rig: the cameras.
+        patterns: the target; all of it stays in view.
+        times_s: (N,) times, s.
+        distance_m: of the path's middle from the cameras.
+        speed: 1 for a path that comes back to its start after some ten seconds.
+
+    Returns:
+        (N, 4, 4) poses of the target in the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s.
+
+    Raises:
+        InputError: the target is not in view even at rest in the middle.
+    """
+    middle = _between(rig, distance_m)
+    rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])
+    phases = np.array([0.0, 0.4, 1.0, 0.2, 1.7, 2.5])
+    ranges = np.array([0.35 * distance_m, 0.2 * distance_m, 0.2 * distance_m, 0.5, 0.5, 0.4])
+
+    def at(t: Array, size: float) -> Array:
+        """Return poses (N, 4, 4) at times (N,)."""
+        sway = size * ranges * np.sin(t[:, None] * rates + phases)
+        T = exp_se3(np.concatenate([np.zeros_like(sway[:, 3:]), sway[:, 3:]], axis=1))
+        T[:, :3, 3] = middle + sway[:, :3]
+        return T
+
+    size, step = 1.0, 1e-4
+    while not all(in_view(rig, T @ p.T_body_pattern, p) for T in at(times_s, size) for p in patterns):
+        size *= 0.9
+        if size < 0.05:
+            raise InputError(f"the target is not in full view of both cameras at {distance_m:g} m")
+    before, after = at(times_s - step, size), at(times_s + step, size)
+    return at(times_s, size), log_se3(inverse(before) @ after) / (2 * step)
+
+
+def tag_plate() -> tuple[tuple[Pattern, ...], str]:
+    """Return the demo's end-effector: its patterns, and the text of the body file that describes it."""
+    patterns, lines = [plate(*PLATE_M, value=0.12)], ['name = "plate"']
+    for k, (x, y) in enumerate(TAG_MIDDLES_M):
+        patterns.append(tag(marker_bits(TAG_FAMILY, k), TAG_M).on_body(pose(np.eye(3), np.array([x, y, 0.0]))))
+        lines += [
+            "",
+            "[[markers]]",
+            f'name = "T{k}"',
+            f"position_mm = [{x * 1e3:g}, {y * 1e3:g}, 0.0]",
+            "roll_pitch_yaw_deg = [0.0, 0.0, 0.0]",
+            f'tag = {{ family = "{TAG_FAMILY}", id = {k}, size_mm = {TAG_M * 1e3:g} }}',
+        ]
+    return tuple(patterns), "\n".join(lines) + "\n"
+
+
+def demo_recording(
+    folder: str | Path,
+    *,
+    seed: int = 0,
+    image_size_px: tuple[int, int] = (960, 540),
+    boards: int = 20,
+    shots: int = 40,
+    rate_hz: float = 15.0,
+) -> tuple[Truth, Truth]:
+    """Record a bench: a board for calibration and an end-effector on its way.
+
+    Args:
+        folder: where to: ``board`` and ``arm`` below it, and ``plate.toml``, the end-effector's body file.
+        seed: of poses, background and noise.
+        image_size_px: (width, height) of both cameras; the focal length goes with it.
+        boards: pairs of the board.
+        shots: pairs of the end-effector.
+        rate_hz: of the end-effector's shots.
+
+    Returns:
+        The truth of ``board`` and of ``arm``.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    rig = bench_rig(image_size_px, focal_px=900 / 1280 * image_size_px[0])
+    board = chessboard(9, 6, 0.025)
+    Ts = board_poses(np.random.default_rng(seed), rig, board, boards)
+    of_board = Truth(rig, BOARD, shot_names(boards), np.arange(float(boards)), Ts)
+    record(Path(folder) / "board", of_board, [board], seed=seed)
+    plate_patterns, body_file = tag_plate()
+    times_s: Array = np.arange(shots) / rate_hz
+    Ts, twists = path(rig, plate_patterns, times_s)
+    of_arm = Truth(rig, "plate.toml", shot_names(shots), times_s, Ts)
+    record(Path(folder) / "arm", of_arm, plate_patterns, twists=twists, look=Look(shutter=EXPOSURE), seed=seed + 1)
+    write_text(Path(folder) / "plate.toml", body_file)
+    return of_board, of_arm

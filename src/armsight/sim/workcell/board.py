@@ -1,0 +1,72 @@
+"""The configuration of the workcell's board: tables, limits and gains, all from the nominal arm and its motors.
+
+What an owner would do with an arm on the bench: the potentiometers' ends from the drawing, gains from what the motors turn.
+With ``J`` the inertia at the joint, ``B`` the damping of motor and friction and ``K`` the stall torque, the loop
+``J q'' + (B + K kd) q' + K kp q = K kp r`` is given the natural frequency and the damping that are asked for; the
+feed-forward ``kv = B / K`` takes the motor's own voltage off. Weight is carried by the host (:func:`gravity_duty`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.robot.arm import Arm
+from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.configuration import CONFIG, Configuration, check_configuration
+from armsight.sim.workcell.arm import pot_travel
+from armsight.sim.workcell.motors import Motors
+from armsight.sim.cell_pots import COUNTS, HIGH_SHARE, LOW_SHARE
+from armsight.sim.cell_solids import Solids, inertia, weight_torque
+
+#: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
+#: speed, s. As stiff as the potentiometers' noise allows: where dry friction holds a joint that is off by little, only the
+#: integral frees it, and a loop that is closed on vision meanwhile winds up and hunts.
+NATURAL_RAD_S = np.array([50.0, 70.0, 80.0, 85.0, 90.0, 90.0])
+DAMPING, INTEGRAL_PER_S, FILTER_S = 1.0, 8.0, 0.004
+_SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
+
+
+def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
+    """Return the board's configuration for an arm.
+
+    Args:
+        model: the nominal table.
+        parts: its solids.
+        motors: what turns it.
+    """
+    config = np.zeros((), CONFIG)
+    joint, travel = config["joint"], pot_travel(model)
+    turned = motors.rotor_inertia + inertia(model, parts, model.home)
+    damping = motors.emf_damping + motors.viscous
+    gains = joint["gains"]
+    gains["kp_per_rad"] = turned * NATURAL_RAD_S**2 / motors.stall_nm
+    gains["ki_per_rad_s"] = INTEGRAL_PER_S * gains["kp_per_rad"]
+    gains["kd_s_per_rad"] = np.maximum(2 * DAMPING * NATURAL_RAD_S * turned - damping, 0.0) / motors.stall_nm
+    gains["kv_s_per_rad"] = damping / motors.stall_nm + gains["kd_s_per_rad"]
+    gains["derivative_filter_s"], gains["anti_windup_per_s"] = FILTER_S, 20.0
+    pot = joint["pot"]
+    pot["node_count"], pot["direction"] = 2, 1
+    pot["counts"][:, :2] = np.rint(np.array([LOW_SHARE, HIGH_SHARE]) * COUNTS)
+    pot["angle_rad"][:, :2] = travel
+    pot["short_counts"], pot["open_counts"] = round(0.02 * COUNTS), round(0.98 * COUNTS)
+    pot["jump_rad"] = 0.01 + 2e-3 * model.qd_max
+    pot["frozen_rad"], pot["inverted_rad"] = 0.05, 0.1
+    joint["soft_min_rad"], joint["soft_max_rad"] = model.q_min, model.q_max
+    joint["speed_limit_rad_s"] = _SPEED_SPARE * model.qd_max
+    joint["deceleration_rad_s2"] = model.qdd_max
+    # A narrower slew limit would cut the noise unevenly in motion, which brakes.
+    joint["duty_limit"], joint["duty_slew_per_s"], joint["current_cut_per_a_s"] = 1.0, 1000.0, 20.0
+    joint["current_limit_ma"] = np.rint(900.0 * motors.current_max_a)
+    joint["following_rad"], joint["stall_duty"], joint["stall_rad"] = 0.15, 0.9, 0.005
+    joint["motor_direction"] = 1
+    config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 20000, 28000, 5
+    config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 50, 300
+    config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
+    check_configuration(config)
+    return config
+
+
+def gravity_duty(model: Arm, parts: Solids, motors: Motors, q: Array) -> Array:
+    """Return the duty (6,) that carries the weight of the nominal arm at joint angles q (6,), rad."""
+    return np.asarray(np.clip(-weight_torque(model, parts, q) / motors.stall_nm, -1.0, 1.0))

@@ -1,0 +1,90 @@
+"""The body on the tool: a plate with four wings that lean back, nine bright discs of three sizes on dark faces.
+
+The wings put discs off the plate's plane and far from its middle, which is what tells its tilt; nothing stands before
+anything else as long as the cameras see the plate from within 30 degrees of its normal, and the three sizes tell discs
+apart. x to the right, y down and z into the plate, as one looks at it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armsight.data import Array, Body, Record
+from armsight.geometry.pose import pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.render.scene import Pattern, plate
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.targets import Composite
+
+NAME = "tool_body"
+DARK, BRIGHT = 0.06, 0.85
+_LEAN_DEG = 30.0
+Spot = tuple[str, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _Face(Record):
+    """One flat face: where it is on the body, its sides, m, and its discs: name, x, y and radius, m."""
+
+    T_body_face: Array
+    size_m: tuple[float, float]
+    discs: tuple[Spot, ...]
+
+
+def _wing(x: float, y: float, z: float, disc: Spot) -> _Face:
+    """Return a wing at a place, mm, leaning away from the middle."""
+    lean = np.radians(_LEAN_DEG) * np.array([np.sign(y), -np.sign(x), 0.0])
+    return _Face(pose(exp_so3(lean), np.array([x, y, z]) * 1e-3), (0.046, 0.046), (disc,))
+
+
+_FACES = (
+    _Face(
+        np.eye(4),
+        (0.104, 0.104),
+        (
+            ("A", -0.034, -0.035, 0.0068),
+            ("B", 0.036, -0.033, 0.0091),
+            ("C", 0.034, 0.035, 0.0068),
+            ("D", -0.033, 0.032, 0.0121),
+            ("E", 0.004, -0.002, 0.0091),
+        ),
+    ),
+    _wing(-78.0, 3.0, 14.0, ("F", 0.0, 0.0, 0.0091)),
+    _wing(78.0, -4.0, 14.0, ("G", 0.0, 0.0, 0.0121)),
+    _wing(-5.0, -78.0, 14.0, ("H", 0.0, 0.0, 0.0121)),
+    _wing(4.0, 78.0, 14.0, ("I", 0.0, 0.0, 0.0068)),
+)
+
+
+def body_patterns() -> tuple[Pattern, ...]:
+    """Return what the painter paints, one pattern for each face."""
+    return tuple(
+        plate(*face.size_m, DARK, [(x, y, radius, BRIGHT) for _, x, y, radius in face.discs]).on_body(face.T_body_face)
+        for face in _FACES
+    )
+
+
+def body_target() -> Composite:
+    """Return the target to find: what the body's file says, see :func:`body_text`."""
+    spots = [(face, spot) for face in _FACES for spot in face.discs]
+    points = np.array([transform(face.T_body_face, np.array([x, y, 0.0])) for face, (_, x, y, _) in spots])
+    body = Body(NAME, tuple(name for _, (name, *_) in spots), points)
+    radii = np.array([radius for _, (*_, radius) in spots])
+    normals = np.array([-face.T_body_face[:3, 2] for face, _ in spots])
+    return Composite(NAME, (), DiscTarget(body, radii, np.ones(len(spots), dtype=bool), normals))
+
+
+def body_text() -> str:
+    """Return the body's file (docs/targets.md)."""
+    discs = body_target().discs
+    assert discs is not None
+    lines = [f'name = "{NAME}"']
+    for name, p, normal, radius in zip(
+        discs.body.point_names, discs.body.points, discs.normals, discs.radii_m, strict=True
+    ):
+        at, out = (", ".join(f"{n:.9f}" for n in values) for values in (1e3 * p, normal))
+        lines += ["", "[[markers]]", f'name = "{name}"', f"position_mm = [{at}]", f"normal = [{out}]"]
+        lines.append(f"disc = {{ radius_mm = {1e3 * radius:g}, bright = true }}")
+    return "\n".join(lines) + "\n"

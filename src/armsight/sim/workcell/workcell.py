@@ -1,0 +1,260 @@
+"""The workcell: an arm with motors, a board that runs the firmware, two cameras, a body on the tool, and time.
+
+Time is the plant's, in milliseconds. It passes when a board is listened to, when a shot is waited for, and by
+:meth:`Workcell.advance`; each millisecond the firmware runs once and the arm moves on. What is handed out are a Board and
+a Source: nothing that uses them can tell that they are simulated. The truth is in :attr:`Workcell.truth`, for judges only.
+Presets and amounts: docs/workcell.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Self
+
+import numpy as np
+
+from armsight.data import Array, Image, Record, Shot
+from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.robot.arm import Arm
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import configured
+from armsight.robot.models import open_arm
+from armsight.sim.example_rig import board_poses
+from armsight.sim.workcell.arm import drawn, imperfections
+from armsight.sim.workcell.board import configuration, gravity_duty
+from armsight.sim.workcell.body import body_patterns, body_target, body_text
+from armsight.sim.workcell.cameras import (BASELINE_M, DISTANCE_M, open_rig, open_timing, placed_rig)
+from armsight.sim.workcell.motors import chosen
+from armsight.sim.workcell.images import CellCamera
+from armsight.sim.cell_picture import picture
+from armsight.sim.cell_solids import solids
+from armsight.sim.cell_source import CellSource
+from armsight.sim.render.optics import Sensor
+from armsight.sim.workcell.plant import TICK_S, ArmPlant
+from armsight.sim.render.scene import chessboard
+from armsight.vision.markers.targets import Composite
+from armsight.vision.rig import StereoRig
+
+#: The board that is shown to the cameras.
+BOARD = "chessboard:9x6:30mm"
+_BOARD_FILL = (0.35, 1.0)  # of the image's height
+#: The body on the tool: turned half about y, so that its z runs into the plate; on a bracket, towards the cameras.
+_MOUNT_M, _MOUNT_RAD = np.array([0.003, -0.004, 0.035]), np.radians([-10.0, 12.0, 4.0])
+#: The chapter's five poses, seen from home: the tool's shift, m, base axes, and turn about its own axes, degrees.
+_POSES = (
+    ((-0.17, 0.20, 0.08), (-8.0, 12.0, 12.0)),
+    ((-0.17, -0.20, 0.11), (-12.0, -12.0, -20.0)),
+    ((-0.16, -0.17, -0.13), (12.0, -12.0, 25.0)),
+    ((-0.18, 0.17, -0.12), (14.0, 12.0, -28.0)),
+    ((-0.24, 0.02, 0.15), (-14.0, 4.0, 20.0)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CellTruth(Record):
+    """What is true of a cell up to now. No estimator gets it.
+
+    Attributes:
+        arm: the true table.
+        rig: the true cameras; covariance zero.
+        T_base_rig: (4, 4) where the left camera is, m.
+        T_tool_body: (4, 4) where the body is on the tool, m.
+        t_s: (N,) every millisecond since the beginning, s.
+        q: (N, 6) true joint angles, rad: of the links, behind backlash and twist.
+        shaft: (N, 6) true angles of the gears' shafts, where the potentiometers sit, rad.
+        shot_t_s: name of each shot handed out -> middle of its left exposure, s.
+    """
+
+    arm: Arm
+    rig: StereoRig
+    T_base_rig: Array
+    T_tool_body: Array
+    t_s: Array
+    q: Array
+    shaft: Array
+    shot_t_s: dict[str, float]
+
+    @cached_property
+    def T_base_tool(self) -> Array:
+        """(N, 4, 4) where the tool really was, m."""
+        return self.arm.forward(self.q)
+
+
+class Workcell:
+    """An arm, its board, two cameras and a body.
+
+    Attributes:
+        model: the arm as it is believed to be: all that anybody may know of it.
+        link: the wire to the board, and all of its inside; see EmulatedLink.
+        board: the board, configured, its drives off; the arm is at home, held by brakes.
+        source: the cameras.
+        target: the body on the tool, as it is looked for.
+        body_text: its body file.
+        board_spec: the board that :meth:`board_shots` shows.
+        timing: how the cameras keep time, as their maker says: rate, exposure, how well they are synchronised.
+    """
+
+    def __init__(
+        self,
+        *,
+        arm: str = "used",
+        cameras: str = "1280x720@60",
+        seed: int = 0,
+        machine: str = "unicorn",
+        rig: str = "parallel",
+        model: Arm | None = None,
+        believed: Arm | None = None,
+        distance_m: float = DISTANCE_M,
+        baseline_m: float = BASELINE_M,
+        noise: float = 2.0,
+        like: Workcell | None = None,
+    ) -> None:
+        """Build a cell; a second or so.
+
+        Args:
+            arm: how far the arm is from its table: nominal, used, worn, or a TOML file.
+            cameras: ``1280x720@60``, ``1920x1080@120``, ``webcams`` and their like.
+            seed: of all that is drawn; the same seed gives the same numbers.
+            machine: what runs the firmware: unicorn, qemu or host.
+            rig: parallel or verging.
+            model: the table that the arm was built to; the chapter's arm by default.
+            believed: the table that it is believed to have, as an identification found; ``model`` by default.
+            distance_m: from the cameras to the body of the arm at home.
+            baseline_m: between the cameras.
+            noise: of the sensors, grey levels.
+            like: a cell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
+
+        Raises:
+            InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
+            DeviceError: the firmware is not there or does not answer.
+        """
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+            raise InputError(f"seed {seed!r}: must be a whole number from 0 to {2**32 - 1}")
+        if not 0 <= noise <= 50:
+            raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
+        self.timing, amounts = open_timing(cameras), imperfections(arm)
+        self._built_to = model if model is not None else open_arm("six_r")
+        self.model = believed if believed is not None else self._built_to
+        self._rig, self._seed = open_rig(rig, self.timing.image_size_px, baseline_m), seed
+        self._parts = solids(self._built_to)
+        self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
+        self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
+        size, table = self.timing.image_size_px, self._built_to.table.tobytes()
+        self._room = (arm, rig, seed, baseline_m, distance_m, noise, size, table)
+        self._stand(distance_m, noise, like)
+        self.target: Composite = body_target()
+        self.body_text, self.board_spec = body_text(), BOARD
+        self.link = EmulatedLink(open_machine(machine), self.plant)
+        self.board = configured(self.link, configuration(self._built_to, self._parts, self._motors))
+
+    def _stand(self, distance_m: float, noise: float, like: Workcell | None) -> None:
+        """Screw the body to the tool and stand the cameras before it."""
+        if like is not None and like._room != self._room:
+            told = f"this cell is {self._room[:-1]}, the one it is to be like is {like._room[:-1]}"
+            raise InputError(f"{told}: arm, rig, seed, distances, noise, image size and table must be the same")
+        seed = self._seed
+        mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
+        off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
+        self._T_tool_body = mount @ exp_se3(off)
+        self._T_base_rig = placed_rig(self._built_to, self._rig, mount, seed, distance_m)
+        if like is not None:
+            cameras = like._cameras
+        else:
+            places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
+            stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
+            with ThreadPoolExecutor(2) as pool:
+                left, right = pool.map(stand, self._rig.cameras, places)
+            cameras = left, right
+        self._cameras: tuple[CellCamera, CellCamera] = cameras
+        clock = (lambda: self.t_s, self.advance)
+        body = (body_patterns(), self._T_tool_body)
+        self.source = CellSource(self.plant, cameras, self.timing, body, clock, seed)
+
+    @property
+    def t_s(self) -> float:
+        """Now, s, on the board's clock too."""
+        return self.link.t_s
+
+    def advance(self, dt_s: float) -> None:
+        """Let time pass, to the nearest millisecond."""
+        self.link.step(round(dt_s / TICK_S))
+
+    def poll(self) -> Shot | None:
+        """Return the newest shot that has come by now and was not handed out; no time passes."""
+        return self.source.poll()
+
+    def gravity_duty(self, q: Array) -> Array:
+        """Return the duty (6,) that carries the nominal arm's weight at joint angles q (6,), rad."""
+        return gravity_duty(self._built_to, self._parts, self._motors, q)
+
+    @cached_property
+    def poses(self) -> Array:
+        """(5, 6) the joint angles of the chapter's five poses, rad, as the nominal table has them; body in view.
+
+        Raises:
+            InputError: the arm does not reach one.
+        """
+        T_home, found = self.model.forward(self.model.home), []
+        for n, (shift, turn) in enumerate(_POSES, start=1):
+            T = pose(T_home[:3, :3] @ exp_so3(np.radians(turn)), T_home[:3, 3] + np.array(shift))
+            solutions = self.model.inverse(T, near=self.model.home)
+            if solutions.best is None:
+                raise InputError(f"{self.model.name} does not reach pose {n} of the cell: {solutions.reason}")
+            found.append(solutions.best)
+        return np.array(found)
+
+    def board_shots(self, count: int) -> Iterator[Shot]:
+        """Show a board at many places and turns, as a person would who calibrates, past the arm; no time passes.
+
+        Args:
+            count: how many shots.
+        """
+        pattern, shown = chessboard(9, 6, 0.030), 0
+        rng = np.random.default_rng([self._seed, 10])
+        while shown < count:
+            for T in board_poses(rng, self._rig, pattern, count, fill=_BOARD_FILL):
+                if shown < count and self.source.clear(pattern, T):
+                    yield self.source.still((pattern,), T, shown)
+                    shown += 1
+
+    def cover(self, from_s: float, to_s: float) -> None:
+        """Hold a card before the body from one time to another: it is not seen meanwhile."""
+        self.source.cover(from_s, to_s)
+
+    def picture(self, size_px: tuple[int, int] = (1280, 720)) -> Image:
+        """Return the cell as it is now, seen from aside, (H, W, 3) BGR."""
+        body = (body_patterns(), self._T_tool_body)
+        return picture(size_px, self.plant, body, (self._T_base_rig, self._rig), self._seed)
+
+    @property
+    def truth(self) -> CellTruth:
+        """What is true up to now; for judging only."""
+        path = self.plant.path.copy()
+        taken = {name: times.left_s for name, times in self.source.taken.items()}
+        return CellTruth(
+            self.plant.arm,
+            self._rig,
+            self._T_base_rig,
+            self._T_tool_body,
+            np.asarray(np.arange(len(path)) * TICK_S, dtype=np.float64),
+            path[:, 6:],
+            path[:, :6],
+            taken,
+        )
+
+    def close(self) -> None:
+        """End the firmware and the threads; harmless when called twice."""
+        self.board.close()
+        self.source.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,166 @@
+"""Which detection is which disc where the pose is about known: gates, and a choice only where there is one.
+
+A disc's two detections are judged together: what is not known of the pose moves both images of a disc as one, so the
+epipolar distance and the disparity count by themselves. What is settled narrows the pose, and with it the other gates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.special import chdtri
+
+from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
+from armsight.geometry.pose import exp_se3
+from armsight.vision.disc_view import DiscView
+from armsight.vision.expected import Expected, expect, visible
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.rig import StereoRig
+
+#: A detection beyond this quantile of the chi-square distribution of its distance is of something else.
+GATE_QUANTILE = 1.0 - 1e-5
+_GATE_ONE, _GATE_BOTH = (float(chdtri(n, 1 - GATE_QUANTILE)) for n in (2, 4))
+_NONE = np.zeros(0, np.int64)
+#: Rows of the left and of the right camera's discs that may be one disc of the body.
+Claim = tuple[Ids, Ids]
+
+
+@dataclass(frozen=True, eq=False)
+class Assigned(Record):
+    """Detections named by a pose.
+
+    Attributes:
+        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
+        T_left_body: (4, 4) the pose, improved by what was settled.
+        dropped: discs for which detections compete.
+    """
+
+    rows: Ids
+    T_left_body: Array
+    dropped: tuple[Dropped, ...]
+
+
+def assign(
+    rig: StereoRig, target: DiscTarget, T_left_body: Array, cov: Array, left: Discs, right: Discs
+) -> Correspondences | Missed:
+    """Name the discs of a body whose pose is about known.
+
+    Args:
+        rig: the calibrated pair.
+        target: the discs.
+        T_left_body: (4, 4) about where the body is: predicted, or from its coded markers.
+        cov: (6, 6) covariance of its tangent.
+        left: what the left camera saw.
+        right: what the right camera saw.
+
+    Returns:
+        Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed where
+        nothing is left.
+    """
+    view = DiscView.of(rig, target, left, right)
+    found = settle(view, T_left_body, cov, np.full((len(target.radii_m), 2), -1))
+    seen = correspondences(view, found)
+    if len(seen.ids):
+        return seen
+    if found.dropped:
+        return Missed(f"ambiguous: {'; '.join(f'{d.point}: {d.reason}' for d in found.dropped)}")
+    return Missed(f"no disc is where {target.body.name} should show one")
+
+
+def correspondences(view: DiscView, found: Assigned) -> Correspondences:
+    """Return what was named as correspondences of ellipse centres."""
+    ids = np.flatnonzero((found.rows >= 0).any(axis=1))
+    uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
+    for side, seen in enumerate(view.discs):
+        rows = found.rows[ids, side]
+        there = rows >= 0
+        uv[there, side], cov[there, side] = seen.uv[rows[there]], seen.cov_uv[rows[there]]
+    return Correspondences(ids, uv, cov, found.dropped)
+
+
+def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
+    """Name detections by a pose, the clear ones first.
+
+    Args:
+        view: what both cameras saw.
+        T_left_body: (4, 4) about where the body is.
+        cov: (6, 6) covariance of its tangent.
+        rows: (M, 2) what is settled already and is part of the pose; -1 elsewhere.
+    """
+    T, rows = T_left_body, rows.copy()
+    while True:
+        expected = expect(view.rig, view.target, T)
+        see = visible(view.rig, expected)
+        free = [np.isin(np.arange(len(seen.uv)), rows[:, s], invert=True) for s, seen in enumerate(view.discs)]
+        claims: dict[int, Claim] = {}
+        for m in np.flatnonzero((rows < 0).all(axis=1) & see.any(axis=1)).tolist():
+            left, right = (_near(view, expected, cov, m, s, free[s]) if see[m, s] else _NONE for s in (0, 1))
+            if len(left) or len(right):
+                claims[m] = _together(view, expected, cov, m, (left, right))
+        clear = _clear(claims)
+        if not len(clear):
+            break
+        rows[clear[:, 0]] = clear[:, 1:]
+        T, cov = _improved(view, expected, T, cov, clear)
+    names = view.target.body.point_names
+    return Assigned(rows, T, tuple(Dropped(names[m], _competing(claim)) for m, claim in claims.items()))
+
+
+def _near(view: DiscView, expected: Expected, cov: Array, m: int, side: int, free: NDArray[np.bool_]) -> Ids:
+    """Return the free detections of one camera that may be disc m."""
+    rows = np.flatnonzero(free & view.alike(m, side, float(expected.radius_px[m, side])))
+    gap = view.discs[side].uv[rows] - expected.uv[m, side]
+    J = expected.J[m, side]
+    S = J @ cov @ J.T + view.covariances(expected, np.full(len(rows), m), side, rows)
+    far = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap)
+    return np.asarray(rows[far <= _GATE_ONE])
+
+
+def _together(view: DiscView, expected: Expected, cov: Array, m: int, near: Claim) -> Claim:
+    """Return what is left of a disc's detections where those of both cameras must agree; all of one camera's."""
+    if not len(near[0]) or not len(near[1]):
+        return near
+    a, b = (grid.ravel() for grid in np.meshgrid(*near, indexing="ij"))
+    J = expected.J[m].reshape(4, 6)
+    S = np.tile(J @ cov @ J.T, (len(a), 1, 1))
+    S[:, :2, :2] += view.covariances(expected, np.full(len(a), m), 0, a)
+    S[:, 2:, 2:] += view.covariances(expected, np.full(len(b), m), 1, b)
+    gap = np.concatenate([view.discs[0].uv[a] - expected.uv[m, 0], view.discs[1].uv[b] - expected.uv[m, 1]], axis=1)
+    good = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap) <= _GATE_BOTH
+    return np.unique(a[good]), np.unique(b[good])
+
+
+def _clear(claims: dict[int, Claim]) -> Ids:
+    """Return (K, 3) disc, left and right row of every disc that has one choice and shares it with no other disc."""
+    wanted = [np.concatenate([claim[side] for claim in claims.values()] or [_NONE]) for side in (0, 1)]
+    clear = []
+    for m, claim in claims.items():
+        alone = all((wanted[s] == claim[s]).sum() == 1 for s in (0, 1) if len(claim[s]) == 1)
+        if max(map(len, claim)) == 1 and alone:
+            clear.append((m, *(rows[0] if len(rows) else -1 for rows in claim)))
+    return np.array(clear, np.int64).reshape(-1, 3)
+
+
+def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, clear: Ids) -> tuple[Array, Array]:
+    """Return the pose and its covariance with discs (K, 3) more, by a Kalman update."""
+    J, gap, noises = [], [], []
+    for side in (0, 1):
+        m, rows = clear[clear[:, 1 + side] >= 0][:, [0, 1 + side]].T
+        J.append(expected.J[m, side].reshape(-1, 6))
+        gap.append((view.discs[side].uv[rows] - expected.uv[m, side]).ravel())
+        noises += list(view.covariances(expected, m, side, rows))
+    by_pose = np.concatenate(J)
+    S = by_pose @ cov @ by_pose.T + block_diag(*noises)
+    gain = np.linalg.solve(S, by_pose @ cov).T
+    return T @ exp_se3(gain @ np.concatenate(gap)), cov - gain @ by_pose @ cov
+
+
+def _competing(claim: Claim) -> str:
+    """Say which detections compete for a disc."""
+    if not any(map(len, claim)):
+        return "what the two cameras show in its place does not belong together"
+    counts = ", ".join(f"{len(rows)} in the {side} image" for side, rows in zip(SIDES, claim, strict=True))
+    return f"several detections may be it: {counts}"

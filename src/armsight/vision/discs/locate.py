@@ -1,0 +1,101 @@
+"""Bodies that carry plain discs: named by their coded parts' pose or by themselves, freed of their bias, located together.
+
+discs, detections --identify or assign--> ellipse centres --centred--> disc centres --locate--> PoseEstimate --.
+                                              ^-------------- until the bias stays ---------------------------'
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs, Ids, Missed, PoseEstimate
+from armsight.vision.discs.assign import assign
+from armsight.vision.expected import centred
+from armsight.vision.discs.identify import Identified, identify
+from armsight.vision.locate import locate
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.match import match
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+
+#: The bias has settled when no centre moves by more than this, px; it shrinks a hundredfold each round.
+SETTLED_PX, _ROUNDS = 1e-4, 6
+
+
+def locate_composite(
+    rig: StereoRig,
+    body: Body,
+    target: DiscTarget,
+    coded: tuple[Detections, Detections],
+    discs: tuple[Discs, Discs],
+    *,
+    flips: tuple[Ids, ...] = (),
+) -> PoseEstimate | Missed:
+    """Locate a body from what both cameras saw of its coded parts and of its discs.
+
+    Args:
+        rig: the calibrated pair.
+        body: all points; the discs' come last.
+        target: the discs.
+        coded: what each camera saw of the coded parts, by rows of ``body``.
+        discs: the discs each camera saw.
+        flips: as in :func:`~armsight.vision.match.match`.
+
+    Returns:
+        The pose. The coded parts name the discs where they fix a pose by themselves; else the discs name themselves.
+    """
+    names = match(rig, body, *coded, flips=flips)
+    by_code = locate(rig, body, triangulate(rig, body, names)) if len(names.ids) else None
+    if isinstance(by_code, PoseEstimate):
+        seen = assign(rig, target, by_code.T_left_body, by_code.cov, *discs)
+        if isinstance(seen, Missed):
+            return by_code
+        return locate_discs(rig, body, target, names, seen, by_code.T_left_body, by_code.cov)
+    found = identify(rig, target, *discs)
+    if isinstance(found, Missed):
+        if isinstance(identify(rig, target, discs[1], discs[0]), Identified):
+            return Missed(f"left and right are exchanged: the discs fit the rig the other way round ({found.reason})")
+        told = [f"{side}: {d.problem}" for side, d in zip(SIDES, coded, strict=True) if d.problem]
+        told += [by_code.reason] if by_code is not None and not told else []
+        return Missed("; ".join([*told, found.reason]) if len(body.points) > len(target.body.points) else found.reason)
+    return locate_discs(rig, body, target, names, found.seen, found.T_left_body, found.cov)
+
+
+def locate_discs(
+    rig: StereoRig,
+    body: Body,
+    target: DiscTarget,
+    coded: Correspondences,
+    seen: Correspondences,
+    T_left_body: Array,
+    cov: Array,
+) -> PoseEstimate | Missed:
+    """Locate a body from named discs and coded points, the perspective bias of the discs taken off.
+
+    Args:
+        rig: the calibrated pair.
+        body: all points; the discs' come last.
+        target: the discs.
+        coded: what is known of coded points, by rows of ``body``; may be empty.
+        seen: ellipse centres by rows of ``target.body``.
+        T_left_body: (4, 4) about where the body is.
+        cov: (6, 6) covariance of its tangent.
+    """
+    first = len(body.points) - len(target.body.points)
+    before: Array | None = None
+    for _ in range(_ROUNDS):
+        centres = centred(rig, target, T_left_body, cov, seen)
+        if before is not None and np.nanmax(np.abs(centres.uv - before), initial=0.0) <= SETTLED_PX:
+            break
+        before = centres.uv
+        together = Correspondences(
+            np.concatenate([coded.ids, centres.ids + first]),
+            np.concatenate([coded.uv, centres.uv]),
+            np.concatenate([coded.cov_uv, centres.cov_uv]),
+            coded.dropped + centres.dropped,
+        )
+        result = locate(rig, body, triangulate(rig, body, together))
+        if isinstance(result, Missed):
+            return result
+        T_left_body, cov = result.T_left_body, result.cov
+    return result

@@ -1,0 +1,211 @@
+"""How well two cameras will know a body before it is built: predicted covariance, and how far apart two readings are.
+
+A body is put before the cameras, its points are projected, and the information of their pixels is summed: the covariance
+of the pose is its inverse (the Cramer-Rao bound), and what the rig's own covariance does comes on top.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Ids, Record
+from armsight.geometry.pose import inverse, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.bundle import Model, Observations, State, predict
+from armsight.vision.camera import Camera
+from armsight.vision.discs.symmetry import Relabeling
+from armsight.vision.posefit import Sightings, fit_pose
+from armsight.vision.rig import StereoRig
+
+#: A face turned away from a camera by more than this is not relied on, cosine.
+FACING = float(np.cos(np.radians(70.0)))
+#: Turns of the body at which two readings are compared, besides that which faces the cameras, rad.
+_TURN = np.radians(45.0)
+
+
+def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
+    """Return two perfect HD cameras side by side."""
+    camera = Camera((1280, 720), "none", np.array([focal_px, focal_px, 639.5, 359.5]), np.zeros(0))
+    T_left_right = pose(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
+    return StereoRig(camera, camera, T_left_right, np.zeros((14, 14)), 0.0, {"source": "stated, not measured"})
+
+
+@dataclass(frozen=True, eq=False)
+class View(Record):
+    """A body before two cameras.
+
+    Attributes:
+        T_left_body: (4, 4) where it is.
+        forward: (3,) unit vector from the cameras to it, left camera's frame.
+        seen: (M, 2) whether a camera sees a point: in its image, and its face not turned away.
+    """
+
+    T_left_body: Array
+    forward: Array
+    seen: NDArray[np.bool_]
+
+    @property
+    def paired(self) -> Ids:
+        """Rows of the points that both cameras see."""
+        return np.flatnonzero(self.seen.all(axis=1))
+
+
+def look_direction(points: Array, normals: Array) -> Array:
+    """Return the unit vector (3,), body frame, from which most of a body's faces are seen.
+
+    Args:
+        points: (M, 3) points, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+
+    Returns:
+        The direction from the body to who looks at it; where no normal is known, square to the flattest plane through
+        the points, on the side of -z.
+    """
+    known = normals[np.isfinite(normals).all(axis=1)]
+    if not len(known):
+        normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
+        first = normal[np.abs(normal) > 1e-9][-1]
+        return np.asarray(-np.sign(first) * normal)
+    candidates = [known.mean(axis=0), *known]
+    units = [c / np.linalg.norm(c) for c in candidates if np.linalg.norm(c) > 0.1]
+    return np.asarray(max(units, key=lambda v: (int((known @ v > FACING).sum()), float((known @ v).clip(0).sum()))))
+
+
+def view(
+    rig: StereoRig, points: Array, normals: Array, distance_m: float, turn: tuple[float, float] = (0.0, 0.0)
+) -> View:
+    """Put a body before the cameras, its faces towards them and its middle between their axes.
+
+    Args:
+        rig: the cameras.
+        points: (M, 3) points, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        distance_m: from the cameras to the body's middle.
+        turn: about the horizontal and the vertical axis of the image, rad.
+    """
+    towards = look_direction(points, normals)
+    ahead = np.array([0.0, 0.0, distance_m, 1.0])
+    middle = (ahead[:3] + (rig.T_left_right @ ahead)[:3]) / 2
+    forward = middle - rig.T_left_right[:3, 3] / 2
+    forward = forward / np.linalg.norm(forward)
+    R = _axes(forward, np.array([1.0, 0.0, 0.0])) @ exp_so3(np.array([*turn, 0.0])) @ face_axes(towards).T
+    facing = normals @ towards > FACING
+    used = facing | ~np.isfinite(normals).all(axis=1)
+    T = pose(R, middle - R @ points[used].mean(axis=0))
+    return View(T, forward, _seen(rig, T, points, normals))
+
+
+def face_axes(normal: Array) -> Array:
+    """Return (3, 3) axes of a face as columns, body frame: right, down, and into it, as one looks at it.
+
+    The body's x axis runs to the right; where it is square to the face, the body's y axis runs down.
+    """
+    right = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.cross([0.0, 1.0, 0.0], -normal)
+    return _axes(-normal, right)
+
+
+def _axes(z: Array, x: Array) -> Array:
+    """Return (3, 3) orthonormal axes as columns: z as given, x as near as can be to what is given."""
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _seen(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
+    """(M, 2) whether a camera has a point in its image, its face not turned away."""
+    columns = []
+    for camera, T in ((rig.left, T_left_body), (rig.right, inverse(rig.T_left_right) @ T_left_body)):
+        uv = camera.project(transform(T, points))
+        with np.errstate(invalid="ignore"):
+            columns.append(((uv >= 0) & (uv <= np.array(camera.image_size_px) - 1)).all(axis=1))
+    return np.stack(columns, axis=1) & _facing(rig, T_left_body, points, normals)
+
+
+def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
+    """(M, 2) whether a point's face is not turned away from a camera; true where it is unknown."""
+    columns = []
+    for T in (T_left_body, inverse(rig.T_left_right) @ T_left_body):
+        p = transform(T, points)
+        cosine = -np.einsum("ni,ni->n", normals @ T[:3, :3].T, p) / np.linalg.norm(p, axis=1)
+        columns.append(~(cosine <= FACING))
+    return np.stack(columns, axis=1)
+
+
+def pose_covariance(rig: StereoRig, points: Array, seen: View, sigma_px: float) -> Array | None:
+    """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
+
+    Args:
+        rig: the cameras; what their calibration does is in it where the rig's covariance is known.
+        points: (M, 3) points, m.
+        seen: where the body is.
+        sigma_px: standard deviation of a place in the image, px.
+
+    Returns:
+        The covariance, or None where what is seen fixes no pose.
+    """
+    rows, sides = np.nonzero(seen.seen)
+    if len(seen.paired) < 3:
+        return None
+    state = State(rig.cameras, rig.T_left_right, seen.T_left_body[None], np.zeros(0))
+    cov_uv = np.tile(sigma_px**2 * np.eye(2), (len(rows), 1, 1))
+    observed = Observations(np.zeros(len(rows), np.int64), sides, rows, np.zeros((len(rows), 2)), cov_uv, 1)
+    _, J_rig, J_pose = predict(Model(points, np.zeros((0, len(points), 3)), 1.0, False), state, observed)
+    A, B = J_pose.reshape(-1, 6) / sigma_px, J_rig.reshape(-1, rig.parameter_count) / sigma_px
+    information = A.T @ A
+    scale = np.sqrt(np.diag(information))
+    if not (scale > 0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e12:
+        return None
+    noise = np.linalg.inv(information)
+    gain = noise @ (A.T @ B)
+    return np.asarray(noise + gain @ rig.cov @ gain.T)
+
+
+def separation(
+    rig: StereoRig,
+    points: Array,
+    normals: Array,
+    relabeling: Relabeling,
+    distance_m: float,
+    sigma_px: float,
+    hidden: int = -1,
+) -> float:
+    """Tell by how many standard deviations taking discs for others misses what the cameras see, at the worst turn tried.
+
+    Args:
+        rig: the cameras.
+        points: (M, 3) places of the discs, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        relabeling: which are taken for which.
+        distance_m: of the body.
+        sigma_px: standard deviation of a disc's place in the image.
+        hidden: a disc that something hides; none where below zero.
+
+    Returns:
+        The root of the weighted sum of squares that the wrong reading leaves; infinity where its discs would always be seen
+        from behind, NaN where there is no turn at which the discs in view are seen and no others.
+    """
+    seen, taken = relabeling.seen, relabeling.taken_for
+    others = np.setdiff1d(np.arange(len(points)), [*seen, hidden])
+    worst = np.nan
+    for turn in ((0.0, 0.0), (_TURN, 0.0), (-_TURN, 0.0), (0.0, _TURN), (0.0, -_TURN)):
+        true = view(rig, points[seen], normals[seen], distance_m, turn)
+        here = np.asarray(_facing(rig, true.T_left_body, points, normals).all(axis=1))
+        if not here[seen].all() or here[others].any():
+            continue
+        worst = np.fmin(worst, np.inf)
+        start = true.T_left_body @ inverse(relabeling.T)
+        if not _facing(rig, start, points[taken], normals[taken]).all():
+            continue
+        p = transform(true.T_left_body, points[seen])
+        uv = np.concatenate([rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))])
+        count = len(seen)
+        sightings = Sightings(
+            np.repeat([0, 1], count), np.tile(taken, 2), uv, np.tile(sigma_px**2 * np.eye(2), (2 * count, 1, 1))
+        )
+        fit = fit_pose(rig.cameras, rig.T_left_right, points, sightings, start, robust=False)
+        if fit is not None:
+            worst = np.fmin(worst, np.sqrt(fit.cost))
+    return float(worst)

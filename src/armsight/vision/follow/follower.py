@@ -1,0 +1,285 @@
+"""Following a body of discs from shot to shot: once seen, only the places where it should be are looked at.
+
+The pose is carried on with the velocity of the last two; each disc is searched within a margin that follows how wrong the
+last predictions were, and everything from pixels to covariance is one compiled call
+(:mod:`~armsight.vision.follow.kernel`). What does not fit, and any first shot, goes the slow way through
+:func:`~armsight.vision.measure.measure`, which searches the whole image and takes no hint from the past.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Shot
+from armsight.geometry.pose import inverse, log_se3
+from armsight.vision.discs.pose import (SEEN, Found, Scene, velocity)
+from armsight.vision.expected import bias_normals
+from armsight.vision.follow.kernel import (NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair)
+from armsight.vision.image import grey
+from armsight.vision.likeness import misfit_limit
+from armsight.vision.markers import disc_outline
+from armsight.vision.markers.disc import search as disc_search
+from armsight.vision.markers.disc.fit import REASONS
+from armsight.vision.markers.disc_model import workspace
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.targets import Composite
+from armsight.vision.measure import measure
+from armsight.vision.rehearse import rehearse
+from armsight.vision.rig import StereoRig
+from armsight.vision.track import LEAST_S, Track
+
+Way = Literal["followed", "searched", "lost"]
+
+#: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
+#: least and at the most; and in sizes of the last errors of prediction.
+_MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
+#: While it is looked for where it is expected, the whole image is searched once in so many shots.
+_SEARCH_EVERY = 8
+#: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
+_JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
+_WORDS = {
+    **REASONS,
+    TURNED_AWAY: "turned away from the camera",
+    OUTSIDE: "outside the image",
+    NOT_THERE: "not where it should be",
+    OTHER_SIZE: "not of the size it should have",
+}
+
+
+class Follower:
+    """Measures a body of discs shot after shot.
+
+    Attributes:
+        way: how the last shot was measured.
+        jump: what was unbelievable about the last pose, seen from the ones before; None where nothing was.
+    """
+
+    way: Way
+    jump: str | None
+
+    def __init__(self, rig: StereoRig, target: Target) -> None:
+        """Make ready to follow; compiles where that was not done on this machine yet (a minute or two, once).
+
+        Args:
+            rig: the calibrated pair.
+            target: a body whose markers are discs and nothing else, with the normals of all known.
+        """
+        self.way, self.jump = "lost", None
+        self._track: Track | None = None
+        self._count = self._vain = 0
+        if not follows(target):
+            raise ValueError(
+                f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no codes"
+            )
+        discs = target.discs
+        assert discs is not None
+        self.rig, self.target = rig, target
+        kernel = [camera.kernel_arguments() for camera in rig.cameras]
+        sizes = [camera.parameters.size for camera in rig.cameras]
+        self._scene = Scene(
+            np.array([k[0] for k in kernel]),
+            np.stack([k[1] for k in kernel]),
+            np.stack([k[2] for k in kernel]),
+            np.array([0, sizes[0]]),
+            np.array(sizes),
+            inverse(rig.T_left_right),
+            np.array(rig.cov),
+            max(rig.sigma_px, 1e-6) ** 2,
+            np.array(discs.body.points),
+            bias_normals(discs),
+            np.isfinite(discs.normals[:, 0]),
+            np.array(discs.radii_m),
+            np.where(discs.bright, 1, -1),
+        )
+        self._found = _room(len(discs.radii_m), rig.parameter_count)
+        self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
+        self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
+        self._work, self._outline = workspace(), disc_outline.workspace()
+        # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
+        rehearse(rig, target, discs)
+        black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
+        track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
+        track.predicted(1.0)
+        velocity(track.T_left_body, track.T_left_body, 1.0, np.zeros(6))
+        self._noise = disc_search.noise_of(black[0])
+        self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
+
+    def measure(self, shot: Shot, expected: Array | None = None) -> PoseEstimate | Missed:
+        """Measure one shot; shots come in the order of their time.
+
+        Args:
+            shot: the pair of images.
+            expected: T_left_body (4, 4) where somebody else has the body, an arm's joints say, for when it is lost: it is
+                looked for there, and in the whole image only every so often, for that takes long.
+        """
+        self._count += 1
+        t_s = float(self._count) if shot.t_s is None else shot.t_s
+        self.jump = None
+        result: PoseEstimate | Missed | None = None
+        track = self._track
+        usable = shot.left is not None and shot.right is not None and shot.problem is None
+        if usable and track is not None and track.foretells(t_s):
+            result = self._followed(shot, track, t_s)
+        lost = self.way == "lost"
+        if usable and result is None and lost and expected is not None:
+            result = self._expected(shot, expected, t_s)
+        if isinstance(result, PoseEstimate):
+            self.way, self._vain = "followed", 0
+            return result
+        if lost and expected is not None and 0 < self._vain < _SEARCH_EVERY:
+            result = Missed(
+                "not where it was lost, nor where it is expected; the whole image was searched shortly before"
+            )
+        else:
+            result, self._vain = measure(self.rig, self.target, shot), 0
+        if isinstance(result, Missed):
+            self.way = "lost"
+            self._vain += 1
+            if track is not None:
+                self._track = Track(
+                    track.T_left_body,
+                    track.twist,
+                    track.t_s,
+                    track.shots + 1,
+                    _MARGIN_MOST_PX,
+                    track.step_s,
+                    track.proven,
+                )
+            return result
+        self.way = "searched"
+        self._begin(shot, result, track, t_s)
+        return result
+
+    def _begin(self, shot: Shot, result: PoseEstimate, track: Track | None, t_s: float) -> None:
+        """Take up the track at a pose that was found by searching."""
+        assert shot.left is not None
+        self._noise = disc_search.noise_of(grey(shot.left))
+        self._found.contrast[:] = 0.0
+        if track is not None and track.proven and track.foretells(t_s):
+            before = track.predicted(t_s)
+            xi = log_se3(inverse(before) @ result.T_left_body)
+            px = (
+                self.rig.left.intrinsics[0] * float(np.linalg.norm(xi[:3])) / max(float(result.T_left_body[2, 3]), 1e-3)
+            )
+            turned = float(np.linalg.norm(xi[3:]))
+            if turned > _JUMP_RAD or px > _JUMP_PX:
+                self.jump = (
+                    f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(turned):.0f} degrees from where it was "
+                    "expected"
+                )
+        twist, step_s = np.zeros(6), math.inf
+        if track is not None and track.shots == 0 and LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
+            step_s = t_s - track.t_s  # two poses found by searching tell the velocity as well
+            velocity(track.T_left_body, result.T_left_body, step_s, twist)
+        self._track = Track(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
+
+    def _expected(self, shot: Shot, T_left_body: Array, t_s: float) -> PoseEstimate | None:
+        """Measure where somebody else has the body; None where that gives nothing to be believed."""
+        assert shot.left is not None
+        self._noise = disc_search.noise_of(grey(shot.left))
+        self._found.contrast[:] = 0.0
+        result = self._followed(
+            shot, Track(T_left_body, np.zeros(6), t_s - 1.0, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
+        )
+        if result is not None:  # where it was expected tells no velocity
+            self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
+        return result
+
+    def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
+        """Measure where the body should be; None where that gives nothing to be believed."""
+        assert shot.left is not None
+        assert shot.right is not None
+        left, right = grey(shot.left), grey(shot.right)
+        for camera, image in zip(self.rig.cameras, (left, right), strict=True):
+            if (image.shape[1], image.shape[0]) != camera.image_size_px:
+                return None
+        twist = track.twist.copy()
+        seen, chi_square, wrong = self._pair(left, right, track.T_left_body, twist, t_s - track.t_s, track.margin_px)
+        if not seen:
+            return None
+        margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
+        T = self._found.T.copy()
+        self._track = Track(T, twist, t_s, 0, margin, t_s - track.t_s, True)
+        return self._estimate(T, seen, chi_square)
+
+    def _pair(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, margin: float
+    ) -> tuple[int, float, float]:
+        """Run the compiled call."""
+        least = max(disc_search.LEAST_CONTRAST, 5.0 * self._noise)
+        arguments = (self._limits, self._found, self._cov_noise, self._work, self._outline)
+        seen, chi_square, wrong = follow_pair(
+            left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments
+        )
+        return seen, chi_square, wrong
+
+    def _estimate(self, T: Array, count: int, chi_square: float) -> PoseEstimate:
+        """Make the record of what the compiled call found: ``count`` ellipses."""
+        found = self._found
+        freedom = 2 * count - 6
+        misfit = max(chi_square / freedom, 1.0) if chi_square > self._limits[count] else 1.0
+        uv, cov_uv = found.uv - found.bias, found.cov_uv.copy()
+        dropped: tuple[Dropped, ...] = ()
+        seen = both = self._rows
+        p_left, cov_p, by_rig = found.p_left.copy(), found.cov_p.copy(), found.by_rig.copy()
+        if count < 2 * len(seen):
+            good = found.codes == SEEN
+            seen, both = np.flatnonzero(good.any(axis=1)), np.flatnonzero(good.all(axis=1))
+            uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(good)
+            uv, cov_uv = uv[seen], cov_uv[seen]
+            p_left, cov_p, by_rig = p_left[both], cov_p[both], by_rig[both]
+        noise = self._cov_noise * misfit
+        return PoseEstimate(
+            T,
+            found.cov + noise,
+            noise,
+            math.sqrt(found.squares[0] / len(both)),
+            math.sqrt(found.squares[1] / count),
+            math.sqrt(misfit),
+            Points(both, p_left, cov_p, by_rig, Correspondences(seen, uv, cov_uv, dropped), dropped),
+            dropped,
+        )
+
+    def _dropped(self, good: NDArray[np.bool_]) -> tuple[Dropped, ...]:
+        """Say which discs which camera did not see, and why."""
+        names = self.target.body.point_names
+        return tuple(
+            Dropped(names[m], f"{side}: {_WORDS[int(self._found.codes[m, c])]}")
+            for c, side in enumerate(SIDES)
+            for m in np.flatnonzero(~good[:, c])
+        )
+
+
+def follows(target: Target) -> TypeGuard[Composite]:
+    """Whether a target can be followed: three discs or more and nothing else, their normals known or of no account."""
+    if not isinstance(target, Composite) or target.parts or target.discs is None:
+        return False
+    return len(target.discs.radii_m) >= 3 and bool(np.isfinite(bias_normals(target.discs)).all())
+
+
+def _room(count: int, parameters: int) -> Found:
+    """Return arrays for the results of one pair."""
+    return Found(
+        np.full((count, 2), NOT_THERE),
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2, 2, 2)),
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2)),
+        np.zeros((count, 2, 2)),
+        np.eye(4),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, parameters)),
+        np.zeros(4 * count),
+        np.zeros((4 * count, 6)),
+        np.zeros((4 * count, parameters)),
+        np.zeros((count, 2, 2)),
+        np.zeros(2),
+    )

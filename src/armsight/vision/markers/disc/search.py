@@ -1,0 +1,260 @@
+"""Where in an image discs may be: every third row in steps of eight pixels, then a look around each find.
+
+A disc is brighter (or darker) than what lies eight pixels to its left. Eight pixels are compared at a time, in
+one 64-bit word; the least contrast that counts follows from the image's own noise. The look around gives an ellipse to
+start the fit from, or the reason why there is none (:mod:`~armsight.vision.markers.disc_outline`).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.vision.markers.disc.fit import FOUND_TWICE, fit, shape_of
+from armsight.vision.markers.disc_model import Work
+from armsight.vision.markers.disc_outline import Grey, Room, outline
+
+#: Rows between those looked at; the smallest disc, 5 px across, shows on one at least.
+_ROW_STEP = 3
+#: Rows of the image of which those looked at are looked at together first.
+_TOGETHER = 8 * _ROW_STEP
+#: Least contrast, grey levels, and in standard deviations of the noise of a difference.
+LEAST_CONTRAST = 10.0
+_CONTRAST_SIGMAS = 5.0
+#: A find so near to the rim of a known disc is that disc, px.
+_RIM_PX = 3.0
+_HIGH = np.uint64(0x8080808080808080)
+_SIX = np.uint64(0x3F3F3F3F3F3F3F3F)
+_LANES = np.uint64(0x0101010101010101)
+_TWO, _MARK = np.uint64(2), np.uint64(0x80)
+_EMPTY = np.uint64(0)
+
+Words = NDArray[np.uint64]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def noise_of(image: Grey) -> float:
+    """Estimate the standard deviation of an image's noise, grey levels: the median difference of neighbours.
+
+    A tenth of a level at the least; pixels without light or with too much say nothing.
+    """
+    height, width = image.shape
+    counts = np.zeros(256, np.int64)
+    total = 0
+    length = min(32, width - 1)
+    for k in range(16):
+        # Short runs of pixels, spread over the image as a lattice of coprime steps spreads them.
+        y = ((2 * k + 1) * height) // 32
+        first = ((k * 7) % 16) * (width - 1 - length) // 15
+        for x in range(first, first + length):
+            a, b = np.int64(image[y, x]), np.int64(image[y, x + 1])
+            if 0 < a < 255 and 0 < b < 255:
+                counts[abs(a - b)] += 1
+                total += 1
+    if total < 100:
+        return 1.0
+    half, below = 0.5 * total, 0
+    for d in range(256):
+        if below + counts[d] >= half:
+            # Differences are whole levels: the median lies within its bin, which reaches from d - 1/2 to d + 1/2.
+            low = d - 0.5 if d > 0 else 0.0
+            median = low + (half - below) / counts[d] * (d + 0.5 - low)
+            return float(max(median / 0.954, 0.1))
+        below += counts[d]
+    return 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _marks(a: np.uint64, b: np.uint64, t: np.uint64) -> np.uint64:
+    """Mark, with the high bit of its byte, each pixel of b that is brighter than its fellow of a by t times four levels."""
+    return ((((b >> _TWO) & _SIX) | _HIGH) - ((a >> _TWO) & _SIX) - t) & _HIGH
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def _apart(row: Words, i: int, t: np.uint64) -> np.uint64:
+    """Mark the pixels of word i of a row that differ from those eight further on."""
+    return _marks(row[i], row[i + 1], t) | _marks(row[i + 1], row[i], t)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def differs(row: Words, t: np.uint64) -> bool:
+    """Tell whether any two pixels of a row (W / 8,), eight apart, differ by t units of four levels."""
+    every = _EMPTY
+    for i in range(len(row) - 1):
+        every |= _apart(row, i, t)
+    return bool(every != _EMPTY)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def any_differs(words: Words, y: int, t: np.uint64) -> bool:
+    """Tell whether any two pixels of the eight rows from y that are looked at differ as :func:`differs` has it.
+
+    An image that nobody has looked at is far away in memory, and one row at a time waits for each of its lines. Eight at
+    a time wait for eight at once: half the time.
+    """
+    every = _EMPTY
+    a, b, c, d = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
+    y += 4 * _ROW_STEP
+    e, f, g, h = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
+    for i in range(len(a) - 1):
+        every |= _apart(a, i, t) | _apart(b, i, t) | _apart(c, i, t) | _apart(d, i, t)
+        every |= _apart(e, i, t) | _apart(f, i, t) | _apart(g, i, t) | _apart(h, i, t)
+    return bool(every != _EMPTY)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
+    """Whether a place was looked at already, or lies on a disc that was found."""
+    n = cells[y >> 3, x >> 3]
+    if n < 0:
+        return False
+    if codes[n] != 0:
+        return True
+    u, v = x - starts[n, 0], y - starts[n, 1]
+    q = starts[n, 2] * u * u + 2 * starts[n, 3] * u * v + starts[n, 4] * v * v
+    return bool(np.sqrt(q) < 1.0 + _RIM_PX * np.sqrt(starts[n, 2] + starts[n, 4]))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
+    """Let the cells that a disc covers, and a little more, know it."""
+    height, width = cells.shape
+    det = starts[n, 2] * starts[n, 4] - starts[n, 3] ** 2
+    half_w, half_h = np.sqrt(starts[n, 4] / det) + _RIM_PX, np.sqrt(starts[n, 2] / det) + _RIM_PX
+    left, right = max(int(starts[n, 0] - half_w), 0) >> 3, min(int(starts[n, 0] + half_w) >> 3, width - 1)
+    top, bottom = max(int(starts[n, 1] - half_h), 0) >> 3, min(int(starts[n, 1] + half_h) >> 3, height - 1)
+    for y in range(top, bottom + 1):
+        for x in range(left, right + 1):
+            cells[y, x] = n
+
+
+@numba.njit(cache=True, error_model="numpy")
+def search(
+    image: Grey, words: Words, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    signs: NDArray[np.int64], room: Room,
+) -> int:  # fmt: skip
+    """Look for discs in a whole image.
+
+    Args:
+        image: (H, W) grey, W a multiple of eight.
+        words: (H, W / 8) the same memory.
+        noise: standard deviation of the image's noise, grey levels.
+        bright: whether bright discs are looked for.
+        dark: whether dark ones are.
+        starts: (N, 10) filled with starts for the fit; where there is no disc, with the place that was looked at.
+        codes: (N,) filled with 0 or why there is no disc.
+        signs: (N,) filled with 1 for bright discs, -1 for dark ones.
+        room: what ``disc_outline.workspace`` returns.
+
+    Returns:
+        How many were looked at, at most N.
+    """
+    height, width = image.shape
+    contrast = max(LEAST_CONTRAST, _CONTRAST_SIGMAS * 1.4142 * noise)
+    least = min(int(np.ceil(contrast / 4.0)), 60)
+    t = np.uint64(least) * _LANES
+    cells = np.empty((2, height // 8 + 1, width // 8 + 1), np.int16)
+    n, plain, begun = 0, False, False
+    for y in range(1, height - 1, _ROW_STEP):
+        if (y - 1) % _TOGETHER == 0:
+            plain = y + _TOGETHER < height and not any_differs(words, y, t)
+        row = words[y]
+        if plain or not differs(row, t):
+            continue
+        if not begun:
+            cells[:], begun = -1, True
+        for i in range(len(row) - 1):
+            for sign in (1, -1):
+                if not (bright if sign > 0 else dark):
+                    continue
+                left = _marks(row[i], row[i + 1], t) if sign > 0 else _marks(row[i + 1], row[i], t)
+                mine = cells[(1 - sign) // 2]
+                while left != _EMPTY:
+                    # A run of marked pixels is one find: where the two differ most.
+                    lane, best, x = 0, -1, 0
+                    while (left >> np.uint64(8 * lane)) & _MARK == _EMPTY:
+                        lane += 1
+                    while lane < 8 and (left >> np.uint64(8 * lane)) & _MARK != _EMPTY:
+                        left &= ~(_MARK << np.uint64(8 * lane))
+                        gap = sign * (int(image[y, 8 * i + lane + 8]) - int(image[y, 8 * i + lane]))
+                        if gap > best:
+                            best, x = gap, 8 * i + lane + 8
+                        lane += 1
+                    if _known(x, y, starts, codes, mine):
+                        continue
+                    if n == len(starts):
+                        return n
+                    codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room), sign
+                    if codes[n] == 0:
+                        _note(n, starts, mine)
+                    else:
+                        starts[n, 0], starts[n, 1] = x, y
+                        mine[y >> 3, x >> 3] = n
+                    n += 1
+    return n
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
+    """Whether disc n is one of those before it; if not, let its cell of 8 px know it.
+
+    Two discs in one cell do not look for each other's copies: they are smaller than 5 px then.
+    """
+    x, y = int(starts[n, 0]) >> 3, int(starts[n, 1]) >> 3
+    for j in range(max(y - 1, 0), min(y + 2, cells.shape[0])):
+        for i in range(max(x - 1, 0), min(x + 2, cells.shape[1])):
+            m = cells[j, i]
+            if m < 0 or signs[m] != signs[n]:
+                continue
+            if (starts[m, 0] - starts[n, 0]) ** 2 + (starts[m, 1] - starts[n, 1]) ** 2 < 4.0:
+                return True
+    cells[y, x] = n
+    return False
+
+
+@numba.njit(cache=True, error_model="numpy")
+def find(
+    image: Grey, words: Words, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64], signs: NDArray[np.int64],
+    cov: Array, shape: Array, room: Room, work: Work,
+) -> tuple[int, int]:  # fmt: skip
+    """Search an image and fit what was found.
+
+    Args:
+        image: as in :func:`search`, and words, bright, dark, starts, codes, signs and room.
+        words: see there.
+        bright: see there.
+        dark: see there.
+        starts: see there; in the end the discs come first, fitted, then what is none.
+        codes: see there; in the same order.
+        signs: see there; in the same order.
+        cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
+        shape: (N, 3) filled with the discs' ellipses, px^2.
+        room: see there.
+        work: room for fits.
+
+    Returns:
+        How many discs, and how many places in all.
+    """
+    noise = noise_of(image)
+    n = search(image, words, noise, bright, dark, starts, codes, signs, room)
+    if n == 0:
+        return 0, 0
+    good = 0
+    cells = np.full((image.shape[0] // 8 + 1, image.shape[1] // 8 + 1), -1, np.int16)
+    for i in range(n):
+        if codes[i] == 0:
+            codes[i] = fit(image, noise, starts[i], cov[good], work)
+        if codes[i] != 0:
+            continue
+        for a in range(starts.shape[1]):
+            starts[good, a], starts[i, a] = starts[i, a], starts[good, a]
+        codes[good], codes[i] = codes[i], codes[good]
+        signs[good], signs[i] = signs[i], signs[good]
+        if _again(good, starts, signs, cells):
+            codes[good] = FOUND_TWICE
+        else:
+            shape_of(starts[good], shape[good])
+            good += 1
+    return good, n
