@@ -33,15 +33,13 @@ import numpy as np  # noqa: E402
 import test_firmware_pid as pid_tests  # noqa: E402
 
 from armsight import firmware  # noqa: E402
-from armsight.app.board_bench import Bench  # noqa: E402
-from armsight.app.board.scenarios import DRIVEN
+from armsight.app.board.scenarios import DRIVEN, Bench  # noqa: E402
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
 from armsight.firmware.stack import stack_use  # noqa: E402
 from armsight.robot.boards.configuration import gains_array, lab_configuration  # noqa: E402
 from armsight.robot.boards.emulated import EmulatedLink  # noqa: E402
-from armsight.robot.boards.machines import open_machine  # noqa: E402
-from armsight.robot.boards.opening import configured  # noqa: E402
+from armsight.robot.boards.opening import configured, open_machine  # noqa: E402
 from armsight.robot.boards.qemu import PROGRAM  # noqa: E402
 from armsight.robot.boards.unicorn import UnicornMachine  # noqa: E402
 from armsight.sim.joints import JointPlant  # noqa: E402

@@ -12,18 +12,18 @@ from armsight.data import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import bench_rig
-from armsight.sim.render.mesh import (Solid, box, joined, moved, see, with_noise)
+from armsight.sim.render.mesh import Solid, box, joined, moved, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.depth import depth_of
-from armsight.vision.dense.fill import filled
 from armsight.vision.dense.evaluate import Truth, judge
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.middlebury import find_scenes, load_scene
-from armsight.vision.dense.scanline import Scanline
-from armsight.vision.dense.semiglobal import Semiglobal
+from armsight.vision.dense.postprocess import filled
 from armsight.vision.dense.rectified import plain_grey
 from armsight.vision.dense.registration import CloudPose, Surface, locate_cloud
+from armsight.vision.dense.scanline import Scanline
+from armsight.vision.dense.semiglobal import Semiglobal
 
 OURS = {
     "block": Block(),

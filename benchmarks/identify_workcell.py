@@ -17,22 +17,20 @@ import numpy as np
 
 from armsight.data import JointCommand
 from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop.identify.backlash import plays
+from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import plan_poses
-from armsight.loop.identify.backlash import plays
-from armsight.loop.identify.priors import prior_sigma
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machines import open_machine
-from armsight.robot.boards.opening import configured
+from armsight.robot.boards.opening import configured, open_machine
 from armsight.robot.models import open_arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import drawn, imperfections
 from armsight.sim.workcell.board import configuration, gravity_duty
-from armsight.sim.workcell.motors import chosen
-from armsight.sim.cell_solids import solids
+from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import ArmPlant
 
 POSES, PLANNED, UNSEEN, REACH_RAD, HIGH_M = 60, 30, 200, 0.9, 0.1

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from worn_arm import distance_m, poses, worn
 
+from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import placed
 from armsight.loop.identify.plan import free_of_collision, plan_poses
-from armsight.loop.identify.priors import prior_sigma
 
 POSES, UNSEEN, FIRST = 60, 200, 15
 

@@ -32,8 +32,9 @@ import numba  # noqa: E402
 import numpy as np  # noqa: E402
 import peers  # noqa: E402
 
-from armsight.robot.kinematics import chain, inverse, batch as lanes
-from armsight.robot.kinematics.rows import MOST, WIDTH  # noqa: E402
+from armsight.robot.kinematics import batch as lanes  # noqa: E402
+from armsight.robot.kinematics import chain, inverse  # noqa: E402
+from armsight.robot.kinematics.inverse import MOST, WIDTH  # noqa: E402
 from armsight.robot.models import MODELS  # noqa: E402
 
 POSES, BATCH, CHUNK = 1_000_000, 100_000, 20_000

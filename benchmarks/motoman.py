@@ -17,7 +17,7 @@ from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.locate import locate
-from armsight.vision.markers.bodies import load_body_csv
+from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.match import gate
 from armsight.vision.measure import measure_seen
 from armsight.vision.triangulate import triangulate

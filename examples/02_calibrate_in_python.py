@@ -1,9 +1,15 @@
-"""Calibrate two cameras from pairs of board images, and save the rig.
+"""
+Calibrate in Python
+===================
 
-    python examples/02_calibrate_in_python.py
+Calibrate two cameras from pairs of images of a board, and save the rig.
 
-The images are rendered here; with your own, give their folder to ``open_source``, your board to ``open_board``, the size
-of your images to ``calibrate_boards``, and leave ``models`` out: the held-out error then chooses.
+.. code-block:: console
+
+    $ python examples/02_calibrate_in_python.py
+
+The images are rendered here. For your own images give their folder to ``open_source``, your board to ``open_board`` and the
+size of the images to ``calibrate_boards``, and leave ``models`` out: the held-out error then selects the lens model.
 """
 
 import tempfile
@@ -34,6 +40,26 @@ def main(folder: Path) -> None:
         print(f"weak: {weakness}")
 
 
+# %%
+# Corners cover both images. Where there is no corner, the distortion is extrapolated:
+
+
+def plot(folder: Path) -> None:
+    """Show where the corners of all pairs are in both images; needs matplotlib."""
+    import matplotlib.pyplot as plt
+
+    board, source = open_board(BOARD), open_source(str(folder / "board"))
+    _, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
+    while (shot := source.read()) is not None:
+        for ax, image in zip(axes, (shot.left, shot.right), strict=True):
+            uv = board.detect(grey(image)).uv
+            ax.plot(uv[:, 0], uv[:, 1], ".", markersize=3)
+    for ax, side in zip(axes, ("left", "right"), strict=True):
+        ax.set(title=side, xlabel="u, px", ylabel="v, px", xlim=(0, 640), ylim=(360, 0), aspect="equal")
+    plt.show()
+
+
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
         main(Path(name))
+        plot(Path(name))

@@ -1,8 +1,14 @@
-"""Depth for every pixel: render a box before a wall, match the pair, and find the box without any marker on it.
+"""
+Dense stereo and a body without markers
+=======================================
 
-    python examples/04_dense.py
+Render a box in front of a wall, match the pair of images, and locate the box, which carries no marker.
 
-The first run on a machine compiles for half a minute.
+.. code-block:: console
+
+    $ python examples/04_dense.py
+
+The first run on a computer compiles for half a minute.
 """
 
 import numpy as np
@@ -23,8 +29,8 @@ T_TRUE = pose(exp_so3(np.array([0.5, 0.6, 0.2])), np.array([0.05, 0.0, 0.8]))
 WALL = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.4]))
 
 
-def main() -> None:
-    """Render, match, measure."""
+def main() -> np.ndarray:
+    """Render, match, locate; return the depth (H, W) in m, NaN where it was not measured."""
     rng, rig = np.random.default_rng(1), bench_rig((480, 360), focal_px=480.0, baseline_m=0.12, convergence_deg=6.0)
     thing = box(BOX_M, grain_m=0.02, seed=1)
     wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, seed=2)
@@ -41,14 +47,29 @@ def main() -> None:
           f"{1e3 * np.median(depth.sigma_m[chosen]):.1f} mm at {np.median(depth.depth_m[chosen]):.2f} m")  # fmt: skip
     v, u = np.nonzero(chosen)
     p_left = form.points(np.column_stack([u, v]).astype(float), result.disparity[chosen].astype(float))
-    about = T_TRUE @ exp_se3(np.array([0.006, -0.005, 0.008, 0.04, -0.03, 0.03]))  # what an arm's joints would tell
+    about = T_TRUE @ exp_se3(np.array([0.006, -0.005, 0.008, 0.04, -0.03, 0.03]))  # what an arm's joints would report
     found = locate_cloud(Surface.of_mesh(thing.vertices, thing.triangles), p_left, depth.sigma_m[chosen], about)
     if isinstance(found, Missed):
         print("missed:", found.reason)
-        return
+        return np.where(chosen, depth.depth_m, np.nan)
     off = log_se3(inverse(found.T_left_body) @ T_TRUE)
     print(f"the box: error {1e3 * np.linalg.norm(off[:3]):.2f} mm, {np.degrees(np.linalg.norm(off[3:])):.2f} deg")
+    return np.where(chosen, depth.depth_m, np.nan)
+
+
+# %%
+# The measured depth. White pixels were not measured:
+
+
+def plot(depth_m: np.ndarray) -> None:
+    """Show the depth; needs matplotlib."""
+    import matplotlib.pyplot as plt
+
+    figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    figure.colorbar(ax.imshow(depth_m, cmap="viridis_r"), label="depth, m")
+    ax.set(xlabel="u, px", ylabel="v, px")
+    plt.show()
 
 
 if __name__ == "__main__":
-    main()
+    plot(main())

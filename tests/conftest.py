@@ -8,7 +8,7 @@ import pytest
 from hypothesis import settings
 
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 
 ROOT = Path(__file__).resolve().parent.parent
 

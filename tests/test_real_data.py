@@ -14,7 +14,7 @@ from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
-from armsight.vision.markers.bodies import load_body_csv
+from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.match import join
 from armsight.vision.measure import measure_seen
 from cli_runs import run

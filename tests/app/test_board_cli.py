@@ -12,7 +12,7 @@ from armsight.app.board.scenarios import AT_REST, DRIVEN
 from armsight.firmware import build, host_library
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.host import HostMachine
-from armsight.robot.boards.machines import MACHINES
+from armsight.robot.boards.opening import MACHINES
 from cli_runs import refused
 
 HOST = ("--board", "emulated:host")

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from armsight.app.body import draw as body_draw
-from armsight.app.body.check import judge
-from armsight.app.body_swaps import TOLD
+from armsight.app.body.check import TOLD, judge
 from armsight.data import Discs, Missed
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.discs.bias import project_discs
-from armsight.vision.discs.predict import plain_rig, view
 from armsight.vision.discs.identify import identify
+from armsight.vision.discs.predict import plain_rig, view
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from cli_runs import refused

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from armsight.app.check_figures import paths_figure
-from armsight.app.check_paths import _turn_times
+from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
+from armsight.app.check.run_folder import _turn_times
 from cli_runs import Said, refused, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
 from armsight.geometry.pose import inverse, log_se3, pose, transform
-from armsight.vision.markers.bodies import save_body_csv
+from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
 from cli_runs import refused

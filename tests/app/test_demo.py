@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app.demo import demo
-from armsight.app.demo import command
+from armsight.app.demo import command, demo
 from armsight.app.demo.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3

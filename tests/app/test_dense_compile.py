@@ -8,7 +8,7 @@ import sys
 def test_the_second_process_compiles_nothing(tmp_path):
     code = (
         "from numba.core import event\n"
-        "from armsight.app.dense_compile import compile_apart, _run\n"
+        "from armsight.app.dense.run import compile_apart, _run\n"
         "compile_apart('block')\n"
         "with event.install_recorder('numba:compile') as seen:\n"
         "    _run('block')\n"

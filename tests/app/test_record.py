@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.record import recording
 from armsight.app.main import main
+from armsight.app.record import recording
 from armsight.app.record.recording import record
 from armsight.data import Shot
 from armsight.errors import DeviceError, InputError
@@ -262,7 +262,9 @@ def test_the_commands_mistakes_are_one_line_and_code_2(monkeypatch, capsys, stor
 
 
 def test_a_stop_in_the_middle_is_a_partial_result_that_says_so(monkeypatch, capsys, tmp_path):
-    module = sys.modules.get("armsight.app.record.command") or __import__("armsight.app.record.command", fromlist=["command"])
+    module = sys.modules.get("armsight.app.record.command") or __import__(
+        "armsight.app.record.command", fromlist=["command"]
+    )
     for stop, expected, said in (
         (DeviceError("/dev/video0: gone"), 2, "armsight: error: /dev/video0: gone; 3 shots are stored in"),
         (KeyboardInterrupt(), 130, "armsight: interrupted; 3 shots are stored in"),

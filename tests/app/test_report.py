@@ -12,15 +12,20 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.report import page
 from armsight.app.calibrate import report
-from armsight.app.calibrate.report import FIGURES, report_folder, write_report
-from armsight.app.report.plotting import (drawing, nice, plain, png)
-from armsight.app.calibrate.figures import (MOST_BARS, STANDS_OUT, coverage_figure, grid_counts, mean_residuals, pairs_figure)
-from armsight.app.calibrate.assessment import advice, verdict
-from armsight.app.report_maps import round_steps
-from armsight.app.report_tables import pose_table
-from armsight.app.report_volume import predicted_sigmas, volume_slice
+from armsight.app.calibrate.assessment import advice, predicted_sigmas, verdict, volume_slice
+from armsight.app.calibrate.figures import (
+    MOST_BARS,
+    STANDS_OUT,
+    coverage_figure,
+    grid_counts,
+    mean_residuals,
+    pairs_figure,
+    round_steps,
+)
+from armsight.app.calibrate.report import FIGURES, pose_table, report_folder, write_report
+from armsight.app.report import page
+from armsight.app.report.plotting import drawing, nice, plain, png
 from armsight.data import Body, Detections
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform

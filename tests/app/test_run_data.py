@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from armsight.app.run_data import assembled
-from armsight.app.run.record import Log, Segment
-from armsight.app.run_tracks import ToolTrack, errors
+from armsight.app.run.record import Log, Segment, ToolTrack, assembled, errors
 from armsight.data import JointStates, PoseEstimate
 from armsight.geometry.pose import exp_se3
 from armsight.loop.estimators import Delay, Mounting

@@ -11,11 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app import run_files
+from armsight.app.run import folder as run_files
 from armsight.app.run import folder as run_folder
 from armsight.app.run.experiment import Outcome
-from armsight.app.run_files import write_shots
-from armsight.app.run.folder import (Finished, finish, make_room, write_run)
+from armsight.app.run.folder import Finished, finish, make_room, write_run, write_shots
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 

@@ -12,14 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.run import experiment, calibrate as run_calibrate
-from armsight.app.run.experiment import run_experiment
 from armsight.app.interrupts import uninterrupted
-from armsight.app.run.motion_file import QUICK, read_motions
-from armsight.app.run_beside import beside, steady
-from armsight.app.run.record import Log, Segment
-from armsight.app.run.loop import PERIOD_S, Loop
+from armsight.app.run import calibrate as run_calibrate
+from armsight.app.run import experiment
 from armsight.app.run.controllers import Planned
+from armsight.app.run.experiment import run_experiment
+from armsight.app.run.loop import PERIOD_S, Loop, beside, steady
+from armsight.app.run.motion_file import QUICK, read_motions
+from armsight.app.run.record import Log, Segment
 from armsight.app.run.setup import Station
 from armsight.data import JointStates, Missed, Shot
 from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError

@@ -5,16 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from armsight.app.run.experiment import enable, rehearse, require_start
 from armsight.app.run.motion_file import QUICK, read_motions
-from armsight.app.run_ready import enable, rehearse, require_start
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import Fault, Reaction, State
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machines import open_machine
-from armsight.robot.boards.opening import configured
+from armsight.robot.boards.opening import configured, open_machine
 from armsight.robot.models import open_arm
 from armsight.sim.joints import JointPlant, PotFault
 

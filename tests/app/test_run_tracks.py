@@ -7,7 +7,7 @@ import pytest
 from pyarrow import parquet
 
 from armsight.app.run.metrics import path_distances, spread, track_figures
-from armsight.app.run_tracks import ToolTrack, errors, write_track
+from armsight.app.run.record import ToolTrack, errors, write_track
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import from_quaternion_wxyz

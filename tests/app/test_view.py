@@ -8,20 +8,27 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.measure import view as view_module
 from armsight.app.measure import command as measure_module
+from armsight.app.measure import view as view_module
+from armsight.app.measure.chart import SHOT, TIME, _stretches, chart, run_of
+from armsight.app.measure.picture import (
+    WIDTH,
+    _Panel,
+    angle_sigmas_deg,
+    ascii_text,
+    draw_shot,
+    ellipse,
+    header,
+    marks_of,
+    wrapped,
+)
 from armsight.app.measure.poses import pose_record
-from armsight.app.measure.view import (CHART, EACH_UP_TO, View, view_folder)
-from armsight.app.measure.chart import (SHOT, TIME, _stretches, chart, run_of)
-from armsight.app.measure.picture import WIDTH, _Panel, draw_shot
-from armsight.app.view_marks import marks_of
-from armsight.app.view_paint import ascii_text, ellipse, wrapped
-from armsight.app.view_words import angle_sigmas_deg, header
+from armsight.app.measure.view import CHART, EACH_UP_TO, View, view_folder
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
-from armsight.vision.expected import expect
+from armsight.vision.discs.bias import expect
 from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig

@@ -12,7 +12,7 @@ from armsight import firmware
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build, stack
 from armsight.firmware.elf import read_elf
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 
 #: What every board's linker script keeps free for the stack.
 STACK_BYTES = 8 * 1024

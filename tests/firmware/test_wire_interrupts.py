@@ -14,7 +14,7 @@ from firmware_pil import Host
 from armsight import firmware
 from armsight.errors import InputError
 from armsight.firmware.elf import read_elf
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 
 RETURN = 0x3FFE0
 STACKED = 26 * 4 + 8

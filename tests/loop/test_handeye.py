@@ -6,9 +6,8 @@ from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse
-from armsight.loop import handeye_start
-from armsight.loop.handeye.handeye import calibrate_handeye
-from armsight.loop.handeye_fit import Poses, adjoint, residuals
+from armsight.loop.handeye import handeye as handeye_start
+from armsight.loop.handeye.handeye import Poses, adjoint, calibrate_handeye, residuals
 from asserts import assert_jacobian
 
 

@@ -8,9 +8,9 @@ from worn_arm import distance_m, poses, worn
 
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.identify.backlash import plays
 from armsight.loop.identify.corrected import Corrected
-from armsight.loop.identify.fit import fit
-from armsight.loop.identify.selection import PLACEMENT, _Folds, _pays
+from armsight.loop.identify.fit import fit, prior_sigma
 from armsight.loop.identify.identify import contributions, identify
 from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
@@ -19,8 +19,7 @@ from armsight.loop.identify.model_file import open_model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import placed
 from armsight.loop.identify.plan import free_of_collision, plan_poses
-from armsight.loop.identify.backlash import plays
-from armsight.loop.identify.priors import prior_sigma
+from armsight.loop.identify.selection import PLACEMENT, _Folds, _pays
 from armsight.loop.identify.toml_write import table_text
 from armsight.loop.identify.validate import validate
 from armsight.robot.models import open_arm

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from armsight.loop.identify.design import exchanged
+from armsight.loop.identify.plan import exchanged
 
 
 def test_exchange_makes_a_choice_better_and_keeps_to_what_is_allowed():

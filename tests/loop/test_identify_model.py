@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.identify import chain
+from armsight.loop.identify import model as chain
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.robot.models import open_arm

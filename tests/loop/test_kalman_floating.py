@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from arm_bench import ARM, MIDDLE, TICK_S, TrueArm, distance_mm, legs, link_motion, rms, run, states
 
-from armsight.loop.estimators import (Delay, KalmanEstimator, Prior, backlash_dynamics as floating)
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior
+from armsight.loop.estimators import backlash_dynamics as floating
 from armsight.loop.estimators.readings import GAP_RAD, Readings
 from armsight.robot.models import MODELS
 

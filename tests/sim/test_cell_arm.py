@@ -7,8 +7,7 @@ from armsight.errors import InputError
 from armsight.robot.models import open_arm
 from armsight.sim.workcell.arm import PRESETS, drawn, imperfections
 from armsight.sim.workcell.board import configuration
-from armsight.sim.workcell.motors import chosen
-from armsight.sim.cell_solids import solids
+from armsight.sim.workcell.motors import chosen, solids
 
 MODEL = open_arm("six_r")
 

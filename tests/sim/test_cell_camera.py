@@ -6,7 +6,16 @@ import pytest
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.robot.models import open_arm
-from armsight.sim.workcell.cameras import (DISTANCE_M, RIGS, WEBCAMS, Timing, open_rig, open_timing, placed_rig, shot_times)
+from armsight.sim.workcell.cameras import (
+    DISTANCE_M,
+    RIGS,
+    WEBCAMS,
+    Timing,
+    open_rig,
+    open_timing,
+    placed_rig,
+    shot_times,
+)
 
 
 def test_shots_come_at_their_rate_and_are_stamped_when_they_came():

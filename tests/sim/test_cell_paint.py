@@ -6,15 +6,13 @@ import pytest
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.models import open_arm
-from armsight.sim.workcell.body import body_patterns, body_target
-from armsight.sim.workcell.cameras import open_rig, placed_rig
-from armsight.sim.cell_links import moving
-from armsight.sim.cell_noise import noise_start, noise_strip
-from armsight.sim.workcell.images import LENS, ArmSeen, CellCamera
-from armsight.sim.cell_solids import row_frames, solids
-from armsight.sim.render.optics import Sensor, exposed, shaded
+from armsight.sim.render.optics import Sensor, exposed, noise_start, noise_strip, shaded
 from armsight.sim.render.render import Shutter, radiance
 from armsight.sim.render.scene import Placed, plate
+from armsight.sim.workcell.body import body_patterns, body_target
+from armsight.sim.workcell.cameras import open_rig, placed_rig
+from armsight.sim.workcell.images import LENS, ArmSeen, CellCamera, moving
+from armsight.sim.workcell.motors import row_frames, solids
 
 MODEL = open_arm("six_r")
 PARTS = solids(MODEL)

@@ -4,8 +4,8 @@ import numpy as np
 
 from armsight.robot.models import open_arm
 from armsight.sim.workcell import raycast as cell_rays
-from armsight.sim.cell_scene import LAMP_BASE, corner_rays, furniture, pixel_rays, view
-from armsight.sim.cell_solids import solids
+from armsight.sim.workcell.motors import solids
+from armsight.sim.workcell.raycast import LAMP_BASE, corner_rays, furniture, pixel_rays, view
 from armsight.vision.camera import Camera
 
 EYE = np.array([1.3, -0.2, 0.6])

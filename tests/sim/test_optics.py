@@ -5,7 +5,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.sim.render.background import BACKGROUNDS
-from armsight.sim.render.optics import (Optics, Sensor, exposed, psf_taps, shaded)
+from armsight.sim.render.optics import Optics, Sensor, exposed, psf_taps, shaded
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0])

@@ -9,10 +9,8 @@ import pytest
 from armsight.robot.models import MODELS, open_arm
 from armsight.sim.workcell.arm import PRESETS, drawn, pot_travel
 from armsight.sim.workcell.board import gravity_duty
-from armsight.sim.cell_mjcf import mjcf
-from armsight.sim.workcell.motors import SUPPLY_V, chosen
-from armsight.sim.cell_solids import GRAVITY_M_S2, row_frames, solids, weight_torque
-from armsight.sim.workcell.plant import TICK_S, ArmPlant
+from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, row_frames, solids, weight_torque
+from armsight.sim.workcell.plant import TICK_S, ArmPlant, mjcf
 
 MODEL = open_arm("six_r")
 OFF = np.zeros(6)

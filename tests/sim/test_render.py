@@ -7,8 +7,8 @@ from render_oracle import brute, displacement_px
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.render.render import (Shutter, radiance, render, render_pair)
-from armsight.sim.render.scene import (BLACK, CLEAR, WHITE, Pattern, Placed, charuco, chessboard, marker_bits, plate, tag)
+from armsight.sim.render.render import Shutter, radiance, render, render_pair
+from armsight.sim.render.scene import BLACK, CLEAR, WHITE, Pattern, Placed, charuco, chessboard, marker_bits, plate, tag
 from armsight.vision.camera import Camera
 
 #: The issue's bound on a displaced corner or centre, and one grey level of a sensor of unit gain.

@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.sim.render.scene import (BLACK, WHITE, Pattern, aprilgrid, charuco, chessboard, circle_grid, marker_bits, plate, tag)
+from armsight.sim.render.scene import (
+    BLACK,
+    WHITE,
+    Pattern,
+    aprilgrid,
+    charuco,
+    chessboard,
+    circle_grid,
+    marker_bits,
+    plate,
+    tag,
+)
 
 
 def at(pattern, x, y):

@@ -7,7 +7,7 @@ from armsight.data import Correspondences, Discs, Missed
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.discs.assign import assign
-from armsight.vision.expected import expect
+from armsight.vision.discs.bias import expect
 from disc_views import PLATE, SIGMA, discs_of, hd_rig, someplace, views
 
 SIX = discs_of([[0, 0, 0], [0.06, 0, 0], [0.06, 0.05, 0], [-0.02, 0.07, 0], [0.03, -0.04, 0.02], [-0.05, 0.02, 0.03]])

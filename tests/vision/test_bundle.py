@@ -12,7 +12,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3, log_se3
 from armsight.vision import bundle
 from armsight.vision.bundle import CAUCHY_SCALE, Model, Observations, State, minimise, moved, predict, whiteners
-from armsight.vision.shape import smooth
+from armsight.vision.projection import smooth
 from asserts import assert_jacobian
 from strategies import CAMERAS, ordinary_rig
 from views import board, both_pixels, seen, somewhere

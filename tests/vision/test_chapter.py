@@ -17,7 +17,17 @@ from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
 from armsight.vision import closed_form as chapter
-from armsight.vision.closed_form import (T_world_camera, VergingRig, image_coordinates, orientation, rotation, rotation_from_angles, stereo_rig, triangulate_parallel, triangulate_verging)
+from armsight.vision.closed_form import (
+    T_world_camera,
+    VergingRig,
+    image_coordinates,
+    orientation,
+    rotation,
+    rotation_from_angles,
+    stereo_rig,
+    triangulate_parallel,
+    triangulate_verging,
+)
 from armsight.vision.locate import locate
 from armsight.vision.triangulate import triangulate
 from asserts import assert_rotation

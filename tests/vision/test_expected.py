@@ -9,7 +9,7 @@ import pytest
 from armsight.data import Correspondences
 from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.expected import bias_normals, centred, expect, visible
+from armsight.vision.discs.bias import bias_normals, centred, expect, visible
 from asserts import assert_jacobian, numeric_jacobian
 from disc_views import PLATE, discs_of, hd_rig, someplace, views
 from views import both_pixels, pixels

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.sim.example_rig import bench_rig
-from armsight.vision.discs.predict import (look_direction, plain_rig, pose_covariance, separation, view)
+from armsight.vision.discs.predict import look_direction, plain_rig, pose_covariance, separation, view
 from armsight.vision.discs.symmetry import relabelings
 from armsight.vision.posefit import Sightings, fit_pose
 from armsight.vision.rig import StereoRig

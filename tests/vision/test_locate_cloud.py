@@ -8,11 +8,11 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import bench_rig
-from armsight.sim.render.mesh import (box, joined, moved, see, with_noise)
+from armsight.sim.render.mesh import box, joined, moved, see, with_noise
 from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.semiglobal import Semiglobal
 from armsight.vision.dense.registration import Surface, locate_cloud, read_stl
+from armsight.vision.dense.semiglobal import Semiglobal
 
 GRAIN = {"grain_m": 0.012, "contrast": 30.0, "seed": 3}
 

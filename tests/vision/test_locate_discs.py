@@ -10,9 +10,9 @@ from armsight.data import Body, Correspondences, Detections, Missed, PoseEstimat
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
 from armsight.vision.closed_form import orientation
-from armsight.vision.expected import expect
-from armsight.vision.locate import locate
+from armsight.vision.discs.bias import expect
 from armsight.vision.discs.locate import locate_composite, locate_discs
+from armsight.vision.locate import locate
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from armsight.vision.triangulate import triangulate

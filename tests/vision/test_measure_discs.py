@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from armsight.data import Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
-from armsight.sim.render import background
 from armsight.sim.example_rig import PLATE_M, tag_plate
+from armsight.sim.render import background
 from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import render_pair
 from armsight.sim.render.scene import Placed, plate

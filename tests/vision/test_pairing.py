@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Discs
 from armsight.geometry.pose import transform
-from armsight.vision.disc_view import SIZE_TOLERANCE, DiscView
-from armsight.vision.discs.pairing import (DEPTHS_M, GATE_SIGMAS, MOST_PAIRS, pair)
+from armsight.vision.discs.identify import DISTANCE_SIGMAS, triples
+from armsight.vision.discs.pairing import DEPTHS_M, GATE_SIGMAS, MOST_PAIRS, SIZE_TOLERANCE, DiscView, pair
 from armsight.vision.triangulate import optimal_points
-from armsight.vision.triples import DISTANCE_SIGMAS, triples
 from disc_views import PLATE, discs_of, hd_rig, someplace, views
 from strategies import ordinary_rig
 from views import both_pixels

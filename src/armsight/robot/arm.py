@@ -2,10 +2,21 @@
 
 In: joint angles, rad, or a wanted pose. Out: poses ``T_base_tool``, Jacobians, :class:`Solutions`. The work is done by
 the functions in ``kinematics``; here stands what is checked once at the public door. Conventions: docs/arm.md.
+
+The table whose closed form starts the iterative inverse of an arm with axes a little off parallel.
+
+The common normal of two axes that are all but parallel is far away, so that such a row holds a d of many metres, the next
+one takes it back, and what lies between looks like no arm. Here d is carried on to where the normal is near, and the tilt
+left out.
+
+Joint angles and poses as they come in at the public door: made into new arrays, and refused with the reason.
+
+New arrays, so that the kernels see one type only. What costs time, looking at every number, the kernels do.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
@@ -18,14 +29,96 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
-from armsight.robot.arm_nearby import untilted
-from armsight.robot.checks import DEGREES, angle_refusal, angles_of, near_angles, pose_refusal, poses_of
-from armsight.robot.kinematics import chain, inverse, batch as lanes
+from armsight.robot.kinematics import batch as lanes
+from armsight.robot.kinematics import chain, inverse
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
-from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
+from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised
-from armsight.robot.kinematics.table import BASE, KIND, packed
+from armsight.robot.kinematics.table import BASE, KIND, link, packed
 from armsight.robot.solutions import ManySolutions, Nearest, Solutions
+
+#: Axes further apart than this, rad, are not meant to be parallel.
+TILT_RAD = np.deg2rad(3.0)
+_A, _D, _COS, _SIN, _OFFSET, _DIRECTION = range(6)
+
+
+def untilted(table: Array) -> Array:
+    """Return a packed table (96,) with axes that are all but parallel made parallel, and the rest as near as may be."""
+    out = table.copy()
+    rows = out[:BASE].reshape(6, 6)
+    for row, after in itertools.pairwise(rows):
+        if abs(row[_SIN]) > np.sin(TILT_RAD) or row[_SIN] == 0.0:
+            continue
+        along = -row[_D] / row[_COS]  # on the next axis, as far up as this joint stands
+        turn = np.array([[np.cos(row[_OFFSET]), -np.sin(row[_OFFSET])], [np.sin(row[_OFFSET]), np.cos(row[_OFFSET])]])
+        at = link(*row[:4]) @ [0.0, 0.0, along, 1.0]
+        x, y = turn @ at[:2]
+        facing = row[_OFFSET]  # where the next frame's x points; the tilt turns it by its square
+        row[_A], row[_D] = np.hypot(x, y), 0.0
+        row[_OFFSET] = np.arctan2(y, x)
+        row[_COS], row[_SIN] = np.sign(row[_COS]), 0.0
+        after[_D] -= along
+        after[_OFFSET] += row[_COS] * (facing - row[_OFFSET])
+    return out
+
+
+DEGREES = "are these degrees? give radians: numpy.deg2rad(...)"
+
+
+def angles_of(q: ArrayLike, *, batch: bool = True, name: str = "q") -> Array:
+    """Return joint angles as a new array, so that kernels see one type only."""
+    try:
+        angles = np.array(q, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers: {error}") from None
+    if angles.shape != (6,) and not (batch and angles.ndim == 2 and angles.shape[1] == 6):
+        raise InputError(f"{name} has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
+    return angles
+
+
+def near_angles(near: ArrayLike) -> Array:
+    """Return the angles to be near to."""
+    angles = angles_of(near, batch=False, name="near")
+    if chain.verdict(angles):
+        raise InputError(str(angle_refusal(angles)).replace("q", "near", 1))
+    return angles
+
+
+def poses_of(T: ArrayLike, dimensions: int) -> Array:
+    """Return poses as a new array, so that kernels see one type only."""
+    try:
+        poses = np.array(T, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"T_base_tool must be numbers: {error}") from None
+    if poses.ndim != dimensions or poses.shape[-2:] != (4, 4):
+        want = "(4, 4)" if dimensions == 2 else "(N, 4, 4)"
+        raise InputError(f"T_base_tool has shape {poses.shape}, must be {want}")
+    return poses
+
+
+def pose_refusal(Ts: Array) -> InputError:
+    """Tell what is wrong with poses that a kernel refused."""
+    if not np.isfinite(Ts).all():
+        return InputError("T_base_tool contains NaN or infinity; every entry must be a finite number")
+    R = Ts[:, :3, :3]
+    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max()
+    if (Ts[:, 3] != (0, 0, 0, 1)).any():
+        return InputError("T_base_tool is no rigid motion: its last row must be 0 0 0 1")
+    if off < 1e-6:
+        return InputError("T_base_tool is no rigid motion: its 3x3 part is a mirror image, its determinant is -1")
+    return InputError(
+        f"T_base_tool is no rigid motion: its columns are off from orthonormal by {off:.2g}; allowed is 1e-6"
+    )
+
+
+def angle_refusal(angles: Array) -> InputError:
+    """Tell what is wrong with joint angles that a kernel refused."""
+    if not np.isfinite(angles).all():
+        return InputError("q contains NaN or infinity; every joint angle must be a finite number")
+    row, joint = divmod(int(np.argmax(np.abs(angles) > chain.MOST_RADIANS)), 6)
+    where = f"joint {joint + 1}" + (f" of row {row}" if angles.ndim == 2 else "")
+    return InputError(f"q: {where} is at {angles.ravel()[6 * row + joint]:g} rad; {DEGREES}")
+
 
 Convention = Literal["standard", "modified"]
 Axes = Literal["base", "tool"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.robot.kinematics.rows import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
+from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.recording import Look, Truth, record, shot_names
 from armsight.sim.render.render import OUTLINE, Shutter, outline
-from armsight.sim.render.scene import (Pattern, chessboard, marker_bits, plate, tag)
+from armsight.sim.render.scene import Pattern, chessboard, marker_bits, plate, tag
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 

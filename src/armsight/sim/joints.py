@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.boards.machine import Sensed
+from armsight.robot.boards.link import Sensed
 
 JOINTS = 6
 _SUBSTEPS = 4
@@ -95,7 +95,7 @@ def _read(
 
 
 class JointPlant:
-    """Six joints behind the contract :class:`~armsight.robot.boards.machine.Plant`; what breaks on them is set here.
+    """Six joints behind the contract :class:`~armsight.robot.boards.link.Plant`; what breaks on them is set here.
 
     Args:
         q: (6,) where the joints are at first, rad.

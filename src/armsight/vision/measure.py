@@ -12,9 +12,9 @@ import numpy as np
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
+from armsight.vision.discs.locate import locate_composite
 from armsight.vision.image import grey
 from armsight.vision.locate import locate
-from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.match import gate, join, match

@@ -10,8 +10,7 @@ from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machines import open_machine
-from armsight.robot.boards.opening import configured
+from armsight.robot.boards.opening import configured, open_machine
 from armsight.sim.joints import JointPlant
 
 

@@ -10,7 +10,7 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Order, Refusal, State
 from armsight.robot.boards.configuration import gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 from armsight.sim.joints import JointPlant, PotFault
 
 ZERO = np.zeros(6)

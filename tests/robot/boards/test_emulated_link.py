@@ -9,8 +9,7 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC
-from armsight.robot.boards.machines import MACHINES, open_machine
-from armsight.robot.boards.opening import configured, open_board
+from armsight.robot.boards.opening import MACHINES, configured, open_board, open_machine
 from armsight.sim.joints import JointPlant
 
 

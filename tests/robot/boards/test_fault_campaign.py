@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.robot.boards.frames import ANSWER, REQUEST
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 
 PATH = Path(__file__).resolve().parents[3] / "benchmarks" / "board_faults.py"
 

@@ -13,7 +13,7 @@ from armsight.robot.boards import qemu
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, REQUEST
 from armsight.robot.boards.host import HostMachine
-from armsight.robot.boards.machines import open_machine
+from armsight.robot.boards.opening import open_machine
 from armsight.robot.boards.qemu import QemuMachine
 from armsight.robot.boards.unicorn import UnicornMachine
 from armsight.sim.joints import JointPlant

@@ -7,8 +7,7 @@ from dense_scenes import layers
 
 from armsight.errors import InputError
 from armsight.vision.dense.evaluate import Truth, judge, seen_by_right
-from armsight.vision.dense.middlebury import find_scenes, load_scene
-from armsight.vision.dense.pfm import read_pfm, write_pfm
+from armsight.vision.dense.middlebury import find_scenes, load_scene, read_pfm, write_pfm
 
 
 def test_figures_are_those_counted_by_hand():

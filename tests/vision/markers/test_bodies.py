@@ -6,7 +6,7 @@ import pytest
 from armsight.data import Body, Detections
 from armsight.errors import InputError
 from armsight.geometry.rotation import from_quaternion_wxyz
-from armsight.vision.markers.bodies import load_body_csv, save_body_csv
+from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.targets import MARKERS, Composite, open_body, open_target
 
 TAG = """

@@ -14,8 +14,7 @@ import pytest
 
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, url
-from armsight.vision.sources.streams import MjpegStream, RtspStream
-from armsight.vision.sources.url import UrlSource
+from armsight.vision.sources.url import MjpegStream, RtspStream, UrlSource
 
 PERIOD = 0.03
 BOUNDARY = "frameboundary"

@@ -12,7 +12,7 @@ import click
 
 from armsight import firmware
 from armsight.app.board import text as board_words
-from armsight.app.board.flash import (FLASHED, PROGRAMMERS, build_firmware, flash)
+from armsight.app.board.flash import FLASHED, PROGRAMMERS, build_firmware, flash
 from armsight.app.board.selftest import selftest
 from armsight.app.progress import steps
 from armsight.firmware import build

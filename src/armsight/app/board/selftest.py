@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from armsight import firmware
-from armsight.app.board_bench import Bench
-from armsight.app.board.scenarios import (AT_REST, DRIVEN, EMULATED_ONLY, Scenario)
+from armsight.app.board.scenarios import AT_REST, DRIVEN, EMULATED_ONLY, Bench, Scenario
 from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machine import Machine
-from armsight.robot.boards.machines import open_machine
-from armsight.robot.boards.opening import SERIAL, configured, emulated_machine
+from armsight.robot.boards.link import Machine
+from armsight.robot.boards.opening import SERIAL, configured, emulated_machine, open_machine
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant
 

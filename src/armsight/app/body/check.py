@@ -1,18 +1,345 @@
 """Is a body good before it is built: which discs may be taken for which, how well it fixes a pose, what to change.
 
 A layout and a rig go in, figures and findings in words come out; ``armsight body check`` prints them.
+
+What is wrong or weak about a body's markers themselves: overlaps, sizes, what is in view, what its pose lacks.
+
+Which discs of a body may be taken for which, whether that is told apart, and what would separate them.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
-from armsight.app.body_faults import in_view, neighbours, pose_findings, sizes
-from armsight.app.body_swaps import SEARCHED, ambiguities, find_swaps, seen_together, single_camera
-from armsight.app.body.finding import (Finding, Grade, Outlook, Swap, Verdict)
-from armsight.vision.discs.predict import pose_covariance, view
+from armsight.app.body.finding import Finding, Grade, Outlook, Swap, Verdict, axis_words, pair_words, swap_words
+from armsight.data import Array, Ids
+from armsight.geometry.rotation import skew
+from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
+from armsight.vision.discs.predict import FACING, look_direction, pose_covariance, separation, view
+from armsight.vision.discs.symmetry import Relabeling, flat, other_side, relabelings
+from armsight.vision.markers.body_check import on_one_line
 from armsight.vision.markers.body_layout import Layout
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
+
+#: A disc's diameter in an image that can be used, px.
+DISC_PX = (5.0, 60.0)
+#: The plain surround that a disc's edge wants, as a share of its radius.
+SURROUND = 0.5
+#: A face turned away by less than this is seen by both cameras wherever it is in their images, cosine.
+_WELL_FACING = 0.7
+
+
+def neighbours(layout: Layout) -> list[Finding]:
+    """Say which discs overlap, or leave each other no plain surround."""
+    if layout.discs is None:
+        return []
+    findings = []
+    places, normals, radii = layout.discs.body.points, layout.discs.normals, layout.discs.radii_m
+    names = layout.discs.body.point_names
+    for i in range(len(places)):
+        for j in range(i + 1, len(places)):
+            if normals[i] @ normals[j] < FACING:
+                continue
+            gap = float(np.linalg.norm(places[i] - places[j]) - radii[i] - radii[j])
+            apart = f"move them at least {1e3 * (SURROUND * max(radii[i], radii[j]) - gap):.1f} mm further apart"
+            if gap < 0:
+                text = f"{names[i]} and {names[j]} overlap by {-1e3 * gap:.1f} mm"
+                findings.append(Finding("bad", "overlap", text, apart))
+            elif gap < SURROUND * max(radii[i], radii[j]):
+                text = f"{names[i]} and {names[j]} leave only {1e3 * gap:.1f} mm of plain surround between them"
+                findings.append(Finding("weak", "surround", text, apart))
+    return findings + _on_squares(layout, layout.discs)
+
+
+def _on_squares(layout: Layout, discs: DiscTarget) -> list[Finding]:
+    """Say which discs lie on a tag or on a board, or near one."""
+    squares: list[tuple[str, Array, Array]] = []
+    for tag in () if layout.tags is None else layout.tags.tags:
+        half = np.full(2, tag.size_m / 2)
+        squares.append((tag.name, tag.T_body_tag, np.stack([-half, half])))
+    for placed in () if layout.boards is None else layout.boards.boards:
+        flat_points = placed.board.body.points[:, :2]
+        squares.append((placed.name, placed.T_body_board, np.stack([flat_points.min(axis=0), flat_points.max(axis=0)])))
+    findings = []
+    for name, T, (low, high) in squares:
+        p = (discs.body.points - T[:3, 3]) @ T[:3, :3]
+        outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - p[:, :2], p[:, :2] - high)), axis=1)
+        for i in np.flatnonzero(np.abs(p[:, 2]) < discs.radii_m):
+            disc, radius = discs.body.point_names[i], float(discs.radii_m[i])
+            gap = float(outside[i]) - radius
+            apart = f"move {disc} {1e3 * (SURROUND * radius - gap):.1f} mm or more away from {name}"
+            if gap < 0:
+                findings.append(Finding("bad", "overlap", f"the disc {disc} lies on {name}", apart))
+            elif gap < SURROUND * radius:
+                text = f"{disc} and {name} leave only {1e3 * gap:.1f} mm of plain surround between them"
+                findings.append(Finding("weak", "surround", text, apart))
+    return findings
+
+
+def in_view(layout: Layout, rig: StereoRig, outlooks: tuple[Outlook, ...]) -> list[Finding]:
+    """Say where too few points are seen together."""
+    points, normals = layout.body.points, layout.normals
+    cosine = normals @ look_direction(points, normals)
+    facing, well = ~(cosine <= FACING), ~(cosine <= _WELL_FACING)
+    if facing.sum() < 3 or on_one_line(points[facing]):
+        text = f"at most {facing.sum()} points are seen together from any side, and 3 off one line are needed"
+        return [Finding("bad", "view", text, "put 3 or more markers on one side")]
+    findings = []
+    for one in outlooks:
+        lost_rows = np.flatnonzero(well & ~view(rig, points, normals, one.distance_m).seen.all(axis=1))
+        lost = [layout.body.point_names[i] for i in lost_rows]
+        if lost:
+            few = "" if len(lost) <= 3 else f" and {len(lost) - 3} more"
+            text = f"at {one.distance_m:g} m {', '.join(lost[:3])}{few} are not in both images"
+            findings.append(
+                Finding(
+                    "bad" if np.isnan(one.cov).any() else "weak", "image", text, "make the body smaller, or go farther"
+                )
+            )
+    return findings
+
+
+def sizes(layout: Layout, rig: StereoRig, outlooks: tuple[Outlook, ...]) -> list[Finding]:
+    """Say which discs are too small or too large in the images."""
+    if layout.discs is None:
+        return []
+    findings = []
+    low, high = DISC_PX
+    for one in outlooks:
+        per_px = 1e3 * one.distance_m / rig.left.intrinsics[0] / 2
+        wanted = f"radii of {low * per_px:.1f} to {high * per_px:.1f} mm suit {one.distance_m:g} m"
+        if one.disc_px[0] < low:
+            text = f"at {one.distance_m:g} m the smallest disc is {one.disc_px[0]:.1f} px across, below {low:g}"
+            findings.append(Finding("bad", "size", text, wanted))
+        if one.disc_px[1] > high:
+            text = f"at {one.distance_m:g} m the largest disc is {one.disc_px[1]:.0f} px across, above {high:g}"
+            findings.append(Finding("bad", "size", text, wanted))
+    return findings
+
+
+def pose_findings(layout: Layout, outlooks: tuple[Outlook, ...]) -> list[Finding]:
+    """Say which turn is known least, what would help, and what else weakens the pose."""
+    findings = []
+    known = [one for one in outlooks if np.isfinite(one.cov).all()]
+    if known:
+        one = known[len(known) // 2]
+        values, vectors = np.linalg.eigh(one.cov[3:, 3:])
+        axis, sigma = vectors[:, -1], np.degrees(np.sqrt(values[-1]))
+        facing = ~(layout.normals @ look_direction(layout.body.points, layout.normals) <= FACING)
+        p = layout.body.points[facing]
+        reach = float(np.linalg.norm(np.cross(p - p.mean(axis=0), axis), axis=1).max())
+        alike = values[-1] < 1.3 * values[-2]
+        about = "any axis across the direction of sight" if alike else axis_words(axis, one.forward, layout)
+        text = (
+            f"known least: the turn about {about}, {sigma:.2g} deg at {one.distance_m:g} m: the markers reach "
+            f"{1e3 * reach:.0f} mm from that axis"
+        )
+        lopsided = values[-1] > 9 * values[-2]
+        change = f"a marker {2e3 * reach:.0f} mm from that axis would about halve it"
+        findings.append(Finding("weak" if lopsided else "note", "weakest", text, change))
+        lever = float(np.linalg.norm(p.mean(axis=0)))
+        at_middle = _moved_origin(one.cov, p.mean(axis=0))
+        worse = float(np.sqrt(np.trace(one.cov[:3, :3]) / np.trace(at_middle[:3, :3])))
+        if worse > 2:
+            text = (
+                f"the body's origin lies {1e3 * lever:.0f} mm from the markers' middle, so turns move it: its position is "
+                f"known {worse:.1f} times worse than the middle's"
+            )
+            findings.append(Finding("weak", "origin", text, "put markers around the place that matters"))
+    if layout.disc_count == 3 and not layout.coded:
+        text = "three discs leave nothing over: where one is hidden there is no pose"
+        findings.append(Finding("note", "spare", text, "a fourth disc, best off the plane of the three"))
+    return findings
+
+
+def _moved_origin(cov: Array, to: Array) -> Array:
+    """Return the covariance (6, 6) of the same pose about another origin (3,), body frame."""
+    A = np.eye(6)
+    A[:3, 3:] = -skew(to)
+    return np.asarray(A @ cov @ A.T)
+
+
+#: A wrong reading is told from the right one where it misses by so many standard deviations: the odds of a million that
+#: identification asks for take five, chance may favour the wrong one by three.
+TOLD = 8.0
+#: More discs than these are not searched for what may be taken for what; with one of them hidden; for a better place.
+SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 25, 10, 6
+#: Ways to take discs for others that are looked into, the closest first.
+_LOOKED_INTO = 60
+_MOVES_MM = (2, 3, 4, 6, 8, 10, 15, 20, 30, 40)
+_FLAT_M = 1e-4
+
+
+def told_sigma_px(rig: StereoRig, discs: DiscTarget, distance_m: float) -> float:
+    """Return how well identification takes a disc's place to be known, px: noise, and a body not made quite as drawn."""
+    made_m = UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(discs.body.points, axis=0)))
+    return float(np.hypot(np.hypot(rig.sigma_px, UNMODELLED_PX), made_m * rig.left.intrinsics[0] / distance_m))
+
+
+def alike(discs: DiscTarget) -> NDArray[np.bool_]:
+    """(M, M) whether two discs look alike: in brightness, and in size as far as identification relies on it."""
+    same = discs.bright[:, None] == discs.bright[None]
+    ratio = discs.radii_m[:, None] / discs.radii_m[None]
+    most = (1 + SIZE_TOLERANCE) / (1 - SIZE_TOLERANCE)
+    return np.asarray(same & (ratio <= most) & (ratio >= 1 / most))
+
+
+def search_tolerance_m(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...]) -> float:
+    """Return how much two lengths may differ and still be worth a closer look, m: by far more than is told apart."""
+    f, sigma = rig.left.intrinsics[0], told_sigma_px(rig, discs, max(distances_m))
+    depth = np.sqrt(2) * sigma * max(distances_m) ** 2 / (f * rig.baseline_m)
+    size = float(pdist(discs.body.points).max())
+    return float(min(TOLD * depth, 0.5 * size))
+
+
+def seen_together(discs: DiscTarget) -> list[Ids]:
+    """Return which discs are seen from in front of each face, and from where most are: rows, three or more off a line."""
+    points, normals = discs.body.points, discs.normals
+    known = normals[np.isfinite(normals[:, 0])]
+    found: dict[tuple[int, ...], Ids] = {}
+    for direction in np.vstack([look_direction(points, normals), known]):
+        rows = np.flatnonzero(~(normals @ direction <= FACING))
+        if len(rows) >= 3 and not on_one_line(points[rows]):
+            found.setdefault(tuple(rows), rows)
+    return list(found.values())
+
+
+def find_swaps(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], seen: Ids, hidden: int = -1
+) -> tuple[Swap, ...]:
+    """Find what may be taken for what where a distance is not told apart, or only the normals tell.
+
+    Args:
+        rig: the cameras.
+        discs: the body's discs.
+        distances_m: where the body is to be used.
+        seen: rows of the discs in view.
+        hidden: a disc that something hides; none where below zero.
+    """
+    points, normals = discs.body.points, discs.normals
+    far = max(distances_m)
+    sigma = told_sigma_px(rig, discs, far)
+    swaps = []
+    found = relabelings(points, alike(discs), seen, search_tolerance_m(rig, discs, distances_m))
+    for one in found[:_LOOKED_INTO]:
+        told = separation(rig, points, normals, one, far, sigma, hidden)
+        by_side = np.isinf(told) and _sideless(rig, points, one, far, sigma) < TOLD
+        if told < TOLD or by_side:
+            each = [separation(rig, points, normals, one, d, told_sigma_px(rig, discs, d), hidden) for d in distances_m]
+            swaps.append(Swap(one, np.array(each), flat(points[seen], _FLAT_M) and other_side(one, points)))
+    return tuple(swaps)
+
+
+def _sideless(rig: StereoRig, points: Array, one: Relabeling, distance_m: float, sigma: float) -> float:
+    """Tell by how many standard deviations discs taken for each other miss if it were not known which way they look."""
+    if set(one.seen.tolist()) != set(one.taken_for.tolist()):
+        return np.inf
+    count = len(one.seen)
+    here = Relabeling(np.arange(count), np.searchsorted(one.seen, one.taken_for), one.T, one.mirrored, one.off_m)
+    return separation(rig, points[one.seen], np.full((count, 3), np.nan), here, distance_m, sigma)
+
+
+def ambiguities(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: tuple[Swap, ...], coded: bool
+) -> list[Finding]:
+    """Say what may be taken for what, what settles it, and what would; ``coded``: whether a tag or a board is there too."""
+    names, points = discs.body.point_names, discs.body.points
+    unsettled = [swap for swap in swaps if (swap.told < TOLD).any()]
+    findings = [_ambiguity(rig, discs, distances_m, swap, coded) for swap in unsettled[:4]]
+    if len(unsettled) > 4:
+        findings.append(Finding("note", "swap", f"and {len(unsettled) - 4} more ways to take discs for others"))
+    if unsettled and not coded:
+        findings.append(Finding("note", "change", "", _what_separates(rig, discs, distances_m, unsettled)))
+    for swap in swaps:
+        if swap.by_side:
+            text = f"{swap_words(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
+            findings.append(Finding("note", "behind", text))
+    most = seen_together(discs)[0]
+    if unsettled or coded or not 4 <= len(most) <= SEARCHED_HIDDEN:
+        return findings
+    for hidden in most:
+        seen = most[most != hidden]
+        if on_one_line(points[seen]):
+            findings.append(Finding("weak", "hidden", f"where {names[hidden]} is hidden, the others lie on one line"))
+            continue
+        lost = [swap for swap in find_swaps(rig, discs, distances_m, seen, int(hidden)) if (swap.told < TOLD).any()]
+        if lost:
+            what = swap_words(lost[0].relabeling, names)
+            at = distances_m[int(np.flatnonzero(lost[0].told < TOLD)[0])]
+            text = f"where {names[hidden]} is hidden, {what} fits as well or nearly from {at:g} m on: it may be missed"
+            findings.append(Finding("weak", "hidden", text))
+    return findings
+
+
+def _ambiguity(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swap: Swap, coded: bool) -> Finding:
+    """Say what one way to take discs for others means."""
+    what = swap_words(swap.relabeling, discs.body.point_names) + (", seen from behind," if swap.behind else "")
+    if swap.relabeling.off_m < 1e-6:
+        text = f"{what} is the same body"
+    else:
+        k = int(np.flatnonzero(swap.told < TOLD)[-1])
+        sigma = told_sigma_px(rig, discs, distances_m[k])
+        wanted = f"; {1e3 * swap.relabeling.off_m * TOLD / swap.told[k]:.1f} mm would do" if swap.told[k] > 0.1 else ""
+        lengths = pair_words(swap.relabeling, discs.body)
+        known = f"{sigma * swap.told[k] / TOLD:.2g} px (reckoned with: {sigma:.2g} px){wanted}"
+        only = f"told apart at {distances_m[k]:g} m only if a disc's place is known to {known}"
+        text = f"{what.rstrip(',')}: {lengths}, {only}"
+    if coded:
+        return Finding("note", "swap", f"{text}; a tag or a board in view settles it")
+    return Finding("bad", "ambiguous", text)
+
+
+def _what_separates(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: list[Swap]) -> str:
+    """Say how the discs can be told apart: by normals, or by moving one of them as little as will do."""
+    points, names = discs.body.points, discs.body.point_names
+    unknown = np.isnan(discs.normals)
+    normals = np.where(unknown, look_direction(points, discs.normals), discs.normals)
+    given = "give every disc its normal and " if unknown.any() else ""
+    if unknown.any() and _separate(rig, discs, max(distances_m), points, normals):
+        return "give every disc its normal: then its side tells which is which"
+    pairs = [(int(i), int(j)) for s in swaps for i, j in zip(s.relabeling.seen, s.relabeling.taken_for, strict=True)]
+    moved = sorted({i for i, j in pairs if i != j})
+    for step in _MOVES_MM if len(points) <= SEARCHED_MOVES else ():
+        for i in moved:
+            for direction in np.vstack([np.eye(3), -np.eye(3)]):
+                if abs(direction @ normals[i]) > FACING:
+                    continue
+                trial = points.copy()
+                trial[i] += 1e-3 * step * direction
+                if _separate(rig, discs, max(distances_m), trial, normals):
+                    axis = f"{'+' if direction.sum() > 0 else '-'}{'xyz'[int(np.abs(direction).argmax())]}"
+                    return f"{given}move {names[i]} by {step} mm along {axis}: then the distances differ enough"
+    return f"{given}place the discs so that no two distances are alike, or add a tag"
+
+
+def _separate(rig: StereoRig, discs: DiscTarget, distance_m: float, points: Array, normals: Array) -> bool:
+    """Whether no disc may be taken for another at a distance, with a margin of a tenth, were they at other places."""
+    if float(pdist(points).min()) < (2 + SURROUND) * float(discs.radii_m.max()):
+        return False
+    tolerance, sigma = search_tolerance_m(rig, discs, (distance_m,)), told_sigma_px(rig, discs, distance_m)
+    return all(
+        separation(rig, points, normals, one, distance_m, sigma) >= 1.1 * TOLD
+        for seen in seen_together(discs)
+        for one in relabelings(points, alike(discs), seen, tolerance)
+    )
+
+
+def single_camera(discs: DiscTarget) -> list[Finding]:
+    """Say what one camera alone cannot tell."""
+    points = discs.body.points
+    if flat(points, _FLAT_M):
+        text = "a flat body has two poses that one camera alone hardly tells apart; two cameras do"
+        return [Finding("note", "single", text)]
+    everything = np.arange(len(points))
+    mirrored = relabelings(points, alike(discs), everything, 1e-3, mirrored=True)
+    if not mirrored:
+        return []
+    what = swap_words(mirrored[0], discs.body.point_names)
+    return [Finding("note", "mirror", f"{what} is its mirror image: harmless to two cameras, not to one alone")]
+
 
 #: Standard deviation of a disc's place in its image, px: what the fit reaches on a clean print.
 IMAGE_SIGMA_PX = 0.02

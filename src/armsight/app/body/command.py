@@ -9,11 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
+from armsight.app.body.check import TOLD, judge, sigma_px
 from armsight.app.body.draw import PAPERS, draw_body
-from armsight.app.body.check import judge, sigma_px
-from armsight.app.body_swaps import TOLD
-from armsight.app.body.finding import Outlook, Verdict
-from armsight.app.body_words import swap_words
+from armsight.app.body.finding import Outlook, Verdict, swap_words
 from armsight.errors import InputError
 from armsight.files import check_writable
 from armsight.vision.discs.predict import plain_rig

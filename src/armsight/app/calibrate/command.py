@@ -14,8 +14,8 @@ import cv2
 from rich.console import Console
 from rich.table import Table
 
-from armsight.app.progress import bar, steps
 from armsight.app.calibrate.report import report_folder, write_report
+from armsight.app.progress import bar, steps
 from armsight.data import SIDES, Detections
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -26,7 +26,7 @@ from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey
 from armsight.vision.markers.board import Board, open_board
-from armsight.vision.markers.bodies import load_body_csv, save_body_csv
+from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.sources import PairsSource
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]

@@ -2,27 +2,338 @@
 
 A Calibration goes in, a folder comes out. The page holds its figures itself, needs no network and runs no script. All is
 drawn in memory first; then every file is put in place whole, the page last.
+
+The tables of a calibration's report as HTML; whatever comes from outside is escaped.
+
+The sections of a calibration's report, in the order a person needs them: verdict, images, pairs, volume, numbers.
+
+Each is a function of the calibration and of its figures (name -> HTML image); what it says beside a figure is what one
+should see there and what would be bad.
 """
 
 from __future__ import annotations
 
 import base64
+import html
+import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from armsight.app.calibrate.assessment import (
+    BEYOND,
+    SHARES,
+    advice,
+    board_points,
+    corner_variance_px2,
+    judged,
+    predicted_sigmas,
+    target,
+    verdict,
+)
+from armsight.app.calibrate.figures import (
+    MOST_BARS,
+    OUTSTANDING,
+    STANDS_OUT,
+    board_figure,
+    coverage_figure,
+    pairs_figure,
+    residuals_figure,
+    volume_figure,
+)
 from armsight.app.report.page import html_page, put_files
-from armsight.app.report.plotting import drawing, png, require_matplotlib
-from armsight.app.calibrate.figures import coverage_figure, pairs_figure, residuals_figure
-from armsight.app.report_maps import board_figure, volume_figure
-from armsight.app.report_sections import SECTIONS
-from armsight.app.report_tables import text
+from armsight.app.report.plotting import drawing, plain, png, require_matplotlib
+from armsight.data import Array
 from armsight.errors import InputError
-from armsight.vision.calibrate.result import Calibration
+from armsight.geometry.pose import exp_se3
+from armsight.geometry.rotation import log_so3
+from armsight.vision.calibrate.result import Calibration, HeldOut
+from armsight.vision.rig import StereoRig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_STEP_RAD = 1e-6
+_ROUNDING = 1e-12
+
+
+def text(value: object) -> str:
+    """Return a value as text that is safe anywhere in the page."""
+    return html.escape(plain(str(value), most=2000))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """Return a table of cells that are HTML already; the first cell of a row names it."""
+    top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in rest) + "</tr>\n"
+        for first, *rest in rows
+    )
+    return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list of plain lines, escaped."""
+    return "<ul>" + "".join(f"<li>{text(line)}</li>\n" for line in lines) + "</ul>\n"
+
+
+def headline_table(calibration: Calibration) -> str:
+    """Return the held-out figures beside those of the fit, each with what it means and how good it is."""
+    rows = [
+        (
+            text(row.name),
+            f"<b>{text(row.heldout)}</b>",
+            text(row.fit),
+            f'<span class="grade {row.grade}">{row.grade}</span>' if row.grade else "your call",
+            text(row.meaning),
+        )
+        for row in judged(calibration)
+    ]
+    fit = f"{calibration.reprojection_rms_px:.3g} px"
+    meaning = "How well the fitted model reproduces the points it was fitted to. It says nothing about millimetres."
+    rows.append(("reprojection RMS", "–", fit, "", meaning))
+    head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "what it tells")
+    return table(head, rows, "headline")
+
+
+def models_table(calibration: Calibration) -> str:
+    """Return the distortion models that were tried, with their held-out errors."""
+
+    def row(name: str, h: HeldOut) -> tuple[str, ...]:
+        chosen = "<b>chosen</b>" if name == calibration.rig.left.model else ""
+        figures = (f"{h.epipolar_rms_px:.4f}", f"{1e3 * h.rigid_rms_m:.4f}", f"{100 * h.scale_error:+.3f}")
+        return (text(name), *figures, f"{h.normalised_rms:.2f}", chosen)
+
+    head = ("model", "epipolar RMS, px", "rigid RMS, mm", "scale error, %", "residual / sigma", "")
+    return table(head, [row(name, h) for name, h in calibration.models.items()], "numbers")
+
+
+def _with_sigma(value: float, sigma: float, unit: str = "") -> str:
+    """Return a value to the digits its sigma allows, with the sigma; "given" where it was not estimated."""
+    if not sigma > _ROUNDING * max(abs(value), 1.0):
+        return f"{value:.6g}{unit} <i>given</i>"
+    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}{unit}"
+
+
+def cameras_table(rig: StereoRig) -> str:
+    """Return intrinsics and distortion of both cameras with their sigmas."""
+    sigma, n_left = np.sqrt(np.diag(rig.cov)), rig.left.parameters.size
+    cells: dict[str, list[str]] = {}
+    for k, (name, value) in enumerate(
+        zip(rig.parameter_names, np.r_[rig.left.parameters, rig.right.parameters], strict=False)
+    ):
+        label = name.split(".", 1)[1].replace("_px", ", px")
+        cells.setdefault(label, ["–", "–"])[k >= n_left] = _with_sigma(float(value), float(sigma[k]))
+    rows = [("image, px", *("{} x {}".format(*camera.image_size_px) for camera in rig.cameras))]
+    rows.append(("distortion model", *(text(camera.model) for camera in rig.cameras)))
+    return table(("", "left", "right"), [*rows, *((name, *both) for name, both in cells.items())], "numbers")
+
+
+def pose_table(rig: StereoRig) -> str:
+    """Return where the right camera stands in the left one's frame, mm and degrees, with sigmas."""
+    cov, T = rig.cov[-6:, -6:], rig.T_left_right
+    rotation, J = log_so3(T[:3, :3]), np.empty((3, 6))
+    for k, axis in enumerate(np.eye(6)):
+        ends = [log_so3((T @ exp_se3(h * axis))[:3, :3]) for h in (_STEP_RAD, -_STEP_RAD)]
+        J[:, k] = (ends[0] - ends[1]) / (2 * _STEP_RAD)
+    cov_t = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T  # the tangent's translation is along the right camera's axes
+    sigma_mm, sigma_deg = 1e3 * np.sqrt(np.diag(cov_t)), np.degrees(np.sqrt(np.diag(J @ cov @ J.T)))
+    toward = T[:3, 3] / max(rig.baseline_m, 1e-12)
+    rows = [("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * float(np.sqrt(toward @ cov_t @ toward))))]
+    rows += [
+        (f"{axis}, mm", _with_sigma(1e3 * value, s)) for axis, value, s in zip("XYZ", T[:3, 3], sigma_mm, strict=True)
+    ]
+    rows.append(("angle between the optical axes, degrees", f"{rig.convergence_deg:.3f}"))
+    rows += [
+        (f"rotation vector {axis}, degrees", _with_sigma(float(np.degrees(value)), s))
+        for axis, value, s in zip("XYZ", rotation, sigma_deg, strict=True)
+    ]
+    return table(("T_left_right", "value ± one sigma"), rows, "numbers")
+
+
+def sigma_table(calibration: Calibration) -> str:
+    """Return the predicted sigmas at the nearest, the middle and the farthest board."""
+    middle = board_points(calibration).mean(axis=1)
+    order = np.argsort(middle[:, 2])
+    chosen: Array = middle[order[[0, len(order) // 2, -1]]]
+    depth, lateral = predicted_sigmas(calibration.rig, chosen, corner_variance_px2(calibration))
+    rows, what = [], target(calibration)
+    for k, name in enumerate(("nearest", "middle", "farthest")):
+        figures = [f"{1e3 * s[k]:.2g}" if np.isfinite(s[k]) else "not seen by both" for s in (*depth, *lateral)]
+        rows.append((f"{name} {what}, Z {1e3 * chosen[k, 2]:.0f} mm", *figures))
+    head = ("sigma, mm", *(f"{kind}: {share}" for kind in ("depth", "lateral") for share in SHARES))
+    return table(head, rows, "numbers")
+
+
+def provenance_table(provenance: Mapping[str, Any]) -> str:
+    """Return where a rig comes from, as its file will say."""
+    rows = [
+        (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
+        for key, value in provenance.items()
+    ]
+    return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
+
+
+Figures = Mapping[str, str]
+Section = Callable[[Calibration, Figures], str]
+
+
+def _figure(figures: Figures, name: str, see: str, bad: str, opening: str = "You should see") -> str:
+    """Return a figure with its caption: what one should see, and what would be bad."""
+    caption = f"<p><b>{opening}</b> {see}</p><p><b>Bad would be</b> {bad}</p>"
+    return f"<figure>{figures[name]}<figcaption>{caption}</figcaption></figure>\n"
+
+
+def result(calibration: Calibration, figures: Figures) -> str:
+    """Return the verdict, the held-out figures, what is weak, what was rejected, what was mended."""
+    grade, headline, meaning = verdict(calibration)
+    parts = [f'<div class="verdict {grade}"><p class="headline">{text(headline)}</p><p>{text(meaning)}</p></div>\n']
+    parts.append(headline_table(calibration))
+    parts.append(
+        "<p>Believe the held-out column: a fit adapts to the very pairs it is made from, and the more so the fewer they "
+        "are; the held-out figures come from pairs that were kept from it, by the very steps of a later measurement.</p>\n"
+    )
+    parts.append("<h3>What is weak, and what to do</h3>\n")
+    weak = advice(calibration)
+    parts.append(bullets(weak) if weak else "<p>Nothing stands out.</p>\n")
+    used, found = len(calibration.pairs), calibration.pairs_found
+    parts.append("<h3>Pairs that were not used</h3>\n")
+    if calibration.rejected:
+        reasons: dict[str, list[str]] = {}
+        for pair in calibration.rejected:
+            reasons.setdefault(pair.reason, []).append(pair.pair)
+        rows = [(", ".join(text(name) for name in names), text(reason)) for reason, names in reasons.items()]
+        parts.append(f"<p>{used} of {found} pairs were used.</p>\n" + table(("pair", "why not"), rows, "words"))
+    else:
+        parts.append(f"<p>None: all {used} pairs were used.</p>\n")
+    if calibration.notes:
+        parts.append("<h3>Mended, or used in part</h3>\n" + bullets(calibration.notes))
+    return "".join(parts)
+
+
+def coverage(calibration: Calibration, figures: Figures) -> str:
+    """Return the coverage maps."""
+    what = target(calibration)
+    see = (
+        f"points of the {what} (dots) in nearly all cells of both images, right into their corners. Colour counts them."
+    )
+    bad = (
+        "hatched cells where you want to measure: nothing was ever seen there, so the lens is only guessed at. Take more "
+        f"pairs with the {what} there. (The dark rim around the picture of a fisheye stays empty.)"
+    )
+    return _figure(figures, "coverage", see, bad)
+
+
+def residuals(calibration: Calibration, figures: Figures) -> str:
+    """Return the residual vectors."""
+    sigma = np.sqrt(corner_variance_px2(calibration))
+    see = (
+        "above, short arrows in all directions, alike in both images, as noise is: one sigma of a point along u or v is "
+        f"taken to be {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without order. Mind the scale "
+        "over each panel."
+    )
+    bad = (
+        "neighbours that point the same way, or a whirl or a star below: the lens differs from its model there, or the "
+        f"{target(calibration)} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
+        "Longer arrows in one image than in the other: that camera is out of focus, moves or is badly lit."
+    )
+    return _figure(figures, "residuals", see, bad)
+
+
+def pairs(calibration: Calibration, figures: Figures) -> str:
+    """Return the held-out errors by pair."""
+    see = "bars of similar length, all blue."
+    shown = len(calibration.errors.pair)
+    if shown > MOST_BARS:
+        see += f" Of {shown} pairs the {MOST_BARS} with the largest rigid error are shown."
+    see += " Pairs that were not used are named below them." if calibration.rejected else ""
+    bad = (
+        f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
+        "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
+        "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it."
+    )
+    return _figure(figures, "pairs", see, bad)
+
+
+def volume(calibration: Calibration, figures: Figures) -> str:
+    """Return the predicted sigma over the volume, and where the board was."""
+    what = target(calibration)
+    see = (
+        f"one sigma of a triangulated point, in a slice through the middle of where the {what} was (dots): of 100 "
+        "measurements of a point, 95 are off by less than two sigma. Depth is along the line of sight, and its sigma grows "
+        "with the square of the distance; lateral is across it, in the worse direction. The axes are the left camera's."
+    )
+    bad = (
+        "a calibration's share above that of the pixel noise where you measure: more and better pairs help there, while "
+        "a longer baseline, more pixels or nearer cameras help against the pixel noise. Beyond the dots the calibration "
+        "is extrapolated."
+    )
+    known = (
+        "<p>The calibration's share is common to all points and all shots: averaging does not lessen it, but it largely "
+        "cancels between places close to each other. The noise is that of a typical point of these images. The slice "
+        f"reaches {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the size given for the {what} "
+        "comes on top.</p>\n"
+    )
+    if not calibration.rig.cov.any():
+        known += "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
+    return _figure(figures, "volume", see, bad, "It shows") + sigma_table(calibration) + known
+
+
+def board(calibration: Calibration, figures: Figures) -> str:
+    """Return how the estimated board differs from its drawing, where it was estimated."""
+    if "board" not in figures:
+        return ""
+    see = (
+        f"how the board differs from its drawing, {1e3 * calibration.deviation_m:.2g} mm RMS: a few hundredths of a "
+        "millimetre for a board on glass or aluminium, tenths for paper on card. It was estimated with the cameras, so "
+        "that it does not spoil them."
+    )
+    bad = (
+        "a millimetre or more: a loose or bowed sheet, which also bends from pair to pair. Glue it to something stiff. "
+        "(The size of the whole board cannot be seen by the cameras; it is the one you gave.)"
+    )
+    return _figure(figures, "board", see, bad, "It shows")
+
+
+def numbers(calibration: Calibration, figures: Figures) -> str:
+    """Return the parameters with their sigmas and the distortion models tried."""
+    rig = calibration.rig
+    parts = [
+        cameras_table(rig),
+        pose_table(rig),
+        "<p>± is one sigma. T_left_right is the pose of the right camera in the left camera's frame: X right, Y down, Z "
+        "forward. Parameters vary together, so a single sigma may look large while what is measured is well known; the "
+        f"rig file holds the whole covariance. Noise of a point beyond what the image tells: {rig.sigma_px:.3g} px.</p>\n",
+    ]
+    if calibration.models:
+        parts.append("<h3>Distortion models tried</h3>\n" + models_table(calibration))
+        parts.append(
+            "<p>Judged on held-out pairs alone; of models that are about as good, the simplest is chosen.</p>\n"
+        )
+    return "".join(parts)
+
+
+def provenance(calibration: Calibration, figures: Figures) -> str:
+    """Return where the rig comes from."""
+    return provenance_table(calibration.rig.provenance)
+
+
+#: Anchor -> title and text, in the page's order; a section without text is left out.
+SECTIONS: dict[str, tuple[str, Section]] = {
+    "result": ("Is it good?", result),
+    "coverage": ("What the cameras have seen", coverage),
+    "residuals": ("Residuals of the fit", residuals),
+    "pairs": ("Held-out errors by pair", pairs),
+    "volume": ("What to expect of a measurement", volume),
+    "board": ("The board itself", board),
+    "parameters": ("The cameras in numbers", numbers),
+    "provenance": ("Where it comes from", provenance),
+}
+
 
 PAGE = "index.html"
 #: Name -> how it is drawn (None where there is nothing to draw) and what it shows, for who cannot see it.

@@ -8,11 +8,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armsight.app.check.plan import (CYCLES, PlannedTest, plan_csv, plan_test)
-from armsight.app.check.report import PAGE, write_check
-from armsight.app.check.evaluate import judge, read_check
-from armsight.app.check_words import text
 from armsight.app.calibrate.report import report_folder
+from armsight.app.check.evaluate import judge, read_check
+from armsight.app.check.plan import CYCLES, PlannedTest, plan_csv, plan_test
+from armsight.app.check.report import PAGE, text, write_check
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.identify.model_file import open_model

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from armsight.app.check.rows import SAME_M, TESTS, Attained, Row, Turn, natural, read_rows
 from armsight.app.check.run_folder import attained_in
-from armsight.app.check.rows import (SAME_M, TESTS, Attained, Row, Turn, natural, read_rows)
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import poses as iso9283
-from armsight.loop.iso9283.statistic import Figure
 from armsight.loop.iso9283.paths import circle_figures, path_figures, plane_axes
+from armsight.loop.iso9283.statistic import Figure
 
 #: So many poses tell something of the workspace where none was attained often enough to tell of itself.
 _WIDE = 10

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import click
-
-from armsight.app.progress import steps
-from armsight.app.run.text import tell
-from armsight.app.demo.demo import Demo, run_demo
-from armsight.app.report.plotting import require_matplotlib
-from armsight.app.run_tracks import require_pyarrow
-from armsight.loop.identify.model_file import open_model
-
+import json
+from armsight.app.demo.demo import (Demo, run_demo)
+from armsight.app.progress import (steps)
+from armsight.app.report.plotting import (require_matplotlib)
+from armsight.app.run.record import (require_pyarrow)
+from armsight.app.run.text import (tell)
+from armsight.loop.identify.model_file import (open_model)
+from pathlib import (Path)
 
 @click.command("demo")
 @click.option("-o", "--out", default="demo", show_default=True, metavar="DIR", type=click.Path(path_type=Path))

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
-
 import numpy as np
-
-from armsight.app.run.experiment import Outcome, Progress, run_experiment
-from armsight.app.run.motion_file import (CHAPTER, QUICK, MotionPlan, read_motions)
-from armsight.app.rate_study import rate_study
-from armsight.app.run.calibrate import calibrated, handeye_poses
+import time
+from armsight.app.demo.studies import (Study, rate_study, vision_studies)
+from armsight.app.run.calibrate import (calibrated, handeye_poses)
+from armsight.app.run.experiment import (Outcome, Progress, run_experiment)
 from armsight.app.run.folder import (Finished, finish, make_room, open_folder)
-from armsight.app.run.setup import Station
-from armsight.app.demo.studies import Study, vision_studies
-from armsight.data import Array
-from armsight.errors import ArmsightError
-from armsight.files import write_text
-from armsight.geometry.pose import inverse
-from armsight.robot.arm import Arm
-from armsight.robot.models import open_arm
-from armsight.sim.workcell.cameras import open_timing
-from armsight.sim.workcell.workcell import Workcell
-from armsight.vision.calibrate.result import Calibration
+from armsight.app.run.motion_file import (CHAPTER, MotionPlan, QUICK, read_motions)
+from armsight.app.run.setup import (Station)
+from armsight.data import (Array)
+from armsight.errors import (ArmsightError)
+from armsight.files import (write_text)
+from armsight.geometry.pose import (inverse)
+from armsight.robot.arm import (Arm)
+from armsight.robot.models import (open_arm)
+from armsight.sim.workcell.cameras import (open_timing)
+from armsight.sim.workcell.workcell import (Workcell)
+from armsight.vision.calibrate.result import (Calibration)
+from concurrent.futures import (ThreadPoolExecutor)
+from dataclasses import (dataclass, replace)
+from pathlib import (Path)
+from typing import (Any)
 
 #: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
 _AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}

@@ -9,11 +9,10 @@ from typing import Any
 
 import click
 
-from armsight.app.progress import bar
-from armsight.app.dense_compile import compile_apart
+from armsight.app.dense.evaluate import Line, evaluate_scene, evaluation_json, table_text, write_evaluation
 from armsight.app.dense.files import check_folder, make_folder
-from armsight.app.dense.run import (read_pair, result_line, run_shot, search_of)
-from armsight.app.dense.evaluate import (Line, evaluate_scene, evaluation_json, table_text, write_evaluation)
+from armsight.app.dense.run import compile_apart, read_pair, result_line, run_shot, search_of
+from armsight.app.progress import bar
 from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.vision.dense.methods import METHODS, open_method

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.dense.files import write_png
-from armsight.app.dense_picture import paint_disparity, paint_errors
+from armsight.app.dense.files import paint_disparity, paint_errors, write_png
 from armsight.files import write_text
 from armsight.vision.dense.evaluate import Judgement, judge
 from armsight.vision.dense.methods import open_method

@@ -10,11 +10,11 @@ from typing import Any
 
 import click
 
-from armsight.app import identify_words
-from armsight.app.progress import steps
+from armsight.app.identify import run as identify_words
 from armsight.app.identify.plan import plan_csv, plan_from, plan_text
 from armsight.app.identify.report import write_identify_report
-from armsight.app.identify.run import (results_in, run_identify, summary, write_results)
+from armsight.app.identify.run import results_in, run_identify, summary, write_results
+from armsight.app.progress import steps
 from armsight.app.report.plotting import require_matplotlib
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.geometry.pose import inverse, transform
+from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import begun
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import Plan, plan_poses
-from armsight.loop.identify.priors import prior_sigma
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 

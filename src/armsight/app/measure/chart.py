@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.report.plotting import (BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png)
-from armsight.app.view_words import angle_sigmas_deg
+from armsight.app.measure.picture import angle_sigmas_deg
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array, Record
 
 if TYPE_CHECKING:

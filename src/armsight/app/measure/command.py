@@ -13,9 +13,9 @@ from typing import Any
 import click
 import numpy as np
 
-from armsight.app.progress import bar
 from armsight.app.measure.poses import csv_text, pose_record
 from armsight.app.measure.view import CHART, View, view_folder
+from armsight.app.progress import bar
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text

@@ -1,37 +1,307 @@
-"""One shot as a picture: what was measured, both images side by side, and below them the points enlarged."""
+"""One shot as a picture: what was measured, both images side by side, and below them the points enlarged.
+
+What a shot's picture shows of the body's points: where the pose puts each, where it was seen, what was dropped and why.
+
+A disc is shown by its image ellipse. Its detected centre, which a measurement frees of the perspective bias, gets that
+bias back, so that detection and ellipse belong together; the residual is the same either way.
+
+Strokes and letters on a BGR image, with OpenCV.
+
+Its letters are ASCII on some versions: other characters are spelt out, or become a question mark.
+
+What is written above a shot's picture, and the sigmas of roll, pitch and yaw that it and the chart show.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.app.report.plotting import nice, plain
-from armsight.app.view_marks import Marks
-from armsight.app.view_paint import (
-    BLANK,
-    INK,
-    LINE,
-    MUTED,
-    PAPER,
-    RED,
-    Canvas,
-    Colour,
-    arrow,
-    beside,
-    cross,
-    ellipse,
-    outline,
-    paper,
-    paragraph,
-    segment,
-    text_width,
-    wrapped,
-    write,
-)
-from armsight.data import SIDES, Array, Image
+from armsight.data import SIDES, Array, Body, Dropped, Image, PoseEstimate, Record
+from armsight.geometry.pose import inverse, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.discs.bias import expect
 from armsight.vision.image import grey
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.rig import StereoRig
+
+
+@dataclass(frozen=True, eq=False)
+class Marks(Record):
+    """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none.
+
+    Attributes:
+        names: what the points are called.
+        at: (N, 2, 2) where the located pose puts a point, or the centre of a disc's ellipse, raw px; NaN where that is
+            not seen and looks away from the camera.
+        shape: (N, 2, 3) S11, S12, S22 of the ellipse that a disc has at the located pose, px^2.
+        found: (N, 2, 2) where a camera saw it, raw px; of a disc the centre of its ellipse.
+        cov: (N, 2, 2, 2) covariance of that, px^2.
+        dropped: (N, 2) whether a camera's sight of it was dropped.
+        reasons: why; empty where neither was.
+        others: what else was dropped, in words.
+    """
+
+    names: tuple[str, ...]
+    at: Array
+    shape: Array
+    found: Array
+    cov: Array
+    dropped: NDArray[np.bool_]
+    reasons: tuple[str, ...]
+    others: tuple[str, ...]
+
+    @property
+    def residual(self) -> Array:
+        """(N, 2, 2) detection less the pose's projection, px."""
+        return np.asarray(self.found - self.at)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N, 2) whether a camera saw a point."""
+        return np.asarray(np.isfinite(self.found[..., 0]))
+
+    def worst(self, most: int) -> list[int]:
+        """Return the rows to show enlarged: all where that is at most ``most``, else the dropped and the worst."""
+        if len(self.names) <= most:
+            return list(range(len(self.names)))
+        off = np.nan_to_num(np.linalg.norm(self.residual, axis=2)).max(axis=1)
+        order: list[int] = np.lexsort([-off, ~self.dropped.any(axis=1)]).tolist()
+        return order[:most]
+
+
+def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: PoseEstimate) -> Marks:
+    """Say what there is to draw of a measured shot.
+
+    Args:
+        rig: the calibrated pair.
+        body: all points; the discs' come last.
+        discs: the body's plain discs, None where it has none.
+        estimate: what was measured.
+    """
+    at, shape, bias, away = _expected(rig, body, discs, estimate.T_left_body)
+    seen = estimate.points.seen
+    found, cov = np.full_like(at, np.nan), np.zeros((len(at), 2, 2, 2))
+    found[seen.ids] = seen.uv + np.nan_to_num(bias[seen.ids])
+    cov[seen.ids] = seen.cov_uv + rig.sigma_px**2 * np.eye(2)
+    hidden = away & ~np.isfinite(found[..., 0])
+    at[hidden], shape[hidden] = np.nan, np.nan
+    reasons, others = _reasons(body, estimate.dropped)
+    rows = range(len(at))
+    dropped = np.array([_sides(reasons.get(i, [])) for i in rows], bool)
+    return Marks(
+        body.point_names, at, shape, found, cov, dropped, tuple(_together(reasons.get(i, [])) for i in rows), others
+    )
+
+
+def _expected(
+    rig: StereoRig, body: Body, discs: DiscTarget | None, T: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return where a pose puts all M points (M, 2, 2), their ellipses (M, 2, 3), biases (M, 2, 2), and what looks away."""
+    p_left, count = transform(T, body.points), len(body.points)
+    p_right = transform(inverse(rig.T_left_right), p_left)
+    at = np.stack([camera.project(p) for camera, p in zip(rig.cameras, (p_left, p_right), strict=True)], axis=1)
+    shape, bias, away = np.full((count, 2, 3), np.nan), np.zeros((count, 2, 2)), np.zeros((count, 2), bool)
+    if discs is not None:
+        first, expected = count - len(discs.radii_m), expect(rig, discs, T)
+        at[first:] = np.where(np.isfinite(expected.uv), expected.uv, at[first:])
+        shape[first:], bias[first:], away[first:] = expected.shape, expected.bias, expected.facing <= 0.0
+    return at, shape, bias, away
+
+
+def _reasons(body: Body, dropped: tuple[Dropped, ...]) -> tuple[dict[int, list[str]], tuple[str, ...]]:
+    """Return why points were dropped by their row, and the words for what is no point of the body."""
+    row = {name: i for i, name in enumerate(body.point_names)}
+    said: dict[int, list[str]] = {}
+    others = []
+    for drop in dropped:
+        if drop.point in row:
+            said.setdefault(row[drop.point], []).append(drop.reason)
+        else:
+            others.append(f"{drop.point}: {drop.reason}")
+    return {i: list(dict.fromkeys(reasons)) for i, reasons in said.items()}, tuple(others)
+
+
+def _sides(reasons: list[str]) -> list[bool]:
+    """Tell in which images a point was dropped: those its reasons speak of, both where they speak of none."""
+    spoken = [[bool(re.search(rf"\b{side}\b", reason)) for side in SIDES] for reason in reasons]
+    return [any(said[side] or not any(said) for said in spoken) for side in (0, 1)]
+
+
+def _together(reasons: list[str]) -> str:
+    """Join reasons; ``left: why; right: why`` becomes ``both: why``."""
+    left, right = (f"{side}: " for side in SIDES)
+    if len(reasons) == 2 and reasons[0].startswith(left) and reasons[1].startswith(right):
+        first, second = reasons[0].removeprefix(left), reasons[1].removeprefix(right)
+        if first == second:
+            return f"both: {first}"
+    return "; ".join(reasons)
+
+
+Canvas = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+PAPER: Colour = (255, 255, 255)
+INK: Colour = (41, 32, 26)
+MUTED: Colour = (124, 110, 97)
+RED: Colour = (40, 40, 200)
+BLANK = 200  # grey of what no image covers
+LINE = 24  # height of a line of text, px
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
+_FAR = 1e5  # px: what lies further off is not drawn
+_SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
+
+
+def ascii_text(text: str) -> str:
+    """Return a text in ASCII, on one line."""
+    return plain(text, 10_000).translate(_SPELT).encode("ascii", "replace").decode()
+
+
+def wrapped(text: str, size: float, width: int) -> list[str]:
+    """Break a text into lines of at most ``width`` px, between words where that is possible."""
+    lines = [""]
+    for word in ascii_text(text).split():
+        if text_width(f"{lines[-1]} {word}", size) > width and lines[-1]:
+            lines.append("")
+        while text_width(word, size) > width:
+            fits = max(n for n in range(1, len(word)) if n == 1 or text_width(word[:n], size) <= width)
+            lines[-1], word = word[:fits], word[fits:]
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return lines
+
+
+def text_width(text: str, size: float) -> int:
+    """Return the width of a text, px."""
+    text = ascii_text(text)
+    return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
+
+
+def write(
+    canvas: Canvas, text: str, at: tuple[int, int], colour: Colour, size: float, *, rim: Colour | None = None
+) -> None:
+    """Write one line from its lower left corner on, with a rim of another colour where it stands on an image."""
+    text = ascii_text(text)
+    if rim is not None:
+        for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            cv2.putText(canvas, text, (at[0] + x, at[1] + y), _FONT, size, rim, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, _FONT, size, colour, 1, cv2.LINE_AA)
+
+
+def paragraph(lines: Sequence[str], colour: Colour, size: float, width: int, edge: int = 0) -> Canvas:
+    """Return lines of text on white, broken where they are too long, ``edge`` px from the left."""
+    broken = [part for line in lines for part in wrapped(line, size, width - 2 * edge)]
+    canvas = paper(LINE * len(broken), width)
+    for row, text in enumerate(broken):
+        write(canvas, text, (edge, LINE * row + 17), colour, size)
+    return canvas
+
+
+def paper(height: int, width: int) -> Canvas:
+    """Return a white canvas."""
+    return np.full((height, width, 3), 255, np.uint8)
+
+
+def beside(parts: Sequence[Canvas], width: int, gap: int) -> Canvas:
+    """Put canvases beside one another on white, with gaps before and between them."""
+    out = paper(max(part.shape[0] for part in parts), width)
+    x = gap
+    for part in parts:
+        out[: part.shape[0], x : x + part.shape[1]] = part
+        x += part.shape[1] + gap
+    return out
+
+
+def ellipse(packed: Array) -> Array:
+    """Return (64, 2) rim of an ellipse x^T S^-1 x = 1 about the origin, from its S11, S12, S22; NaN where it is none."""
+    values, axes = np.linalg.eigh(np.nan_to_num(packed[[0, 1, 1, 2]]).reshape(2, 2))
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sqrt(np.maximum(values, 0)) @ axes.T
+    return rim if np.isfinite(packed).all() else np.full_like(rim, np.nan)
+
+
+def outline(canvas: Canvas, points: Array, colour: Colour, width: int = 1) -> None:
+    """Draw a closed line through points (N, 2), px; nothing where a point is far off or none."""
+    if (np.abs(points) < _FAR).all():
+        fixed = np.rint(points * 2**_SHIFT).astype(np.int32)
+        cv2.polylines(canvas, [fixed], True, colour, width, cv2.LINE_AA, _SHIFT)
+
+
+def segment(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
+    """Draw a line between two places (2,), px."""
+    outline(canvas, np.array([a, b]), colour, width)
+
+
+def cross(canvas: Canvas, at: Array, size: float, colour: Colour) -> None:
+    """Draw an upright cross with arms of ``size`` px."""
+    for arm in (np.array([size, 0.0]), np.array([0.0, size])):
+        segment(canvas, at - arm, at + arm, colour)
+
+
+def arrow(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
+    """Draw an arrow from a to b (2,), px, its head never longer than itself."""
+    segment(canvas, a, b, colour, width)
+    length = float(np.linalg.norm(b - a))
+    if length > 1.0:
+        along = (b - a) / length * min(9.0, 0.5 * length)
+        for side in (1, -1):
+            segment(canvas, b, b - along + side * 0.45 * np.array([-along[1], along[0]]), colour, width)
+
+
+def header(record: Mapping[str, Any]) -> list[str]:
+    """Return the lines above a shot's picture, mm and degrees, one sigma behind each +-.
+
+    Args:
+        record: the shot as ``measure --json`` prints it.
+    """
+    first = [f"shot {record['shot']}"]
+    if record["t_s"] is not None:
+        first.append(f"t {record['t_s']:.3f} s")
+    if "way" in record:
+        first.append(f"{record['way']}, {record['took_ms']:.1f} ms")
+    if record.get("jump"):
+        first.append(str(record["jump"]))
+    if record["status"] != "ok":
+        return [", ".join(first)]
+    sigma = 1e3 * np.sqrt(np.diag(record["covariance"])[:3])
+    place = _pairs(("x", "y", "z"), 1e3 * np.array(record["position_m"]), sigma)
+    turn = _pairs(("roll", "pitch", "yaw"), np.array(record["roll_pitch_yaw_deg"]), angle_sigmas_deg(record))
+    singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""
+    count, dropped = len(record["points_m"]), len(record["dropped"])
+    fit = f"reprojection {record['reprojection_rms_px']:.3f} px RMS, misfit {record['misfit']:.1f}, {count} points"
+    return [", ".join(first), f"{place} mm; {turn} deg{singular}", fit + (f", {dropped} dropped" if dropped else "")]
+
+
+def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
+    """Format values with their sigmas; one that is not determined has none."""
+    return ", ".join(
+        f"{name} {value:.3f}" + (f" +- {sigma:.3f}" if np.isfinite(sigma) else "")
+        for name, value, sigma in zip(names, values, sigmas, strict=True)
+    )
+
+
+def angle_sigmas_deg(record: Mapping[str, Any]) -> Array:
+    """Return (3,) one sigma of roll, pitch and yaw of a measured shot, degrees; NaN where the pitch is singular.
+
+    A turn of the body by the rotation vector w along the left camera's axes changes the angles by J^-1 w; the columns of
+    J are the axes that roll, pitch and yaw turn about, R = R_z(roll) R_y(pitch) R_x(yaw).
+    """
+    if record["pitch_singular"]:
+        return np.full(3, np.nan)
+    roll, pitch, _ = np.radians(record["roll_pitch_yaw_deg"])
+    of_roll, of_pitch = exp_so3(np.array([0.0, 0.0, roll])), exp_so3(np.array([0.0, pitch, 0.0]))
+    J = np.column_stack([[0.0, 0.0, 1.0], of_roll[:, 1], (of_roll @ of_pitch)[:, 0]])
+    back = np.linalg.inv(J)
+    return np.asarray(np.degrees(np.sqrt(np.diag(back @ np.array(record["covariance"])[3:, 3:] @ back.T))))
+
 
 #: Width of a picture, height of its two images at the most, side of an enlarged place: px.
 WIDTH, _TALLEST, _TILE, _GAP = 1640, 760, 264, 12

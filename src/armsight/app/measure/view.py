@@ -14,11 +14,9 @@ from typing import Any
 
 import cv2
 
-from armsight.app.report.plotting import require_matplotlib
 from armsight.app.measure.chart import chart
-from armsight.app.measure.picture import draw_shot
-from armsight.app.view_marks import marks_of
-from armsight.app.view_words import header
+from armsight.app.measure.picture import draw_shot, header, marks_of
+from armsight.app.report.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import replacing

@@ -2,38 +2,35 @@
 
 from __future__ import annotations
 
+import click
 import contextlib
 import json
-import time
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
-
-import click
 import numpy as np
-
-from armsight.app.progress import steps
-from armsight.app.run.text import tell
-from armsight.app.demo.demo import station_of
-from armsight.app.run.experiment import Progress, run_experiment
-from armsight.app.run.motion_file import CHAPTER, MotionPlan, read_motions
-from armsight.app.report.plotting import require_matplotlib
-from armsight.app.run.calibrate import handeye_poses
+import time
+from armsight.app.demo.demo import (station_of)
+from armsight.app.progress import (steps)
+from armsight.app.report.plotting import (require_matplotlib)
+from armsight.app.run.calibrate import (handeye_poses)
+from armsight.app.run.experiment import (Progress, require_start, run_experiment)
 from armsight.app.run.folder import (Finished, finish, make_room, open_folder)
-from armsight.app.run_ready import require_start
-from armsight.app.run.setup import HostClock, LiveShots, Station
-from armsight.app.run_tracks import require_pyarrow
-from armsight.data import Array
-from armsight.errors import InputError
-from armsight.files import read_text, write_text
-from armsight.loop.identify.model_file import open_model
-from armsight.robot.arm import Arm
-from armsight.robot.boards.opening import EMULATED, emulated_machine, open_board
-from armsight.sim.workcell.workcell import Workcell
-from armsight.vision.follow.follower import follows
-from armsight.vision.markers.targets import Composite, open_target
-from armsight.vision.rig import StereoRig
-from armsight.vision.sources import open_source
+from armsight.app.run.motion_file import (CHAPTER, MotionPlan, read_motions)
+from armsight.app.run.record import (require_pyarrow)
+from armsight.app.run.setup import (HostClock, LiveShots, Station)
+from armsight.app.run.text import (tell)
+from armsight.data import (Array)
+from armsight.errors import (InputError)
+from armsight.files import (read_text, write_text)
+from armsight.loop.identify.model_file import (open_model)
+from armsight.robot.arm import (Arm)
+from armsight.robot.boards.opening import (EMULATED, emulated_machine, open_board)
+from armsight.sim.workcell.workcell import (Workcell)
+from armsight.vision.follow.follower import (follows)
+from armsight.vision.markers.targets import (Composite, open_target)
+from armsight.vision.rig import (StereoRig)
+from armsight.vision.sources import (open_source)
+from dataclasses import (replace)
+from pathlib import (Path)
+from typing import (Any)
 
 _HANDEYE_POSES = 30
 _SIM = "sim:"

@@ -1,39 +1,226 @@
-"""A run's folder: its tables, its summary, its report. Files are put in place whole; what a broken run measured is kept."""
+"""A run's folder: its tables, its summary, its report. Files are put in place whole; what a broken run measured is kept.
+
+Single files of a run's folder: the joints, the hand-eye calibration, the shots that are kept.
+
+The summary of a run: what summary.json holds.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import cv2
+import io
 import json
 import math
+import numpy as np
+import os
 import shutil
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from armsight.app.demo.studies import (Study)
+from armsight.app.interrupts import (uninterrupted)
+from armsight.app.measure.poses import (UPPER, csv_text, left_axes, pose_record)
+from armsight.app.record.recording import (record)
+from armsight.app.run.calibrate import (HandEyeRun)
+from armsight.app.run.experiment import (Outcome)
+from armsight.app.run.metrics import (judge, path_errors, rest_errors, rms, singular, spread, track_figures)
+from armsight.app.run.motion_file import (MotionPlan)
+from armsight.app.run.record import (RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track)
+from armsight.app.run.report import (NAMES, PAGE, RunReport, write_run_report)
+from armsight.data import (Array, Image, Missed, PoseEstimate, Shot)
+from armsight.errors import (ArmsightError, InputError)
+from armsight.files import (write_text)
+from armsight.geometry.rotation import (quaternion_wxyz)
+from armsight.robot.arm import (Arm)
+from armsight.vision.image import (grey)
+from armsight.vision.rig import (StereoRig)
+from collections import (Counter)
+from collections.abc import (Callable, Iterator, Mapping, Sequence)
+from concurrent.futures import (Future, ThreadPoolExecutor)
+from dataclasses import (dataclass)
+from numpy.typing import (NDArray)
+from pathlib import (Path)
+from typing import (Any)
 
-import cv2
-import numpy as np
+def joint_columns(t_s: Array, q: Array, q_wanted: Array) -> dict[str, Any]:
+    """Return the joints' columns: measured and wanted angles."""
+    named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
+    for joint in range(6):
+        named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
+        named[f"q{joint + 1}_wanted_rad"] = np.round(q_wanted[:, joint], 9)
+    return named
 
-from armsight.app.run.experiment import Outcome
-from armsight.app.interrupts import uninterrupted
-from armsight.app.run.motion_file import MotionPlan
-from armsight.app.measure.poses import csv_text, pose_record
-from armsight.app.run_data import RunData, assembled, cut, joints_of
-from armsight.app.run_files import joint_columns, write_handeye, write_shots
-from armsight.app.run.report import (FIGURES, PAGE, RunReport, write_run_report)
-from armsight.app.run_summary import summary_of
-from armsight.app.run_tracks import ToolTrack, write_columns, write_track
-from armsight.app.demo.studies import Study
-from armsight.data import Array, Image, Missed, PoseEstimate
-from armsight.errors import ArmsightError, InputError
-from armsight.files import write_text
-from armsight.robot.arm import Arm
-from armsight.vision.image import grey
-from armsight.vision.rig import StereoRig
+
+def write_handeye(folder: Path, run: HandEyeRun) -> None:
+    """Write the hand-eye calibration, and the poses it was made from as ``armsight identify`` reads them."""
+    found, (position, angle) = run.found, run.found.held_out.rms()
+    told = {
+        "T_base_rig": run.mounting.T_base_rig.tolist(),
+        "T_tool_body": run.mounting.T_tool_body.tolist(),
+        "cov": found.cov.tolist(),
+        "held_out_position_rms_m": position,
+        "held_out_angle_rms_rad": angle,
+        "sigma_flange_m": found.sigma_flange_m,
+        "sigma_flange_rad": found.sigma_flange_rad,
+        "poses": len(run.q),
+        "missed": list(run.missed),
+    }
+    write_text(folder / "handeye.json", json.dumps(told, indent=1) + "\n")
+    T = run.Ts_left_body
+    covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
+    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
+    named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
+    turns = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
+    named |= {f"q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
+    named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
+    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(named)
+    writer.writerows(zip(*named.values(), strict=True))
+    write_text(folder / "handeye_poses.csv", out.getvalue())
+
+
+def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
+    """Write the kept shots as a recording; it is there whole or not at all.
+
+    Args:
+        folder: to be made.
+        shots: none makes no folder.
+
+    Raises:
+        InputError: it cannot be written, the disk is full.
+        KeyboardInterrupt: it came meanwhile.
+    """
+    left = iter(shots)
+
+    class Kept:
+        def read(self) -> Shot | None:
+            return next(left, None)
+
+        def close(self) -> None:
+            pass
+
+    if not shots:
+        return
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as place:
+            stored = record(Kept(), Path(place) / folder.name)
+            if stored.interrupted:
+                raise KeyboardInterrupt
+            if stored.stopped is not None:
+                raise InputError(stored.stopped.replace(str(stored.directory), str(folder)))
+            os.replace(stored.directory, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def summary_of(
+    arm: Arm,
+    outcome: Outcome,
+    plan: MotionPlan,
+    run: RunData,
+    before: RunData | None,
+    after: RunData | None,
+    studies: Sequence[Study],
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the figures of a run, SI units in the keys.
+
+    Args:
+        arm: the nominal arm.
+        outcome: what was measured; its hand-eye calibration is there.
+        plan: what was to be done.
+        run: all of it.
+        before: the motions with potentiometers alone; None where they were not made.
+        after: the same with the loop closed; None likewise.
+        studies: made after it.
+        facts: what else to say.
+    """
+    assert outcome.handeye is not None
+    position, angle = outcome.handeye.found.held_out.rms()
+    summary: dict[str, Any] = {} if before is None else _against_truth(before, outcome.covered_s)
+    if before is not None and after is not None:
+        goals = {m.name: m.trajectory.at(m.trajectory.duration_s).q for m in plan.motions}
+        summary["closed_loop"] = _closed(before, after, [n for n, q in goals.items() if singular(arm, q)])
+    if len(run.latency_s):
+        summary["latency_s"] = spread(run.latency_s)
+    return summary | {
+        "handeye": {
+            "held_out_position_rms_m": position,
+            "held_out_angle_rms_rad": angle,
+            "poses": len(outcome.handeye.q),
+        },
+        "camera_delay_s": {"value": outcome.delay.delay_s, "sigma": outcome.delay.sigma_s},
+        "shots": {"measured": len(run.vision), "missed": run.missed, "not_believed": run.outliers},
+        "studies": [_study(study) for study in studies],
+        **facts,
+        "ended_by": outcome.said,
+    }
+
+
+def _study(study: Study) -> dict[str, Any]:
+    """Return a study's figures."""
+    return {
+        "name": study.name,
+        "unit": study.unit,
+        "values": study.values.tolist(),
+        "position_rms_m": study.position_rms_m.tolist(),
+        "predicted_m": study.predicted_m.tolist(),
+    }
+
+
+def _against_truth(before: RunData, covered_s: tuple[float, float] | None) -> dict[str, Any]:
+    """Return how far each track of the motions is from the truth, with the body in view and hidden; empty without one."""
+    found: dict[str, Any] = {}
+    if before.truth is None:
+        return found
+    for name in ("vision", "potentiometers", "fused", "live"):
+        track: ToolTrack = getattr(before, name)
+        seen = ~_hidden(track, covered_s)
+        moving, resting = (track.phase == "open_loop") & seen, (track.phase == "rest") & seen
+        if moving.any() and resting.any():
+            at_rest = track_figures(track[resting], before.truth)["position_rms_m"]
+            found[name] = {**track_figures(track[moving], before.truth), "rest_position_rms_m": at_rest}
+    if covered_s is not None and (before.t_s > covered_s[0]).any():
+        found["occlusion"] = {"duration_s": float(np.ptp(covered_s))}
+        for name in ("fused", "live"):
+            track = getattr(before, name)
+            figures = track_figures(track[_hidden(track, covered_s)], before.truth)
+            found["occlusion"] |= {
+                f"{name}_position_rms_m": figures["position_rms_m"],
+                f"{name}_position_max_m": figures["position_max_m"],
+            }
+    return found
+
+
+def _closed(before: RunData, after: RunData, singular_at: list[str]) -> dict[str, Any]:
+    """Return the error of the tool against where it was to be, with potentiometers alone and with the loop closed.
+
+    Rests at which the arm is singular stand apart: there it cannot be moved to where it should be.
+    """
+    found: dict[str, Any] = {"singular_rests": {name: {} for name in singular_at}}
+    for when, run in (("before", before), ("after", after)):
+        rests = rest_errors(run, judge(run))
+        for name in singular_at:
+            if name in rests:
+                found["singular_rests"][name][f"rest_error_{when}_m"] = rests.pop(name)
+        paths = [away for _, away in path_errors(run, judge(run)).values()]
+        if rests:
+            found[f"rest_error_{when}_m"] = rms(np.array(list(rests.values())))
+            found[f"rest_error_{when}_max_m"] = max(rests.values())
+        if paths:
+            found[f"path_error_{when}_m"] = rms(np.concatenate(paths))
+    return found
+
+
+def _hidden(track: ToolTrack, covered_s: tuple[float, float] | None) -> NDArray[np.bool_]:
+    """Return (N,) which rows lie where the body was hidden on purpose, or just after."""
+    if covered_s is None:
+        return np.zeros(len(track), bool)
+    return (track.t_s > covered_s[0] - 0.01) & (track.t_s < covered_s[1] + 0.05)
+
 
 #: Files of tracks, and the fields of RunData they hold.
 _TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "wanted")
@@ -184,7 +371,7 @@ def make_room(folder: Path) -> None:
     Raises:
         InputError: something cannot be taken away.
     """
-    names = [f"{name}.png" for name in (*FIGURES, "pose", "cell")]
+    names = [f"{name}.png" for name in (*NAMES, "pose", "cell")]
     names += [f"{name}.{kind}" for name in (*_TRACKS, "joints") for kind in ("csv", "parquet")]
     names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"]
     try:

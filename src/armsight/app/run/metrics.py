@@ -6,17 +6,14 @@ it where motions are judged, and nothing is said about the error of the tracks t
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.special import chdtri
-
-from armsight.app.run_data import RunData
-from armsight.app.run_tracks import ToolTrack, errors
-from armsight.data import Array
-from armsight.loop.servo import EASY
-from armsight.robot.arm import Arm
+from armsight.app.run.record import (RunData, ToolTrack, errors)
+from armsight.data import (Array)
+from armsight.loop.servo import (EASY)
+from armsight.robot.arm import (Arm)
+from scipy.spatial import (cKDTree)
+from scipy.special import (chdtri)
+from typing import (Any)
 
 #: Kinds of motion whose path in space is what counts.
 PATHS = ("line", "circle")

@@ -1,13 +1,215 @@
-"""What a run keeps: its stretches, and all that was measured and commanded, as it came."""
+"""What a run keeps: its stretches, and all that was measured and commanded, as it came.
+
+Where the tool was, as files that anyone can compute with: one CSV and one Parquet a track.
+
+Columns: ``t_s, x_m, y_m, z_m, qw, qx, qy, qz`` of the tool in the base frame; where a track has a covariance,
+``sigma_x_m .. sigma_z_m`` along the base's axes and ``sigma_rx_rad .. sigma_rz_rad`` about them; ``phase`` and ``motion``.
+
+What cameras that do not expose at the same instant add to the covariance of a moving body's pose.
+
+A run as tables: its log brought onto one axis of time, beside what was wanted and, in the workcell, the truth.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import numpy as np
+from armsight.data import (Array, JointCommand, JointStates, Missed, PoseEstimate, Record)
+from armsight.errors import (InputError)
+from armsight.files import (read_table, replacing)
+from armsight.geometry.pose import (inverse, log_se3)
+from armsight.loop.estimators import (ArmEstimate, Delay, Mounting, Sighting, Verdict)
+from armsight.robot.arm import (Arm)
+from armsight.robot.trajectories import (Trajectory)
+from armsight.vision.rig import (StereoRig)
+from dataclasses import (dataclass, field, replace)
+from numpy.typing import (NDArray)
+from pathlib import (Path)
+from scipy.spatial.transform import (Rotation)
+from typing import (Any)
 
-from armsight.app.run_tracks import ToolTrack
-from armsight.data import JointCommand, JointStates, Missed, PoseEstimate
-from armsight.loop.estimators import ArmEstimate, Verdict
-from armsight.robot.trajectories import Trajectory
+_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+#: What a moment belongs to.
+PHASES = ("calibration", "open_loop", "closed_loop", "rest")
+_DIGITS = 9  # decimals of m, s and rad that are written
+
+
+@dataclass(frozen=True, eq=False)
+class ToolTrack(Record):
+    """Where the tool was at N times.
+
+    Attributes:
+        t_s: (N,) times on the board's clock, s, rising.
+        Ts_base_tool: (N, 4, 4) poses.
+        phase: (N,) names out of PHASES.
+        motion: (N,) names of the motions, "" between them.
+        covs: (N, 6, 6) covariances of the right tangents; None where there are none.
+    """
+
+    t_s: Array
+    Ts_base_tool: Array
+    phase: NDArray[np.str_]
+    motion: NDArray[np.str_]
+    covs: Array | None = None
+
+    def __len__(self) -> int:
+        """Return N."""
+        return len(self.t_s)
+
+    def __getitem__(self, rows: NDArray[Any]) -> ToolTrack:
+        """Return some of the rows."""
+        covs = None if self.covs is None else self.covs[rows]
+        return ToolTrack(self.t_s[rows], self.Ts_base_tool[rows], self.phase[rows], self.motion[rows], covs)
+
+    def at(self, t_s: Array) -> Array:
+        """Return the poses (N, 4, 4) at times within the track: straight and by slerp between its rows."""
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
+        T0, T1, t0, t1 = (x[k] for x in (self.Ts_base_tool, self.t_s) for k in (after - 1, after))
+        share = np.clip((t_s - t0) / np.maximum(t1 - t0, 1e-12), 0.0, 1.0)[:, None]
+        out = T0.copy()
+        out[:, :3, 3] += share * (T1 - T0)[:, :3, 3]
+        turn = Rotation.from_matrix(np.swapaxes(T0[:, :3, :3], 1, 2) @ T1[:, :3, :3]).as_rotvec()
+        out[:, :3, :3] @= Rotation.from_rotvec(share * turn).as_matrix()
+        return out
+
+
+def errors(track: ToolTrack, truth: ToolTrack) -> Array:
+    """Return (N, 6) right tangents from each pose of a track to the true one, [m; rad], the tool's axes."""
+    T, T_true = track.Ts_base_tool, truth.at(track.t_s)
+    turned = np.swapaxes(T[:, :3, :3], 1, 2)
+    shift = np.einsum("nij,nj->ni", turned, T_true[:, :3, 3] - T[:, :3, 3])
+    return np.hstack([shift, Rotation.from_matrix(turned @ T_true[:, :3, :3]).as_rotvec()])
+
+
+def columns(track: ToolTrack) -> dict[str, NDArray[Any]]:
+    """Return a track's columns by name."""
+    T = track.Ts_base_tool
+    quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    named = {"t_s": track.t_s}
+    named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
+    named |= {f"q{axis}": quaternion[:, i] for i, axis in enumerate("wxyz")}
+    if track.covs is not None:
+        R = T[:, :3, :3]
+        for first, kind, unit in ((0, "", "m"), (3, "r", "rad")):
+            part = track.covs[:, first : first + 3, first : first + 3]
+            sigma = np.sqrt(np.einsum("nij,njk,nik->ni", R, part, R))
+            named |= {f"sigma_{kind}{axis}_{unit}": sigma[:, i] for i, axis in enumerate("xyz")}
+    return {name: np.round(values, _DIGITS) for name, values in named.items()} | {
+        "phase": track.phase,
+        "motion": track.motion,
+    }
+
+
+def require_pyarrow() -> None:
+    """Raise an InputError that says what to install unless pyarrow can be imported."""
+    try:
+        import pyarrow  # noqa: F401 - only whether it is there
+    except ImportError:
+        raise InputError('a run is written with pyarrow, which is not installed: pip install "armsight[run]"') from None
+
+
+def write_columns(folder: Path, name: str, named: dict[str, NDArray[Any]]) -> None:
+    """Write columns of one length as NAME.csv and NAME.parquet.
+
+    Raises:
+        InputError: a file cannot be written, the disk is full; no file is left half-written.
+    """
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    table = pa.table(named)
+    with replacing(folder / f"{name}.csv", "wb") as file:
+        csv.write_csv(table, file, csv.WriteOptions(quoting_style="needed"))
+    with replacing(folder / f"{name}.parquet", "wb") as file:
+        parquet.write_table(table, file)
+
+
+def write_track(folder: Path, name: str, track: ToolTrack) -> None:
+    """Write a track as NAME.csv and NAME.parquet; errors as :func:`write_columns`."""
+    write_columns(folder, name, columns(track))
+
+
+def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array]:
+    """Read the CSV of a track, without its covariances.
+
+    Args:
+        file: as :func:`write_track` writes it.
+        more: names of further columns of numbers.
+
+    Returns:
+        The track, and those columns (N, k).
+
+    Raises:
+        InputError: unreadable, a column missing, no rows, a cell that is no finite number, or times that fall; the message
+            names the line.
+    """
+    table = read_table(file)
+    header = table[0] if table else []
+    columns = (*_COLUMNS, "phase", "motion", *more)
+    for name in columns:
+        if name not in header:
+            raise InputError(f"{file}: line 1: column {name} is missing; needed are {', '.join(columns)}")
+    at = [header.index(name) for name in columns]
+    body = table[1:]
+    try:
+        numbers = np.array([[float(row[k]) for k in (*at[:8], *at[10:])] for row in body]).reshape(-1, 8 + len(more))
+        texts = np.array([[row[k] for k in at[8:10]] for row in body], dtype=str).reshape(-1, 2)
+    except (ValueError, IndexError):
+        line = next(n for n, row in enumerate(body, start=2) if not _whole(row, at))
+        raise InputError(f"{file}: line {line}: numbers are needed in {', '.join(_COLUMNS)}") from None
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if len(bad):
+        raise InputError(f"{file}: line {bad[0] + 2}: finite numbers are needed in {', '.join((*_COLUMNS, *more))}")
+    falls = np.flatnonzero(np.diff(numbers[:, 0]) < 0)
+    if len(falls):
+        raise InputError(f"{file}: line {falls[0] + 3}: t_s is less than in the line before; times must rise")
+    if not len(numbers):
+        raise InputError(f"{file}: no rows")
+    if not np.linalg.norm(numbers[:, 4:8], axis=1).all():
+        raise InputError(f"{file}: a quaternion qw .. qz is zero")
+    Ts = np.tile(np.eye(4), (len(numbers), 1, 1))
+    Ts[:, :3, 3], Ts[:, :3, :3] = numbers[:, 1:4], Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
+    return ToolTrack(numbers[:, 0], Ts, texts[:, 0], texts[:, 1]), numbers[:, 8:]
+
+
+def _whole(row: list[str], at: list[int]) -> bool:
+    """Say whether a line has all its cells, and numbers where they must be."""
+    try:
+        return bool([float(row[k]) for k in (*at[:8], *at[10:])]) and len(row) > max(at)
+    except (ValueError, IndexError):
+        return False
+
+
+#: Two poses further apart than this, s, tell no speed.
+APART_S = 0.5
+
+
+class Skew:
+    """Widens poses of a body by how fast it moves.
+
+    Between the exposures it moves v dt along the baseline, which is taken for disparity: the depth is off by Z / B v dt
+    along the line of sight.
+
+    Args:
+        rig: the calibrated pair.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
+    """
+
+    def __init__(self, rig: StereoRig, sync_s: float) -> None:
+        self._rig, self._sync_s = rig, sync_s
+        self._last: tuple[float, Array] | None = None
+
+    def widened(self, pose: PoseEstimate, t_s: float) -> PoseEstimate:
+        """Return a pose with its covariance widened; poses come in order of time."""
+        p = pose.T_left_body[:3, 3]
+        last, self._last = self._last, (t_s, p)
+        if last is None or not 0.0 < t_s - last[0] < APART_S:
+            return pose
+        baseline = self._rig.T_left_right[:3, 3]
+        along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))
+        off = pose.T_left_body[:3, :3].T @ p * (self._sync_s * along / np.linalg.norm(baseline))
+        extra = np.zeros((6, 6))
+        extra[:3, :3] = np.outer(off, off)
+        return replace(pose, cov=pose.cov + extra, cov_noise=pose.cov_noise + extra)
 
 
 @dataclass(frozen=True)
@@ -58,3 +260,159 @@ class Log:
     modes: list[str] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class RunData(Record):
+    """A run.
+
+    Attributes:
+        t_s: (N,) times of the potentiometers' readings, board's clock.
+        q: (N, 6) what they said, rad.
+        q_wanted: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
+        potentiometers: where the table of the arm has the tool with them.
+        vision: where each used shot saw it.
+        fused: where the estimator has it, a little later, with vision on both sides of each time.
+        live: where the estimator had it at once: what the loop goes by.
+        wanted: where it was to be, at the times something was planned.
+        truth: where it was; None for a real arm.
+        segments: what happened when.
+        latency_s: from each image to the command that knows it, our time, s.
+        modes: (M,) what each command was based on.
+        missed: shots that gave no pose.
+        outliers: sightings that the estimator did not believe.
+    """
+
+    t_s: Array
+    q: Array
+    q_wanted: Array
+    potentiometers: ToolTrack
+    vision: ToolTrack
+    fused: ToolTrack
+    live: ToolTrack
+    wanted: ToolTrack
+    truth: ToolTrack | None
+    segments: tuple[Segment, ...]
+    latency_s: Array
+    modes: NDArray[np.str_]
+    missed: int
+    outliers: int
+
+
+def assembled(
+    log: Log, arm: Arm, mounting: Mounting, delay: Delay, truth: tuple[Array, Array] | None = None
+) -> RunData:
+    """Bring a log onto one axis of time.
+
+    Args:
+        log: of the run.
+        arm: the nominal arm.
+        mounting: where cameras and body are.
+        delay: how late the camera's stamps are: what is not known of that, too, spoils the pose of a tool that moves.
+        truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
+    """
+    t_s, q, q_wanted = joints_of(log)
+    planned = np.isfinite(q_wanted).all(axis=1)
+    named = _Named(log.segments)
+    seen = [mounting.sighting(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
+    fused = [part for part in log.fused if part.covs is not None]
+    return RunData(
+        t_s,
+        q,
+        q_wanted,
+        named.track(t_s, arm.forward(q)),
+        named.track(
+            np.array([s.t_s for s in seen]),
+            np.array([s.T_base_tool for s in seen]).reshape(-1, 4, 4),
+            np.array([s.cov_noise + s.cov_common for s in seen]).reshape(-1, 6, 6) + _mistimed(seen, delay),
+        ),
+        named.track(
+            np.concatenate([part.t_s for part in fused]),
+            np.concatenate([part.Ts_base_tool for part in fused]),
+            np.concatenate([part.covs for part in fused if part.covs is not None]),
+        ),
+        named.track(
+            np.array([e.t_s for e in log.live]),
+            np.array([e.T_base_tool for e in log.live]),
+            np.array([e.cov for e in log.live]),
+        ),
+        named.track(t_s[planned], arm.forward(q_wanted[planned])),
+        None if truth is None else named.track(*truth),
+        tuple(log.segments),
+        np.array(log.latency_s),
+        np.array(log.modes),
+        len(log.poses) - len(seen),
+        sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
+    )
+
+
+def _mistimed(seen: list[Sighting], delay: Delay) -> Array:
+    """Return what the stamps' errors add to the covariances (N, 6, 6) of poses of a moving tool."""
+    if len(seen) < 2:
+        return np.zeros((len(seen), 6, 6))
+    t_s, Ts = np.array([s.t_s for s in seen]), np.array([s.T_base_tool for s in seen])
+    apart_s = np.diff(t_s)
+    tells = ((apart_s > 0.0) & (apart_s < APART_S)).astype(float)
+    speeds = tells[:, None] * log_se3(inverse(Ts[:-1]) @ Ts[1:]) / np.maximum(apart_s, 1e-9)[:, None]
+    # The mean of the speeds before and after a pose, as far as there are such.
+    v, count = np.zeros((len(seen), 6)), np.zeros((len(seen), 1))
+    for rows in (slice(None, -1), slice(1, None)):
+        v[rows] += speeds
+        count[rows] += tells[:, None]
+    v /= np.maximum(count, 1.0)
+    return np.asarray((delay.sigma_s**2 + delay.jitter_s**2) * v[:, :, None] * v[:, None, :])
+
+
+def joints_of(log: Log) -> tuple[Array, Array, Array]:
+    """Return a log's times (N,) of readings, the joints (N, 6) then, and as planned, rad; NaN where nothing was."""
+    t_s = np.concatenate([s.t_s for s in log.joints])
+    q = np.concatenate([s.q for s in log.joints])
+    q_wanted = np.full_like(q, np.nan)
+    for segment in log.segments:
+        rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
+        if segment.trajectory is not None and rows.any():
+            since = t_s[rows] - segment.begin_s
+            q_wanted[rows] = segment.trajectory.at(
+                since + (segment.trajectory.duration_s if _rests(segment) else 0.0)
+            ).q
+    return t_s, q, q_wanted
+
+
+def _rests(segment: Segment) -> bool:
+    """Whether the arm stands at the end of its trajectory."""
+    return segment.phase == "rest"
+
+
+class _Named:
+    """Tells for any time which phase and motion it belongs to."""
+
+    def __init__(self, segments: list[Segment]) -> None:
+        self._begins = np.array([s.begin_s for s in segments])
+        self._phase = np.array([s.phase for s in segments] + ["calibration"])
+        self._motion = np.array([s.motion for s in segments] + [""])
+
+    def track(self, t_s: Array, Ts_base_tool: Array, covs: Array | None = None) -> ToolTrack:
+        """Return a track with its phases and motions; what lies before the first segment belongs to the calibration."""
+        at = np.searchsorted(self._begins, t_s, side="left") - 1
+        return ToolTrack(t_s, Ts_base_tool, self._phase[at], self._motion[at], covs)
+
+
+def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
+    """Return what lies between two times of all tracks."""
+
+    def within(track: ToolTrack) -> ToolTrack:
+        return track[(track.t_s > begin_s) & (track.t_s <= end_s)]
+
+    rows = (run.t_s > begin_s) & (run.t_s <= end_s)
+    return replace(
+        run,
+        t_s=run.t_s[rows],
+        q=run.q[rows],
+        q_wanted=run.q_wanted[rows],
+        potentiometers=within(run.potentiometers),
+        vision=within(run.vision),
+        fused=within(run.fused),
+        live=within(run.live),
+        wanted=within(run.wanted),
+        segments=tuple(s for s in run.segments if s.begin_s >= begin_s - 1e-9 and s.end_s <= end_s + 1e-9),
+    )

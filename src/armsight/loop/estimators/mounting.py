@@ -12,8 +12,7 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators.estimator import Sighting
-from armsight.loop.handeye.handeye import HandEye
-from armsight.loop.handeye_fit import adjoint
+from armsight.loop.handeye.handeye import HandEye, adjoint
 from armsight.robot.arm import Arm
 
 

@@ -4,23 +4,336 @@ In: poses of the flange in the base (from the joints) and of the body in the rig
 Out: :class:`HandEye` with both unknown transforms, their covariance, and the error on poses left out of the fit. Eye to
 hand, T_base_flange T_flange_body = T_base_rig T_rig_body; eye in hand, T_base_flange T_flange_rig T_rig_body =
 T_base_body. Closed-form starts, then maximum likelihood; equations in docs/handeye.md.
+
+Maximum likelihood of a hand-eye calibration: poses with covariance, an arm and a vision that are off by unknown amounts.
+
+In: poses of the flange and of what is seen, with covariance, and a start. Out: both unknown transforms, their covariance,
+and how far arm and vision are off. The residual of a pose is the tangent, in the axes of what the camera measured, of the
+motion left over. Its covariance is what is given, plus that of an unknown share (``SHARES``): of the flange, about the
+flange, or of what is seen, about its middle, carried over by the adjoint. Its sigmas of place and turn are those of the
+greatest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971).
+
+Closed-form starts for hand-eye calibration: A_i X = Z B_i, from all poses and from small parts of them.
+
+In: poses of the flange in the base and of what is seen. Out: candidates for (X, Z), best first. Own: rotations by the
+leading singular vectors of the Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/
+hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried
+beside it where the installed OpenCV has them (5.0 has not).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import inverse, log_se3, transform
-from armsight.loop.handeye_fit import SHARES, Fit, Poses, Share, fit, information
-from armsight.loop.handeye_start import starts
+from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, pose, transform
+from armsight.geometry.rotation import skew
+
+#: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
+CHANCE = 1e-5
+#: Gauss-Newton steps at most, and the step (m, rad) below which it has converged.
+STEPS, CONVERGED = 30, 1e-10
+#: Poses that the sigmas are estimated from at most, spread evenly.
+MOST = 200
+#: The sigmas are looked for between these, m and rad: beyond, they are zero, or no arm.
+LEAST_SIGMA, MOST_SIGMA = 1e-7, 0.1
+
+
+Sigmas = tuple[float, float, float, float]
+Share = Literal["flange", "seen", "places"]
+#: Who has the share of the error that nobody gave: the flange (its joints), what is seen, or what is seen with its turns
+#: hardly believed: an arm's turns and its places may contradict each other by more than either scatters.
+SHARES: tuple[Share, ...] = ("flange", "seen", "places")
+#: Sigma of turns that are hardly believed, rad: enough to determine what places leave open.
+HARDLY = 0.005
+
+
+def adjoint(T: Array) -> Array:
+    """Return the adjoints (..., 6, 6) of transforms (..., 4, 4): T exp(xi) T^-1 = exp(Ad xi)."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = skew(T[..., :3, 3]) @ R
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Record):
+    """What a hand-eye calibration is made from.
+
+    Attributes:
+        A: (N, 4, 4) T_base_flange, m.
+        B: (N, 4, 4) T_rig_body, m.
+        cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
+        in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
+        centre: (3,) the middle of what is seen of the body, body frame, m.
+    """
+
+    A: Array
+    B: Array
+    cov: Array
+    in_hand: bool
+    centre: Array
+
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
+        """Return a part of the poses."""
+        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre)
+
+    @property
+    def turned(self) -> Array:
+        """(N, 4, 4) the poses that stand for B in A_i X = Z B_i."""
+        return inverse(self.B) if self.in_hand else self.B
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(Record):
+    """The unknown transforms of A_i X = Z B_i.
+
+    Attributes:
+        Z: (4, 4) what stands still, in the base.
+        X: (4, 4) what the flange carries, in the flange.
+        cov: (12, 12) covariance of the right tangents of Z and X, in this order.
+        sigma: sigmas along or about one axis: the flange's place, m, and turn, rad; the body's middle's, and turn, beyond
+            the covariance given.
+        used: (N,) whether a pose was used.
+    """
+
+    Z: Array
+    X: Array
+    cov: Array
+    sigma: Sigmas
+    used: NDArray[np.bool_]
+
+
+def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
+    """Return what is left over, its derivative, and the adjoints that carry an error of the flange over to it.
+
+    Returns:
+        (N, 6) residuals e in the axes of the body, (N, 6, 12) their derivative by the right tangents of Z and X, exact to
+        the square of e, and (N, 6, 6).
+    """
+    if poses.in_hand:
+        M, last = X @ poses.B, poses.B  # E = Z^-1 A X B
+        E = inverse(Z) @ poses.A @ M
+        by_x = adjoint(inverse(last))
+    else:
+        M = np.broadcast_to(X, poses.A.shape)  # E = B^-1 Z^-1 A X
+        E = inverse(Z @ poses.B) @ poses.A @ M
+        by_x = np.broadcast_to(np.eye(6), (len(poses.A), 6, 6))
+    # A change of Z comes in from the left of what follows it.
+    by_z = -adjoint(inverse(E) if poses.in_hand else inverse(poses.A @ M) @ Z)
+    e = log_se3(E)
+    bend = np.eye(6) + 0.5 * _small_adjoint(e)  # the right Jacobian's inverse, to first order
+    return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
+
+
+def _small_adjoint(xi: Array) -> Array:
+    """Return ad(xi) (..., 6, 6) of tangents (..., 6)."""
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = skew(xi[..., 3:])
+    out[..., :3, 3:] = skew(xi[..., :3])
+    return out
+
+
+def covariances(poses: Poses, carry: Array, sigma: Sigmas) -> Array:
+    """Return the covariance (N, 6, 6) of residuals: what is given, the flange's carried over, and the body's."""
+    flange, body = np.repeat(np.square(sigma[:2]), 3), np.repeat(np.square(sigma[2:]), 3)
+    about = np.eye(6)
+    about[:3, 3:] = skew(poses.centre)  # the adjoint of the shift from the body's origin to its middle
+    return np.asarray(poses.cov + (carry * flange) @ np.swapaxes(carry, 1, 2) + (about * body) @ about.T)
+
+
+def fit(poses: Poses, start: tuple[Array, Array], share: Share) -> Fit:
+    """Fit both transforms, the unknown sigmas, and which poses are mistakes.
+
+    Args:
+        poses: at least three.
+        start: X and Z near the answer.
+        share: who has the share of the error that is not given.
+    """
+    X, Z = start
+    sigma = _robust_sigma(poses, Z, X, share)
+    used = np.ones(len(poses.A), bool)
+    for _ in range(8):
+        e, _, carry = residuals(poses, Z, X)
+        far = _squares(e, covariances(poses, carry, sigma))
+        keep = far < chdtri(6, CHANCE)
+        if keep.sum() < max(3, len(keep) // 2):  # no half can be a mistake: then the sigmas are what is wrong
+            keep = far <= np.sort(far)[max(3, len(keep) // 2) - 1]
+        part = poses.rows(keep)
+        Z, X = _newton(part, Z, X, sigma)
+        sigma_new = _variance(part, Z, X, sigma, share)
+        settled = bool((keep == used).all()) and bool(np.allclose(sigma_new, sigma, rtol=0.02, atol=1e-8))
+        used, sigma = keep, sigma_new
+        if settled:
+            break
+    part = poses.rows(used)
+    Z, X = _newton(part, Z, X, sigma)
+    return Fit(Z, X, np.asarray(np.linalg.inv(information(part, Z, X, sigma))), sigma, used)
+
+
+def information(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> Array:
+    """Return the information (12, 12) about the right tangents of Z and X."""
+    _, J, carry = residuals(poses, Z, X)
+    WJ = np.linalg.solve(covariances(poses, carry, sigma), J)
+    return np.asarray(np.einsum("nki,nkj->ij", J, WJ))
+
+
+def _squares(e: Array, cov: Array) -> Array:
+    """Return the squared Mahalanobis lengths (N,)."""
+    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(cov, e[..., None])[..., 0]))
+
+
+def _shared(place: float, turn: float, share: Share) -> Sigmas:
+    """Return the four sigmas of a share."""
+    if share == "flange":
+        return place, turn, 0.0, 0.0
+    return 0.0, 0.0, place, turn if share == "seen" else HARDLY
+
+
+def _robust_sigma(poses: Poses, Z: Array, X: Array, share: Share) -> Sigmas:
+    """Return sigmas along one axis from the median residual, which mistakes do not reach."""
+    e, _, _ = residuals(poses, Z, X)
+    middle = np.sqrt(chdtri(3, 0.5))
+    place, turn = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
+    return _shared(max(place, LEAST_SIGMA), max(turn, LEAST_SIGMA), share)
+
+
+def _newton(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> tuple[Array, Array]:
+    """Minimise the weighted squares over both transforms."""
+    for _ in range(STEPS):
+        e, J, carry = residuals(poses, Z, X)
+        WJ = np.linalg.solve(covariances(poses, carry, sigma), J)
+        step = -np.linalg.lstsq(np.einsum("nki,nkj->ij", J, WJ), np.einsum("nki,nk->i", WJ, e), rcond=1e-15)[0]
+        Z, X = Z @ exp_se3(step[:6]), X @ exp_se3(step[6:])
+        if np.abs(step).max() < CONVERGED:
+            break
+    return Z, X
+
+
+def _variance(poses: Poses, Z: Array, X: Array, sigma: Sigmas, share: Share) -> Sigmas:
+    """Return the sigmas of the greatest restricted likelihood."""
+    if len(poses.A) > MOST:
+        poses = poses.rows(np.linspace(0, len(poses.A) - 1, MOST).astype(np.int64))
+    e, _, carry = residuals(poses, Z, X)
+    freedom = max(1 - 12 / e.size, 1 / e.size)  # what the fit has left of the residuals'
+    low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
+
+    def shared(logs: Array) -> Sigmas:
+        place, turn = np.exp(np.clip(logs, low, high))
+        return _shared(float(place), float(turn), share)
+
+    def cost(logs: Array) -> float:
+        C = covariances(poses, carry, shared(logs))
+        return float(freedom * np.linalg.slogdet(C)[1].sum() + _squares(e, C).sum())
+
+    start = np.log(np.maximum(sigma[:2] if share == "flange" else sigma[2:], LEAST_SIGMA))
+    best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-3})
+    return shared(best.x)
+
+
+#: OpenCV as it is at run time: its type stubs are those of one version.
+_CV: Any = cv2
+#: Parts of this many poses are tried too, so that some of them are free of gross errors.
+PART = 6
+#: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
+PARTS = 24
+#: What a turn counts in the score, m: 1 mrad as much as 0.3 mm, as it does at a tool 0.3 m from the wrist.
+LEVER_M = 0.3
+#: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
+_OPENCV = ("CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "CALIB_ROBOT_WORLD_HAND_EYE_LI")
+_OPENCV_MOTIONS = (
+    "CALIB_HAND_EYE_TSAI",
+    "CALIB_HAND_EYE_PARK",
+    "CALIB_HAND_EYE_HORAUD",
+    "CALIB_HAND_EYE_ANDREFF",
+    "CALIB_HAND_EYE_DANIILIDIS",
+)
+
+
+def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
+    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
+
+    Args:
+        A: (N, 4, 4) poses, N >= 3.
+        B: (N, 4, 4) poses.
+        seed: of the choice of parts.
+    """
+    rng = np.random.default_rng(seed)
+    found = [kronecker(A, B), *_opencv(A, B)]
+    if len(A) > PART:
+        for _ in range(PARTS):
+            rows = rng.choice(len(A), PART, replace=False)
+            found.append(kronecker(A[rows], B[rows]))
+    found = [(X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _turns(X) and _turns(Z)]
+    return sorted(found, key=lambda XZ: _score(A, B, *XZ))
+
+
+def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
+    """Solve ``A_i X = Z B_i`` in closed form: rotations first, then translations.
+
+    With column-stacked matrices, R_A R_X R_B^T = R_Z reads (R_B kron R_A) vec(R_X) = vec(R_Z) for every i, so both are the
+    leading singular vectors of the sum of the Kronecker products.
+
+    Returns:
+        (4, 4) X and (4, 4) Z.
+    """
+    RA, RB = A[:, :3, :3], B[:, :3, :3]
+    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
+    U, _, Vt = np.linalg.svd(K)
+    RX, RZ = _rotation(Vt[0].reshape(3, 3, order="F")), _rotation(U[:, 0].reshape(3, 3, order="F"))
+    # R_A t_X - t_Z = R_Z t_B - t_A
+    M = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
+    right = (B[:, :3, 3] @ RZ.T - A[:, :3, 3]).ravel()
+    t = np.linalg.lstsq(M, right, rcond=None)[0]
+    return pose(RX, t[:3]), pose(RZ, t[3:])
+
+
+def _rotation(M: Array) -> Array:
+    """Return the rotation nearest to a multiple, of either sign, of a rotation (3, 3)."""
+    U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M)))
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield what OpenCV's solvers find, where it has them and they take what they are given."""
+    back = inverse(B)
+    for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
+            X = pose(R, t.ravel())
+            yield X, mean_pose(A @ X @ back)
+    for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
+            yield pose(RX, tX.ravel()), pose(RZ, tZ.ravel())
+
+
+def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
+    return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
+
+
+def _turns(T: Array) -> bool:
+    """Say whether a solver's answer is a rigid motion at all."""
+    return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
+
+
+def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
+    """Return the median size of the residual motions, m."""
+    e = log_se3(inverse(Z @ B) @ A @ X)
+    return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
+
 
 Eye = Literal["to_hand", "in_hand"]
 #: Parts into which the poses are cut for the held-out error.

@@ -19,8 +19,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.handeye.handeye import Eye, HandEye, calibrate_handeye
-from armsight.loop.handeye_fit import Poses, covariances, residuals
+from armsight.loop.handeye.handeye import Eye, HandEye, Poses, calibrate_handeye, covariances, residuals
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
 MOST = 600

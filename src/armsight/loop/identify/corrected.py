@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.identify import chain
+from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import Model
 from armsight.robot.arm import Arm

@@ -17,10 +17,10 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.loop.handeye_start import kronecker
+from armsight.loop.handeye.handeye import kronecker
+from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.placement import linear_placement, turn_between
-from armsight.loop.identify.priors import SIGMA
 from armsight.loop.identify.read import TURNS, AnglesMeasured, turned
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain

@@ -15,16 +15,13 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.loop.identify.diagnose import check_plausible, without_tool
-from armsight.loop.identify.evidence import scaled_prior
-from armsight.loop.identify.features import PLENTY, approaches
-from armsight.loop.identify.fit import Mask, Solution, covariance, fit
-from armsight.loop.identify.selection import (PLACEMENT, TOGETHER, Step, grown)
+from armsight.loop.identify.fit import Mask, Solution, covariance, fit, prior_sigma
 from armsight.loop.identify.joint_noise import NO_CHANCE, JointNoise, joint_noise, with_joint_noise
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import Model
+from armsight.loop.identify.model import PLENTY, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import placed
-from armsight.loop.identify.priors import prior_sigma
+from armsight.loop.identify.selection import PLACEMENT, TOGETHER, Step, grown, scaled_prior
 from armsight.robot.arm import Arm
 
 #: Fewest poses: what places base and tool, with some to spare.

@@ -2,25 +2,237 @@
 
 Order of the vector: where the base is in the rig (shift along the rig's axes; turn about them, from a start), where the
 tool's points or the body are on frame 6, the table's numbers, and the coefficients of the causes in ``features``.
+
+Forward kinematics of an arm that is not what its table says, and the derivative by everything that can be off.
+
+A row of the table is Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta), modified Rx(alpha) Tx(a) Ry(beta) Rz(theta) Tz(d). Beta is
+Hayati's angle ("Robot arm geometric link parameter estimation", CDC 1983): between neighbouring axes that are parallel, d
+says nothing and only beta can tilt the second axis about the common normal's perpendicular. The derivative of a point by an
+elementary turn about axis u through o is u x (p - o), by a shift u.
+
+What a joint's true angle may differ by from what its sensor reads: linear in the unknown coefficients.
+
+gain: the sensor's scale. wave, ripple: linearity error of a sensor, sin and cos of its angle and of multiples of it.
+backlash: half of it to either side, by the direction of approach: play that friction holds where the joint left it. slack:
+the same for play that the weight beyond the joint closes, whichever way it came, save where the lever is so small that
+friction is stronger. sag: a compliant gear under the links'
+weight; the torque about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j
+link j's own vector.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from armsight.data import Array, Record
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.geometry.rotation import exp_so3, log_so3, skew
-from armsight.loop.identify import chain
-from armsight.loop.identify.features import ENOUGH, FAST, PLENTY, RIPPLES, Feature, all_features, values
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
+#: Columns of a table of lengths and angles, (6, 5).
+COLUMNS = ("offset", "d", "a", "alpha", "beta")
+OFFSET, D, A, ALPHA, BETA = range(5)
+_STANDARD = (OFFSET, D, A, ALPHA, BETA)
+_MODIFIED = (ALPHA, A, BETA, OFFSET, D)
+#: Column -> the axis it turns about or shifts along.
+_AXIS = {OFFSET: 2, D: 2, A: 0, ALPHA: 0, BETA: 1}
+_SHIFTS = (D, A)
+
+
+class Motion(NamedTuple):
+    """Where an arm's last frame is, and how it moves with each number of the table.
+
+    Attributes:
+        R: (N, 3, 3) turn of frame 6 in the rig.
+        o: (N, 3) its origin.
+        axis: (6, 5, N, 3) the axes that each number turns about or shifts along.
+        through: (6, 5, N, 3) points on those axes.
+    """
+
+    R: Array
+    o: Array
+    axis: Array
+    through: Array
+
+
+def nominal_table(arm: Arm) -> Array:
+    """Return the table (6, 5) of an arm, by COLUMNS."""
+    return np.stack([arm.offset, arm.d, arm.a, arm.alpha, np.zeros(6)], axis=1)
+
+
+def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> Motion:
+    """Carry a frame along the chain.
+
+    Args:
+        table: (6, 5) by COLUMNS, m and rad.
+        theta: (N, 6) what each joint turns beside its offset, rad.
+        modified: whether the table follows the modified convention.
+        R_rig_0: (3, 3) turn of frame 0 in the rig.
+        o_rig_0: (3,) its origin.
+    """
+    n = len(theta)
+    R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
+    axis, through = np.empty((6, 5, n, 3)), np.empty((6, 5, n, 3))
+    for i in range(6):
+        for column in _MODIFIED if modified else _STANDARD:
+            k = _AXIS[column]
+            axis[i, column], through[i, column] = R[:, :, k], o
+            value = table[i, column]
+            if column in _SHIFTS:
+                o += value * R[:, :, k]
+            elif column == OFFSET:
+                _turn(R, k, value + theta[:, i])
+            elif value != 0.0:
+                _turn(R, k, np.full(n, value))
+    return Motion(R, o, axis, through)
+
+
+def _turn(R: Array, k: int, angle: Array) -> None:
+    """Turn frames (N, 3, 3) in place about their own axis ``k``."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    u, v = R[:, :, (k + 1) % 3].copy(), R[:, :, (k + 2) % 3].copy()
+    R[:, :, (k + 1) % 3] = c * u + s * v
+    R[:, :, (k + 2) % 3] = c * v - s * u
+
+
+def point_derivative(m: Motion, p: Array) -> Array:
+    """Return the derivative (6, 5, N, 3) of points p (N, 3), rig, by every number of the table."""
+    out = np.cross(m.axis, p - m.through)
+    out[:, _SHIFTS] = m.axis[:, _SHIFTS]
+    return out
+
+
+def turn_derivative(m: Motion) -> Array:
+    """Return the derivative (6, 5, N, 3) of the turn of frame 6, as a rotation vector in the rig's axes."""
+    out = m.axis.copy()
+    out[:, _SHIFTS] = 0.0
+    return out
+
+
+def turned(start: Array, by: Array) -> Array:
+    """Return exp(by) @ start for a rotation vector (3,)."""
+    return np.asarray(exp_so3(by) @ start)
+
+
+#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and the
+#: fastest: the workcell's potentiometers swing up to nine times over their travel, which may be three quarters of a turn.
+WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
+#: Fewer numbers measured than this are not given ripples at all: their one prior would be told by chance.
+ENOUGH = 100
+#: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before. The
+#: fastest are then left out: chosen one by one, no prior holds them where the arm was not looked at.
+PLENTY = 10
+#: A bearing's friction holds a link in its play against weight with up to about this lever, m: some per cent of what the
+#: links of such arms have, as bearings' friction is of the load. Over half of it the play closes.
+FRICTION_M = 2e-3
+
+
+class Feature(NamedTuple):
+    """A cause that moves one joint.
+
+    Attributes:
+        name: of the coefficient.
+        kind: "gain", "wave", "ripple", "backlash", "slack" or "sag".
+        joint: 0 to 5.
+        unit: of the coefficient.
+        detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose weight sags; (0, 0) elsewhere.
+    """
+
+    name: str
+    kind: str
+    joint: int
+    unit: str
+    detail: tuple[int, int] = (0, 0)
+
+
+def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
+    """Return every cause there is; ``backlash`` where directions of approach are known; the ripples' harmonics."""
+    found = []
+    for i in range(6):
+        found.append(Feature(f"gain{i + 1}", "gain", i, "rad/rad"))
+        for n in (*WAVES, *ripples):
+            kind = "wave" if n in WAVES else "ripple"
+            found += [Feature(f"{kind}{i + 1}_{w}{n}", kind, i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
+        if backlash:
+            found.append(Feature(f"backlash{i + 1}", "backlash", i, "rad"))
+        found.append(Feature(f"slack{i + 1}", "slack", i, "rad"))
+        found += [Feature(f"sag{i + 1}_{j + 1}", "sag", i, "rad/m", (j, 0)) for j in range(i, 6)]
+    return tuple(found)
+
+
+def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | None, up_base: Array) -> Array:
+    """Return what one unit of every coefficient adds to its joint's angle.
+
+    Args:
+        arm: the nominal arm, whose links the levers of sag are taken from.
+        features: F of them.
+        q: (N, 6) joint angles, rad.
+        approach: (N, 6) directions of approach, or None.
+        up_base: (3,) unit vector against gravity, base.
+
+    Returns:
+        (N, F).
+    """
+    out = np.zeros((len(q), len(features)))
+    weighty = any(f.kind in ("sag", "slack") for f in features)
+    levers = _levers(arm, q, up_base) if weighty else np.zeros((len(q), 6, 6))
+    for k, f in enumerate(features):
+        angle = q[:, f.joint]
+        if f.kind == "gain":
+            out[:, k] = angle
+        elif f.kind in ("wave", "ripple"):
+            n, phase = f.detail
+            out[:, k] = np.cos(n * angle) if phase else np.sin(n * angle)
+        elif f.kind == "backlash" and approach is not None:
+            out[:, k] = -0.5 * approach[:, f.joint]
+        elif f.kind == "slack":
+            out[:, k] = 0.5 * _side(_weight_lever(arm, levers, f.joint), approach, f.joint)
+        elif f.kind == "sag":
+            out[:, k] = levers[:, f.joint, f.detail[0]]
+    return out
+
+
+def _weight_lever(arm: Arm, levers: Array, joint: int) -> Array:
+    """Return the lever (N,), m, of the weight beyond a joint, if links are rods that are all equally heavy by the metre."""
+    mass = np.hypot(arm.a, arm.d)[joint:] + 1e-9
+    beyond = np.cumsum(mass[::-1])[::-1] - 0.5 * mass  # of a link's own vector: half of itself, and all that follows
+    return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
+
+
+def _side(lever: Array, approach: Array | None, joint: int) -> Array:
+    """Return on which side of its play a link lies (N,), -1 to 1: weight's, or where that is weaker that of friction.
+
+    Near where one gives way to the other it is the mean of both sides, by how likely each is; where the side that it came
+    from is not known, it is so from there to as far on the other side.
+    """
+    if np.abs(lever).max(initial=0.0) < FRICTION_M:
+        return np.zeros(len(lever))  # it carries nothing: that is what ``backlash`` is for
+    side = np.zeros(len(lever)) if approach is None else approach[:, joint]
+    return np.asarray(np.tanh((lever - FRICTION_M * side) / (FRICTION_M * (1 - 0.5 * np.abs(side)))))
+
+
+def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
+    """Return z_i . (L_j x g) (N, 6, 6) for unit gravity g: m of lever of link j about joint i, by the joint's direction."""
+    T = arm.T_base_0
+    modified = arm.convention == "modified"
+    m = motion(nominal_table(arm), arm.direction * q, modified, T[:3, :3], T[:3, 3])
+    z, at = m.axis[:, OFFSET], np.concatenate([m.through[:, OFFSET], m.o[None]])
+    pull = np.cross(at[1:] - at[:-1], -up_base)  # link j goes from axis j to axis j + 1
+    return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
+
+
+def approaches(measured: Measured) -> bool:
+    """Say whether directions of approach are known."""
+    return measured.approach is not None and bool(np.any(measured.approach != 0))
+
+
 BASE = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
-_LENGTHS = (chain.D, chain.A)
+_LENGTHS = (D, A)
 
 
 @dataclass(frozen=True)
@@ -81,7 +293,7 @@ class Model(Record):
         if self.full:
             found += [Parameter(f"tool1_r{axis}", "tool", "rad", -1) for axis in "xyz"]
         for i in range(6):
-            for c, column in enumerate(chain.COLUMNS):
+            for c, column in enumerate(COLUMNS):
                 found.append(Parameter(f"{column}{i + 1}", column, "m" if c in _LENGTHS else "rad", i))
         found += [Parameter(f.name, f.kind, f.unit, f.joint) for f in self.features]
         return tuple(found)
@@ -109,11 +321,11 @@ class Model(Record):
     def nominal(self) -> Array:
         """Return the vector of the nominal arm, its base at the rig and its tool at frame 6."""
         x = np.zeros(len(self.parameters))
-        x[self.table_at : self.causes_at] = chain.nominal_table(self.arm).ravel()
+        x[self.table_at : self.causes_at] = nominal_table(self.arm).ravel()
         return x
 
     def table(self, x: Array) -> Array:
-        """Return the table (6, 5) of a vector, by ``chain.COLUMNS``."""
+        """Return the table (6, 5) of a vector, by ``COLUMNS``."""
         return x[self.table_at : self.causes_at].reshape(6, 5)
 
     def T_rig_base(self, x: Array) -> Array:
@@ -150,17 +362,17 @@ class Model(Record):
                 out[:, f.joint] += self.arm.direction[f.joint] * x[self.causes_at + k] * phi[:, k]
         return np.asarray(out)
 
-    def motion(self, x: Array, q: Array, phi: Array) -> chain.Motion:
+    def motion(self, x: Array, q: Array, phi: Array) -> Motion:
         """Return frame 6 in the rig, and how it moves."""
         T = self.T_rig_base(x) @ self.arm.T_base_0
         modified = self.arm.convention == "modified"
-        return chain.motion(self.table(x), self.theta(x, q, phi), modified, T[:3, :3], T[:3, 3])
+        return motion(self.table(x), self.theta(x, q, phi), modified, T[:3, :3], T[:3, 3])
 
     def residuals(self, x: Array, measured: Measured, phi: Array) -> Array:
         """Return predicted minus measured, (N, M); see :class:`Measured` for its axes."""
         return self._residuals(self.motion(x, measured.q, phi), x, measured)
 
-    def _residuals(self, m: chain.Motion, x: Array, measured: Measured) -> Array:
+    def _residuals(self, m: Motion, x: Array, measured: Measured) -> Array:
         t = self.tool_points(x)
         off = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2) - measured.p_rig
         if measured.R_rig_body is None:
@@ -181,31 +393,29 @@ class Model(Record):
             J[:, rows, 0:3] = np.eye(3)
             J[:, rows, 3:6] = -skew(p - x[:3]) @ _left_jacobian(x[3:6])
             J[:, rows, self.tool_at + 3 * k : self.tool_at + 3 * k + 3] = m.R
-            table = chain.point_derivative(m, p)
+            table = point_derivative(m, p)
             J[:, rows, at : self.causes_at] = table.reshape(30, n, 3).transpose(1, 2, 0)
             if self.features:
-                moved = table[ways, chain.OFFSET] * (by_theta[:, None] * phi.T)[..., None]
+                moved = table[ways, OFFSET] * (by_theta[:, None] * phi.T)[..., None]
                 J[:, rows, self.causes_at :] = moved.transpose(1, 2, 0)
         if measured.R_rig_body is not None:
             self._turn_rows(m, x, measured, phi, e, J)
         return e, J
 
-    def _turn_rows(self, m: chain.Motion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:
+    def _turn_rows(self, m: Motion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:
         """Fill in the derivative of full poses: the body's axes, and the turn."""
         assert measured.R_rig_body is not None  # for the type checker: the caller has looked
         n, at, ways = len(measured), self.table_at, self._ways(phi)
         J[:, :3] = measured.R_rig_body.swapaxes(1, 2) @ J[:, :3]
         R_hat = m.R @ self.T_6_body(x)[:3, :3]
         to_log = (np.eye(3) + 0.5 * skew(e[:, 3:]) + _second(e[:, 3:])) @ R_hat.swapaxes(1, 2)
-        turn = chain.turn_derivative(m)
+        turn = turn_derivative(m)
         W = np.zeros((n, 3, J.shape[2]))
         W[:, :, 3:6] = _left_jacobian(x[3:6])
         W[:, :, at : self.causes_at] = turn.reshape(30, n, 3).transpose(1, 2, 0)
         if self.features:
             way = self.arm.direction[[f.joint for f in self.features]]
-            W[:, :, self.causes_at :] = (turn[ways, chain.OFFSET] * (way[:, None] * phi.T)[..., None]).transpose(
-                1, 2, 0
-            )
+            W[:, :, self.causes_at :] = (turn[ways, OFFSET] * (way[:, None] * phi.T)[..., None]).transpose(1, 2, 0)
         J[:, 3:] = to_log @ W
         J[:, 3:, at - 3 : at] = (to_log @ R_hat) @ _left_jacobian(-x[at - 3 : at])
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.identify import chain
+from armsight.loop.identify import model as chain
 from armsight.loop.identify.fit import Mask, weighted
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model

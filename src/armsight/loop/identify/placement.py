@@ -13,7 +13,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import log_so3
-from armsight.loop.handeye_start import starts
+from armsight.loop.handeye.handeye import starts
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 

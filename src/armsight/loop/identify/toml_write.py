@@ -8,7 +8,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.geometry.rotation import quaternion_wxyz
-from armsight.loop.identify import chain
+from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 
 #: Attribute of the arm -> its unit: what an identification leaves as it was, so that the file holds the whole arm.

@@ -13,12 +13,12 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.identify.fit import fit, noise_cov
-from armsight.loop.identify.selection import PLACEMENT
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import placed
+from armsight.loop.identify.selection import PLACEMENT
 
 #: Another set-up: the error is this many times that of base and tool placed anew,
 OTHER = 5.0

@@ -12,7 +12,7 @@ from scipy.special import chdtri, stdtrit
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283.poses import repeatability
-from armsight.loop.iso9283.statistic import (DRAWS, HIGH, WIDE, Figure, beyond_noise, drawn, lengths, mean_errors)
+from armsight.loop.iso9283.statistic import DRAWS, HIGH, WIDE, Figure, beyond_noise, drawn, lengths, mean_errors
 
 #: Degrees on either side of a reversal that are left out, and that are used, where its step is read off. Until play is
 #: taken up the axis stands still: on the first 8 degrees play of up to 1 % of the radius is, 1 - cos 8 degrees.

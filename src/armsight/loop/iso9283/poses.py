@@ -15,7 +15,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
-from armsight.loop.iso9283.statistic import (Figure, beyond_noise, drawn, group_errors, lengths, mean_errors, scatter)
+from armsight.loop.iso9283.statistic import Figure, beyond_noise, drawn, group_errors, lengths, mean_errors, scatter
 
 #: Fewest attained poses of which a scatter is told.
 LEAST = 3

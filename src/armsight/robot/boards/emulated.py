@@ -28,7 +28,7 @@ from armsight.robot.boards.frames import (
     VERSION,
     WIRE_BYTES,
 )
-from armsight.robot.boards.machine import Machine, Plant
+from armsight.robot.boards.link import Machine, Plant
 
 TICK_S = 0.001
 _BITS_PER_BYTE = 10

@@ -13,7 +13,7 @@ from armsight.robot.boards.frames import ANSWER, REQUEST
 
 
 class HostMachine:
-    """The board's code in a shared library, behind :class:`~armsight.robot.boards.machine.Machine`.
+    """The board's code in a shared library, behind :class:`~armsight.robot.boards.link.Machine`.
 
     Args:
         library: of the board ``host``.

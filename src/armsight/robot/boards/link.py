@@ -1,8 +1,56 @@
-"""The contract of a link: bytes to a board and back. To add one: one file with a class that fulfils :class:`Link`."""
+"""The contract of a link: bytes to a board and back. To add one: one file with a class that fulfils :class:`Link`.
+
+The contracts on the far side of an emulated board: the machine that runs the firmware, and the arm it drives.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+
+
+class Sensed(NamedTuple):
+    """What a board's converters read at the beginning of a tick; a tuple, as one is made every millisecond.
+
+    Attributes:
+        counts: (6,) potentiometers, 16-bit fractions of their supply, uint32.
+        current_ma: (6,) size of the motor currents, mA, uint32.
+        supply_mv: motor supply, mV.
+        stop_pressed: whether the emergency stop button is pressed.
+    """
+
+    counts: NDArray[np.uint32]
+    current_ma: NDArray[np.uint32]
+    supply_mv: int = 24000
+    stop_pressed: bool = False
+
+
+class Plant(Protocol):
+    """The arm at a board's motors: duties go in, readings come out. Steps are 1 ms."""
+
+    def sense(self) -> Sensed:
+        """Return what the converters read now."""
+        ...
+
+    def step(self, duty: Array, drives_on: bool) -> None:
+        """Let 1 ms pass with these duties (6,), -1 to 1, held; with ``drives_on`` False the drivers are switched off."""
+        ...
+
+
+class Machine(Protocol):
+    """Runs the firmware's ``pil`` board in lock-step: one frame in, one tick, one frame out."""
+
+    def tick(self, request: bytes) -> bytes:
+        """Run one tick on a request frame (``pil_request``) and return the answer frame (``pil_answer``)."""
+        ...
+
+    def close(self) -> None:
+        """End the emulation; harmless when called twice."""
+        ...
 
 
 class Link(Protocol):

@@ -24,7 +24,7 @@ _END_S = 5.0
 
 
 class QemuMachine:
-    """The board's image in QEMU, behind :class:`~armsight.robot.boards.machine.Machine`.
+    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Machine`.
 
     Args:
         image: ELF file of the board ``pil``.

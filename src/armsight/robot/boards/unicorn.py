@@ -28,7 +28,7 @@ _END = _CALL + 12
 
 
 class UnicornMachine:
-    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.machine.Machine`.
+    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.link.Machine`.
 
     Args:
         image: ELF file of the board ``pil``.

@@ -2,6 +2,10 @@
 
 Where the arm has a closed form, its solutions are measured against the true table and polished if rounding, or a table
 that has the structure only nearly, left them off. Where it has none, damped least squares starts from many places.
+
+A wanted pose as it comes in: whether it is a rigid motion, and its rotation put right to the last place.
+
+Rows of the inverse's answer: what their columns are, limits, whole turns, doubles and order.
 """
 
 from __future__ import annotations
@@ -12,27 +16,125 @@ import numba
 import numpy as np
 
 from armsight.data import Array, Ids
+from armsight.robot.kinematics.batch import errors, frames, thetas
 from armsight.robot.kinematics.chain import Frame, after, before, tool_frame
 from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
 from armsight.robot.kinematics.descent import WORK, descend, pose_error
-from armsight.robot.kinematics.batch import errors, frames, thetas
-from armsight.robot.kinematics.rigid import rigid
-from armsight.robot.kinematics.rows import (
-    ANGLE,
-    CONFIGURATION,
-    KEY,
-    MOST,
-    OUTSIDE,
-    POSITION,
-    STATE,
-    known,
-    place,
-    placed,
-    sort,
-    wrap,
-)
 from armsight.robot.kinematics.table import KIND, UNBASE, UNTOOL
 from armsight.robot.kinematics.trig import angle_of_each, sincos_each
+
+#: Verdicts on a pose, beside 0.
+NOT_FINITE, NOT_RIGID = -1, -2
+#: A rotation may be off by this much and is then put right.
+_NEARLY_RIGID = 1e-6
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+
+
+@_kernel
+def rigid(T: Array) -> tuple[int, Frame]:
+    """Return the verdict on a transform (4, 4), and its frame with the rotation put right."""
+    total = 0.0
+    for i in range(4):
+        for j in range(4):
+            total += T[i, j] * 0.0
+    xx, xy, xz, yx, yy, yz = T[0, 0], T[1, 0], T[2, 0], T[0, 1], T[1, 1], T[2, 1]
+    zx, zy, zz, px, py, pz = T[0, 2], T[1, 2], T[2, 2], T[0, 3], T[1, 3], T[2, 3]
+    verdict = 0
+    if total != 0.0:
+        verdict = NOT_FINITE
+    else:
+        handed = (xy * yz - xz * yy) * zx + (xz * yx - xx * yz) * zy + (xx * yy - xy * yx) * zz
+        if handed < 0.0 or T[3, 0] != 0.0 or T[3, 1] != 0.0 or T[3, 2] != 0.0 or T[3, 3] != 1.0:
+            verdict = NOT_RIGID
+    for _ in range(2):
+        a, b = (0.5 * (xx * xx + xy * xy + xz * xz - 1.0), 0.5 * (yx * yx + yy * yy + yz * yz - 1.0))
+        c, d = (0.5 * (zx * zx + zy * zy + zz * zz - 1.0), 0.5 * (xx * yx + xy * yy + xz * yz))
+        e, f = 0.5 * (xx * zx + xy * zy + xz * zz), 0.5 * (yx * zx + yy * zy + yz * zz)
+        off = max(max(abs(a), abs(b), abs(c)), max(abs(d), abs(e), abs(f)))
+        if off > _NEARLY_RIGID and verdict == 0:
+            verdict = NOT_RIGID
+        if off < 1e-15 or verdict != 0:
+            break
+        # R (3 I - R^T R) / 2 has the same rotation and the square of the error (Bjorck and Bowie, 1971).
+        xx, yx, zx = (xx - a * xx - d * yx - e * zx, yx - d * xx - b * yx - f * zx, zx - e * xx - f * yx - c * zx)
+        xy, yy, zy = (xy - a * xy - d * yy - e * zy, yy - d * xy - b * yy - f * zy, zy - e * xy - f * yy - c * zy)
+        xz, yz, zz = (xz - a * xz - d * yz - e * zz, yz - d * xz - b * yz - f * zz, zz - e * xz - f * yz - c * zz)
+    return verdict, (xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz)
+
+
+#: Most solutions that are looked for: eight where there is a closed form; a general arm has up to sixteen.
+MOST = 16
+#: Columns of a row: six joint angles, position error, orientation error, shoulder, elbow, wrist (+-1, or 0 where the arm
+#: has no structure), state, and the key by which rows are ordered.
+POSITION, ANGLE, CONFIGURATION, STATE, KEY, WIDTH = 6, 7, 8, 11, 12, 13
+#: Bit of a row's state beside those of ``closed``: a joint is beyond its limits.
+OUTSIDE = 8
+
+#: Two solutions that differ less than this in every joint, rad, are one.
+_SAME_RAD = 1e-7
+_TURN = 2.0 * np.pi
+#: Added to the key of a row outside the limits: more than any distance.
+_LAST = 1e9
+
+
+@_kernel
+def wrap(q: float) -> float:
+    """Bring an angle into (-pi, pi]."""
+    turns: float = np.ceil((q - np.pi) / _TURN)
+    return q - _TURN * turns
+
+
+@_kernel
+def placed(q: float, low: float, high: float, goal: float) -> tuple[float, bool]:
+    """Return the angle, whole turns apart, that lies within the limits and nearest a goal; and whether there is one."""
+    least, most = (np.ceil((low - q) / _TURN - 1e-13), np.floor((high - q) / _TURN + 1e-13))
+    wanted = np.floor((goal - q) / _TURN + 0.5)
+    inside = least <= most
+    held = min(most, max(least, wanted))
+    turned = q + _TURN * (held if inside else wanted)
+    # A joint that rounding put over its limit is put on it.
+    return (min(high, max(low, turned)) if inside else turned), inside
+
+
+@_kernel
+def known(rows: Array, count: int) -> bool:
+    """Say whether row ``count`` stands among the rows before it."""
+    for k in range(count):
+        same = True
+        for i in range(6):
+            apart = abs(wrap(rows[k, i] - rows[count, i]))
+            if apart > _SAME_RAD:
+                same = False
+                break
+        if same:
+            return True
+    return False
+
+
+@_kernel
+def place(limits: Array, near: Array, ordered: bool, row: Array) -> None:
+    """Turn a row's joints within the limits, and write its state and key."""
+    outside, distance = False, 0.0
+    for i in range(6):
+        row[i], inside = placed(row[i], limits[0, i], limits[1, i], near[i])
+        outside = outside or not inside
+        distance += (row[i] - near[i]) ** 2
+    if outside:
+        row[STATE] += OUTSIDE
+    row[KEY] = (distance if ordered else 0.0) + (_LAST if outside else 0.0)
+
+
+@_kernel
+def sort(rows: Array, count: int) -> None:
+    """Order rows by their keys; equal ones keep their order."""
+    for k in range(1, count):
+        j = k
+        while j > 0 and rows[j - 1, KEY] > rows[j, KEY]:
+            for i in range(WIDTH):
+                rows[j - 1, i], rows[j, i] = rows[j, i], rows[j - 1, i]
+            j -= 1
+
 
 #: Size of a call's workspace: the lanes' sines, cosines, angles, thetas, frames, tags, errors; and that of the descent.
 SCRATCH = 4 * 48 + 96 + 32 + 16 + 6 * WORK
@@ -44,8 +146,6 @@ _POLISHED, _WRONG = 1e-12, 3e-10
 _STARTS, _NEAREST_STARTS, _STEPS, _LONG_STEPS = 64, 8, 20, 200
 #: Bounds of a joint that has none, rad.
 _FAR = 1e9
-
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel

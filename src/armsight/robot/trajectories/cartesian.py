@@ -13,9 +13,9 @@ from armsight.errors import InputError
 from armsight.robot.trajectories.chain import fit_chain
 from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, time_of
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
+from armsight.robot.trajectories.lookahead import Obstacle, Walk, derivatives, refined, walk
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped, pieces
-from armsight.robot.trajectories.lookahead import (Obstacle, Walk, derivatives, refined, walk)
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

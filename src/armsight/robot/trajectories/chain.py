@@ -17,9 +17,9 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.trajectories.law import CLOSE, SCALES, SHAPES, Law, along, bounds, keeps, slower
 from armsight.robot.trajectories.limits import ROUNDING, stretches
+from armsight.robot.trajectories.lookahead import Walk
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, check_times, clamped
-from armsight.robot.trajectories.lookahead import Walk
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

@@ -18,9 +18,9 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.trajectories.limits import ROUNDING, stretches, worst
+from armsight.robot.trajectories.lookahead import Walk, columns
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_times
-from armsight.robot.trajectories.lookahead import Walk, columns
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

@@ -20,6 +20,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.rotation import log_so3
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
+from armsight.robot.trajectories.lookahead import behind
 from armsight.robot.trajectories.path import Path, Places
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import (
@@ -29,7 +30,6 @@ from armsight.robot.trajectories.trajectory import (
     check_duration,
     clamped,
 )
-from armsight.robot.trajectories.lookahead import behind
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm

@@ -13,11 +13,8 @@ import numba
 import numpy as np
 
 from armsight.data import Array, Ids, Image
-from armsight.sim.cell_noise import Window
-from armsight.sim.render.optics import Radiance, gather_parts, spread_down
-from armsight.sim.render.paint import paint
-from armsight.sim.paint_disc import paint_disc
-from armsight.sim.paint_parts import SUB, Slots
+from armsight.sim.render.optics import Radiance, Window, gather_parts, spread_down
+from armsight.sim.render.paint import SUB, Slots, paint, paint_disc
 from armsight.sim.render.scene import CLEAR, Pattern
 
 

@@ -8,16 +8,398 @@ of each is exact in area: one edge, or the rim of a disc, cuts a square in two, 
 straight within a part but for a bend that is put in by its mean); where several edges meet, a part is clipped by them
 (``paint_clip``). The parts are kept, so that the blur of the lens can be laid over what is
 really there and not over whole pixels.
+
+What cells and discs are painted with: pixels cast on to a plane, pixels split into parts, straight cuts through squares.
+
+See ``paint``. numba's cache on disk looks at the age of the file that calls: after a change here, or in another of the
+painter's files, delete the cache of all of them.
+
+Cells of a grid where several edges meet in a pixel: which cell a place lies in, and areas clipped by cells.
+
+See ``paint``; polygons are clipped by half planes (Sutherland and Hodgman, CACM 17(1), 1974).
+
+Paint discs as ``paint`` paints cells: a rim is straight within a part of a pixel but for its mean bend there.
 """
 
 from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.sim.paint_clip import VERTICES, Grid, Span, cell_of, cells_of, clip_parts, part_corners, span_of, uniform
-from armsight.sim.paint_parts import SUB, Box, Slots, ahead_of, open_parts, plane_row
+
+#: Parts of an edge pixel along each side.
+SUB = 4
+
+Slots = NDArray[np.int32]
+Box = tuple[int, int, int, int]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def half(c: float, u: float, v: float) -> float:
+    """Return in which share of the square with sides from -1/2 to 1/2 the plane c + u x + v y is above zero."""
+    u, v = abs(u), abs(v)
+    if u < v:
+        u, v = v, u
+    if 2 * abs(c) >= u + v:
+        return 1.0 if c > 0.0 else 0.0
+    if 2 * abs(c) <= u - v:
+        return 0.5 + c / u
+    corner = 0.5 * (u + v) - abs(c)
+    share = corner * corner / (2 * u * v)
+    return 1.0 - share if c > 0.0 else share
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def square_of(top: Array, bottom: Array, k: int, out: Array) -> None:
+    """Write out (4, 3), what interpolates the area between points k and k + 1 of two lines: middle, slopes, twist."""
+    for c in range(3):
+        a, b, d, e = top[c, k], top[c, k + 1], bottom[c, k], bottom[c, k + 1]
+        out[0, c] = 0.25 * (a + b + d + e)
+        out[1, c] = 0.5 * (b - a + e - d)
+        out[2, c] = 0.5 * (d - a + e - b)
+        out[3, c] = a - b - d + e
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> bool:
+    """Cast n pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; tell if all see it."""
+    least = np.inf
+    for k in range(n):
+        x, y, z = rays[v, u0 + k, 0], rays[v, u0 + k, 1], rays[v, u0 + k, 2]
+        for c in range(3):
+            out[c, k] = M[c, 0] * x + M[c, 1] * y + M[c, 2] * z
+        least = min(least, out[2, k])
+    return least > 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def ahead_of(top: Array, bottom: Array, k: int) -> bool:
+    """Tell whether points k and k + 1 of two lines see the plane before them."""
+    return bool(min(min(top[2, k], top[2, k + 1]), min(bottom[2, k], bottom[2, k + 1])) > 0.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: int) -> tuple[Array, int, int]:
+    """Return the parts of a pixel, making them from its one value where it has none yet: parts, slot, count."""
+    if slot[v, u] >= 0:
+        return fine, slot[v, u], count
+    if count == fine.shape[0]:
+        grown = np.empty((2 * count, SUB, SUB))
+        grown[:count] = fine
+        fine = grown
+    for a in range(SUB):  # numba is slow at filling such a small part of an array
+        for b in range(SUB):
+            fine[count, a, b] = coarse[v, u]
+    slot[v, u] = count
+    return fine, count, count + 1
+
+
+#: A square cut by two pairs of lines has at most 8 corners.
+VERTICES = 12
+
+Grid = tuple[Array, Array, Array]
+Span = tuple[int, int, int, int]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _area(p: Array, n: int) -> float:
+    """Return the area of the polygon p (n, 5) in its first two columns."""
+    twice = 0.0
+    for i in range(n):
+        j = i + 1 if i + 1 < n else 0
+        twice += p[i, 0] * p[j, 1] - p[j, 0] * p[i, 1]
+    return 0.5 * abs(twice)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _split(p: Array, n: int, axis: int, edge: float, low: Array, high: Array) -> tuple[int, int]:
+    """Split the convex polygon p (n, 5) where homogeneous coordinate ``axis`` equals ``edge``; return both counts."""
+    n_low = n_high = 0
+    for i in range(n):
+        j = i + 1 if i + 1 < n else 0
+        g_i = p[i, axis] - edge * p[i, 4]
+        g_j = p[j, axis] - edge * p[j, 4]
+        for c in range(5):
+            if g_i < 0.0:
+                low[n_low, c] = p[i, c]
+            else:
+                high[n_high, c] = p[i, c]
+        n_low, n_high = n_low + int(g_i < 0.0), n_high + int(not g_i < 0.0)
+        if (g_i < 0.0) != (g_j < 0.0):
+            t = g_i / (g_i - g_j)
+            for c in range(5):
+                cut = p[i, c] + t * (p[j, c] - p[i, c])
+                low[n_low, c] = cut
+                high[n_high, c] = cut
+            n_low += 1
+            n_high += 1
+    return n_low, n_high
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cell_of(edges: Array, x: float, w: float, i: int) -> int:
+    """Return which cell x / w lies in, starting to look at i: 0 before the first edge, len(edges) past the last."""
+    while i > 0 and x < edges[i - 1] * w:
+        i -= 1
+    while i < edges.size and x >= edges[i] * w:
+        i += 1
+    return i
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cells_of(points: Array, xe: Array, ye: Array, n: int, out: Slots) -> None:
+    """Write out (n,) in which cell each homogeneous plane point (3, n) lies: its row times the columns, and its column."""
+    i = j = 0
+    for k in range(n):
+        i, j = cell_of(xe, points[0, k], points[2, k], i), cell_of(ye, points[1, k], points[2, k], j)
+        out[k] = j * (xe.size + 1) + i
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def span_of(a: Slots, b: Slots, k: int, columns: int) -> Span:
+    """Return the first and last column and row of the cells of points k and k + 1 of two lines a, b (n,)."""
+    i0, i1 = min(a[k] % columns, a[k + 1] % columns), max(a[k] % columns, a[k + 1] % columns)
+    j0, j1 = min(a[k], a[k + 1]), max(a[k], a[k + 1])
+    for m in (k, k + 1):
+        i0, i1 = min(i0, b[m] % columns), max(i1, b[m] % columns)
+        j0, j1 = min(j0, b[m]), max(j1, b[m])
+    return i0, i1, j0 // columns, j1 // columns
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def uniform(values: Array, span: Span) -> bool:
+    """Tell whether all cells of a span have one value."""
+    i0, i1, j0, j1 = span
+    first = values[j0, i0]
+    for j in range(j0, j1 + 1):
+        for i in range(i0, i1 + 1):
+            if values[j, i] != first:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _clip(c: Array, grid: Grid, span: Span, old: float, b: Array) -> float:
+    """Return the mean value over the area between corners c (4, 3) that spans several cells; ``old`` where clear."""
+    xe, ye, values = grid
+    i0, i1, j0, j1 = span
+    rest, spare, strip, spare_strip, piece = b[0], b[1], b[2], b[3], b[4]
+    for n in range(4):
+        # In the area's own square coordinates the corners are (0, 0), (1, 0), (1, 1), (0, 1).
+        rest[n, 0] = 1.0 if n in (1, 2) else 0.0
+        rest[n, 1] = 1.0 if n >= 2 else 0.0
+        for k in range(3):
+            rest[n, 2 + k] = c[n, k]
+    total, n_rest = 0.0, 4
+    for i in range(i0, i1 + 1):
+        n_strip, n_rest = _split(rest, n_rest, 2, xe[i] if i < i1 else np.inf, strip, spare)
+        rest, spare = spare, rest
+        for j in range(j0, j1 + 1):
+            n_piece, n_strip = _split(strip, n_strip, 3, ye[j] if j < j1 else np.inf, piece, spare_strip)
+            strip, spare_strip = spare_strip, strip
+            total += _area(piece, n_piece) * (values[j, i] if values[j, i] >= 0.0 else old)
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def part_corners(top: Array, bottom: Array, k: int, out: Array) -> None:
+    """Interpolate the corners of a pixel's parts, out (SUB + 1, 3, SUB + 1), from those of pixel k of a row."""
+    for a in range(SUB + 1):
+        t = a / SUB
+        for b in range(SUB + 1):
+            s = b / SUB
+            for c in range(3):
+                upper = top[c, k] + s * (top[c, k + 1] - top[c, k])
+                lower = bottom[c, k] + s * (bottom[c, k + 1] - bottom[c, k])
+                out[a, c, b] = upper + t * (lower - upper)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _corners(top: Array, bottom: Array, k: int, c: Array) -> None:
+    """Gather c (4, 3), in turn around it, the corners of the area between points k and k + 1 of two lines (3, n)."""
+    for n in range(3):
+        c[0, n], c[1, n], c[2, n], c[3, n] = top[n, k], top[n, k + 1], bottom[n, k + 1], bottom[n, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def clip_parts(fan: Array, cells: Slots, grid: Grid, parts: Array, buffer: Array) -> None:
+    """Repaint the parts (SUB, SUB) of a pixel whose part corners lie at fan (SUB + 1, 3, SUB + 1) of the plane."""
+    xe, ye, values = grid
+    c = buffer[5, :4, :3]
+    for a in range(SUB + 1):
+        cells_of(fan[a], xe, ye, SUB + 1, cells[a])
+    for a in range(SUB):
+        for b in range(SUB):
+            span = span_of(cells[a], cells[a + 1], b, xe.size + 1)
+            if not uniform(values, span):
+                _corners(fan[a], fan[a + 1], b, c)
+                parts[a, b] = _clip(c, grid, span, parts[a, b], buffer)
+            elif values[span[2], span[0]] >= 0.0:
+                parts[a, b] = values[span[2], span[0]]
+
+
+Line = tuple[float, float, float]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
+    """Return the ends of the line c + u x + v y = 0 within the square of :func:`half`; its middle where it misses."""
+    turned = abs(u) < abs(v)
+    if turned:
+        u, v = v, u
+    if 2 * abs(c) >= abs(u) + abs(v) or u == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    per = 1.0 / u
+    x0, y0, x1, y1 = (0.5 * v - c) * per, -0.5, (-0.5 * v - c) * per, 0.5
+    if abs(x0) > 0.5:
+        x0 = 0.5 if x0 > 0.0 else -0.5
+        y0 = -(c + u * x0) / v
+    if abs(x1) > 0.5:
+        x1 = 0.5 if x1 > 0.0 else -0.5
+        y1 = -(c + u * x1) / v
+    return (y0, x0, y1, x1) if turned else (x0, y0, x1, y1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inside_rim(x: Line, y: Line, w: Line) -> float:
+    """Return in which share of an area a disc is whose rim is nearly straight there.
+
+    Args:
+        x: offset from the disc's centre, homogeneous: in the area's middle, and its slopes across and down.
+        y: the same down.
+        w: the same of the radius.
+    """
+    away = max(np.sqrt(x[0] * x[0] + y[0] * y[0]), 1e-3 * w[0])
+    per = 1.0 / away
+    u, v = w[1] - (x[0] * x[1] + y[0] * y[1]) * per, w[2] - (x[0] * x[2] + y[0] * y[2]) * per
+    c = w[0] - away
+    # The rim bends away from its tangent, by the mean square of the way along it within the area, over its diameter.
+    su, sv, eu, ev = _chord(c, u, v)
+    sx, sy, ex, ey = su * x[1] + sv * x[2], su * y[1] + sv * y[2], eu * x[1] + ev * x[2], eu * y[1] + ev * y[2]
+    way = (sx * (sx + ex) + ex * ex + sy * (sy + ey) + ey * ey) / 3
+    return half(c - 0.5 * max(way - c * c, 0.0) * per, u, v)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inside(points: Array, disc: Array, out: Array) -> None:
+    """Write out (n,), above zero where homogeneous plane points (3, n) lie in a disc: squares of distances within."""
+    for k in range(out.size):
+        x, y = points[0, k] - disc[0] * points[2, k], points[1, k] - disc[1] * points[2, k]
+        w = disc[2] * points[2, k]
+        out[k] = w * w - x * x - y * y
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _bulge(square: Array, disc: Array) -> float:
+    """Return twice by how much a place in a pixel may be further in a disc, as :func:`_inside` counts, than its corners."""
+    total = 0.0
+    for k in range(1, 3):
+        x, y = square[k, 0] - disc[0] * square[k, 2], square[k, 1] - disc[1] * square[k, 2]
+        total += 0.5 * (x * x + y * y)
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _about(square: Array, n: int, scale: float, offset: float) -> tuple[float, float, float, float]:
+    """Return ``scale`` times coordinate n of a pixel less ``offset`` times its last: middle, slopes, twist."""
+    return (
+        scale * square[0, n] - offset * square[0, 2],
+        scale * square[1, n] - offset * square[1, 2],
+        scale * square[2, n] - offset * square[2, 2],
+        scale * square[3, n] - offset * square[3, 2],
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint_rim(square: Array, disc: Array, fine: Array, s: int) -> None:
+    """Repaint the parts fine[s] (SUB, SUB) of a pixel that a disc's rim crosses."""
+    x, y, w = _about(square, 0, 1.0, disc[0]), _about(square, 1, 1.0, disc[1]), _about(square, 2, disc[2], 0.0)
+    # By how much the square of the distance within may change in half a part, at most.
+    steep = abs(w[0] * w[1] - x[0] * x[1] - y[0] * y[1]) + abs(w[0] * w[2] - x[0] * x[2] - y[0] * y[2])
+    most = (steep + 2 * (x[1] * x[1] + x[2] * x[2] + y[1] * y[1] + y[2] * y[2])) / SUB
+    for a in range(SUB):
+        down = (a + 0.5) / SUB - 0.5
+        for b in range(SUB):
+            across = (b + 0.5) / SUB - 0.5
+            both = across * down
+            px = x[0] + across * x[1] + down * x[2] + both * x[3]
+            py = y[0] + across * y[1] + down * y[2] + both * y[3]
+            pw = w[0] + across * w[1] + down * w[2] + both * w[3]
+            inside = pw * pw - px * px - py * py
+            if inside > most:
+                fine[s, a, b] = disc[3]
+            elif inside > -most:
+                share = _inside_rim(
+                    (px, (x[1] + down * x[3]) / SUB, (x[2] + across * x[3]) / SUB),
+                    (py, (y[1] + down * y[3]) / SUB, (y[2] + across * y[3]) / SUB),
+                    (pw, (w[1] + down * w[3]) / SUB, (w[2] + across * w[3]) / SUB),
+                )
+                fine[s, a, b] += share * (disc[3] - fine[s, a, b])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def paint_disc(
+    rays: Array,
+    Ms: Array,
+    box: Box,
+    corner: tuple[int, int],
+    disc: Array,
+    coarse: Array,
+    slot: Slots,
+    fine: Array,
+    count: int,
+) -> tuple[Array, int]:
+    """Paint a disc.
+
+    Args:
+        rays: see :func:`paint`.
+        Ms: see there.
+        box: see there.
+        corner: see there.
+        disc: (4,) centre x, y, radius and value.
+        coarse: see there.
+        slot: see there.
+        fine: see there.
+        count: see there.
+
+    Returns:
+        As there.
+    """
+    u0, v0, u1, v1 = box
+    n = u1 - u0
+    if n <= 0:
+        return fine, count
+    top, bottom = np.empty((3, n + 1)), np.empty((3, n + 1))
+    inside_top, inside_bottom = np.empty(n + 1), np.empty(n + 1)
+    square, ahead = np.empty((4, 3)), False
+    for v in range(v0, v1):
+        M = Ms[min(v, Ms.shape[0] - 1)]
+        if v == v0 or Ms.shape[0] > 1:
+            ahead = plane_row(rays, M, v + corner[1], u0 + corner[0], n + 1, bottom)
+            _inside(bottom, disc, inside_bottom)
+        top, bottom, inside_top, inside_bottom = bottom, top, inside_bottom, inside_top
+        all_ahead = ahead
+        ahead = plane_row(rays, M, v + 1 + corner[1], u0 + corner[0], n + 1, bottom)
+        _inside(bottom, disc, inside_bottom)
+        all_ahead = all_ahead and ahead
+        square_of(top, bottom, n // 2, square)
+        bulge = _bulge(square, disc)
+        for k in range(n):
+            if not all_ahead and not ahead_of(top, bottom, k):
+                continue
+            low = min(min(inside_top[k], inside_top[k + 1]), min(inside_bottom[k], inside_bottom[k + 1]))
+            high = max(max(inside_top[k], inside_top[k + 1]), max(inside_bottom[k], inside_bottom[k + 1]))
+            if low > 0.0:
+                coarse[v, u0 + k] = disc[3]
+                slot[v, u0 + k] = -1
+            elif high > -bulge:
+                fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
+                square_of(top, bottom, k, square)
+                _paint_rim(square, disc, fine, s)
+    return fine, count
+
 
 _TILE = 8  # pixels on a side that are passed over together
 

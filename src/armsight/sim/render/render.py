@@ -17,10 +17,8 @@ import numpy as np
 from armsight.data import Array, Image
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, transform
-from armsight.sim.render.optics import (Optics, Radiance, Sensor, blurred, exposed, shaded)
-from armsight.sim.render.paint import paint
-from armsight.sim.paint_disc import paint_disc
-from armsight.sim.paint_parts import SUB, Box
+from armsight.sim.render.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
+from armsight.sim.render.paint import SUB, Box, paint, paint_disc
 from armsight.sim.render.scene import CLEAR, Pattern, Placed
 from armsight.vision.camera import Camera
 

@@ -15,9 +15,8 @@ from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Reaction
 from armsight.robot.boards.configuration import CONFIG, Configuration, check_configuration
 from armsight.sim.workcell.arm import pot_travel
-from armsight.sim.workcell.motors import Motors
-from armsight.sim.cell_pots import COUNTS, HIGH_SHARE, LOW_SHARE
-from armsight.sim.cell_solids import Solids, inertia, weight_torque
+from armsight.sim.workcell.motors import Motors, Solids, inertia, weight_torque
+from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 
 #: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
 #: speed, s. As stiff as the potentiometers' noise allows: where dry friction holds a joint that is off by little, only the

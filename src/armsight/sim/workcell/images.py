@@ -4,6 +4,12 @@ The arm is cast anew within the pixels it can cover (cell_links), at the middle 
 board, a card) are painted exactly over it by ``paint``, once for about every pixel they move during the exposure, and
 what of the arm is nearer stays before them. Then the lens's blur, light and vignetting, noise and rounding, as in
 ``optics``. Noise comes from a long strip drawn once, begun elsewhere for every image.
+
+Draw the arm's links over what stands still: capsules in a camera's image, without GL.
+
+Light as in ``cell_rays``, with a Phong highlight.
+
+The cell seen from aside, in colour: arm, body, table and the two cameras that watch. For people, not for measuring.
 """
 
 from __future__ import annotations
@@ -13,19 +19,170 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numba
 import numpy as np
 
 from armsight.data import Array, Ids, Image, Record
-from armsight.geometry.pose import exp_se3, inverse, transform
-from armsight.sim import cell_links
-from armsight.sim.cell_noise import Window, exposed
-from armsight.sim.cell_scene import LAMP_BASE, View, arm_capsules, capsule_boxes, corner_rays, pixel_rays, view
-from armsight.sim.cell_solids import Solids
-from armsight.sim.render.optics import (Optics, Radiance, Sensor, part_taps, shaded, spread)
+from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.sim.render.faces import Exposure, paint_faces, palette
+from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
 from armsight.sim.render.render import OUTLINE, Shutter, outline
 from armsight.sim.render.scene import Pattern, Placed
+from armsight.sim.workcell.motors import Solids, row_frames
+from armsight.sim.workcell.plant import ArmPlant
+from armsight.sim.workcell.raycast import (
+    AMBIENT,
+    LAMP,
+    LAMP_BASE,
+    PLAIN,
+    Light,
+    View,
+    arm_capsules,
+    block,
+    capsule_boxes,
+    corner_rays,
+    furniture,
+    pixel_rays,
+    view,
+)
 from armsight.vision.camera import Camera
+from armsight.vision.rig import StereoRig
+
+#: Share of the lamp's reflection in the light.
+GLOSS = 0.25
+_TILE = 16  # pixels on a side that are passed over together
+_BALL = 1e-12  # square of the length, m^2, of what has none: it has no sides
+# Numbers of single precision, for a row is drawn in that: four times as many pixels at once.
+_ZERO, _QUARTER, _HALF, _THREE_QUARTERS, _ONE, _TWO, _LEAST = (
+    np.float32(number) for number in (0.0, 0.25, 0.5, 0.75, 1.0, 2.0, 1e-12)
+)
+_AMBIENT, _LAMP, _GLOSS = np.float32(AMBIENT), np.float32(LAMP), np.float32(GLOSS)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _axis(a: Array, b: Array, radius: float, out: Light) -> None:
+    """Write into out (14,) what of a capsule between a and b :func:`_side` and :func:`_row` ask for: all but the ray."""
+    bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    out[0], out[1], out[2] = bx, by, bz
+    out[3] = max(bx * bx + by * by + bz * bz, _BALL)
+    out[4] = -(bx * a[0] + by * a[1] + bz * a[2])
+    out[5] = radius
+    out[6], out[7], out[8] = by * a[2] - bz * a[1], bz * a[0] - bx * a[2], bx * a[1] - by * a[0]
+    out[9] = a[0] * a[0] + a[1] * a[1] + a[2] * a[2] - radius * radius
+    out[10] = b[0] * b[0] + b[1] * b[1] + b[2] * b[2] - radius * radius
+    out[11], out[12], out[13] = a[0], a[1], a[2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _side(x: float, y: float, z: float, axis: Light) -> int:
+    """Return on which side the unit ray x, y, z passes a cylinder without ends: 1, -1; 0 where it meets."""
+    if axis[3] <= _BALL:
+        return 0
+    bd = axis[0] * x + axis[1] * y + axis[2] * z
+    past = axis[6] * x + axis[7] * y + axis[8] * z
+    if past * past <= axis[5] * axis[5] * (axis[3] - bd * bd):
+        return 0
+    return 1 if past > 0.0 else -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _row(
+    x: Light,
+    y: Light,
+    z: Light,
+    axis: Light,
+    shown: tuple[np.float32, int],
+    lamp: Light,
+    light: Light,
+    depth: Light,
+    ids: Image,
+) -> None:
+    """Draw a capsule into a part of a row: its rays (n,) x, y, z; its light, depth and ids. Without branches.
+
+    Light falls off with the cosine to the lamp, and what faces away from the viewer is a little darker: that tells one
+    link from the next. ``shown`` is the capsule's albedo and its id.
+    """
+    bx, by, bz, long, ba, radius = axis[0], axis[1], axis[2], axis[3], axis[4], axis[5]
+    ax, ay, az = axis[11], axis[12], axis[13]
+    for u in range(x.size):
+        ad = ax * x[u] + ay * y[u] + az * z[u]
+        bd = bx * x[u] + by * y[u] + bz * z[u]
+        past = axis[6] * x[u] + axis[7] * y[u] + axis[8] * z[u]  # by which it passes the axis, times the next's root
+        A = max(long - bd * bd, _LEAST * long)
+        h = long * (radius * radius * A - past * past)
+        t = (long * ad + ba * bd - np.sqrt(max(h, _ZERO))) / A
+        along = (ba + t * bd) / long
+        end = _ZERO if along < _HALF else _ONE
+        # The ball at the nearer end, where the cylinder is met beyond it.
+        ed = ad + end * bd
+        ball = ed * ed - (axis[9] + end * (axis[10] - axis[9]))
+        between = _ZERO < along < _ONE
+        t = t if between else ed - np.sqrt(max(ball, _ZERO))
+        seen = (h if between else ball) >= _ZERO and _ZERO < t < depth[u]
+        along = min(max((ba + t * bd) / long, _ZERO), _ONE)
+        nx = (t * x[u] - ax - along * bx) / radius
+        ny = (t * y[u] - ay - along * by) / radius
+        nz = (t * z[u] - az - along * bz) / radius
+        cosine = nx * lamp[0] + ny * lamp[1] + nz * lamp[2]
+        away = nx * x[u] + ny * y[u] + nz * z[u]
+        lamp_d = lamp[0] * x[u] + lamp[1] * y[u] + lamp[2] * z[u]
+        mirror = max(_TWO * cosine * away - lamp_d, _ZERO) if cosine > _ZERO else _ZERO
+        square = mirror * mirror
+        square = square * square
+        square = square * square
+        shade = (_AMBIENT + _LAMP * max(cosine, _ZERO)) * (_THREE_QUARTERS - _QUARTER * away) + _GLOSS * square * square
+        light[u] = shown[0] * shade if seen else light[u]
+        depth[u] = t if seen else depth[u]
+        ids[u] = shown[1] if seen else ids[u]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def moving(
+    rays: Light,
+    window: tuple[int, int, int, int],
+    boxes_px: Ids,
+    capsules: tuple[Array, Array, Array],
+    lamp: Light,
+    light: Light,
+    depth: Light,
+    ids: Image,
+) -> None:
+    """Draw capsules over an image that knows its depths; all is in the camera's frame.
+
+    Args:
+        rays: (3, H, W) unit rays of all pixels.
+        window: first column, first row, end column, end row of the image that ``light``, ``depth`` and ``ids`` are of.
+        boxes_px: (K, 4) the same of what each capsule can cover.
+        capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
+        lamp: (3,) unit vector to the lamp.
+        light: drawn over.
+        depth: distance of what is there, m; brought up to date.
+        ids: the number of the capsule that is drawn, counted from 1, is written here.
+    """
+    ends, radius, albedo = capsules
+    u_first, v_first, u_end, v_end = window
+    axis = np.empty(14, np.float32)
+    for k in np.argsort(ends[:, 0, 2] + ends[:, 1, 2]):  # what is near first: it hides the rest
+        _axis(ends[k, 0], ends[k, 1], radius[k], axis)
+        shown = np.float32(albedo[k]), k + 1
+        u0, u1 = max(boxes_px[k, 0], u_first), min(boxes_px[k, 2], u_end)
+        v0, v1 = max(boxes_px[k, 1], v_first), min(boxes_px[k, 3], v_end)
+        for v_tile in range(v0, v1, _TILE):
+            v_last = min(v_tile + _TILE, v1)
+            u_begin, u_stop = u1, u0  # of the tiles that are not all to one side of it: one after the other
+            for u_tile in range(u0, u1, _TILE):
+                u_last, sides = min(u_tile + _TILE, u1), 0
+                for corner in range(4):
+                    v, u = (v_tile if corner < 2 else v_last - 1), (u_tile if corner % 2 else u_last - 1)
+                    sides += _side(rays[0, v, u], rays[1, v, u], rays[2, v, u], axis)
+                if abs(sides) != 4:
+                    u_begin, u_stop = min(u_begin, u_tile), u_last
+            first, last = u_begin - u_first, u_stop - u_first
+            for v in range(v_tile, v_last if u_begin < u_stop else v_tile):
+                x, y, z = rays[0, v, u_begin:u_stop], rays[1, v, u_begin:u_stop], rays[2, v, u_begin:u_stop]
+                row = v - v_first
+                _row(x, y, z, axis, shown, lamp, light[row, first:last], depth[row, first:last], ids[row, first:last])
+
 
 #: The lens and the light, after the shading correction that cameras do themselves.
 LENS = Optics(0.7, vignetting=0.08, light_gradient=(0.04, -0.04))
@@ -117,7 +274,7 @@ class CellCamera:
             arm: where the arm is; None leaves it out.
             bodies: flat patterns, placed in the camera's frame in the middle of the exposure of its middle row.
             shutter: how long it looks.
-            strip: standard normal noise, from :func:`~armsight.sim.cell_noise.noise_strip`.
+            strip: standard normal noise, from :func:`~armsight.sim.render.optics.noise_strip`.
             start: where in it this image's noise begins.
 
         Returns:
@@ -134,7 +291,7 @@ class CellCamera:
         u0, v0, u1, v1 = window
         light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
-        cell_links.moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
+        moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
         seen = spread(light, LENS.psf_sigma_px) if light.size else light
         if exposure is not None and crop[0] < crop[2] and crop[1] < crop[3]:
             core = self._core(crop, margin)
@@ -143,7 +300,7 @@ class CellCamera:
         out: Image = np.empty(self._still_grey.shape, np.uint8)
         s = self._sensor
         core, noises = self._core(window, margin), (s.offset, s.read_noise, s.shot_noise)
-        exposed(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
+        exposed_window(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
         return out
 
     def arm_ids(self, arm: ArmSeen) -> Image:
@@ -152,7 +309,7 @@ class CellCamera:
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
         light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
-        cell_links.moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
+        moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
         return ids
 
     def _around(self, boxes: Ids, margin: int) -> Window:
@@ -233,3 +390,81 @@ def _part(part: Window, window: Window) -> tuple[slice, slice]:
 def _reach(sigma_px: float) -> int:
     """Return how far the lens spreads light, px."""
     return math.ceil(4.5 * sigma_px + 0.5)
+
+
+#: Where it is seen from and what is in the middle, m; focal length over the image's width.
+_EYE, _MIDDLE, _FOCAL = np.array([2.05, -1.75, 1.25]), np.array([0.62, -0.08, 0.30]), 0.95
+#: Tints, BGR, of what is grey otherwise: wood, wall and floor, the arm's links, its housings; things take turns.
+_WOOD, _ROOM, _LINK, _HOUSING = (0.62, 0.85, 1.10), (1.06, 1.02, 0.98), (0.55, 0.85, 1.30), (1.05, 1.0, 1.0)
+_THINGS = ((1.25, 0.95, 0.7), (0.75, 1.15, 0.85), (0.75, 0.85, 1.3), (1.1, 1.1, 0.7), (1.0, 0.8, 1.15))
+_CAMERAS = (1.0, 1.0, 1.0)
+_SAME = 3  # grey levels
+
+
+def picture(
+    size_px: tuple[int, int],
+    plant: ArmPlant,
+    body: tuple[tuple[Pattern, ...], Array],
+    rig: tuple[Array, StereoRig],
+    seed: int,
+) -> Image:
+    """Return the cell as it is now.
+
+    Args:
+        size_px: (width, height).
+        plant: the arm.
+        body: the patterns on the tool, and T_tool_body (4, 4), m.
+        rig: T_base_rig (4, 4), m, and the cameras.
+        seed: of the clutter.
+
+    Returns:
+        (H, W, 3) BGR, uint8.
+    """
+    width, height = size_px
+    focal = _FOCAL * width
+    camera = Camera(size_px, "none", np.array([focal, focal, (width - 1) / 2, (height - 1) / 2]), np.zeros(0))
+    z = (_MIDDLE - _EYE) / np.linalg.norm(_MIDDLE - _EYE)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    T_base_eye = pose(np.column_stack([x, np.cross(z, x), z]), _EYE)
+    more = _rig_boxes(*rig)
+    eye = CellCamera(camera, T_base_eye, plant.parts, seed, sensor=Sensor(read_noise=0.0), more=more)
+    q = plant.path[-1, 6:]
+    arm = ArmSeen(plant.parts, row_frames(plant.arm, q))
+    placed = Placed(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
+    grey = eye.image(arm, [placed], Shutter(), np.zeros(width * height, np.float32), 0)
+    bare = eye.image(arm, [], Shutter(), np.zeros(width * height, np.float32), 0)
+    tints = _tints(len(furniture(seed)[0]), len(more))
+    tint = tints[np.minimum(eye.still.ids, len(tints) - 1)]
+    tint[eye.still.ids < 0] = _ROOM
+    ids = eye.arm_ids(arm)
+    housing = np.append(False, plant.parts.housing[plant.parts.link > 0][:-1])
+    tint[ids > 0] = np.where(housing[ids[ids > 0]][:, None], _HOUSING, _LINK)
+    tint[np.abs(grey.astype(int) - bare) > _SAME] = 1.0  # the body is black and white
+    return np.asarray(np.clip(np.rint(tint * grey[..., None]), 0, 255).astype(np.uint8))
+
+
+def _tints(count: int, more: int) -> Array:
+    """Return the tints (N + 1, 3) of so many boxes of furniture, the cameras' boxes and, last, all that is round."""
+    things = np.array([_THINGS[k % len(_THINGS)] for k in range(count)])
+    things[0], things[1:3], things[3:7] = _WOOD, _ROOM, _CAMERAS
+    things[7:9], things[9:12], things[12:14] = _CAMERAS, _WOOD, _CAMERAS
+    return np.concatenate([things, np.tile(_CAMERAS, (more, 1)), [_THINGS[2]]])
+
+
+def _rig_boxes(T_base_rig: Array, rig: StereoRig) -> Array:
+    """Return boxes that look like two cameras on a bar on a post."""
+    Ts = (T_base_rig, T_base_rig @ rig.T_left_right)
+    boxes = []
+    for T in Ts:
+        turn = float(np.degrees(np.arctan2(T[1, 2], T[0, 2])))
+        p, ahead = T[:3, 3], T[:3, 2]
+        for back, size, albedo in ((0.035, (0.06, 0.062, 0.05), 0.10), (-0.005, (0.03, 0.04, 0.04), 0.22)):
+            x, y, z = (p - back * ahead).tolist()
+            boxes.append(block((x, y, z), size, turn, albedo, PLAIN))
+    middle = 0.5 * (Ts[0][:3, 3] + Ts[1][:3, 3]) - 0.04 * T_base_rig[:3, 2]
+    turn = float(np.degrees(np.arctan2(T_base_rig[1, 2], T_base_rig[0, 2])))
+    x, y, z = middle.tolist()
+    boxes.append(block((x, y, z - 0.04), (0.04, rig.baseline_m + 0.12, 0.02), turn, 0.4, PLAIN))
+    boxes.append(block((x, y, (z - 0.05 - 0.74) / 2), (0.035, 0.035, z - 0.05 + 0.74), turn, 0.3, PLAIN))
+    return np.array(boxes)

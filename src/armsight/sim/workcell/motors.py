@@ -3,17 +3,141 @@
 What each joint needs is looked up over many poses of the nominal arm: the greatest torque of its weight, the greatest
 inertia. A gear and a motor are then chosen so that a 24 V supply gives a speed and a torque to spare. Current
 ``i = (duty U - k n w) / R`` within its limit, torque ``n k i`` less friction, at the joint's speed w.
+
+The solids an arm is made of: capsules along the rows of its table, with mass; where they are, and what they weigh.
+
+A row's frame is the one that turns with its joint: frame i-1 of the table after ``Rz(theta_i)``. Link i's capsules are
+given in row frame i, row frame 0 is the base. The weight's torque is the sum over all solids beyond a joint of
+``z . (c - p) x m g`` (Siciliano et al., "Robotics", 2009, section 7.1.2).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from armsight.data import Array, Record
+from armsight.data import Array, Ids, Record
+from armsight.geometry.pose import transform
 from armsight.robot.arm import Arm
-from armsight.sim.cell_solids import Solids, inertia, weight_torque
+from armsight.robot.kinematics.chain import after_link, after_turn, first_frame, store
+from armsight.robot.kinematics.trig import sincos
+
+GRAVITY_M_S2 = 9.81
+#: Radii of the links, share of the arm's whole length; of a joint's housing, share of its link's; density, kg/m^3.
+_RADII = np.array([0.052, 0.040, 0.034, 0.029, 0.026, 0.022])
+_HOUSING, _DENSITY = 1.2, 900.0
+#: What the tool and the body on it weigh, share of the arm; a ball that turns as hard as they do, share of link 6's radius.
+_TOOL_SHARE, _TOOL_RADIUS = 0.03, 2.0
+_SHORTEST_M = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Solids(Record):
+    """Capsules that move with an arm's links.
+
+    Attributes:
+        link: (K,) 0 for the base, 1 to 6.
+        ends: (K, 2, 3) their axes' ends, m, row frame of the link.
+        radius: (K,) m.
+        mass: (K,) kg.
+        housing: (K,) whether it is a joint's housing.
+    """
+
+    link: Ids
+    ends: Array
+    radius: Array
+    mass: Array
+    housing: NDArray[np.bool_]
+
+
+def solids(arm: Arm) -> Solids:
+    """Return what an arm is made of: a capsule along each d and a, housings about its joints, last the load at its tool."""
+    rows = arm.table[:36].reshape(6, 6)
+    whole = float(np.abs(rows[:, :2]).sum())
+    radii = _RADII * whole
+    parts: list[tuple[int, Array, Array, float, bool]] = [
+        (0, np.zeros(3), np.array([0.0, 0.0, 0.02 * whole]), 1.5 * radii[0], True)
+    ]
+    for i, (a, d) in enumerate(rows[:, :2]):
+        foot, knee, hand = np.zeros(3), np.array([0.0, 0.0, d]), np.array([a, 0.0, d])
+        if i == 5:  # the round end stays behind the tool's plate
+            knee[2] = np.sign(d) * max(abs(d) - radii[i], 0.0)
+        if abs(d) > _SHORTEST_M:
+            parts.append((i + 1, foot, knee, radii[i], False))
+        if abs(a) > _SHORTEST_M:
+            parts.append((i + 1, knee, hand, radii[i], False))
+        if 0 < i < 5 or max(abs(a), abs(d)) <= _SHORTEST_M:
+            axle = np.array([0.0, 0.0, radii[i]])
+            parts.append((i + 1, -axle, axle, _HOUSING * radii[i], True))
+    link, foot, hand, radius, housing = (np.array(column) for column in zip(*parts, strict=True))
+    length = np.linalg.norm(hand - foot, axis=1)
+    mass = _DENSITY * np.pi * radius**2 * (length + 4 / 3 * radius)
+    tool = np.array([[rows[5, 0], 0.0, rows[5, 1]]])
+    return Solids(
+        np.append(link, 6),
+        np.append(np.stack([foot, hand], axis=1), np.stack([tool, tool], axis=1), axis=0),
+        np.append(radius, _TOOL_RADIUS * radii[5]),
+        np.append(mass, _TOOL_SHARE * mass[link > 0].sum()),
+        np.append(housing, True),
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _row_frames(table: Array, q: Array, Ts: Array) -> None:
+    """Write the row frames at joint angles q (6,) into Ts (7, 4, 4)."""
+    Ts[0] = np.eye(4)
+    F = first_frame(table)
+    for i in range(6):
+        s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
+        F = after_turn(table, i, c, s, F)
+        store(F, Ts[i + 1])
+        d = table[6 * i + 1]
+        for k in range(3):
+            Ts[i + 1, k, 3] -= d * Ts[i + 1, k, 2]
+        F = after_link(table, i, F)
+
+
+def row_frames(arm: Arm, q: Array) -> Array:
+    """Return where the row frames (7, 4, 4) are in the base, m, at joint angles (6,), rad."""
+    Ts = np.empty((7, 4, 4))
+    _row_frames(arm.table, np.ascontiguousarray(q), Ts)
+    return Ts
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _weight(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
+    """Add the torque of the weight of solids at centre (K, 3) of their row frames about the joints' axes to out (6,)."""
+    for k in range(link.size):
+        T = Ts[link[k]]
+        x = T[0, 0] * centre[k, 0] + T[0, 1] * centre[k, 1] + T[0, 2] * centre[k, 2] + T[0, 3]
+        y = T[1, 0] * centre[k, 0] + T[1, 1] * centre[k, 1] + T[1, 2] * centre[k, 2] + T[1, 3]
+        for i in range(link[k]):
+            # z . (r x f) with f = (0, 0, -m g)
+            z, rx, ry = Ts[i + 1, :3, 2], x - Ts[i + 1, 0, 3], y - Ts[i + 1, 1, 3]
+            out[i] += -mass[k] * GRAVITY_M_S2 * (z[0] * ry - z[1] * rx)
+
+
+def weight_torque(arm: Arm, parts: Solids, q: Array) -> Array:
+    """Return the torque (6,), N m, with which the weight of an arm's solids turns its joints at angles q (6,), rad."""
+    out = np.zeros(6)
+    _weight(row_frames(arm, q), parts.link, parts.ends.mean(axis=1), parts.mass, out)
+    return np.asarray(arm.direction * out)
+
+
+def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
+    """Return the inertia (6,), kg m^2, of all that each joint turns, as points, at angles q (6,), rad."""
+    Ts, out = row_frames(arm, q), np.zeros(6)
+    centres = transform(Ts[parts.link], parts.ends.mean(axis=1))
+    for i in range(6):
+        beyond = parts.link > i
+        r = centres[beyond] - Ts[i + 1, :3, 3]
+        off_axis = (r**2).sum(axis=1) - (r @ Ts[i + 1, :3, 2]) ** 2
+        out[i] = parts.mass[beyond] @ (off_axis + 0.4 * parts.radius[beyond] ** 2)
+    return out
+
 
 SUPPLY_V = 24.0
 #: No-load speed over the joint's greatest; greatest torque and stall torque over what is needed.

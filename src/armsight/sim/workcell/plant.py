@@ -1,23 +1,204 @@
 """The arm at the board's motors: duties go in, what the converters read comes out, and the truth is kept apart.
 
-:class:`ArmPlant` fulfils :class:`armsight.robot.boards.machine.Plant`. The arm is a MuJoCo model made of its true table
+:class:`ArmPlant` fulfils :class:`armsight.robot.boards.link.Plant`. The arm is a MuJoCo model made of its true table
 (cell_mjcf): motors with current limit and friction, backlash and twist in every joint, potentiometers on the gears'
 shafts, which see neither backlash nor twist. Brakes hold the shafts while the drivers are off. Steps are 1 ms.
+
+An arm as a MuJoCo model: twelve degrees of freedom, six gear shafts and six links, joined by play and a spring each.
+
+A motor turns its shaft; the potentiometer sits on the shaft; between shaft and link lie the backlash and the twist. In
+MuJoCo that is a fixed tendon of the length (shaft - link) whose spring has a dead band. Dry friction is MuJoCo's friction
+loss, made so hard that what stands stays; the motor is an actuator whose force falls with speed and is bounded by the
+driver's current limit. Bodies touch nothing.
+
+Potentiometers and the converter behind them: from shaft angles to the counts that a board reads.
+
+A potentiometer spans a joint's travel with nine tenths of its supply. What its wiper says differs from the straight line
+by a smooth error and an offset; each conversion adds noise and is rounded to the converter's step, and a tick's conversions
+are averaged: noise of a step or so makes up for the rounding.
 """
 
 from __future__ import annotations
 
 import mujoco
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.robot.arm import Arm
-from armsight.robot.boards.machine import Sensed
+from armsight.robot.boards.link import Sensed
+from armsight.robot.kinematics.table import BASE, TOOL, link
 from armsight.sim.workcell.arm import TrueArm, pot_travel
-from armsight.sim.cell_mjcf import SUBSTEPS, mjcf
-from armsight.sim.workcell.motors import SUPPLY_V, Motors, chosen
-from armsight.sim.cell_pots import Potentiometers
-from armsight.sim.cell_solids import inertia, solids
+from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, Motors, Solids, chosen, inertia, solids
+
+#: MuJoCo's own steps in a millisecond: the stiffest wrist swings at up to 3000 rad/s.
+SUBSTEPS = 4
+#: A dry friction yields this little: what is held creeps less than a microradian a second.
+_HARD = 'solreffriction="0.0005 1" solimpfriction="0.9999 0.9999 0.001"'
+
+
+def mjcf(arm: Arm, parts: Solids, motors: Motors, backlash_rad: Array, stiffness: Array, damping: Array) -> str:
+    """Write the model.
+
+    Args:
+        arm: the table to build.
+        parts: what its links are made of.
+        motors: what turns it.
+        backlash_rad: (6,) play from stop to stop.
+        stiffness: (6,) of each joint's twist, N m/rad.
+        damping: (6,) between shaft and link, N m s/rad.
+
+    Returns:
+        MJCF; shafts are joints 0 to 5 (``shaft1``...), links 6 to 11 (``link1``...), and the site ``tool`` is the tool.
+    """
+    shafts = "".join(
+        f'<body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1e-9"/><joint name="shaft{i + 1}" axis="0 0 1" '
+        f'armature="{motors.rotor_inertia[i]}" damping="{motors.viscous[i]}" frictionloss="{motors.brake_nm[i]}" '
+        f"{_HARD}/></body>"
+        for i in range(6)
+    )
+    tendons = "".join(
+        f'<fixed stiffness="{stiffness[i]}" damping="{damping[i]}" springlength="{-half} {half}">'
+        f'<joint joint="shaft{i + 1}" coef="1"/><joint joint="link{i + 1}" coef="-1"/></fixed>'
+        for i, half in enumerate(0.5 * backlash_rad)
+    )
+    motor = "".join(
+        f'<general joint="shaft{i + 1}" gainprm="{motors.stall_nm[i]}" biastype="affine" forcelimited="true" '
+        f'forcerange="-{most} {most}"/>'
+        for i, most in enumerate(motors.gear_ratio * motors.torque_constant * motors.current_max_a)
+    )
+    return (
+        f'<mujoco><compiler angle="radian"/><option timestep="{1e-3 / SUBSTEPS}" integrator="implicitfast" '
+        f'gravity="0 0 -{GRAVITY_M_S2}" iterations="8"><flag contact="disable"/></option>'
+        f"<worldbody>{shafts}{_links(arm, parts, motors)}</worldbody>"
+        f"<tendon>{tendons}</tendon><actuator>{motor}</actuator></mujoco>"
+    )
+
+
+def _links(arm: Arm, parts: Solids, motors: Motors) -> str:
+    """Write the links, one body in the other; body i is row frame i."""
+    rows = arm.table[:BASE].reshape(6, 6)
+    T_6_tool = np.vstack([arm.table[TOOL : TOOL + 12].reshape(3, 4), [0, 0, 0, 1]])
+    T, opened = np.vstack([arm.table[BASE : BASE + 12].reshape(3, 4), [0, 0, 0, 1]]), ""
+    for i, (a, d, c, s, offset, way) in enumerate(rows):
+        turned = T @ pose(exp_so3(np.array([0.0, 0.0, offset])), np.zeros(3))
+        opened += (
+            f'<body {_place(turned)}><joint name="link{i + 1}" axis="0 0 {way}" frictionloss="{motors.bearing_nm[i]}" '
+            f"{_HARD}/>" + "".join(_capsule(parts, k) for k in np.flatnonzero(parts.link == i + 1).tolist())
+        )
+        T = link(a, d, c, s)
+    return f'{opened}<site name="tool" {_place(T @ T_6_tool)}/>' + 6 * "</body>"
+
+
+def _place(T: Array) -> str:
+    """Write a pose."""
+    return f'pos="{_row(T[:3, 3])}" quat="{_row(quaternion_wxyz(T[:3, :3]))}"'
+
+
+def _capsule(parts: Solids, k: int) -> str:
+    """Write one solid; one without length is a ball."""
+    foot, hand = parts.ends[k]
+    common = f'mass="{parts.mass[k]}" contype="0" conaffinity="0"'
+    if np.allclose(foot, hand):
+        return f'<geom type="sphere" pos="{_row(foot)}" size="{parts.radius[k]}" {common}/>'
+    return f'<geom type="capsule" fromto="{_row(foot)} {_row(hand)}" size="{parts.radius[k]}" {common}/>'
+
+
+def _row(numbers: Array) -> str:
+    """Write numbers to the last bit."""
+    return " ".join(repr(float(n)) for n in numbers)
+
+
+#: Shares of the supply at the ends of the travel.
+LOW_SHARE, HIGH_SHARE = 0.05, 0.95
+COUNTS = 65536  # of the supply, as the board gives them
+_BLOCK = 256  # ticks whose noise is drawn at once
+
+Counts = NDArray[np.uint32]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, out: Array) -> None:
+    """Write what potentiometers say too much at shaft angles (N, 6) into out (N, 6)."""
+    for n in range(shaft.shape[0]):
+        for i in range(6):
+            along = (shaft[n, i] - low[i]) / span[i]
+            total = offset[i]
+            for k in range(sines.shape[1]):
+                total += sines[i, k, 0] * np.sin(2 * np.pi * sines[i, k, 1] * along + sines[i, k, 2])
+            out[n, i] = total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _read(
+    shaft: Array,
+    offset: Array,
+    sines: Array,
+    low: Array,
+    span: Array,
+    noise: NDArray[np.float32],
+    row: int,
+    steps: float,
+    counts: Counts,
+) -> None:
+    """Convert what wipers say at shaft angles (1, 6), with a row of noise (N, 6, n) in steps; averages into counts (6,)."""
+    n, over = noise.shape[2], np.empty((1, 6))
+    _errors(shaft, offset, sines, low, span, over)
+    for i in range(6):
+        said = shaft[0, i] + over[0, i]
+        share = LOW_SHARE + (HIGH_SHARE - LOW_SHARE) * (said - low[i]) / span[i]
+        total = 0.0
+        for k in range(n):
+            total += min(max(np.floor(share * steps + noise[row, i, k] + 0.5), 0.0), steps - 1.0)
+        counts[i] = np.uint32(min(np.floor(total / n * (COUNTS / steps) + 0.5), COUNTS - 1.0))
+
+
+class Potentiometers:
+    """Six potentiometers on one converter."""
+
+    def __init__(self, true: TrueArm, travel: Array, seed: int) -> None:
+        """Make ready to read.
+
+        Args:
+            true: their errors.
+            travel: (6, 2) joint angles at the ends of their travel, rad.
+            seed: of the noise.
+        """
+        self._given = true.imperfections
+        self._low, self._span = travel[:, 0].copy(), np.ptp(travel, axis=1)
+        self._offset, self._sines = true.pot_offset_rad.copy(), true.pot_sines.copy()
+        self._rng = np.random.default_rng([seed, 2])
+        self._noise = np.zeros((0, 6, 0), np.float32)
+        self._next = 0
+        self._steps = float(1 << self._given.adc_bits)
+
+    def error(self, shaft: Array) -> Array:
+        """Return what they say too much at shaft angles (N, 6), rad."""
+        out = np.empty(shaft.shape)
+        _errors(np.ascontiguousarray(shaft), self._offset, self._sines, self._low, self._span, out)
+        return out
+
+    def read(self, shaft: Array) -> Counts:
+        """Read them once.
+
+        Args:
+            shaft: (6,) shaft angles, rad.
+
+        Returns:
+            (6,) counts, uint32, 0 to 65535.
+        """
+        if self._next == len(self._noise):
+            block = self._rng.standard_normal((_BLOCK, 6, self._given.oversampling), dtype=np.float32)
+            self._noise, self._next = block * np.float32(self._given.pot_noise_lsb), 0
+        counts = np.empty(6, np.uint32)
+        errors = (self._offset, self._sines, self._low, self._span)
+        _read(shaft[None], *errors, self._noise, self._next, self._steps, counts)
+        self._next += 1
+        return counts
+
 
 TICK_S = 0.001
 #: Damping between shaft and link, of critical.

@@ -22,22 +22,18 @@ from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.machines import open_machine
-from armsight.robot.boards.opening import configured
+from armsight.robot.boards.opening import configured, open_machine
 from armsight.robot.models import open_arm
 from armsight.sim.example_rig import board_poses
+from armsight.sim.render.optics import Sensor
+from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.arm import drawn, imperfections
 from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.body import body_patterns, body_target, body_text
-from armsight.sim.workcell.cameras import (BASELINE_M, DISTANCE_M, open_rig, open_timing, placed_rig)
-from armsight.sim.workcell.motors import chosen
-from armsight.sim.workcell.images import CellCamera
-from armsight.sim.cell_picture import picture
-from armsight.sim.cell_solids import solids
-from armsight.sim.cell_source import CellSource
-from armsight.sim.render.optics import Sensor
+from armsight.sim.workcell.cameras import BASELINE_M, DISTANCE_M, CellSource, open_rig, open_timing, placed_rig
+from armsight.sim.workcell.images import CellCamera, picture
+from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
-from armsight.sim.render.scene import chessboard
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 

@@ -36,8 +36,8 @@ from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.pnp import Candidate
+from armsight.vision.projection import every_point
 from armsight.vision.rig import StereoRig
-from armsight.vision.shape import every_point
 
 #: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the drawing as it is.
 TOLERANCES_M = (0.0, 1e-4, 2e-4, 4e-4, 1e-3, 2e-3)

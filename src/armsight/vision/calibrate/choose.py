@@ -21,8 +21,8 @@ from armsight.vision.calibrate.result import HeldOut, PairErrors
 from armsight.vision.calibrate.screen import Screened, noise_px
 from armsight.vision.calibrate.start import imitated, start_board
 from armsight.vision.camera import DISTORTION_MODELS, Camera
+from armsight.vision.projection import smooth
 from armsight.vision.rig import StereoRig
-from armsight.vision.shape import smooth
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which no other program takes for
 #: an ordinary lens, by more.

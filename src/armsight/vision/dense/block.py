@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
-from armsight.vision.dense.strips import on_strips
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.support import COSTS, SUPPORTS, match_planes
 from armsight.vision.dense.window import look, make_room, match_windows
-from armsight.vision.dense.winner import Found, make_found
+from armsight.vision.dense.winner import Found, make_found, on_strips
 
 _STRIP_ROWS = 384
 #: The largest window whose sum of raw costs still fits two bytes.

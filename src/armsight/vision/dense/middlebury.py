@@ -8,6 +8,10 @@
 
 A mask says which pixels both cameras see: ``mask0nocc``, ``nonocc``, ``nocc`` or ``occlusion_left``, 255 there. Without
 one it follows from the truth.
+
+Portable float maps (PFM): the Middlebury benchmark's disparity files, rows from the bottom up.
+
+TIFF files as they are, floats included: some scenes keep their truth so, some cameras their images.
 """
 
 from __future__ import annotations
@@ -15,18 +19,73 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Image, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_text, replacing
 from armsight.vision.dense.evaluate import Truth, seen_by_right
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.pfm import read_pfm
-from armsight.vision.dense.tiff import read_tiff
 from armsight.vision.image import read_image
+
+
+def read_pfm(path: str | Path) -> NDArray[np.float32]:
+    """Read a grey PFM file into (H, W), the first row at the top.
+
+    Raises:
+        InputError: missing, unreadable, or no grey PFM.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        kind, size, scale, rest = data.split(b"\n", 3)
+        width, height = (int(n) for n in size.split())
+        order = "<f4" if float(scale) < 0 else ">f4"
+        if kind.strip() != b"Pf" or width < 1 or height < 1 or len(rest) < 4 * width * height:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{path}: not a grey PFM file: expected Pf, its size, a scale and the pixels") from None
+    pixels = np.frombuffer(rest, order, width * height).reshape(height, width)
+    return np.ascontiguousarray(pixels[::-1], dtype=np.float32)
+
+
+def write_pfm(path: str | Path, image: NDArray[np.floating[Any]], scale: float = 1.0) -> None:
+    """Write a grey PFM file (H, W), little-endian; NaN becomes infinity, the benchmark's "unknown".
+
+    Args:
+        path: where to.
+        image: (H, W).
+        scale: what is written is so many times as much, as for mm in place of m.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    height, width = image.shape
+    with replacing(path, "wb") as file:
+        file.write(f"Pf\n{width} {height}\n-1.0\n".encode())
+        for row in image[::-1]:
+            file.write(np.where(np.isnan(row), np.inf, scale * row).astype("<f4").tobytes())
+
+
+def read_tiff(path: str | Path) -> NDArray[Any] | None:
+    """Read a TIFF file into (H, W) or (H, W, 3) of its own type; None where OpenCV cannot."""
+    if not Path(path).is_file():
+        return None
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # or it warns of tags it does not know
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    return None if image is None else np.asarray(image)
+
 
 _SUFFIXES = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".pfm", ".jpg", ".bmp")
 _MASKS = ("mask0nocc", "nonocc", "nocc", "occlusion_left")

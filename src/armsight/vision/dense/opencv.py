@@ -9,8 +9,8 @@ import numpy as np
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.method import Disparity, Search
+from armsight.vision.dense.postprocess import Trust, finished
 from armsight.vision.dense.winner import Found, Singles
 
 _WINDOW_BM, _WINDOW_SGBM = 15, 3

@@ -1,6 +1,27 @@
 """From what was found to a result: what cannot be believed goes, the rest is smoothed, gaps are filled, sigma is added.
 
 All methods end here, so that they differ in how they match and in nothing else.
+
+Depth breaks drawn where the image has its edges.
+
+A window that matches sees both sides of a break, so that the nearer surface comes out a few pixels too wide, and what
+is filled beside it is a guess. Near breaks and gaps every pixel takes the weighted median of its neighbourhood,
+neighbours that look like it and are near counting more: the surface that its looks belong to (Ma, He, Wei, Sun and Wu,
+"Constant time weighted median filtering for stereo matching and beyond", ICCV 2013). A measured pixel that finds itself
+on another surface is measured no more.
+
+What stands where nothing was measured, told apart by why.
+
+The right camera cannot see what lies behind a nearer surface or beyond its image; what it cannot see continues the
+farther of the surfaces beside it in its row. Where a pixel could have been seen and was not matched, the same is a
+guess.
+
+Disparities smoothed within their own surface.
+
+Winners come from whole disparities with a place between them, and that place is noisy where there is little texture.
+Every measured pixel becomes the mean of those near it that lie within a little of it in disparity, weighted by how
+alike they are in grey: along rows, then along columns, a bilateral filter taken apart (Pham and van Vliet 2005). Depth
+breaks stay, for what lies across them is too far off to count.
 """
 
 from __future__ import annotations
@@ -13,12 +34,254 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
-from armsight.vision.dense.edges import redrawn
-from armsight.vision.dense.fill import filled
-from armsight.vision.dense.method import MEASURED, Disparity, Search
-from armsight.vision.dense.smooth import smoothed
-from armsight.vision.dense.strips import on_strips
-from armsight.vision.dense.winner import Found, Singles
+from armsight.vision.dense.method import FILLED, MEASURED, OCCLUDED, Disparity, Search
+from armsight.vision.dense.winner import Found, Singles, on_strips
+
+#: Half the window, of which every other row and column counts, px; the spread of its weights, px and grey levels.
+_EDGE_REACH, _NEAR_PX, _EDGE_ALIKE = 8, 6.0, 10.0
+#: A step in disparity that is a break, px, and how near to one a pixel is drawn again, px.
+_BREAK, _BESIDE = 1.5, 3
+#: A measured disparity stays if it is so near to the median, px.
+_SAME = np.float32(1.0)
+_EDGE_STRIP_ROWS = 64
+
+
+def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return where (H, W) a pixel is drawn again: near breaks, and in gaps that a window bridges."""
+    three = np.ones((3, 3), np.uint8)
+    broken = cv2.dilate(disparity, three) - cv2.erode(disparity, three) > _BREAK
+    size = 2 * _BESIDE + 1
+    near = cv2.dilate(broken.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    measured = (state == MEASURED).astype(np.uint8)
+    bridged = cv2.dilate(measured, np.ones((2 * _EDGE_REACH + 1, 2 * _EDGE_REACH + 1), np.uint8)) > measured
+    return np.asarray(near | bridged).astype(np.uint8)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _redraw(
+    disparity: Singles,
+    image: Image,
+    doubtful: NDArray[np.uint8],
+    alike: Singles,
+    near: Singles,
+    begin: int,
+    end: int,
+    out: Singles,
+) -> None:
+    """Write weighted medians of doubtful pixels; the rest is copied."""
+    height, width = disparity.shape
+    votes = np.zeros(int(disparity.max()) + 2, np.float32)
+    for y in range(begin, end):
+        for x in range(width):
+            out[y, x] = disparity[y, x]
+            if not doubtful[y, x]:
+                continue
+            low, high, total = votes.shape[0], 0, np.float32(0)
+            for j in range(-_EDGE_REACH, _EDGE_REACH + 1, 2):
+                for i in range(-_EDGE_REACH, _EDGE_REACH + 1, 2):
+                    v, u = y + j, x + i
+                    if 0 <= v < height and 0 <= u < width:
+                        weight = alike[abs(np.int32(image[v, u]) - np.int32(image[y, x]))] * near[abs(j)] * near[abs(i)]
+                        k = int(disparity[v, u] + np.float32(0.5))
+                        votes[k] += weight
+                        total += weight
+                        low, high = min(low, k), max(high, k)
+            middle, below = low, votes[low]
+            while below < total / 2 and middle < high:
+                middle += 1
+                below += votes[middle]
+            votes[low : high + 1] = 0
+            out[y, x] = _mean_of(disparity, image, alike, near, y, x, middle)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mean_of(
+    disparity: Singles, image: Image, alike: Singles, near: Singles, y: int, x: int, middle: int
+) -> np.float32:
+    """Return the weighted mean of the neighbours within a pixel of the median."""
+    height, width = disparity.shape
+    up, down = np.float32(0), np.float32(0)
+    for j in range(-_EDGE_REACH, _EDGE_REACH + 1, 2):
+        for i in range(-_EDGE_REACH, _EDGE_REACH + 1, 2):
+            v, u = y + j, x + i
+            if 0 <= v < height and 0 <= u < width and abs(disparity[v, u] - middle) <= 1:
+                weight = alike[abs(np.int32(image[v, u]) - np.int32(image[y, x]))] * near[abs(j)] * near[abs(i)]
+                up += weight * disparity[v, u]
+                down += weight
+    return up / down if down > 0 else np.float32(middle)
+
+
+def redrawn(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
+    """Draw breaks and gaps again.
+
+    Args:
+        disparity: (H, W) px, filled.
+        state: (H, W) what each is.
+        image: (H, W) uint8, the left image.
+
+    Returns:
+        The same two, drawn again; what was measured and moves to another surface is FILLED.
+    """
+    doubtful, median = _doubtful(disparity, state), np.empty_like(disparity)
+    alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
+    near = np.exp(-((np.arange(_EDGE_REACH + 1) / _NEAR_PX) ** 2) / 2).astype(np.float32)
+
+    def work(begin: int, end: int) -> None:
+        _redraw(disparity, image, doubtful, alike, near, begin, end, median)
+
+    on_strips(disparity.shape[0], _EDGE_STRIP_ROWS, work)
+    stays = (state == MEASURED) & (np.abs(median - disparity) <= _SAME)
+    moved = (state == MEASURED) & ~stays
+    return np.where(stays, disparity, median), np.where(moved, np.uint8(FILLED), state)
+
+
+#: A right pixel that a measured pixel claims, nearer than this, px, hides what is farther.
+_HIDES = np.float32(1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_row(d: Singles, state: NDArray[np.uint8], nearest: Singles) -> bool:
+    """Fill a row from its measured neighbours, and say what was hidden; False where it holds nothing measured."""
+    width, last = d.shape[0], np.float32(np.inf)
+    any_measured = False
+    nearest[:] = -1
+    for x in range(width):
+        if state[x] == MEASURED:
+            last, any_measured = d[x], True
+            right = int(np.floor(x - d[x] + np.float32(0.5)))
+            if 0 <= right < width:
+                nearest[right] = max(nearest[right], d[x])
+        else:
+            d[x] = last
+    last = np.float32(np.inf)
+    for x in range(width - 1, -1, -1):
+        if state[x] == MEASURED:
+            last = d[x]
+            continue
+        d[x] = min(d[x], last)
+        if any_measured:
+            right = int(np.floor(x - d[x] + np.float32(0.5)))
+            hidden = right < 0 or nearest[right] > d[x] + _HIDES
+            state[x] = OCCLUDED if hidden else FILLED
+    return any_measured
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(d: Singles, state: NDArray[np.uint8]) -> None:
+    """Fill all rows; a row without anything measured is like the nearest one that has something."""
+    height, width = d.shape
+    nearest = np.empty(width, np.float32)
+    held = np.zeros(height, np.bool_)
+    for y in range(height):
+        held[y] = _fill_row(d[y], state[y], nearest)
+    for y in range(height):
+        if not held[y]:
+            for k in range(1, height):
+                if y - k >= 0 and held[y - k]:
+                    d[y] = d[y - k]
+                    break
+                if y + k < height and held[y + k]:
+                    d[y] = d[y + k]
+                    break
+            state[y] = FILLED
+
+
+def filled(disparity: Singles) -> tuple[Singles, NDArray[np.uint8]]:
+    """Fill what was not measured.
+
+    Args:
+        disparity: (H, W) px; NaN where nothing was measured, but not everywhere.
+
+    Returns:
+        (H, W) px without NaN, and (H, W) the state of every pixel.
+    """
+    out, state = disparity.copy(), np.where(np.isnan(disparity), np.uint8(FILLED), np.uint8(MEASURED))
+    _fill(out, state)
+    return out, state
+
+
+#: How far to either side, px, and the grey level difference that halves a weight.
+_SMOOTH_REACH, _SMOOTH_ALIKE = 4, np.float32(8.0)
+#: What counts as the same surface in each round, px: more than the error between two disparities, less than a break.
+_ROUNDS = (1.5, 1.0)
+_SMOOTH_STRIP_ROWS = 96
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _add(
+    d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles
+) -> None:
+    """Add neighbours to sums of weighted differences and of weights, a row at a time; NaN never counts."""
+    for x in range(d.shape[0]):
+        gap = other[x] - d[x]
+        near = abs(gap) <= tolerance
+        step = abs(np.float32(other_grey[x]) - np.float32(grey[x]))
+        weight = _SMOOTH_ALIKE / (_SMOOTH_ALIKE + step) if near else np.float32(0)
+        up[x] += weight * (gap if near else np.float32(0))
+        down[x] += weight
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rows(
+    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
+) -> None:
+    """Smooth along rows."""
+    width = source.shape[1]
+    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
+    for y in range(begin, end):
+        up[:], down[:] = 0, 0
+        for k in range(1, _SMOOTH_REACH + 1):
+            a, b, g, h = source[y, k:], source[y, :-k], image[y, k:], image[y, :-k]
+            _add(b, h, a, g, tolerance, up[:-k], down[:-k])
+            _add(a, g, b, h, tolerance, up[k:], down[k:])
+        for x in range(width):
+            out[y, x] = source[y, x] + up[x] / (down[x] + np.float32(1))
+            share[y, x] = down[x] / np.float32(2 * _SMOOTH_REACH)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _columns(
+    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
+) -> None:
+    """Smooth along columns."""
+    height, width = source.shape
+    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
+    for y in range(begin, end):
+        up[:], down[:] = 0, 0
+        for k in range(-_SMOOTH_REACH, _SMOOTH_REACH + 1):
+            if k != 0 and 0 <= y + k < height:
+                _add(source[y], image[y], source[y + k], image[y + k], tolerance, up, down)
+        for x in range(width):
+            out[y, x] = source[y, x] + up[x] / (down[x] + np.float32(1))
+            share[y, x] = np.float32(0.5) * (share[y, x] + down[x] / np.float32(2 * _SMOOTH_REACH))
+
+
+def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.float32]]:
+    """Smooth measured disparities.
+
+    Args:
+        disparity: (H, W) px; NaN where nothing was measured.
+        image: (H, W) uint8, the left image.
+
+    Returns:
+        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on
+        its surface.
+    """
+    height = disparity.shape[0]
+    share, half, out = np.empty_like(disparity), np.empty_like(disparity), disparity
+    for tolerance in map(np.float32, _ROUNDS):
+        source, out = out, np.empty_like(disparity)
+
+        def rows(begin: int, end: int, source: Singles = source, limit: np.float32 = tolerance) -> None:
+            _rows(source, image, limit, begin, end, half, share)
+
+        def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
+            _columns(half, image, limit, begin, end, out, share)
+
+        on_strips(height, _SMOOTH_STRIP_ROWS, rows)
+        on_strips(height, _SMOOTH_STRIP_ROWS, columns)
+    return out, share
+
 
 #: A patch of one disparity that is not larger than the pixels one match looks at (7 x 7) is one mistake, not a surface.
 _SPECKLE_PX = 50

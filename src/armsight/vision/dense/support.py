@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from armsight.data import Image
 from armsight.vision.dense.cost import BLOCK, prepare, raw_row
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.strips import on_strips
-from armsight.vision.dense.winner import Counts, Found, Singles, choose_row, make_found
+from armsight.vision.dense.winner import Counts, Found, Singles, choose_row, make_found, on_strips
 
 #: Steps a unit of cost is cut into before it is rounded.
 _FINE = 32.0

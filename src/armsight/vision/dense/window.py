@@ -19,7 +19,23 @@ import numpy as np
 
 from armsight.data import Image
 from armsight.vision.dense.cost import Bytes
-from armsight.vision.dense.simd import (LANES, above, as_in, bits_set, count_up, differing, half, least, load, minus, plus, spread, start, store, where_less)
+from armsight.vision.dense.simd import (
+    LANES,
+    above,
+    as_in,
+    bits_set,
+    count_up,
+    differing,
+    half,
+    least,
+    load,
+    minus,
+    plus,
+    spread,
+    start,
+    store,
+    where_less,
+)
 from armsight.vision.dense.winner import NOWHERE, Counts, Found
 
 ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(LANES)

@@ -15,8 +15,8 @@ from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
 from armsight.geometry.pose import exp_se3
-from armsight.vision.disc_view import DiscView
-from armsight.vision.expected import Expected, expect, visible
+from armsight.vision.discs.bias import Expected, expect, visible
+from armsight.vision.discs.pairing import DiscView
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 

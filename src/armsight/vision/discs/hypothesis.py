@@ -19,9 +19,8 @@ from scipy.special import chdtri
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.pose import exp_se3, transform
 from armsight.vision.discs.assign import correspondences, settle
-from armsight.vision.disc_view import SIZE_SIGMAS, SIZE_TOLERANCE, DiscView
-from armsight.vision.expected import LEAST_FACING, Expected, expect, visible
-from armsight.vision.discs.pairing import DEPTHS_M, Pairs
+from armsight.vision.discs.bias import LEAST_FACING, Expected, expect, visible
+from armsight.vision.discs.pairing import DEPTHS_M, SIZE_SIGMAS, SIZE_TOLERANCE, DiscView, Pairs
 
 #: A disc in view is found with this probability.
 FOUND = 0.9

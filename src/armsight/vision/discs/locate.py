@@ -10,7 +10,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs, Ids, Missed, PoseEstimate
 from armsight.vision.discs.assign import assign
-from armsight.vision.expected import centred
+from armsight.vision.discs.bias import centred
 from armsight.vision.discs.identify import Identified, identify
 from armsight.vision.locate import locate
 from armsight.vision.markers.disc.target import DiscTarget

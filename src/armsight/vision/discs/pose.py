@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.markers.disc_model import factor, solve
+from armsight.vision.markers.disc.fit import factor, solve
 from armsight.vision.posefit import moved
 
 #: Code of a disc that was seen.

@@ -4,33 +4,126 @@ The pose is carried on with the velocity of the last two; each disc is searched 
 last predictions were, and everything from pixels to covariance is one compiled call
 (:mod:`~armsight.vision.follow.kernel`). What does not fit, and any first shot, goes the slow way through
 :func:`~armsight.vision.measure.measure`, which searches the whole image and takes no hint from the past.
+
+Everything that finding a body of discs runs is run once before a live loop, so that nothing is compiled within it.
+
+A body that is nowhere in the images leaves most of it untouched; so the discs are put where a body before the cameras would
+show them.
+
+What is known of a body's motion between two shots: where it should be next.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Shot
+from armsight.data import (
+    SIDES,
+    Array,
+    Correspondences,
+    Detections,
+    Discs,
+    Dropped,
+    Missed,
+    Points,
+    PoseEstimate,
+    Record,
+    Shot,
+)
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.discs.pose import (SEEN, Found, Scene, velocity)
-from armsight.vision.expected import bias_normals
-from armsight.vision.follow.kernel import (NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair)
+from armsight.vision.discs.bias import LEAST_FACING, bias_normals, expect
+from armsight.vision.discs.locate import locate_composite, locate_discs
+from armsight.vision.discs.pairing import DEPTHS_M
+from armsight.vision.discs.pose import SEEN, Found, Scene, velocity
+from armsight.vision.discs.predict import view
+from armsight.vision.follow.kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
 from armsight.vision.image import grey
-from armsight.vision.likeness import misfit_limit
-from armsight.vision.markers import disc_outline
+from armsight.vision.locate import misfit_limit
+from armsight.vision.markers.disc import search as disc_outline
 from armsight.vision.markers.disc import search as disc_search
-from armsight.vision.markers.disc.fit import REASONS
-from armsight.vision.markers.disc_model import workspace
+from armsight.vision.markers.disc.fit import REASONS, workspace
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
-from armsight.vision.rehearse import rehearse
+from armsight.vision.posefit import moved
 from armsight.vision.rig import StereoRig
-from armsight.vision.track import LEAST_S, Track
+
+#: Where the body is put, in sizes of it from the cameras; and how well its discs are known, px.
+_AWAY, _SIGMA_PX = 5.0, 0.05
+
+
+def rehearse(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
+    """Search for a body in black images, and name and locate it where its discs are given.
+
+    Args:
+        rig: the calibrated pair.
+        target: the body.
+        discs: its discs.
+    """
+    black = [np.zeros(camera.image_size_px[::-1], np.uint8) for camera in rig.cameras]
+    measure(rig, target, Shot("", black[0], black[1]))
+    points = discs.body.points
+    away = np.clip(_AWAY * float(np.linalg.norm(np.ptp(points, axis=0))), *DEPTHS_M)
+    T = view(rig, points, discs.normals, float(away)).T_left_body
+    expected = expect(rig, discs, T)
+    rows = np.flatnonzero(np.isfinite(expected.uv).all(axis=(1, 2)) & ~(expected.facing < LEAST_FACING).any(axis=1))
+    cov = np.tile(_SIGMA_PX**2 * np.eye(2), (len(rows), 2, 1, 1))
+    left, right = (
+        Discs(expected.uv[rows][:, s].copy(), cov[:, s].copy(), expected.shape[rows][:, s].copy(), discs.bright[rows])
+        for s in (0, 1)
+    )
+    coded = Detections.none("")
+    locate_composite(rig, target.body, discs, (coded, coded), (left, right))
+    # A body whose naming is ambiguous there may not be so elsewhere: it is located by the names it is known to have too.
+    seen = Correspondences(rows, expected.uv[rows], cov)
+    nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
+    locate_discs(rig, target.body, discs, nothing, seen, T, _SIGMA_PX**2 * np.eye(6))
+
+
+#: A prediction older than so many shots, or so many times the time between the last two poses, is none; poses nearer to
+#: each other than so many seconds tell no velocity.
+_OLDEST_SHOTS, _OLDEST_STEPS, LEAST_S = 3, 4.0, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Record):
+    """What is known of a body's motion.
+
+    Attributes:
+        T_left_body: (4, 4) last pose.
+        twist: (6,) its velocity in the body's axes, per second, or per shot where shots carry no time.
+        t_s: time of the last pose, or the number of its shot.
+        shots: how many shots ago it was seen.
+        margin_px: how far off predictions may be.
+        step_s: from the pose before to the last; infinite where the twist is not known.
+        proven: whether the motion has foretold a pose before; what is far from it then is a jump.
+    """
+
+    T_left_body: Array
+    twist: Array
+    t_s: float
+    shots: int
+    margin_px: float
+    step_s: float
+    proven: bool
+
+    def foretells(self, t_s: float) -> bool:
+        """Whether it is known where to look at a time: not before the last pose, nor too long after."""
+        since = t_s - self.t_s
+        return self.shots < _OLDEST_SHOTS and LEAST_S <= since < math.inf and since <= _OLDEST_STEPS * self.step_s
+
+    def predicted(self, t_s: float) -> Array:
+        """Return the pose (4, 4) at a time."""
+        T = np.empty((4, 4))
+        moved(self.T_left_body, self.twist * (t_s - self.t_s), T)
+        return T
+
 
 Way = Literal["followed", "searched", "lost"]
 

@@ -12,10 +12,19 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.discs.pose import (SEEN, Found, Scene, believable, settle, sum_squares, triangulated, uncertainty, velocity)
-from armsight.vision.markers.disc.fit import fit, shape_of
-from armsight.vision.markers.disc_model import Work
-from armsight.vision.markers.disc_outline import Room, outline
+from armsight.vision.discs.pose import (
+    SEEN,
+    Found,
+    Scene,
+    believable,
+    settle,
+    sum_squares,
+    triangulated,
+    uncertainty,
+    velocity,
+)
+from armsight.vision.markers.disc.fit import Work, fit, shape_of
+from armsight.vision.markers.disc.search import Room, outline
 from armsight.vision.posefit import moved
 
 #: What came of one disc in one image, beside SEEN and the codes of disc_fit.REASONS.

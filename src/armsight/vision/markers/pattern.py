@@ -6,8 +6,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.vision.markers.edge import edge
-from armsight.vision.markers.normal import edge_noise, factor, invert, normal_equations, solve
+from armsight.vision.markers.normal import edge, edge_noise, factor, invert, normal_equations, solve
 
 FIELD = 12  # coefficients of the quadratic field over the marker
 PARAMETERS = FIELD + 6  # ..., squared blur, b, c, a, k (2)

@@ -14,9 +14,8 @@ from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board import BOARDS, open_board
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
-from armsight.vision.markers.bodies import load_body_csv
 from armsight.vision.markers.body_check import check_points
-from armsight.vision.markers.body_file import Marker, read_body_file
+from armsight.vision.markers.body_file import Marker, load_body_csv, read_body_file
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Discs, Record, Rejected
-from armsight.vision.markers.disc import fit as disc_fit, search as disc_search
-from armsight.vision.markers import disc_model, disc_outline
 from armsight.vision.markers.body_check import check_discs
 from armsight.vision.markers.body_file import Marker
+from armsight.vision.markers.disc import fit as disc_fit
+from armsight.vision.markers.disc import fit as disc_model
+from armsight.vision.markers.disc import search as disc_outline
+from armsight.vision.markers.disc import search as disc_search
 
 #: Most rejected places of an image that are told.
 MOST_TOLD = 100
