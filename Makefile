@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint docs bench clean
 
 demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held against its truth
 	$(BIN)/armsight demo -o demo
@@ -15,6 +15,10 @@ lint: $(VENV)/.armsight-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(VENV)/.armsight-test  ## the site, into docs/_build/html; runs the tutorials and the examples where they changed
+	$(BIN)/python docs/run_tutorials.py docs/_made
+	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -D plot_gallery=1 docs docs/_build/html
 
 bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA; about an hour
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"

@@ -1,0 +1,32 @@
+"""The tutorials' commands run in the order in which their pages have them, and make the pictures that they show."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+sys.path.insert(0, str(DOCS))
+from run_tutorials import PAGES, Runner, blocks, pictures  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory):
+    return Runner(tmp_path_factory.mktemp("tutorials"))
+
+
+def test_every_tutorial_is_run():
+    listed = set(re.findall(r"^(\w+)$", (DOCS / "tutorials/index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {page.removeprefix("tutorials/") for page in PAGES} == listed | {"start"}
+    assert listed == {path.stem for path in (DOCS / "tutorials").glob("*.md")} - {"index"}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_commands_run_and_make_the_pictures(runner, page):
+    run = [command for block in blocks(page) if block.how != "no" for command in block.commands]
+    assert any(command.startswith("armsight ") for command in run)
+    folder = runner.run(page)
+    for short, file in pictures(page):
+        assert short == folder.name
+        assert (folder / file).stat().st_size > 5000, file  # an empty plot of this size would be smaller
