@@ -27,6 +27,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 ROOT = Path(__file__).resolve().parent.parent
 # The law in float64 is the tests' own.
 sys.path.insert(0, str(ROOT / "tests" / "firmware"))
+sys.path.insert(0, str(ROOT / "tests" / "firmware" / "core"))
 
 import firmware_arm  # noqa: E402
 import numpy as np  # noqa: E402
@@ -39,9 +40,9 @@ from armsight.firmware.elf import read_elf  # noqa: E402
 from armsight.firmware.stack import stack_use  # noqa: E402
 from armsight.robot.boards.configuration import gains_array, lab_configuration  # noqa: E402
 from armsight.robot.boards.emulated import EmulatedLink  # noqa: E402
-from armsight.robot.boards.opening import configured, open_machine  # noqa: E402
+from armsight.robot.boards.opening import configured, open_emulator  # noqa: E402
 from armsight.robot.boards.qemu import PROGRAM  # noqa: E402
-from armsight.robot.boards.unicorn import UnicornMachine  # noqa: E402
+from armsight.robot.boards.unicorn import UnicornEmulator  # noqa: E402
 from armsight.sim.joints import JointPlant  # noqa: E402
 from board_faults import LINK_TICKS, Campaign, limits  # noqa: E402
 
@@ -64,7 +65,7 @@ def paced(name, ticks, prepare, run):
     """Ticks a second by the clock and by processor time; the emulator's own counts once it has ended."""
     costs = []
     for n in (0, ticks):  # what starting costs is taken away
-        link = EmulatedLink(open_machine(name), JointPlant())
+        link = EmulatedLink(open_emulator(name), JointPlant())
         before, begun = processor_s(), time.perf_counter()
         thing = prepare(link)
         begun = time.perf_counter()
@@ -95,7 +96,7 @@ def figure_1():
             print(f"{name:9}{what:24}{clock:16.0f}{clock / 1000:8.1f}x{processor:20.0f}{processor / 1000:8.1f}x")
 
 
-class CountingMachine(UnicornMachine):
+class CountingMachine(UnicornEmulator):
     """Runs a tick's three parts one after the other and counts the instructions of each."""
 
     def __init__(self, image):
@@ -167,7 +168,7 @@ def figure_3(faults):
     for name in machines():
         count = faults if name == "host" else min(SAMPLE, faults)
         begun = time.process_time()
-        found = Campaign(open_machine(name), SEED, limits()).run(count)
+        found = Campaign(open_emulator(name), SEED, limits()).run(count)
         took = time.process_time() - begun
         print(f"{name}: {count} faults in {found.ticks / 1000:.0f} s of the board ({took:.0f} s), ", end="")
         print(f"{len(found.violations)} violations")
@@ -216,7 +217,7 @@ def replayed():
             counts.append(sensed.counts)
             return sensed
 
-    link = EmulatedLink(open_machine("unicorn"), Heard())
+    link = EmulatedLink(open_emulator("unicorn"), Heard())
     configured(link)
     bench = Bench(link, None, [])
     link._watch = lambda _: outputs.append(link.answer["outputs"].copy())

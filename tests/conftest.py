@@ -8,7 +8,7 @@ import pytest
 from hypothesis import settings
 
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.opening import open_machine
+from armsight.robot.boards.opening import open_emulator
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,6 +33,6 @@ def data_dir() -> Path:
 def host_firmware() -> None:
     """The firmware as code of this computer, or a skip that says why it is not there."""
     try:
-        open_machine("host").close()
+        open_emulator("host").close()
     except (DeviceError, InputError) as error:
         pytest.skip(f"the firmware is not built: {error}")

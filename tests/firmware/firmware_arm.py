@@ -129,8 +129,8 @@ class LabArm:
 
     def obeyed(self) -> bool:
         """Tell whether the last command was obeyed; it was refused otherwise."""
-        obeyed = self.outputs.obeyed_sequence == self.sequence
-        assert obeyed != (self.outputs.refused_sequence == self.sequence)
+        obeyed = self.outputs.acknowledged_sequence == self.sequence
+        assert obeyed != (self.outputs.rejected_sequence == self.sequence)
         return obeyed
 
 

@@ -76,8 +76,8 @@ class BareWire:
             self.library.wire_before_tick(self.state, ctypes.byref(self.inputs))
             self.outputs.tick = (self.outputs.tick + 1) % 2**32
             if self.inputs.command.kind:
-                self.outputs.obeyed_count += 1
-                self.outputs.obeyed_sequence = self.inputs.command.sequence
+                self.outputs.acknowledged_count += 1
+                self.outputs.acknowledged_sequence = self.inputs.command.sequence
             self.library.wire_after_tick(self.state, ctypes.byref(self.inputs), ctypes.byref(self.outputs))
             self.library.wire_poll(self.state)
             self.line = self.line % 1.0 + self.baud / BITS_PER_BYTE / c.TICKS_PER_S

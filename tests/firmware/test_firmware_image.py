@@ -12,7 +12,7 @@ from armsight import firmware
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build, stack
 from armsight.firmware.elf import read_elf
-from armsight.robot.boards.opening import open_machine
+from armsight.robot.boards.opening import open_emulator
 
 #: What every board's linker script keeps free for the stack.
 STACK_BYTES = 8 * 1024
@@ -45,7 +45,7 @@ def test_a_run_takes_no_more_stack_than_the_bound(tmp_path, name):
         pytest.skip(f"needs {name}, and gcc for the bound")
     image = build.build_board("pil", tmp_path / "pil.elf", found[name])
     try:
-        machine = open_machine("unicorn", image)
+        machine = open_emulator("unicorn", image)
     except InputError as missing:
         pytest.skip(str(missing))
     top = read_elf(image).symbols["stack_top"]
@@ -179,7 +179,7 @@ def test_memory_is_copied_and_filled_at_any_place_and_length(tmp_path, name):
         pytest.skip(f"needs {name} for a Cortex-M4F")
     image = build.build_board("pil", tmp_path / "pil.elf", found[name])
     try:
-        machine = open_machine("unicorn", image)
+        machine = open_emulator("unicorn", image)
     except InputError as missing:
         pytest.skip(str(missing))
     arm = pytest.importorskip("unicorn.arm_const")

@@ -113,7 +113,7 @@ def test_the_tests_reach_the_branches_of_the_core(tmp_path, gcc):
     counted = tmp_path / "counted"
     counted.mkdir()
     flags = f"--coverage -fprofile-update=single -dumpdir {counted}/ -O0"
-    chosen = [str(HERE / f"test_firmware_{name}.py") for name in CORE_TESTS]
+    chosen = [str(HERE / "core" / f"test_firmware_{name}.py") for name in CORE_TESTS]
     again = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", str(tmp_path / "again")]
     counting = {**os.environ, "ARMSIGHT_FIRMWARE_CFLAGS": flags}
     ran = subprocess.run(

@@ -13,7 +13,7 @@ from armsight.app.board.selftest import run_scenario
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
-from armsight.robot.boards.opening import open_machine
+from armsight.robot.boards.opening import open_emulator
 
 #: What a small Cortex-M4F has; the machine's linker script gives the image no more.
 FLASH_BYTES, RAM_BYTES = 64 * 1024, 32 * 1024
@@ -40,7 +40,7 @@ def traces(library_files):
     """What the host build takes and gives in every scenario: those that drive the arm, each from power-up on."""
     found = {}
     for name, scenario in DRIVEN.items():
-        machine = Recorder(open_machine("host", next(iter(library_files.values()))))
+        machine = Recorder(open_emulator("host", next(iter(library_files.values()))))
         assert run_scenario(scenario, machine).problems == (), name
         found[name] = machine.frames
     return found
@@ -62,7 +62,7 @@ def image_of(images, name):
 
 def machine_of(name, image):
     try:
-        return open_machine(name, image)
+        return open_emulator(name, image)
     except InputError as missing:
         pytest.skip(str(missing))
 
@@ -82,7 +82,7 @@ def test_every_host_build_gives_the_same_bits(traces, mavlink, tmp_path):
     for name, compiler in compilers().items():
         library = build_host(compiler, tmp_path, mavlink)
         for scenario, frames in traces.items():
-            running = open_machine("host", library)
+            running = open_emulator("host", library)
             assert [running.tick(request) for request, _ in frames] == [answer for _, answer in frames], (
                 name,
                 scenario,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arm_bench import ARM, MIDDLE, TICK_S, Cell, distance_mm, mounts, rms, worn
+from arm_rig import ARM, MIDDLE, TICK_S, Cell, distance_mm, mounts, rms, worn
 
 from armsight.data import JointCommand
 from armsight.errors import InputError

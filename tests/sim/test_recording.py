@@ -8,7 +8,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.sim.example_rig import bench_rig, board_poses, demo_recording, in_view, path, tag_plate
+from armsight.sim.example_rig import example_rig, board_poses, demo_recording, in_view, path, tag_plate
 from armsight.sim.recording import Look, Truth, record, shot_names
 from armsight.sim.render.scene import aprilgrid, chessboard
 from armsight.vision.sources.folder import FolderSource
@@ -16,7 +16,7 @@ from armsight.vision.sources.folder import FolderSource
 
 @pytest.fixture(scope="module")
 def rig():
-    return bench_rig((640, 360), 450.0)
+    return example_rig((640, 360), 450.0)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_the_images_depend_on_the_seed_and_not_on_the_threads(tmp_path, rig, boa
 @pytest.mark.parametrize("make", [lambda: chessboard(9, 6, 0.025), lambda: aprilgrid(5, 4, 0.04, 0.3)])
 @pytest.mark.parametrize("model", ["none", "brown4", "brown5", "fisheye"])
 def test_board_poses_are_in_view_spread_and_tilted(make, model):
-    pattern, rig = make(), bench_rig(model=model)
+    pattern, rig = make(), example_rig(model=model)
     Ts = board_poses(np.random.default_rng(1), rig, pattern, 24)
     assert all(in_view(rig, T @ pattern.T_body_pattern, pattern) for T in Ts)
     middles = rig.left.project(Ts[:, :3, 3])
@@ -95,7 +95,7 @@ def test_board_poses_are_in_view_spread_and_tilted(make, model):
 
 def test_a_board_that_is_in_view_of_neither_is_refused():
     with pytest.raises(InputError, match="no pose of the board"):
-        board_poses(np.random.default_rng(0), bench_rig(convergence_deg=100.0), chessboard(9, 6, 0.025), 1)
+        board_poses(np.random.default_rng(0), example_rig(convergence_deg=100.0), chessboard(9, 6, 0.025), 1)
 
 
 def test_a_path_stays_in_view_and_knows_its_velocity(rig):
@@ -109,12 +109,12 @@ def test_a_path_stays_in_view_and_knows_its_velocity(rig):
 
 
 def test_the_bench_is_what_it_says():
-    rig = bench_rig(baseline_m=0.22, convergence_deg=5.0)
+    rig = example_rig(baseline_m=0.22, convergence_deg=5.0)
     assert rig.baseline_m == pytest.approx(0.22)
     assert rig.convergence_deg == pytest.approx(5.0, abs=0.1)
     assert rig.T_left_right[0, 2] < 0  # the right camera looks towards the left one's axis
     with pytest.raises(InputError, match="brown7"):
-        bench_rig(model="brown7")
+        example_rig(model="brown7")
 
 
 def test_the_demo_makes_two_recordings_and_a_body(tmp_path):

@@ -4,7 +4,7 @@ from scipy.optimize import least_squares
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.vision.bundle import CAUCHY_SCALE, Model, Observations, State, minimise
-from armsight.vision.posefit import Sightings, fit_pose
+from armsight.vision.posefit import PixelObservations, fit_pose
 from strategies import ordinary_rig
 from views import pixels, seen, somewhere
 
@@ -18,28 +18,28 @@ def shot(model, seed):
     T = somewhere(rng)
     found = seen(rig, points, T, sigma=SIGMA_PX, rng=rng, hidden=((3, 0), (7, 1), (8, 1)))
     A = 0.2 * rng.normal(size=(12, 2, 2, 2))
-    return rig, points, T, Sightings.of(type(found)(found.ids, found.uv, A @ A.swapaxes(-1, -2)), SIGMA_PX), rng
+    return rig, points, T, PixelObservations.of(type(found)(found.ids, found.uv, A @ A.swapaxes(-1, -2)), SIGMA_PX), rng
 
 
-def whitened(rig, points, sightings, T):
+def whitened(rig, points, observations, T):
     """(N, 2) distances in standard deviations by OpenCV's projection."""
-    r = np.empty((len(sightings.uv), 2))
+    r = np.empty((len(observations.uv), 2))
     for side, (camera, T_camera_left) in enumerate(((rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right)))):
-        rows = sightings.camera == side
-        p = transform(T_camera_left @ T, points[sightings.point[rows]])
-        r[rows] = sightings.uv[rows] - pixels(camera, p)
-    L = np.linalg.cholesky(np.linalg.inv(sightings.cov_uv))
+        rows = observations.camera == side
+        p = transform(T_camera_left @ T, points[observations.point[rows]])
+        r[rows] = observations.uv[rows] - pixels(camera, p)
+    L = np.linalg.cholesky(np.linalg.inv(observations.cov_uv))
     return np.einsum("nji,nj->ni", L, r)
 
 
 @pytest.mark.parametrize("model", ["brown4", "brown8", "fisheye"])
 @pytest.mark.parametrize("robust", [False, True])
 def test_the_minimum_is_that_of_scipy(model, robust):
-    rig, points, T_true, sightings, rng = shot(model, 1)
+    rig, points, T_true, observations, rng = shot(model, 1)
     start = T_true @ exp_se3(np.r_[0.01, 0.02, 0.03, 0.1, 0.1, 0.1] * rng.normal(size=6))
 
     def residuals(xi, at):
-        d = whitened(rig, points, sightings, at @ exp_se3(xi))
+        d = whitened(rig, points, observations, at @ exp_se3(xi))
         if not robust:
             return d.ravel()
         d2 = (d**2).sum(axis=1)
@@ -51,32 +51,32 @@ def test_the_minimum_is_that_of_scipy(model, robust):
             residuals, np.zeros(6), args=(T,), xtol=1e-15, ftol=1e-15, gtol=1e-15, jac="3-point", x_scale="jac"
         )
         T = T @ exp_se3(slow.x)
-    fast = fit_pose(rig.cameras, rig.T_left_right, points, sightings, start, robust=robust)
+    fast = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=robust)
     assert fast is not None
     assert fast.cost == pytest.approx(2 * slow.cost, rel=1e-8)
     # A step ends the iterations once it lowers the cost by less than a share of 1e-8: the pose is then off by at most
     # sqrt(1e-8 * cost) of its standard deviations, and by far less where the convergence is quadratic.
     gap = log_se3(inverse(T) @ fast.T_left_body)
     assert gap @ fast.information @ gap < 1e-8 * fast.cost
-    d = whitened(rig, points, sightings, fast.T_left_body)
+    d = whitened(rig, points, observations, fast.T_left_body)
     assert fast.distance2 == pytest.approx((d**2).sum(axis=1), rel=1e-9)
 
 
 @pytest.mark.parametrize("model", ["brown5", "fisheye"])
 @pytest.mark.parametrize("robust", [False, True])
 def test_bundle_adjustment_finds_the_same(model, robust):
-    rig, points, T_true, sightings, rng = shot(model, 2)
+    rig, points, T_true, observations, rng = shot(model, 2)
     start = T_true @ exp_se3(0.02 * rng.normal(size=6))
-    order = np.lexsort((sightings.point, sightings.camera))
+    order = np.lexsort((observations.point, observations.camera))
     observations = Observations(
-        np.zeros(len(order), np.int64), sightings.camera[order], sightings.point[order], sightings.uv[order],
-        sightings.cov_uv[order] - SIGMA_PX**2 * np.eye(2), 1,
+        np.zeros(len(order), np.int64), observations.camera[order], observations.point[order], observations.uv[order],
+        observations.cov_uv[order] - SIGMA_PX**2 * np.eye(2), 1,
     )  # fmt: skip
     state = State(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
     held = np.zeros(sum(camera.parameters.size for camera in rig.cameras) + 6, bool)
     model_ = Model(points, np.zeros((0, len(points), 3)), 1.0, False)
     slow = minimise(model_, state, observations, SIGMA_PX, robust=robust, free=held)
-    fast = fit_pose(rig.cameras, rig.T_left_right, points, sightings, start, robust=robust)
+    fast = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=robust)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-7)
     gap = log_se3(inverse(slow.state.Ts_left_body[0]) @ fast.T_left_body)
     assert gap @ fast.information @ gap < 1e-7 * fast.cost
@@ -84,20 +84,20 @@ def test_bundle_adjustment_finds_the_same(model, robust):
 
 def test_without_noise_the_pose_is_exact():
     rig, points, T_true, _, rng = shot("brown8", 3)
-    exact = Sightings.of(seen(rig, points, T_true), 0.1)
+    exact = PixelObservations.of(seen(rig, points, T_true), 0.1)
     start = T_true @ exp_se3(0.02 * rng.normal(size=6))
     fit = fit_pose(rig.cameras, rig.T_left_right, points, exact, start, robust=False)
     assert fit.T_left_body == pytest.approx(T_true, abs=1e-9)
 
 
 def test_the_information_is_that_of_the_minimum():
-    rig, points, _, sightings, _ = shot("brown4", 4)
-    fit = fit_pose(rig.cameras, rig.T_left_right, points, sightings, shot("brown4", 4)[2], robust=False)
+    rig, points, _, observations, _ = shot("brown4", 4)
+    fit = fit_pose(rig.cameras, rig.T_left_right, points, observations, shot("brown4", 4)[2], robust=False)
     h = np.r_[[1e-6] * 3, [1e-5] * 3]
     columns = [
         (
-            whitened(rig, points, sightings, fit.T_left_body @ exp_se3(h * e))
-            - whitened(rig, points, sightings, fit.T_left_body @ exp_se3(-h * e))
+            whitened(rig, points, observations, fit.T_left_body @ exp_se3(h * e))
+            - whitened(rig, points, observations, fit.T_left_body @ exp_se3(-h * e))
         ).ravel()
         / (2 * h[i])
         for i, e in enumerate(np.eye(6))
@@ -108,14 +108,14 @@ def test_the_information_is_that_of_the_minimum():
 
 
 def test_a_body_behind_the_camera_is_no_start():
-    rig, points, T_true, sightings, _ = shot("brown4", 5)
+    rig, points, T_true, observations, _ = shot("brown4", 5)
     behind = np.array(T_true)
     behind[2, 3] = -0.6
-    assert fit_pose(rig.cameras, rig.T_left_right, points, sightings, behind, robust=True) is None
+    assert fit_pose(rig.cameras, rig.T_left_right, points, observations, behind, robust=True) is None
 
 
 def test_too_few_sightings_determine_no_pose_or_keep_to_the_data():
-    rig, points, T_true, sightings, _ = shot("brown4", 6)
-    two = sightings.select(np.arange(len(sightings.uv)) < 2)
+    rig, points, T_true, observations, _ = shot("brown4", 6)
+    two = observations.select(np.arange(len(observations.uv)) < 2)
     fit = fit_pose(rig.cameras, rig.T_left_right, points, two, T_true, robust=False)
     assert fit is None or np.linalg.matrix_rank(fit.information) <= 4

@@ -7,7 +7,7 @@ import pytest
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.example_rig import bench_rig
+from armsight.sim.example_rig import example_rig
 from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, ordinary_rig
 from views import both_pixels
@@ -77,8 +77,8 @@ def test_images_of_another_size_are_refused():
 
 
 def test_a_verging_rig_agrees_with_opencv():
-    rig, p_left = bench_rig(), scene_points()
-    form, uv = rig.rectify(), both_pixels(bench_rig(), scene_points())
+    rig, p_left = example_rig(), scene_points()
+    form, uv = rig.rectify(), both_pixels(example_rig(), scene_points())
     T = inverse(rig.T_left_right)
     K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in (c.intrinsics for c in rig.cameras)]
     bent, size = [c.distortion for c in rig.cameras], rig.left.image_size_px

@@ -10,14 +10,14 @@ from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_machine
+from armsight.robot.boards.opening import configured, open_emulator
 from armsight.sim.joints import JointPlant
 
 
 def host_board(config=None, **options):
     """A configured board of the host build: (board, link, plant)."""
     plant = JointPlant()
-    link = EmulatedLink(open_machine("host"), plant, **options)
+    link = EmulatedLink(open_emulator("host"), plant, **options)
     return configured(link, config), link, plant
 
 
@@ -95,7 +95,7 @@ class PtyBoard:
 
     def __init__(self, *, fresh=False):
         self.plant = JointPlant()
-        self.link = EmulatedLink(open_machine("host"), self.plant)
+        self.link = EmulatedLink(open_emulator("host"), self.plant)
         if not fresh:
             configured(self.link)
         self.master, slave = pty.openpty()

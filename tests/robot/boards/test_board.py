@@ -7,10 +7,10 @@ from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Order, Refusal, State
+from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Order, Rejection, State
 from armsight.robot.boards.configuration import gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import open_machine
+from armsight.robot.boards.opening import open_emulator
 from armsight.sim.joints import JointPlant, PotFault
 
 ZERO = np.zeros(6)
@@ -38,7 +38,7 @@ def test_a_hello_tells_who_the_board_is():
 
 
 def test_a_fresh_board_runs_on_factory_values_and_cannot_be_enabled():
-    board = Board(EmulatedLink(open_machine("host"), JointPlant()))
+    board = Board(EmulatedLink(open_emulator("host"), JointPlant()))
     assert board.welcome.config_source == ConfigSource.FACTORY
     assert [each.fault for each in board.status.faults] == [Fault.CONFIG]
     with pytest.raises(DeviceError, match="refused the command: not in this state"):
@@ -141,11 +141,11 @@ def test_the_fate_of_each_command_is_known():
     board, _, _ = host_board()
     first = board.send(hold(ZERO))
     board.receive(0.03)
-    assert (board.status.refused_sequence, board.status.refusal) == (first, Refusal.WRONG_STATE)
+    assert (board.status.rejected_sequence, board.status.refusal) == (first, Rejection.WRONG_STATE)
     board.enable()
     second = board.send(hold(ZERO))
     board.receive(0.03)
-    assert board.status.obeyed_sequence == second == first + 2
+    assert board.status.acknowledged_sequence == second == first + 2
     board.confirm(second)
     with pytest.raises(DeviceError, match="refused the command: not in this state"):
         board.confirm(board.order(Order.CLEAR_STOP))
@@ -160,7 +160,7 @@ def test_numbers_go_on_behind_those_of_an_earlier_host():
     other = Board(link)
     assert other.send(hold(ZERO)) == last + 1
     other.receive(0.02)
-    assert other.status.obeyed_sequence == last + 1
+    assert other.status.acknowledged_sequence == last + 1
 
 
 def test_an_emergency_stop_survives_a_disturbed_copy_of_itself():

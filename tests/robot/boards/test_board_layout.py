@@ -64,7 +64,7 @@ def listed(which, text=TYPES):
     [
         ("FAULT", codes.Fault, codes.FAULT_TEXTS),
         ("STATE", codes.State, codes.STATE_TEXTS),
-        ("REFUSAL", codes.Refusal, codes.REFUSAL_TEXTS),
+        ("REFUSAL", codes.Rejection, codes.REFUSAL_TEXTS),
     ],
 )
 def test_codes_and_texts_are_the_headers(which, ours, texts):

@@ -9,7 +9,7 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import Fault, State
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC
-from armsight.robot.boards.opening import MACHINES, configured, open_board, open_machine
+from armsight.robot.boards.opening import EMULATORS, configured, open_board, open_emulator
 from armsight.sim.joints import JointPlant
 
 
@@ -93,7 +93,7 @@ def test_a_world_that_owns_the_time_steps_the_link():
 
 
 def test_a_whole_board_runs_in_a_world_that_owns_the_time():
-    link = EmulatedLink(open_machine("host"), JointPlant(), advance=lambda dt_s: link.step(round(dt_s * 1000)))
+    link = EmulatedLink(open_emulator("host"), JointPlant(), advance=lambda dt_s: link.step(round(dt_s * 1000)))
     board = configured(link)
     board.enable()
     assert board.status.state == State.ENABLED
@@ -172,5 +172,5 @@ def test_boards_are_opened_by_name():
     with pytest.raises(InputError, match="emulated:host needs a plant"):
         open_board("emulated:host")
     with pytest.raises(InputError, match="no machine 'bochs'; there are unicorn, qemu, host"):
-        open_machine("bochs")
-    assert set(MACHINES) == {"unicorn", "qemu", "host"}
+        open_emulator("bochs")
+    assert set(EMULATORS) == {"unicorn", "qemu", "host"}

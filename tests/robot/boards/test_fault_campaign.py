@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.robot.boards.frames import ANSWER, REQUEST
-from armsight.robot.boards.opening import open_machine
+from armsight.robot.boards.opening import open_emulator
 
 PATH = Path(__file__).resolve().parents[3] / "benchmarks" / "board_faults.py"
 
@@ -24,7 +24,7 @@ def campaign():
 
 
 def test_nothing_is_violated_by_any_kind_of_fault(campaign):
-    found = campaign.Campaign(open_machine("host"), 3, campaign.limits()).run(120)
+    found = campaign.Campaign(open_emulator("host"), 3, campaign.limits()).run(120)
     assert found.violations == []
     assert set(found.faults) == set(campaign.KINDS)
     assert max(found.fastest.values()) < campaign.CATCHING_UP
@@ -35,7 +35,7 @@ class Changed:
     """The firmware with something wrong: its answers, or what it is told, are changed."""
 
     def __init__(self, *, answer=lambda frame: None, request=lambda frame: None):
-        self.machine, self.answer, self.request = open_machine("host"), answer, request
+        self.machine, self.answer, self.request = open_emulator("host"), answer, request
 
     def tick(self, request):
         asked = np.frombuffer(bytearray(request), REQUEST)
@@ -60,7 +60,7 @@ def blind_to_supply(frame):
 
 
 def forgets_numbers(frame):
-    frame["outputs"]["obeyed_sequence"] += 1
+    frame["outputs"]["acknowledged_sequence"] += 1
 
 
 def overdrives(frame):

@@ -12,10 +12,10 @@ from armsight.firmware import build
 from armsight.robot.boards import qemu
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, REQUEST
-from armsight.robot.boards.host import HostMachine
-from armsight.robot.boards.opening import open_machine
-from armsight.robot.boards.qemu import QemuMachine
-from armsight.robot.boards.unicorn import UnicornMachine
+from armsight.robot.boards.host import HostEmulator
+from armsight.robot.boards.opening import open_emulator
+from armsight.robot.boards.qemu import QemuEmulator
+from armsight.robot.boards.unicorn import UnicornEmulator
 from armsight.sim.joints import JointPlant
 
 COMPILERS = ("zig", "gcc")
@@ -38,7 +38,7 @@ def library(tmp_path_factory):
 @pytest.fixture(scope="module")
 def expected(library):
     """What each scenario does on the host build."""
-    return {name: run_scenario(scenario, HostMachine(library)) for name, scenario in DRIVEN.items()}
+    return {name: run_scenario(scenario, HostEmulator(library)) for name, scenario in DRIVEN.items()}
 
 
 @pytest.mark.parametrize("scenario", DRIVEN)
@@ -47,11 +47,11 @@ def test_every_scenario_passes(expected, scenario):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("machine", [UnicornMachine, QemuMachine])
+@pytest.mark.parametrize("machine", [UnicornEmulator, QemuEmulator])
 def test_every_machine_and_compiler_gives_the_same_bits(images, expected, machine, compiler):
     if compiler not in images:
         pytest.skip(f"{compiler} is not installed")
-    if machine is QemuMachine and not shutil.which(qemu.PROGRAM):
+    if machine is QemuEmulator and not shutil.which(qemu.PROGRAM):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     for name, scenario in DRIVEN.items():
         assert run_scenario(scenario, machine(images[compiler])) == expected[name], name
@@ -73,14 +73,14 @@ def test_one_bit_of_a_potentiometer_is_another_trace():
     for nudge in (False, True):
         trace, plant = hashlib.sha256(), Nudged()
         plant.nudge = nudge
-        link = EmulatedLink(open_machine("host"), plant, watch=trace.update)
+        link = EmulatedLink(open_emulator("host"), plant, watch=trace.update)
         link.step(3)
         traces.append(trace.digest())
     assert traces[0] != traces[1]
 
 
 def test_two_host_boards_do_not_share_anything(library):
-    first, second = (EmulatedLink(HostMachine(library), JointPlant(seed=seed)) for seed in (1, 2))
+    first, second = (EmulatedLink(HostEmulator(library), JointPlant(seed=seed)) for seed in (1, 2))
     first.step(5)
     second.step(1)
     assert first.answer["tick"] == 5
@@ -90,7 +90,7 @@ def test_two_host_boards_do_not_share_anything(library):
 def test_a_missing_qemu_is_told(monkeypatch, images):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match="qemu-system-arm is not installed: apt install qemu-system-arm, or use"):
-        QemuMachine(next(iter(images.values())))
+        QemuEmulator(next(iter(images.values())))
 
 
 def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
@@ -98,7 +98,7 @@ def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     broken = tmp_path / "none.elf"
     broken.write_bytes(b"\x7fELF nothing more")
-    machine = QemuMachine(broken)
+    machine = QemuEmulator(broken)
     with pytest.raises(DeviceError, match="the emulated board broke down: qemu-system-arm ended"):
         list(map(machine.tick, [bytes(REQUEST.itemsize)] * 3))
     machine.close()
@@ -106,20 +106,20 @@ def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
 
 
 def test_a_request_that_is_none_runs_no_tick(images):
-    machine = UnicornMachine(images[next(iter(images))])
+    machine = UnicornEmulator(images[next(iter(images))])
     answer = machine.tick(bytes(REQUEST.itemsize))
     assert len(answer) == ANSWER.itemsize
     assert answer[:4] == b"ASNO"
 
 
 def test_an_image_that_breaks_down_is_told(images):
-    machine = UnicornMachine(images[next(iter(images))])
+    machine = UnicornEmulator(images[next(iter(images))])
     machine._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
     with pytest.raises(DeviceError, match="the emulated board broke down"):
         machine.tick(bytes(REQUEST.itemsize))
 
 
-@pytest.mark.parametrize("machine", [UnicornMachine, HostMachine])
+@pytest.mark.parametrize("machine", [UnicornEmulator, HostEmulator])
 def test_a_file_that_is_no_firmware_is_named(machine, tmp_path):
     wrong = tmp_path / "wrong.so"
     wrong.write_bytes(b"nothing")

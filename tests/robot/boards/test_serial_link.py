@@ -113,7 +113,7 @@ def test_a_board_behind_a_port_follows_as_one_in_lock_step(cable):
         assert board.welcome.board == "pil"
         board.enable()
         until(board, lambda: np.abs(board.joints.reference_rad - 0.1).max() < 1e-4, hold([0.1] * 6))
-        assert board.status.obeyed_count > 0
+        assert board.status.acknowledged_count > 0
         until(board, lambda: np.abs(cable.plant.q - 0.1).max() < 0.02, hold([0.1] * 6))
         states = board.receive(0.02)
         assert len(states.t_s)

@@ -12,7 +12,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.render import render
-from armsight.sim.render.scene import Placed, chessboard
+from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, open_board
@@ -269,7 +269,7 @@ def test_lengths_take_their_units(text, metres):
 def test_a_board_said_too_small_is_refused(said):
     T = pose(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([-0.1, -0.06, 0.45]))
     camera = Camera((640, 480), "none", np.array([560.0, 560.0, 319.5, 239.5]), np.zeros(0))
-    image = render(camera, [Placed((chessboard(9, 6, 0.025),), T)], rng=np.random.default_rng(0))
+    image = render(camera, [PosedBody((chessboard(9, 6, 0.025),), T)], rng=np.random.default_rng(0))
     assert open_board("chessboard:9x6:25mm").detect(image).problem is None
     problem = open_board(f"chessboard:{said}:25mm").detect(image).problem
     assert problem is not None

@@ -1,7 +1,7 @@
 """The contract of a foreign rig file: another program's calibration goes in, a StereoRig comes out, and back.
 
 To add a format: write one module with the two functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
-``__init__.py``. The laws in tests/vision/test_rigfiles.py are parametrised over that registry. What the formats share,
+``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the formats share,
 such as reading YAML, checking matrices and OpenCV's rectification, stands here too.
 """
 

@@ -1,0 +1,217 @@
+"""The command ``armsight board``: what it prints, its JSON, and one line for every mistake."""
+
+import os
+import shutil
+import stat
+
+import pytest
+
+from armsight.app.board import selftest as board_selftest
+from armsight.app.board.flash import FLASHED, PROGRAMMERS
+from armsight.app.board.scenarios import AT_REST, DRIVEN
+from armsight.firmware import build, host_library
+from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.host import HostEmulator
+from armsight.robot.boards.opening import EMULATORS
+from cli_runs import refused
+
+HOST = ("--board", "emulated:host")
+
+
+def test_the_self_test_prints_exactly_its_record(armsight):
+    said = armsight("board", "selftest", *HOST, "--json")
+    assert said.code == 0, said.err
+    (record,) = said.lines
+    assert list(record) == ["board", "scenarios", "ticks_per_s", "elf"]
+    assert record["board"] == "emulated:host"
+    assert list(record["scenarios"]) == list(DRIVEN)
+    for each in record["scenarios"].values():
+        assert set(each) == {"passed", "trace_sha256"}
+        assert each["passed"] is True
+        assert len(each["trace_sha256"]) == 64
+    assert record["ticks_per_s"] > 0
+    assert record["elf"]["hard_float"] is True
+    assert 5000 < record["elf"]["flash_bytes"] < 64 * 1024
+    assert 4000 < record["elf"]["ram_bytes"] < 64 * 1024
+
+
+class Deaf:
+    """A board that does not hear commands once it is driven: its arm goes where it likes."""
+
+    def __init__(self, image):
+        self.machine, self.ticks = HostEmulator(host_library()), 0
+
+    def tick(self, request):
+        self.ticks += 1
+        frame = bytearray(request)
+        if self.ticks > 700:
+            frame[:] = request[:76] + bytes(len(request) - 76)  # no byte of the wire
+        return self.machine.tick(bytes(frame))
+
+    def close(self):
+        self.machine.close()
+
+
+def test_a_board_that_fails_is_told_with_what_is_wrong(armsight, monkeypatch):
+    monkeypatch.setitem(EMULATORS, "host", (Deaf, lambda: None))
+    monkeypatch.setattr(board_selftest, "DRIVEN", {"nominal": DRIVEN["nominal"], "e_stop": DRIVEN["e_stop"]})
+    said = armsight("board", "selftest", *HOST, "--json")
+    assert said.code == 1
+    assert not any(each["passed"] for each in said.lines[0]["scenarios"].values())
+    assert "nominal: while swinging: HOLDING (host silent: no motion command within the time set)" in said.err
+    assert "e_stop: a stopped board took a motion command" in said.err
+    assert "Traceback" not in said.err
+
+
+def test_the_self_test_reads_well(armsight):
+    said = armsight("board", "selftest", *HOST)
+    assert [line.split()[:2] for line in said.out.splitlines()[:6]] == [[name, "passed"] for name in DRIVEN]
+    assert "times real time" in said.out
+    assert "hardware floating point" in said.out
+
+
+def test_every_scenario_of_a_board_at_rest_has_a_driven_twin():
+    assert set(AT_REST) <= set(DRIVEN)
+
+
+def test_monitor_prints_a_line_at_a_time(armsight):
+    said = armsight("board", "monitor", *HOST, "--seconds", "1", "--every", "0.25", "--json")
+    assert said.code == 0
+    assert len(said.lines) == 4
+    assert all(line["state"] == State.DISABLED.name and line["faults"] == [] for line in said.lines)
+    assert [line["readings"] for line in said.lines[1:]] == [250] * 3
+    assert "board pil, firmware" in said.err
+    text = armsight("board", "monitor", *HOST, "--seconds", "0.5")
+    assert "disabled" in text.out
+    assert "deg" in text.out
+
+
+def test_monitor_shows_faults(armsight, monkeypatch):
+    class Broken(board_selftest.JointPlant):
+        def __init__(self):
+            super().__init__()
+            self.supply_mv = 4000
+
+    monkeypatch.setattr("armsight.app.board.command.JointPlant", Broken)
+    said = armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1", "--json")
+    assert said.lines[0]["faults"] == [{"fault": Fault.SUPPLY_LOW.name, "joint": None}]
+    assert "SUPPLY_LOW" in armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1").out
+
+
+def test_gains_are_printed_and_changed(armsight):
+    said = armsight("board", "gains", *HOST, "--json")
+    before = said.lines[0]
+    assert before["kp_per_rad"] == [4.0] * 6
+    changes = ("--set", "3:kp_per_rad=7.5", "--set", "all:ki_per_rad_s=0")
+    after = armsight("board", "gains", *HOST, *changes, "--store", "--json").lines[0]
+    assert after["kp_per_rad"] == [4.0, 4.0, 7.5, 4.0, 4.0, 4.0]
+    assert after["ki_per_rad_s"] == [0.0] * 6
+    assert after["kd_s_per_rad"] == before["kd_s_per_rad"]
+    table = armsight("board", "gains", *HOST, *changes).out.splitlines()
+    assert table[0].split()[:2] == ["joint", "kp_per_rad"]
+    assert table[3].split()[:3] == ["3", "7.5", "0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("gains", *HOST, "--set", "3:kp_per_rad=700"),
+            ["joint 3: kp_per_rad is 700; 0 to 100", "nothing was changed"],
+        ),
+        (("gains", *HOST, "--set", "3:kp_per_rad=nan"), ["joint 3: kp_per_rad is nan"]),
+        (("gains", *HOST, "--set", "7:kp_per_rad=1"), ["JOINT:NAME=VALUE is needed", "derivative_filter_s"]),
+        (("gains", *HOST, "--set", "1:kp=1"), ["JOINT:NAME=VALUE is needed"]),
+        (("gains", *HOST, "--set", "1:kp_per_rad=much"), ["'much' is no number"]),
+        (("gains", "--board", "emulated:avr"), ["no board 'emulated:avr'", "emulated:unicorn", "serial:PORT"]),
+        (("monitor", "--board", "serial:/dev/ttyNONE"), ["/dev/ttyNONE: no such port"]),
+        (("monitor", "--board", "serial:/dev/null"), ["/dev/null: not a serial port"]),
+        (("selftest", "--board", "usb"), ["no board 'usb'"]),
+        (("build", "--board", "mega"), ["no board 'mega'", "stm32f4"]),
+        (("build", "--board", "stm32f4", "--compiler", "tcc"), ["no firmware compiler 'tcc'"]),
+        (("build", "--board", "stm32f4", "-o", "/proc/none"), ["/proc/none: cannot be made"]),
+    ],
+)
+def test_a_mistake_is_one_line(armsight, arguments, words):
+    refused(armsight("board", *arguments), *words)
+
+
+def test_an_image_is_built_with_its_pieces(armsight, tmp_path):
+    said = armsight("board", "build", "--board", "stm32f4", "-o", tmp_path / "out", "--json")
+    (facts,) = said.lines
+    assert facts["board"] == "stm32f4"
+    assert facts["hard_float"] is True
+    assert facts["compiler"] in build.compilers()
+    assert sum(os.path.getsize(piece) for _, piece in facts["pieces"]) == facts["flash_bytes"]
+    assert facts["pieces"][0][0] == 0x08000000
+
+
+@pytest.fixture(scope="module")
+def stm32f4(tmp_path_factory):
+    """The real board's image, built once."""
+    return build.build_board("stm32f4", tmp_path_factory.mktemp("image") / "stm32f4.elf", build.open_compiler())
+
+
+@pytest.fixture
+def programmers(tmp_path, monkeypatch, stm32f4):
+    """Installs programmers that write down what they were told; the image they are given is built already."""
+    monkeypatch.setattr(build, "build_board", lambda board, target, compiler: shutil.copyfile(stm32f4, target))
+    folder = tmp_path / "bin"
+    folder.mkdir()
+
+    def install(*names, code=0):
+        for name in names:
+            program = folder / name
+            program.write_text(
+                f'#!/bin/sh\necho "{name} $@" >> {tmp_path}/told\necho "no probe found" >&2\nexit {code}\n'
+            )
+            program.chmod(program.stat().st_mode | stat.S_IXUSR)
+        monkeypatch.setenv("PATH", str(folder) + os.pathsep + os.environ["PATH"])
+        monkeypatch.setattr("armsight.app.board.flash.which", lambda name: name if name in names else None)
+
+    return install
+
+
+def test_without_a_programmer_the_user_is_told_what_to_install_and_where_the_image_lies(
+    armsight, programmers, tmp_path
+):
+    programmers()
+    said = armsight("board", "flash", "-o", tmp_path / "out")
+    piece = tmp_path / "out" / "stm32f4-08000000.bin"
+    refused(said, "none of st-flash, openocd, dfu-util is installed", "apt install", f"{piece} (to 0x08000000)")
+    assert piece.stat().st_size > 0
+    said = armsight("board", "flash", "-o", tmp_path / "out", "--programmer", "openocd")
+    refused(said, "openocd is not installed")
+
+
+@pytest.mark.parametrize("name", PROGRAMMERS)
+def test_a_programmer_writes_every_piece_to_its_place(armsight, programmers, tmp_path, name):
+    programmers(name)
+    said = armsight("board", "flash", "-o", tmp_path / "out", "--json")
+    assert said.code == 0, said.err
+    facts = said.lines[0]
+    assert facts["programmer"] == name
+    told = (tmp_path / "told").read_text()
+    if name == "openocd":
+        assert f"program {{{facts['image']}}} verify reset exit" in told
+    else:
+        for address, piece in facts["pieces"]:
+            assert piece in told
+            assert f"{address:#x}" in told
+
+
+def test_a_programmer_that_fails_is_told_in_its_own_words(armsight, programmers, tmp_path):
+    programmers("st-flash", code=1)
+    said = armsight("board", "flash", "-o", tmp_path / "out")
+    refused(said, "st-flash could not write the board (no probe found)", "is it plugged in", "stm32f4-08000000.bin")
+
+
+def test_what_was_built_reads_well(armsight, programmers, tmp_path):
+    said = armsight("board", "build", "--board", "stm32f4", "-o", tmp_path)
+    assert "hardware floating point" in said.out
+    assert f"{tmp_path}/stm32f4-08000000.bin: to 0x08000000" in said.out
+
+
+def test_only_a_real_board_is_flashed(armsight, programmers, tmp_path):
+    assert FLASHED == ("stm32f4",)
+    refused(armsight("board", "flash", "--board", "pil", "-o", tmp_path), "pil is no board to plug in")

@@ -1,0 +1,422 @@
+"""``armsight body``: the verdict on good and bad bodies, drawings to scale, and what is typed wrongly."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.app.body import draw as body_draw
+from armsight.app.body.check import TOLD, judge
+from armsight.data import Discs, Missed
+from armsight.geometry.pose import inverse, transform
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.discs.identify import identify
+from armsight.vision.discs.predict import plain_rig, view
+from armsight.vision.markers.body_layout import read_layout
+from armsight.vision.markers.targets import open_target
+from cli_runs import refused
+
+PLATE = Path(__file__).resolve().parents[3] / "examples" / "plate.toml"
+TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
+#: What a measurement on paper may be off by: the bound asked of a drawing, mm.
+PAPER_MM = 0.05
+
+
+def disc(name, place, normal="normal = [0, 0, -1]", radius=8.0, bright="true"):
+    return (
+        f'[[markers]]\nname = "{name}"\nposition_mm = {[float(c) for c in place]}\n{normal}\n'
+        f"disc = {{ radius_mm = {radius}, bright = {bright} }}\n"
+    )
+
+
+TAG = (
+    '[[markers]]\nname = "T"\nposition_mm = [0, 30, 0]\nnormal = [0, 0, -1]\nx_axis = [1, 1, 0]\n'
+    'tag = { family = "tag36h11", id = 3, size_mm = 30 }\n'
+)
+BOARD = (
+    '[[markers]]\nname = "B"\nposition_mm = [-60, 60, 0]\nnormal = [0, 0, -1]\nx_axis = [1, 0.1, 0]\n'
+    'board = { spec = "SPEC" }\n'
+)
+
+
+@pytest.fixture
+def body(tmp_path):
+    """Write a body of discs and more."""
+
+    def written(places=TRIANGLE, more="", **looks):
+        path = tmp_path / "body.toml"
+        path.write_text("".join(disc(f"P{i + 1}", p, **looks) for i, p in enumerate(places)) + more)
+        return path
+
+    return written
+
+
+def regular(count, radius=60.0):
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1).tolist()
+
+
+def facts(said):
+    (one,) = said.lines
+    return one
+
+
+def kinds(verdict, grade):
+    return {f["kind"] for f in verdict["findings"] if f["grade"] == grade}
+
+
+def test_the_chapters_plate_is_usable_and_its_twin_is_settled_by_the_normals(armsight):
+    said = armsight("body", "check", PLATE, "--json")
+    assert said.code == 0
+    got = facts(said)
+    assert got["verdict"] == "usable"
+    side = np.hypot(55, 85)
+    assert [d["mm"] for d in got["distances_mm"]] == pytest.approx([side, side, 110.0])
+    (swap,) = got["swaps"]
+    assert swap["words"] == "P1 and P2 exchanged"
+    assert swap["from_behind"]
+    assert swap["settled_by_normals"]
+    assert [e["disc_px"] for e in got["expected"]] == [pytest.approx([16 * 0.9 / d] * 2) for d in (0.6, 0.8, 1.2)]
+    text = armsight("body", "check", PLATE).out
+    assert "verdict: usable" in text
+    assert "P1 and P2 exchanged would fit, but seen from behind: the normals settle it" in text
+
+
+def test_without_normals_the_same_plate_is_ambiguous_and_normals_are_asked_for(armsight, body):
+    said = armsight("body", "check", body(normal=""))
+    assert said.code == 1
+    assert "verdict: ambiguous" in said.out
+    assert "P1 and P2 exchanged, seen from behind, is the same body" in said.out
+    assert "change: give every disc its normal" in said.out
+
+
+@pytest.mark.parametrize(("count", "turns"), [(3, 2), (4, 3), (5, 4)])
+def test_a_regular_body_is_ambiguous_by_each_of_its_turns_and_the_move_that_is_advised_mends_it(
+    armsight, body, tmp_path, count, turns
+):
+    path = body(regular(count))
+    said = armsight("body", "check", path, "--json")
+    assert said.code == 1
+    got = facts(said)
+    assert got["verdict"] == "ambiguous"
+    assert sum(not s["distinguishable"] for s in got["swaps"]) == turns
+    assert sum(s["settled_by_normals"] for s in got["swaps"]) == count  # the mirror axes
+    (advice,) = [f["change"] for f in got["findings"] if f["kind"] == "change"]
+    name, mm, sign, axis = re.search(r"move P(\d) by (\d+) mm along ([+-])([xyz])", advice).groups()
+    places = regular(count)
+    places[int(name) - 1]["xyz".index(axis)] += float(f"{sign}{mm}")
+    assert armsight("body", "check", body(places)).code == 0
+
+
+def test_the_side_of_a_body_with_a_tag_is_told_by_the_tag(armsight, body):
+    got = facts(armsight("body", "check", body(more=TAG, normal=""), "--json"))
+    assert got["verdict"] == "usable"
+    assert got["coded"]
+
+
+def test_a_mirror_image_is_harmless_and_said(armsight, body):
+    said = armsight("body", "check", body([*TRIANGLE, (0, 30, -40)], normal=""))
+    assert said.code == 0
+    assert "note  P1 and P2 exchanged is its mirror image: harmless to two cameras, not to one alone" in said.out
+
+
+def test_nearly_equal_distances_are_told_apart_near_and_not_far(armsight, body):
+    path = body(((-55, 0, 0), (61, 0, 0), (0, 95, 0)))
+    near, far = (facts(armsight("body", "check", path, "--distance", d, "--json")) for d in (0.4, 1.6))
+    assert near["verdict"] == "usable"
+    assert far["verdict"] == "ambiguous"
+    (text, *_) = [f["text"] for f in far["findings"] if f["kind"] == "ambiguous"]
+    wanted, reckoned = map(float, re.search(r"is known to ([\d.]+) px \(reckoned with: ([\d.]+) px", text).groups())
+    assert wanted < reckoned
+
+
+def test_dark_and_bright_discs_are_not_taken_for_each_other(armsight, body):
+    path = body(regular(3)[:2], more=disc("D", regular(3)[2], bright="false"))
+    got = facts(armsight("body", "check", path, "--json"))
+    assert got["verdict"] == "usable"
+    assert [s["words"] for s in got["swaps"]] == ["P1 and P2 exchanged"]
+
+
+@pytest.mark.parametrize(
+    ("places", "looks", "more", "kind", "words"),
+    [
+        (TRIANGLE, {"radius": 1.5}, "", "size", "4.5 px across, below 5"),
+        (TRIANGLE, {"radius": 26.0}, "", "size", "78 px across, above 60"),
+        (((0, 0, 0), (15, 0, 0), (0, 85, 0)), {}, "", "overlap", "P1 and P2 overlap by 1.0 mm"),
+        (((-55, 0, 0), (55, 0, 0), (0, 50, 0)), {}, TAG, "overlap", "the disc P3 lies on T"),
+        (((-700, 0, 0), (700, 0, 0), (0, 85, 0)), {}, "", "image", "P1, P2 are not in both images"),
+        (
+            TRIANGLE[:2],
+            {},
+            disc("B1", (0, 85, 5), "normal = [0, 0, 1]") + disc("B2", (9, 9, 5), "normal = [0, 0, 1]"),
+            "view",
+            "at most 2 points are seen together",
+        ),
+    ],
+)
+def test_what_makes_a_body_unusable_is_said(armsight, body, places, looks, more, kind, words):
+    said = armsight("body", "check", body(places, more, **looks))
+    assert said.code == 1
+    assert "verdict: unusable" in said.out
+    assert words in said.out
+    assert kind in kinds(facts(armsight("body", "check", body(places, more, **looks), "--json")), "bad")
+
+
+def test_what_could_be_better_is_said_and_the_body_is_usable(armsight, body):
+    close = armsight("body", "check", body(((-30, 0, 0), (-11, 0, 0), (0, 85, 0))))
+    assert close.code == 0
+    assert "weak  P1 and P2 leave only 3.0 mm of plain surround" in close.out
+    slim = armsight("body", "check", body(((-55, 0, 0), (65, 0, 0), (10, 20, 0))))
+    assert "known least: the turn about the body's x axis" in slim.out
+    far = armsight("body", "check", body([(x, y, 400) for x, y, _ in TRIANGLE]))
+    assert "the body's origin lies 401 mm from the markers' middle" in far.out
+
+
+def named(rig, target, distance, rng):
+    """What identification makes of a body's discs at five turns: right, wrong or missed; places as good as they get."""
+    words = []
+    for turn in ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7)):
+        T = view(rig, target.body.points, target.normals, distance, turn).T_left_body
+        sides = []
+        for camera, T_camera_body in ((rig.left, T), (rig.right, inverse(rig.T_left_right) @ T)):
+            p, n = transform(T_camera_body, target.body.points), target.normals @ T_camera_body[:3, :3].T
+            uv, shape, _, _ = project_discs(camera, p, n, target.radii_m)
+            order = rng.permutation(len(uv))
+            noisy = uv[order] + rng.normal(0, 0.02, uv.shape)
+            sides.append(Discs(noisy, np.tile(4e-4 * np.eye(2), (len(uv), 1, 1)), shape[order], target.bright[order]))
+        found = identify(rig, target, *sides)
+        if isinstance(found, Missed):
+            words.append(found.reason.split(":")[0])
+        else:
+            off = transform(found.T_left_body, target.body.points) - transform(T, target.body.points)
+            # Depth is known to sqrt(2) 0.02 z^2 / (f b) = 0.2 mm at 1.2 m; another naming is 100 mm off.
+            words.append("right" if np.abs(off).max() < 2e-3 else "wrong")
+    return words
+
+
+@pytest.mark.parametrize(
+    "places", [TRIANGLE, regular(3), [(64, 0, 0), *regular(3)[1:]], [(-55, 0, 0), (55.4, 0, 0), (0, 95, 0)]]
+)
+def test_identification_names_what_is_called_usable_and_misses_what_is_called_ambiguous(armsight, body, places):
+    path = body(places)
+    for distance in (0.6, 1.2):
+        said = armsight("body", "check", path, "--distance", distance, "--json")
+        words = set(named(plain_rig(), read_layout(path).discs, distance, np.random.default_rng(5)))
+        assert words == {"right" if facts(said)["verdict"] == "usable" else "ambiguous"}
+
+
+def test_one_hidden_disc_is_looked_into(armsight, body):
+    """Three of the four are an equilateral triangle: without the fourth they are ambiguous."""
+    got = facts(armsight("body", "check", body([*regular(3), (20.0, 5.0, -40.0)]), "--json"))
+    assert got["verdict"] == "usable"
+    assert any("where P4 is hidden" in (f["text"] or "") for f in got["findings"])
+
+
+def test_a_better_rig_knows_more_and_a_rigs_own_uncertainty_counts(armsight, bench):
+    plain = facts(armsight("body", "check", PLATE, "--distance", "0.5", "--json"))["expected"][0]
+    got = facts(armsight("body", "check", PLATE, "--rig", bench.rig, "--distance", "0.5", "--json"))
+    assert str(bench.rig) in got["cameras"]
+    assert got["expected"][0]["sigma_depth_mm"] > plain["sigma_depth_mm"]
+
+
+def test_the_tolerance_of_a_verdict_is_the_one_that_is_named():
+    layout = read_layout(PLATE)
+    verdict = judge(layout, plain_rig(), (0.6,))
+    assert verdict.word == "usable"
+    assert all((swap.told >= TOLD).all() for swap in verdict.swaps)
+
+
+@pytest.mark.parametrize("command", [["check"], ["draw", "-o", "OUT"]])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, ["no such file"]),
+        ("", ["[[markers]]"]),
+        ("name = ", ["not TOML"]),
+        (disc("P1", TRIANGLE[0]), ["1 disc", "3 or more"]),
+        ("".join(disc(f"P{i}", (i, 0, 0), radius=0.1) for i in range(3)), ["one line"]),
+        ("".join(disc(f"P{i}", (1, 2, 3)) for i in range(3)), ["same place"]),
+        ("".join(disc(f"P{i}", p, radius=0) for i, p in enumerate(TRIANGLE)), ["radius_mm"]),
+        ("".join(disc(f"P{i}", np.array(p) * 1e3) for i, p in enumerate(TRIANGLE)), ["110 m", "mm?"]),
+        ("".join(disc(f"P{i}", p, bright="1") for i, p in enumerate(TRIANGLE)), ["bright", "true or false"]),
+        (disc("P1", TRIANGLE[0]).replace("radius_mm", "radius"), ["radius_mm"]),
+        (
+            disc("P1", TRIANGLE[0]) + "[[markers]]\nname = 'X'\nposition_mm = [0, 0, 0]\nring = {}",
+            ["(X)", "ring", "disc"],
+        ),
+    ],
+)
+def test_a_wrong_body_file_is_one_clear_line(armsight, tmp_path, command, text, words):
+    path = tmp_path / "wrong.toml"
+    if text is not None:
+        path.write_text(text)
+    arguments = [str(tmp_path / "out.pdf") if a == "OUT" else a for a in command]
+    refused(armsight("body", *arguments, path), "wrong.toml", *words)
+    assert not (tmp_path / "out.pdf").exists()
+
+
+def test_what_else_is_typed_wrongly_is_one_clear_line(armsight, tmp_path, body):
+    refused(armsight("body", "check", "points.csv"), "points.csv", "TOML")
+    refused(armsight("body", "check", PLATE, "--distance", "0"), "--distance 0", "metres")
+    refused(armsight("body", "check", PLATE, "--distance", "nan"), "--distance nan", "metres")
+    refused(armsight("body", "check", PLATE, "--rig", tmp_path / "no.json"), "no.json", "no such file")
+    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "plate.docx"), "plate.docx", ".pdf")
+    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "plate"), ".pdf")
+    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "no" / "plate.pdf"), "no folder")
+    refused(armsight("body", "draw", PLATE, "-o", PLATE), "given twice")
+    wide = body([(10 * x, 10 * y, z) for x, y, z in TRIANGLE])
+    refused(armsight("body", "draw", wide, "-o", tmp_path / "wide.pdf"), "P1, P2, P3", "a4 is 210 x 297", "--paper fit")
+    refused(armsight("body", "draw", wide, "-o", tmp_path / "wide.png", "--paper", "fit", "--dpi", "2400"), "--dpi")
+    bent = body(TRIANGLE, disc("Q", (0, 0, 40), normal=""))
+    refused(armsight("body", "draw", bent, "-o", tmp_path / "bent.pdf"), "not flat", "Q needs its normal")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["body.toml"]
+
+
+def test_without_matplotlib_drawing_says_what_to_install(armsight, monkeypatch, tmp_path):
+    monkeypatch.setattr(body_draw.importlib.util, "find_spec", lambda name: None)
+    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "p.pdf"), "matplotlib", 'pip install "armsight[report]"')
+
+
+DPI = 300
+PX_PER_MM = DPI / 25.4
+
+
+def drawn(armsight, path, folder, *more):
+    """Draw as PNG and return the pages, grey."""
+    said = armsight("body", "draw", path, "-o", folder / "drawn.png", "--dpi", DPI, "--json", *more)
+    assert said.code == 0, said.err
+    return [cv2.imread(name, cv2.IMREAD_GRAYSCALE) for name in facts(said)["files"]]
+
+
+def measured_disc(image, middle, radius_px, bright):
+    """Centre and radius of a disc on its plain surround by moments of grey, mm on the paper."""
+    x, y = (round(float(c)) for c in middle)
+    half = int(1.6 * radius_px)
+    window = image[y - half : y + half + 1, x - half : x + half + 1].astype(float)
+    weight = window if bright else 255.0 - window
+    rows, columns = np.mgrid[y - half : y + half + 1, x - half : x + half + 1]
+    area = weight.sum() / 255.0
+    centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    return centre / PX_PER_MM, np.sqrt(area / np.pi) / PX_PER_MM
+
+
+def blobs(image, bright, radius_px):
+    """Rough middles of what has the area of a disc and is round, px."""
+    mask = (image > 127) if bright else (image <= 127)
+    _, _, stats, middles = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    round_ = np.abs(stats[:, cv2.CC_STAT_AREA] / (np.pi * radius_px**2) - 1) < 0.02
+    square = np.abs(stats[:, cv2.CC_STAT_WIDTH] - stats[:, cv2.CC_STAT_HEIGHT]) < 3
+    return middles[round_ & square]
+
+
+@pytest.mark.parametrize("bright", [True, False])
+@pytest.mark.parametrize("paper", ["a4", "letter", "fit"])
+def test_discs_are_drawn_to_scale(armsight, body, tmp_path, bright, paper):
+    path = body(((-50, -10, 0), (55, 0, 0), (5, 85, 0)), radius=6.35, bright=str(bright).lower())
+    (image,) = drawn(armsight, path, tmp_path, "--paper", paper)
+    if paper != "fit":
+        assert image.shape[::-1] == tuple(int(mm * PX_PER_MM) for mm in body_draw.PAPERS[paper])
+    radius_px = 6.35 * PX_PER_MM
+    found = [measured_disc(image, middle, radius_px, bright) for middle in blobs(image, bright, radius_px)]
+    assert len(found) == 3
+    assert [radius for _, radius in found] == pytest.approx([6.35] * 3, abs=PAPER_MM)
+    centres = np.array(sorted((tuple(c) for c, _ in found), key=lambda c: c[1]))
+    expected = np.array([(-50, -10), (55, 0), (5, 85)])  # seen from -z: x to the right, y down, not mirrored
+    np.testing.assert_allclose(centres - centres[0], expected - expected[0], atol=PAPER_MM)
+
+
+def test_the_bar_is_as_long_as_it_says(armsight, tmp_path):
+    (image,) = drawn(armsight, PLATE, tmp_path)
+    low = image[int(0.9 * len(image)) :] < 128
+    (row,) = np.unravel_index(low.sum(axis=1).argmax(), (len(low),))
+    columns = np.flatnonzero(low[row])
+    ends = columns[np.flatnonzero(np.diff(columns) > 1)] if (np.diff(columns) > 1).any() else columns[-1:]
+    # A line's ends and its ticks are half a stroke (0.3 pt) beyond it at the most.
+    assert (ends[0] - columns[0] + 1) / PX_PER_MM == pytest.approx(100.0, abs=PAPER_MM + 0.3 / 72 * 25.4 * 2)
+
+
+@pytest.mark.parametrize(
+    "spec", ["tag", "chessboard:7x4:10mm", "charuco:8x5:15mm:11mm:DICT_5X5_100", "aprilgrid:3x2:20mm:0.3"]
+)
+def test_tags_and_boards_are_drawn_to_scale_and_found_where_the_body_has_them(armsight, body, tmp_path, spec):
+    path = body(more=TAG if spec == "tag" else BOARD.replace("SPEC", spec))
+    if spec != "tag":
+        path = body(((-80, 0, 0), (55, 0, 0)), more=BOARD.replace("SPEC", spec))
+    (image,) = drawn(armsight, path, tmp_path)
+    target = open_target(str(path))
+    found = target.detect(cv2.GaussianBlur(image, (0, 0), 0.8))
+    assert found.problem is None
+    points = 1e3 * target.body.points[found.ids, :2]
+    assert len(points) >= 4
+    # A similarity without a mirror image: complex numbers, least squares.
+    p, q = points @ [1, 1j], found.uv / PX_PER_MM @ [1, 1j]
+    (scale, shift), *_ = np.linalg.lstsq(np.stack([p, np.ones_like(p)], axis=1), q)
+    assert scale == pytest.approx(1.0, abs=PAPER_MM / np.ptp(points, axis=0).max())
+    assert np.abs(scale * p + shift - q).max() < PAPER_MM
+
+
+def test_each_plane_has_its_page(armsight, body, tmp_path):
+    side = "".join(
+        disc(f"S{i}", (60, y, z), normal="normal = [1, 0, 0]") for i, (y, z) in enumerate([(0, 10), (40, 20), (10, 60)])
+    )
+    path = body(more=side)
+    said = armsight("body", "draw", path, "-o", tmp_path / "two.png", "--dpi", DPI)
+    assert "note: the body is not flat: 2 planes, a page each" in said.err
+    assert said.out.splitlines()[:2] == ["page 1: P1, P2, P3", "page 2: S0, S1, S2"]
+    image = cv2.imread(str(tmp_path / "two-2.png"), cv2.IMREAD_GRAYSCALE)
+    radius_px = 8 * PX_PER_MM
+    centres = np.array([measured_disc(image, m, radius_px, True)[0] for m in blobs(image, True, radius_px)])
+    centres = centres[np.argsort(centres[:, 1])]
+    # Seen from +x with y down, z runs to the right: y x (-x) = z.
+    expected = np.array([(10, 0), (60, 10), (20, 40)], float)
+    np.testing.assert_allclose(centres - centres[0], expected - expected[0], atol=PAPER_MM)
+
+
+def test_a_bright_disc_beside_a_tag_keeps_its_surround_off_it(armsight, body, tmp_path):
+    path = body(((-29, 30, 0), (55, 0, 0), (0, 85, 0)), more=TAG.replace("[1, 1, 0]", "[1, 0, 0]"))
+    said = armsight("body", "draw", path, "-o", tmp_path / "near.png", "--dpi", DPI)
+    # The tag reaches 15 mm and its white margin a cell of 30/8 mm: 29 - 18.75 - 8 mm are left.
+    assert "P1 has only 2.2 mm of dark surround" in said.err
+    image = cv2.imread(str(tmp_path / "near.png"), cv2.IMREAD_GRAYSCALE)
+    assert len(open_target(str(path)).detect(cv2.GaussianBlur(image, (0, 0), 0.8)).ids) == 4
+
+
+def test_pdf_and_svg_have_the_papers_size_and_are_the_same_each_time(armsight, tmp_path):
+    for name in ("one.pdf", "two.pdf", "one.svg"):
+        assert armsight("body", "draw", PLATE, "-o", tmp_path / name).code == 0
+    pdf = (tmp_path / "one.pdf").read_bytes()
+    (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+) ?\]", pdf)
+    points = [float(n) for n in box.split()]
+    assert points == pytest.approx([0, 0, 210 / 25.4 * 72, 297 / 25.4 * 72], abs=PAPER_MM / 25.4 * 72)
+    assert pdf == (tmp_path / "two.pdf").read_bytes()
+    svg = (tmp_path / "one.svg").read_text()
+    width, height = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', svg).groups()
+    assert [float(width), float(height)] == pytest.approx([210 / 25.4 * 72, 297 / 25.4 * 72], abs=0.01)
+
+
+def test_names_that_are_not_plain_are_drawn(armsight, body, tmp_path):
+    path = body()
+    path.write_text(path.read_text().replace('"P1"', '"$x^2$"').replace('"P2"', '"\\u6e2c\\u5b9a"'))
+    assert armsight("body", "draw", path, "-o", tmp_path / "names.pdf").code == 0
+
+
+def test_a_drawing_that_fails_leaves_nothing_behind(armsight, tmp_path, full_disk, body):
+    shutil.copy(PLATE, tmp_path / "plate.toml")
+    refused(armsight("body", "draw", tmp_path / "plate.toml", "-o", full_disk / "plate.png"), "plate.png")
+    assert [p.name for p in full_disk.iterdir()] == ["ballast"]
+
+
+def test_the_command_ends_with_its_code():
+    run = subprocess.run([sys.executable, "-m", "armsight.app.main"], capture_output=True, text=True, check=False)
+    assert run.returncode == 0
+    code = "from armsight.app.main import main; main()"
+    arguments = [sys.executable, "-c", code, "body", "check", str(PLATE), "--json", "--distance", "5"]
+    run = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert json.loads(run.stdout)["verdict"] == "unusable"

@@ -1,0 +1,282 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from armsight.app.calibrate import command
+from armsight.vision.rig import StereoRig
+from board_views import rig_error
+from cli_runs import listening, refused
+
+QUICK = ("--model", "brown5", "--folds", "3", "--flat-board")
+
+
+@pytest.fixture
+def few(bench, tmp_path):
+    """A folder of its own with five pairs of the board, to be spoilt."""
+    folder = tmp_path / "few"
+    folder.mkdir()
+    for n in range(0, 10, 2):
+        for side in ("left", "right"):
+            shutil.copy(bench.folder / "board" / f"{side}{n:03d}.png", folder)
+    return folder
+
+
+def images(folder):
+    return "--left", folder / "left*.png", "--right", folder / "right*.png"
+
+
+CHESS = ("--board", "chessboard:9x6:25mm")
+
+
+def test_the_rendered_rig_is_recovered(bench):
+    true, rig = bench.of_board.rig, StereoRig.load(bench.rig)
+    # The truth's middle coefficient order is brown5, the model asked for.
+    error, sigma = rig_error(rig, true), np.sqrt(np.diag(rig.cov))
+    assert (np.abs(error) < 4 * sigma).all(), error / sigma
+    along = true.T_left_right[:3, 3] / true.baseline_m
+    J = np.zeros(len(sigma))
+    J[-6:-3] = along @ true.T_left_right[:3, :3]
+    assert abs(rig.baseline_m - true.baseline_m) < 4 * np.sqrt(J @ rig.cov @ J)
+    assert rig.provenance["pairs_used"] == 12
+    assert rig.provenance["heldout_epipolar_rms_px"] < 0.05
+
+
+def test_json_has_what_was_promised(bench, armsight, tmp_path):
+    out = tmp_path / "rig.json"
+    said = armsight("calibrate", *bench.board, *QUICK, "-o", out, "--json")
+    assert said.code == 0, said.err
+    (summary,) = said.lines
+    promised = {
+        "pairs_found", "pairs_used", "rejected", "fit", "heldout", "baseline_m", "convergence_deg",
+        "distortion_model", "rig",
+    }  # fmt: skip
+    assert promised <= set(summary)
+    assert set(summary["fit"]) == {"epipolar_rms_px", "reprojection_rms_px"}
+    assert {"folds", "epipolar_rms_px", "rigid_rms_m", "scale_error"} <= set(summary["heldout"])
+    assert (summary["pairs_found"], summary["pairs_used"], summary["rejected"]) == (12, 12, [])
+    assert summary["heldout"]["epipolar_rms_px"] < 0.05
+    assert summary["distortion_model"] == "brown5"
+    assert summary["rig"] == str(out)
+    rig = StereoRig.load(out)
+    assert summary["baseline_m"] == pytest.approx(rig.baseline_m, rel=1e-12)
+    assert summary["convergence_deg"] == pytest.approx(rig.convergence_deg, rel=1e-9)
+
+
+def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json")
+    assert said.code == 0, said.err
+    assert said.out.index("Held-out errors") < said.out.index("fit:") < said.out.index("rig written to")
+    assert "weak: only 5 pairs were used" in said.out
+    assert said.err == ""
+
+
+def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monkeypatch):
+    written = []  # its pages have their own tests
+    monkeypatch.setattr(command, "write_report", lambda calibration, folder: written.append((calibration, folder)))
+    said = armsight(
+        "calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--report", tmp_path / "r", "--json"
+    )
+    assert said.code == 0, said.err
+    assert Path(said.lines[0]["report"]) == tmp_path / "r" / "index.html"
+    ((calibration, folder),) = written
+    assert folder == tmp_path / "r"
+    assert len(calibration.pairs) == 5
+
+
+# Bad input, one by one.
+
+
+def test_a_missing_file(few, armsight, tmp_path):
+    (few / "left004.png").unlink()
+    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "4 left and 5 right", "004")
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_an_empty_glob(few, armsight, tmp_path):
+    said = armsight(
+        "calibrate", "--left", tmp_path / "no*.png", "--right", few / "right*.png", *CHESS, "-o", tmp_path / "rig.json"
+    )
+    refused(said, "no*.png", "no such file")
+
+
+def test_no_image_can_be_read(few, armsight, tmp_path):
+    for path in few.glob("*.png"):
+        path.write_bytes(b"not an image")
+    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "none of 5 pairs can be read")
+    assert not (tmp_path / "rig.json").exists()
+
+
+@pytest.mark.parametrize("keep", [0, 40, 0.5])
+def test_one_truncated_image_is_a_rejected_pair(few, armsight, tmp_path, keep):
+    path = few / "right004.png"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data)) if keep < 1 else keep])
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--json")
+    assert said.code == 0, said.err
+    (summary,) = said.lines
+    assert (summary["pairs_found"], summary["pairs_used"]) == (5, 4)
+    ((pair, reason),) = [(r["pair"], r["reason"]) for r in summary["rejected"]]
+    assert pair == "left004"
+    assert "right004.png" in reason
+
+
+def test_the_wrong_board(few, armsight, tmp_path):
+    said = armsight("calibrate", *images(few), "--board", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
+    refused(said, "0 of 5 pairs are usable", "Is --board the board in the images")
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_the_wrong_square_size_cannot_be_seen_but_scales_the_baseline(few, armsight, tmp_path):
+    sizes = []
+    for square in ("25mm", "50mm"):
+        said = armsight(
+            "calibrate", *images(few), "--board", f"chessboard:9x6:{square}", *QUICK, "-o", tmp_path / "r", "--json"
+        )
+        sizes.append(said.lines[0]["baseline_m"])
+    # The same images at twice the size: what is left is where the iterations stop.
+    assert sizes[1] == pytest.approx(2 * sizes[0], rel=1e-6)
+
+
+def test_two_image_sizes(few, armsight, tmp_path):
+    path = few / "right006.png"
+    cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
+    said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json")
+    refused(said, path, "320x180", "640x360")
+
+
+def test_the_same_images_on_both_sides(few, armsight, tmp_path):
+    said = armsight(
+        "calibrate", "--left", few / "left*.png", "--right", few / "left*.png", *CHESS, "-o", tmp_path / "rig.json"
+    )
+    refused(said, "both a left and a right image")
+
+
+def test_left_and_right_exchanged_is_told(few, armsight, tmp_path):
+    said = armsight(
+        "calibrate", "--left", few / "right*.png", "--right", few / "left*.png", *CHESS, *QUICK,
+        "-o", tmp_path / "rig.json", "--json",
+    )  # fmt: skip
+    assert said.code == 0, said.err
+    assert any("are left and right swapped" in weak for weak in said.lines[0]["weaknesses"])
+
+
+@pytest.mark.parametrize(
+    "spec",
+    ["chessboard", "chessboard:9x6", "chessboard:9x6:25", "chessboard:9:25mm", "chessboard:0x6:25mm", "quilt:9x6:25mm",
+     "chessboard:9x6:-25mm", "chessboard:9x6:nanmm", "", "charuco:9x6:25mm:30mm:DICT_4X4_50"],
+)  # fmt: skip
+def test_a_bad_board_spec(few, armsight, tmp_path, spec):
+    refused(armsight("calibrate", *images(few), "--board", spec, "-o", tmp_path / "rig.json"))
+
+
+def test_no_folder_for_the_result(few, armsight, tmp_path):
+    out = tmp_path / "nowhere" / "rig.json"
+    refused(armsight("calibrate", *images(few), *CHESS, "-o", out), out, "there is no folder")
+    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path), tmp_path, "is a folder")
+
+
+def test_a_report_where_a_file_stands(few, armsight, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "r.json", "--report", tmp_path / "taken")
+    refused(said, "taken")
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--left", "a*.png"),
+        ("--left", "a*.png", "--right", "b*.png"),
+        ("--left", "a", "--right", "b", "--board", "chessboard:9x6:25mm", "--detections", "d.csv"),
+        ("--left", "a", "--right", "b", "--board", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
+        ("--detections", "d.csv", "--cameras", "c.json"),
+    ],
+)
+def test_options_that_do_not_go_together(armsight, tmp_path, options):
+    refused(armsight("calibrate", *options, "-o", tmp_path / "rig.json"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("calibrat",),
+        ("calibrate", "--no-such-option"),
+        ("calibrate",),
+        ("calibrate", "-o", "rig.json", "--folds", "1"),
+        ("calibrate", "-o", "rig.json", "--folds", "many"),
+        ("calibrate", "-o", "rig.json", "--model", "pinhole"),
+    ],
+)
+def test_what_is_typed_wrong(armsight, arguments):
+    said = armsight(*arguments)
+    assert said.code == 2
+    assert "Error:" in said.err
+    assert "Traceback" not in said.err
+
+
+# Where a real process, or a real file system, matters.
+
+
+#: Runs the command line, and says on stdout that it is there when a function is called.
+INTERRUPTED = """
+import sys, time
+from unittest import mock
+import {module}
+from armsight.app.main import main
+real = {module}.{name}
+def told(*arguments, **options):
+    print("there", flush=True)
+    {wait}
+    return real(*arguments, **options)
+with mock.patch("{module}.{name}", told):
+    main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "wait"),
+    [
+        # Asleep, too: an interrupt that falls into numba's loading of compiled code ends the process (docs/limits.md).
+        ("armsight.app.calibrate.command", "calibrate_boards", "time.sleep(60)"),
+        ("armsight.vision.sources.pairs", "read_image", "time.sleep(60)"),
+        ("armsight.files", "os.replace", "time.sleep(60)"),
+    ],
+    ids=["adjusting", "reading", "writing"],
+)
+def test_an_interrupt_leaves_nothing(bench, tmp_path, module, name, wait):
+    out = tmp_path / "rig.json"
+    out.write_text("what stood there")
+    script = INTERRUPTED.format(module=module, name=name, wait=wait)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, "calibrate", *bench.board, *QUICK, "-o", out],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listening,
+    )  # fmt: skip
+    assert process.stdout.readline() == "there\n"
+    process.send_signal(signal.SIGINT)
+    printed, complained = process.communicate(timeout=60)
+    assert process.returncode == 130, complained
+    assert complained.splitlines() == ["armsight: interrupted"]
+    assert printed == ""
+    assert out.read_text() == "what stood there"
+    assert os.listdir(tmp_path) == ["rig.json"]
+
+
+def test_a_full_disk(few, armsight, full_disk):
+    out = full_disk / "rig.json"
+    refused(armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", out), out, "No space left on device")
+    assert os.listdir(full_disk) == ["ballast"]
+
+
+def test_the_rig_is_json_that_others_can_read(bench):
+    document = json.loads(bench.rig.read_text())
+    assert document["format"] == "armsight-rig"
+    assert np.shape(document["covariance"]) == (len(document["parameters"]),) * 2

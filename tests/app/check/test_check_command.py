@@ -1,0 +1,324 @@
+"""``armsight check`` from a CSV, and its plan."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+from armsight.app.run.motion_file import read_motions
+from armsight.geometry.pose import pose
+from armsight.robot.models import open_arm
+from armsight.sim.workcell.workcell import Workcell
+from cli_runs import Said, refused, run
+
+COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+COMMAND = ["command_x_m", "command_y_m", "command_z_m", "command_qw", "command_qx", "command_qy", "command_qz"]
+SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
+
+
+def said(capsys, *arguments):
+    capsys.readouterr()
+    code = run("check", *arguments)
+    out = capsys.readouterr()
+    return Said(code, out.out, out.err)
+
+
+def rows_of(sigma_arm=1e-4, noise=5e-5):
+    """Five poses by 30 cycles from two directions, a path and a circle with 0.2 mm of play along x."""
+    rng = np.random.default_rng(1)
+    rows, still = [], [1, 0, 0, 0]
+    commands = rng.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.7], (5, 3))
+    for cycle in range(30):
+        for k, command in enumerate(commands):
+            side = 1 if cycle % 2 else -1
+            off = rng.normal([1e-3 + 1e-4 * side, 0, 0], np.hypot(sigma_arm, noise))
+            rows.append(["pose", f"P{k + 1}", cycle, side, cycle * 5.0 + k, *(command + off), *still, *command, *still])
+    for cycle in range(5):
+        for s in range(20):
+            command = np.array([0.3 + 0.01 * s, 0.1, 0.4])
+            rows.append(["path", s, cycle, "", "", *(command + 5e-4 * np.eye(3)[1]), *still, *command, *still])
+    for way in (1, -1):
+        for angle in np.arange(0.5, 360, 1.0):
+            a = np.radians(angle)
+            command = np.array([0.5 + 0.1 * np.cos(a), 0.1 * np.sin(a), 0.4])
+            lag = -0.5 * 2e-4 * np.sign(-way * np.sin(a))
+            rows.append(["circle", angle, 0, way, "", *(command + lag * np.eye(3)[0]), *still, *command, *still])
+    return [[*row, noise, noise, noise] for row in rows]
+
+
+def file_of(path, rows):
+    with open(path, "w", newline="") as file:
+        csv.writer(file).writerows([[*COLUMNS, *COMMAND, *SIGMA], *rows])
+    return path
+
+
+def test_every_figure(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    file_of(tmp_path / "run" / "check.csv", rows_of())
+    answer = said(capsys, tmp_path / "run", "--json", "-o", tmp_path / "report")
+    assert answer.code == 0
+    (facts,) = answer.lines
+    assert json.loads((tmp_path / "report" / "check.json").read_text()) == facts
+    assert set(facts["poses"]) == {f"P{k}" for k in range(1, 6)}
+    for p in facts["poses"].values():
+        assert p["count"] == 30
+        assert p["AP_m"]["clean"] == pytest.approx(1e-3, abs=1e-4)
+        assert p["RP_m"]["clean"] < p["RP_m"]["raw"]
+    assert facts["vAP_m"]["P1"]["raw"] == pytest.approx(2e-4, abs=1.5e-4)
+    assert facts["distance"]["AD_m"]["raw"] < 1e-4
+    assert facts["paths"]["path"]["AT_m"]["raw"] == pytest.approx(5e-4, abs=1e-9)
+    assert [play["raw"] for play in facts["circle"]["backlash_m"]] == pytest.approx([2e-4, 0], abs=2e-5)
+    assert len(facts["drift"]["dAP_m"]) == 5
+    page = (tmp_path / "report" / "report.html").read_text()
+    for name in ("scatter", "drift", "paths", "circle"):
+        assert f'id="{name}"' in page
+        assert (tmp_path / "report" / f"check-{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert "://" not in page
+    again = said(capsys, tmp_path / "report" / "check.csv", "--json")
+    assert again.lines[0]["poses"]["P1"]["AP_m"]["raw"] == pytest.approx(facts["poses"]["P1"]["AP_m"]["raw"], abs=2e-9)
+
+
+def test_what_is_below_the_noise_is_said(tmp_path, capsys):
+    rows = rows_of(sigma_arm=0.0, noise=1e-4)
+    answer = said(capsys, file_of(tmp_path / "c.csv", rows), "-o", tmp_path / "report")
+    assert answer.code == 0
+    assert "not resolvable: below" in answer.out
+    assert "could have been told" in answer.out
+    assert re.search(r"^play +along x +0\.2\d\d mm", answer.out, re.MULTILINE)
+    assert "not resolvable" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_a_constant_error_of_the_instrument_is_in_the_accuracy(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose"]
+    plain = said(capsys, file_of(tmp_path / "a.csv", rows), "--json").lines[0]["poses"]["P1"]
+    with open(tmp_path / "b.csv", "w", newline="") as file:
+        common = [f"sigma_common_{a}_m" for a in "xyz"]
+        csv.writer(file).writerows([[*COLUMNS, *COMMAND, *SIGMA, *common], *([*row, 1e-4, 1e-4, 1e-4] for row in rows)])
+    facts = said(capsys, tmp_path / "b.csv", "--json").lines[0]["poses"]["P1"]
+    assert facts["AP_m"]["sigma"] == pytest.approx(np.hypot(1e-4, plain["AP_m"]["sigma"]), rel=0.1)
+    assert plain["AP_m"]["sigma"] < 5e-5
+    assert facts["RP_m"] == plain["RP_m"]
+
+
+def test_the_wide_test(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    rows = []
+    for k in range(100):
+        command = rng.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.7])
+        off = rng.normal(0, 1e-3, 3)
+        rows.append(["pose", f"P{k}", 1, "", k, *(command + off), 1, 0, 0, 0, *command, 1, 0, 0, 0, 1e-5, 1e-5, 1e-5])
+    answer = said(capsys, file_of(tmp_path / "wide.csv", rows), "--json", "-o", tmp_path / "report")
+    (facts,) = answer.lines
+    assert facts["anywhere"]["count"] == 100
+    assert facts["anywhere"]["mean_m"]["clean"] == pytest.approx(1e-3 * np.sqrt(8 / np.pi), rel=0.2)
+    assert "poses" not in facts
+    assert (tmp_path / "report" / "check-anywhere.png").exists()
+    assert not (tmp_path / "report" / "check-scatter.png").exists()
+
+
+def test_the_plan(tmp_path, capsys):
+    answer = said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.csv")
+    assert answer.code == 0
+    assert "cycles: 30" in answer.out
+    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
+    refused(said(capsys, "plan", "--model", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    nowhere = said(capsys, "plan", "--model", "six_r", "--test", "line", "--centre", "nan", "0", "0")
+    refused(nowhere, "finite numbers")
+    assert "--speed" not in nowhere.err
+    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
+    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
+    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
+    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "rig.json", "no such file")
+    assert "--test" in said(capsys, "plan", "--help").out
+    assert "RUN|POSES.csv" in said(capsys, "--help").out
+
+
+@pytest.mark.parametrize(
+    ("test", "cycles", "count"), [("poses", 2, 1 + 2 * 5), ("wide", 1, 100), ("line", 2, 5), ("circle", 2, 5)]
+)
+def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
+    out = tmp_path / "check.toml"
+    answer = said(capsys, "plan", "--model", "six_r", "--test", test, "--cycles", cycles, "-o", out, "--json")
+    arm, plan = open_arm("six_r"), read_motions(open_arm("six_r"), out)
+    assert len(plan.motions) == count
+    (facts,) = answer.lines
+    attained = {}
+    for motion in plan.motions:
+        q = motion.trajectory.at(np.linspace(0, motion.trajectory.duration_s, 100)).q
+        assert arm.within_limits(q).all()
+        attained.setdefault(motion.name.split(" cycle ")[0], []).append(arm.forward(q[-1]))
+        p = arm.forward(q)[:, :3, 3]
+        if motion.kind == "circle":
+            radii = np.linalg.norm(p - facts["centre_m"], axis=1)
+            np.testing.assert_allclose(radii, 0.4 * facts["side_m"], atol=1e-8)
+            turned = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()  # 100 chords, each shorter than its arc by 1e-3
+            assert turned == pytest.approx(np.radians(420) * 0.4 * facts["side_m"], rel=2e-3)
+    if test == "poses":
+        for name, T in zip(facts["poses"], facts["T_base_tool"], strict=True):
+            np.testing.assert_allclose(attained[name], [T, T], atol=1e-7)  # angles are written to 1e-6 deg
+
+
+def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
+    with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
+        cell.truth.rig.save(tmp_path / "rig.json")
+        (tmp_path / "body.toml").write_text(cell.body_text)
+        near = cell.truth.T_base_rig @ pose(np.eye(3), np.array([0, 0, 0.6]))  # so near that not all fits in
+        mounting = {"T_base_rig": near.tolist(), "T_tool_body": cell.truth.T_tool_body.tolist()}
+    (tmp_path / "handeye.json").write_text(json.dumps(mounting))
+    rig, T_base_rig = cell.truth.rig, np.array(mounting["T_base_rig"])
+
+    def share_seen(*options):
+        """Of the tool's places of a plan, how many both cameras have in their images."""
+        plan = said(capsys, "plan", "--model", "six_r", "--test", "wide", "--json", *options).lines[0]
+        p_left = (np.array(plan["T_base_tool"])[:, :3, 3] - T_base_rig[:3, 3]) @ T_base_rig[:3, :3]
+        p_right = (p_left - rig.T_left_right[:3, 3]) @ rig.T_left_right[:3, :3]
+        good = np.ones(len(p_left), bool)
+        for camera, p in ((rig.left, p_left), (rig.right, p_right)):
+            uv = camera.project(p)
+            good &= (p[:, 2] > 0) & ((uv > 0) & (uv < np.array(camera.image_size_px))).all(axis=1)
+        return good.mean()
+
+    assert share_seen() < 0.95  # else it would say nothing that all of it is seen:
+    assert share_seen("--seen-in", tmp_path) == 1
+    (tmp_path / "handeye.json").write_text("{}")
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_base_rig")
+    (tmp_path / "handeye.json").write_text(json.dumps(mounting | {"T_tool_body": [1, 2, 3]}))
+    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)")
+
+
+def test_without_a_sigma_errors_have_no_interval(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    with open(tmp_path / "wide.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["pose", *COLUMNS[5:8], *COMMAND[:3]])
+        for k in range(20):
+            command = rng.uniform(0.3, 0.7, 3)
+            writer.writerow([f"P{k}", *(command + rng.normal(0, 1e-3, 3)), *command])
+    answer = said(capsys, tmp_path / "wide.csv", "-o", tmp_path / "report")
+    assert answer.out.count("no interval without the instrument's sigma") == 2
+    facts = json.loads((tmp_path / "report" / "check.json").read_text())
+    assert facts["anywhere"]["mean_m"]["low"] is facts["anywhere"]["mean_m"]["sigma"] is None
+
+
+def test_a_few_poses_too_seldom_are_told(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose" and (row[1] != "P3" or row[2] < 2)]
+    (facts,) = said(capsys, file_of(tmp_path / "c.csv", rows), "--json").lines
+    assert facts["notes"] == ["left out: P3, attained too seldom (2)"]
+
+
+def test_another_reports_page_is_not_written_over(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "report.html").write_text("another's")
+    file = file_of(tmp_path / "c.csv", rows_of())
+    refused(said(capsys, file, "-o", tmp_path / "other"), "another command's report.html", "another folder")
+    assert (tmp_path / "other" / "report.html").read_text() == "another's"
+
+
+def test_paths_whose_stations_differ(tmp_path, capsys):
+    rows, bad = [row for row in rows_of() if row[0] == "path"], tmp_path / "bad.csv"
+    moved = [[*row[:12], row[12] + 1e-3 * (row[1] == 4 and row[2] == 2), *row[13:]] for row in rows]
+    refused(said(capsys, file_of(bad, moved)), "path path", "same stations", "cycle 2")
+    swapped = [[row[0], {3: 4, 4: 3}.get(row[1], row[1]) if row[2] == 1 else row[1], *row[2:]] for row in rows]
+    refused(said(capsys, file_of(bad, swapped)), "same stations", "cycle 1")
+    refused(said(capsys, file_of(bad, rows[:-1])), "same stations", "19 rows")
+    still = [[*row[:12], 0.4 if row[1] in (4, 5, 6) else row[12], *row[13:]] for row in rows]
+    refused(said(capsys, file_of(bad, still)), "path path", "station 6", "does not go on")
+
+
+def test_mistakes(tmp_path, capsys):
+    assert said(capsys).code == 2
+    refused(said(capsys, tmp_path / "none.csv"), "none.csv", "no such file")
+    good = rows_of()
+    refused(said(capsys, file_of(tmp_path / "a.csv", good), "--closed"), "--closed", "run's folder")
+    (tmp_path / "file").write_text("")
+    refused(said(capsys, tmp_path / "a.csv", "-o", tmp_path / "file"), "file", "no report")
+    bad = tmp_path / "bad.csv"
+    file_of(bad, [["dance", *good[0][1:]]])
+    refused(said(capsys, bad), "line 2", "'dance'", "pose, path, circle")
+    file_of(bad, [[*good[0][:5], "x", *good[0][6:]]])
+    refused(said(capsys, bad), "line 2", "x_m")
+    file_of(bad, [[*good[0][:5], "nan", *good[0][6:]]])
+    refused(said(capsys, bad), "line 2", "x_m", "finite")
+    file_of(bad, good[:1])
+    refused(said(capsys, bad), "3 times", "repeatability")
+    file_of(bad, [row for row in good if row[0] == "pose" and row[2] == 0])
+    refused(said(capsys, bad, "-o", tmp_path / "none"), "5 poses", "3 times")
+    assert not (tmp_path / "none").exists()
+    file_of(bad, [[*good[0][:8], 2, *good[0][9:]]] * 3)
+    refused(said(capsys, bad), "line 2", "quaternion")
+    file_of(bad, [row for row in good if row[0] == "circle" and row[3] == 1])
+    refused(said(capsys, bad), "circle", "clockwise")
+    bad.write_text("pose,x_m\nP1,0\n")
+    refused(said(capsys, bad), "y_m", "missing")
+
+
+def changed(row, **cells):
+    """A row with other cells."""
+    names = [*COLUMNS, *COMMAND, *SIGMA]
+    return [cells.get(name, cell) for name, cell in zip(names, row, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: [changed(r, sigma_y_m=-1e-4) for r in rows], ["line 2", "sigma_y_m", "below zero"]),
+        (lambda rows: [changed(r, sigma_y_m="") for r in rows], ["line 2", "sigma_y_m is missing"]),
+        (lambda rows: [changed(r, command_qw="") for r in rows], ["line 2", "command_qw is missing"]),
+        (lambda rows: [changed(r, pose="") for r in rows[:1]] + rows[1:], ["line 2", "pose is empty"]),
+        (lambda rows: [rows[0][:1], *rows[1:]], ["line 2", "pose is empty"]),
+        (lambda rows: [*rows, rows[3]], ["P4", "twice", "cycle 0"]),
+        (lambda rows: [changed(rows[0], command_x_m=0.5), *rows[1:]], ["P1", "several commands"]),
+        (lambda rows: [changed(r, x_m=1e3 * r[5]) for r in rows], ["mm from their commands", "in m"]),
+        (lambda rows: [changed(r, x_m=r[6], y_m=r[5]) for r in rows], ["mm from their commands", "frame"]),
+    ],
+)
+def test_what_no_arm_attains_is_refused(tmp_path, capsys, change, words):
+    rows = [row for row in rows_of() if row[0] == "pose" and row[2] < 5]
+    refused(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *words)
+
+
+def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp_path, capsys):
+    rows = [changed(row, cycle="", t_s="", x_m=round(row[5], 3), y_m=round(row[6], 3), z_m=round(row[7], 3))
+            for row in rows_of() if row[0] == "pose" and row[2] < 5]  # fmt: skip
+    answer = said(capsys, file_of(tmp_path / "round.csv", [row[: -len(SIGMA)] for row in rows]))
+    assert answer.code == 0
+    assert "noise is taken for none" in answer.err
+
+
+def test_a_motion_file_is_told_from_what_was_attained(tmp_path, capsys):
+    assert said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
+    refused(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
+
+
+def test_a_row_far_from_its_pose_is_named_and_the_order_of_rows_picks_nothing(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose"]
+    before = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)
+    assert not any("counts" in note for note in before["notes"])
+    after = json.loads(said(capsys, file_of(tmp_path / "b.csv", rows[::-1]), "--json").out)
+    assert (before["distance"]["from"], before["drift"]["pose"]) == ("P2", "P1")
+    assert (after["distance"]["to"], after["drift"]["pose"]) == ("P4", "P1")
+    n = next(n for n, row in enumerate(rows) if row[1] == "P3" and row[2] == 7)
+    rows[n][7] += 5e-3
+    (told,) = [
+        note
+        for note in json.loads(said(capsys, file_of(tmp_path / "c.csv", rows), "--json").out)["notes"]
+        if "counts" in note
+    ]
+    assert "P3, cycle 7: 4.93 mm" in told
+    rows = [row for row in rows_of(2e-6, 2e-6) if row[0] == "pose"]
+    for row in rows:  # a table rounded so far that most agree, and an odd name
+        row[1], row[5:8] = row[1].replace("P1", "P1²"), [round(float(v), 5) for v in row[5:8]]
+    rounded = json.loads(said(capsys, file_of(tmp_path / "d.csv", rows), "--json").out)
+    assert not [note for note in rounded["notes"] if "counts" in note]
+    assert "P1²" in rounded["poses"]
+
+
+def test_turns_that_are_not_given_have_no_figures(tmp_path, capsys):
+    turns = [n for n, name in enumerate([*COLUMNS, *COMMAND]) if "q" in name]
+    for left, known in (([], (True, True)), (turns[4:], (False, True)), (turns, (False, False))):
+        rows = [["" if n in left else v for n, v in enumerate(row)] for row in rows_of() if row[0] == "pose"]
+        pose_1 = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)["poses"]["P1"]
+        assert (pose_1["AP_rotation_rad"] is not None, pose_1["RP_rotation_rad"] is not None) == known

@@ -1,0 +1,143 @@
+"""A board as an earlier run left it, taken over or refused: the firmware itself, in lock-step."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from armsight.app.run.experiment import enable, warm_up, require_start
+from armsight.app.run.motion_file import QUICK, read_motions
+from armsight.data import JointCommand
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import Fault, Reaction, State
+from armsight.robot.boards.configuration import lab_configuration
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.opening import configured, open_emulator
+from armsight.robot.models import open_arm
+from armsight.sim.joints import JointPlant, PotFault
+
+ARM = open_arm("six_r")
+
+
+@pytest.fixture
+def made():
+    """Opens a configured board; returns (board, link, plant)."""
+    boards = []
+
+    def opened(**given):
+        config = lab_configuration()
+        for name, value in given.items():
+            config[name] = value
+        plant = JointPlant()
+        try:
+            link = EmulatedLink(open_emulator("host"), plant)
+        except (DeviceError, InputError) as error:
+            pytest.skip(f"the firmware is not built: {error}")
+        boards.append(configured(link, config))
+        boards[-1].receive(0.1)
+        return boards[-1], link, plant
+
+    yield opened
+    for board in boards:
+        board.close()
+
+
+def left_silent(board, link):
+    """Do what an earlier run does: enable, move, go away. Returns a new host's board."""
+    board.enable()
+    board.send(JointCommand(np.full(6, 0.02), np.zeros(6), np.zeros(6), 0.05))
+    board.receive(0.5)
+    assert [each.fault for each in board.status.faults] == [Fault.HOST_SILENT]
+    return Board(link, name="the board")
+
+
+def test_an_arm_that_is_held_is_taken_over_without_letting_go_of_it(made):
+    board, link, plant = made()
+    again = left_silent(board, link)
+    assert again.status.state is State.HOLDING
+    drives = []
+    link._watch = lambda _: drives.append(bool(link.answer["outputs"]["drives_on"]))
+    q = plant.q.copy()
+    enable(again)
+    assert again.status.state is State.ENABLED
+    assert again.status.faults == ()
+    assert all(drives)
+    assert np.abs(plant.q - q).max() < 1e-3
+
+
+def test_an_arm_that_was_released_is_enabled_anew(made):
+    board, link, _ = made(silence_reaction=Reaction.RELEASE)
+    again = left_silent(board, link)
+    assert again.status.state is State.FAULTED
+    enable(again)
+    assert again.status.state is State.ENABLED
+
+
+def test_an_arm_that_still_slows_down_is_waited_for(made):
+    board, _, _ = made()
+    board.enable()
+    board.send(JointCommand(np.full(6, 1.5), np.full(6, 1.5), np.zeros(6), 1.0))
+    while board.status.state is not State.STOPPING:
+        board.receive(0.01)
+    enable(board)
+    assert board.status.state is State.ENABLED
+
+
+def test_other_faults_are_a_persons_to_look_at(made):
+    board, link, plant = made()
+    again = left_silent(board, link)
+    plant.break_pot(2, PotFault.OPEN)
+    again.receive(0.2)
+    with pytest.raises(DeviceError, match=r"the board is not ready: faulted.*joint 3: potentiometer open") as told:
+        enable(again)
+    assert "\n" not in str(told.value)
+    again.receive(0.05)
+    assert again.status.state is State.FAULTED  # nothing was cleared
+    assert {each.fault for each in again.status.faults} >= {Fault.HOST_SILENT, Fault.POT_OPEN}
+
+
+def test_an_emergency_stop_is_not_undone(made):
+    board, _, _ = made()
+    board.enable()
+    board.stop()
+    board.receive(0.1)
+    with pytest.raises(DeviceError, match="emergency stop"):
+        enable(board)
+    board.receive(0.05)
+    assert board.status.state is State.STOPPED
+
+
+def stands(q):
+    """A board whose joints stand somewhere, with the lab's limits."""
+    states = SimpleNamespace(q=q, t_s=np.ones(len(q)))
+    limits = np.zeros(6, [("soft_min_rad", "f4"), ("soft_max_rad", "f4")])
+    limits["soft_min_rad"], limits["soft_max_rad"] = -2.4, 2.4
+    return SimpleNamespace(receive=lambda wait_s: states, configuration=lambda: {"joint": limits})
+
+
+@pytest.mark.parametrize(
+    ("shift_deg", "target", "said"),
+    [
+        ([0, 0, 30, 0, 0, 0], 0.0, r"joint 3 reads 30\.0 deg, the motion starts at 0\.0"),
+        ([0, 0, 0, 0, 0, 0], 2.6, r"joint 6 is to go from .* to 149\.0 deg, the board allows -137\.5 to 137\.5"),
+    ],
+)
+def test_an_arm_that_does_not_fit_the_board_is_refused(shift_deg, target, said):
+    q = ARM.home + np.radians(shift_deg)
+    setup = SimpleNamespace(board=stands(q[None]), arm=ARM)
+    targets = ARM.home[None] + np.array([[0, 0, 0, 0, 0, target]])
+    with pytest.raises(InputError, match=said) as told:
+        require_start(setup, read_motions(ARM, QUICK), targets)
+    assert "--model six_r" in str(told.value)
+
+
+def test_a_board_that_tells_no_angles(made):
+    setup = SimpleNamespace(board=stands(np.zeros((0, 6))), arm=ARM)
+    with pytest.raises(DeviceError, match="tells no joint angles"):
+        require_start(setup, read_motions(ARM, QUICK), ARM.home[None])
+
+
+def test_all_that_the_loop_runs_can_be_rehearsed():
+    warm_up(ARM)
+    warm_up(open_arm("puma560"))

@@ -1,0 +1,291 @@
+"""The loop of a run on a board and cameras that are made up: how it ends when something goes wrong."""
+
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from armsight.app.interrupts import uninterrupted
+from armsight.app.run import calibrate as run_calibrate
+from armsight.app.run import experiment
+from armsight.app.run.controllers import Planned
+from armsight.app.run.experiment import run_experiment
+from armsight.app.run.loop import PERIOD_S, Loop, beside, steady
+from armsight.app.run.motion_file import QUICK, read_motions
+from armsight.app.run.record import Log, Segment
+from armsight.app.run.setup import Setup
+from armsight.data import JointStates, Missed, Shot
+from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError
+from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.robot.boards.codes import State
+from armsight.robot.models import open_arm
+from armsight.robot.trajectories import point_to_point
+
+ARM = open_arm("six_r")
+
+
+class Standing:
+    """A board whose arm stands at home whatever it is told."""
+
+    def __init__(self):
+        self.t_s, self.sent = 0.0, []
+        self.status = SimpleNamespace(state=State.DISABLED, faults=(), t_s=0.0)
+        self.joints = SimpleNamespace(reference_rad=ARM.home)
+
+    def enable(self):
+        self.status.state = State.ENABLED
+
+    def receive(self, wait_s=0.0):
+        count = round(wait_s * 1000)
+        t_s = self.t_s + np.arange(1, count + 1) * 1e-3
+        self.t_s += count * 1e-3
+        return JointStates(t_s, np.tile(ARM.home, (count, 1)))
+
+    def send(self, command):
+        self.sent.append(command)
+
+
+class Blind:
+    """A follower that sees nothing."""
+
+    rig, way = None, "followed"
+
+    def measure(self, shot, expected=None):
+        return Missed("nothing is seen")
+
+
+def setup(board, last_shot_s=np.inf, clock=None):
+    """Cameras at 60 Hz that send nothing more from a time on."""
+    newest = [0]
+
+    def poll():
+        number = int(board.t_s * 60)
+        if number == newest[0] or board.t_s > last_shot_s:
+            return None
+        newest[0] = number
+        return Shot(str(number), None, None, board.t_s)
+
+    target = SimpleNamespace(body=SimpleNamespace(name="the body"))
+    return Setup(ARM, board, poll, target, lambda q: np.zeros(6), 60.0, 0.0, clock)
+
+
+def looped(board, **given):
+    loop = Loop(setup(board, **given), Blind(), Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    return loop
+
+
+def stand(loop, seconds):
+    still = point_to_point(ARM, ARM.home, ARM.home)
+    loop.run(Planned(still, loop.t_s, lambda q: np.zeros(6)), seconds, Segment("open_loop", "", "", False))
+
+
+def test_cameras_that_stall_end_a_run_and_a_body_that_is_hidden_does_not():
+    board = Standing()
+    loop = looped(board, last_shot_s=2.0)
+    stand(loop, 1.9)
+    with pytest.raises(DeviceError, match=r"no shot has come for 0\.5 s: the cameras have stalled"):
+        stand(loop, 3.0)
+    assert 2.5 < board.t_s < 2.6
+    assert loop.log.segments[-1].end_s == pytest.approx(board.t_s)
+
+
+@pytest.mark.parametrize("error", [InputError("a camera"), KeyboardInterrupt(), ZeroDivisionError("a mistake of ours")])
+def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
+    board = Standing()
+
+    def fails(loop, *_):
+        stand(loop, 0.1)
+        raise error
+
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "_require_seen", fails)
+    plan = read_motions(ARM)
+    if isinstance(error, ArmsightError | KeyboardInterrupt):
+        outcome = run_experiment(setup(board), None, plan, ARM.home[None], progress=lambda line: None)
+        assert outcome.interrupted == isinstance(error, KeyboardInterrupt)
+        assert outcome.ended_by is (error if isinstance(error, ArmsightError) else None)
+    else:
+        with pytest.raises(ZeroDivisionError):
+            run_experiment(setup(board), None, plan, ARM.home[None], progress=lambda line: None)
+    assert (board.sent[-1].qd_ref == 0).all()
+    assert board.sent[-1].duration_s == pytest.approx(0.3)
+
+
+def test_between_the_passes_the_arm_goes_back_to_the_start_by_a_way_of_its_own():
+    board = Standing()
+    loop = looped(board)
+    plan = read_motions(ARM, QUICK)
+    way = plan.motions[-1].trajectory
+    end = way.at(way.duration_s).q
+    assert np.abs(end - plan.start).max() > 0.5  # these motions do not end where they began
+    experiment._to_start(loop, setup(board), plan)
+    q = np.array([end] + [command.q_ref for command in board.sent] + [plan.start])
+    assert (np.abs(np.diff(q, axis=0)) <= ARM.qd_max * PERIOD_S + 1e-6).all()
+
+
+class Live:
+    """A clock that is the board's: time passes by itself."""
+
+    def heard(self, board_s):
+        pass
+
+    def on_board(self, shot):
+        return shot
+
+
+def test_the_loop_goes_on_while_something_is_computed():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    before = len(board.sent)
+
+    def work():
+        while len(board.sent) < before + 50:  # takes until the board has heard so often of the loop
+            time.sleep(0.001)
+        return 42
+
+    assert loop.compute(work) == 42
+    assert all((command.qd_ref == 0).all() for command in board.sent[before:])
+    assert all(np.allclose(command.q_ref, ARM.home) for command in board.sent[before:])
+    with pytest.raises(ZeroDivisionError):
+        loop.compute(lambda: 1 / 0)
+
+
+def test_in_lock_step_no_time_passes_while_something_is_computed():
+    board = Standing()
+    loop = looped(board)
+    stand(loop, 0.1)
+    t_s, sent = board.t_s, len(board.sent)
+    assert loop.compute(lambda: 42) == 42
+    assert (board.t_s, len(board.sent)) == (t_s, sent)
+
+
+def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    ended = threading.Event()
+
+    def work():
+        board.status.state = State.HOLDING
+        ended.wait(10.0)
+
+    with pytest.raises(DeviceError, match="went over to HOLDING"):
+        loop.compute(work)
+    ended.set()
+
+
+def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
+    board = Standing()
+    slow = SimpleNamespace(rig=None, way="followed")
+
+    def measure(shot, expected=None):
+        sent = len(board.sent)
+        while len(board.sent) < sent + 20:
+            time.sleep(0.001)
+        return Missed("searched in vain")
+
+    slow.measure = measure
+    loop = Loop(setup(board, clock=Live()), slow, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    stand(loop, 1.0)
+    assert len(board.sent) >= 250
+    assert 1 <= len(loop.log.poses) <= len(board.sent) / 20
+    names = [name for name, _, _ in loop.log.poses]
+    still = point_to_point(ARM, ARM.home, ARM.home)
+    planned = Planned(still, loop.t_s, lambda q: np.zeros(6))
+    loop.run_until_seen(
+        planned, 0.02, Segment("calibration", "", "", False)
+    )  # what was begun before is not taken for it
+    (name,) = [name for name, _, _ in loop.log.poses[len(names) :]]
+    assert int(name) >= 60
+    assert board.t_s > 1.02
+
+
+def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatch):
+    board = Standing()
+
+    def fails(loop, *_):
+        stand(loop, 0.1)
+        raise KeyboardInterrupt
+
+    send = board.send
+
+    def sent(command):
+        if command.duration_s > 0.1:
+            os.kill(os.getpid(), signal.SIGINT)
+        send(command)
+
+    monkeypatch.setattr(board, "send", sent)
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "_require_seen", fails)
+    outcome = run_experiment(setup(board), None, read_motions(ARM), ARM.home[None], progress=lambda line: None)
+    assert outcome.interrupted
+    assert board.sent[-1].duration_s == pytest.approx(0.3)
+    assert board.t_s > 0.4
+
+
+def test_where_time_passes_by_itself_the_stop_is_said_again_and_again():
+    board = Standing()
+    loop = looped(board, clock=Live())
+    stand(loop, 0.1)
+    before = len(board.sent)
+    loop.stop()
+    durations = [command.duration_s for command in board.sent[before:]]
+    assert durations == pytest.approx(np.arange(0.3, 0.0, -PERIOD_S))
+
+
+def test_slow_cameras_are_given_a_longer_sweep(monkeypatch):
+    board = Standing()
+    loop = looped(board)
+    loop.mounting = SimpleNamespace()
+    slow = replace(loop.setup, rate_hz=4.0)
+    monkeypatch.setattr(loop, "setup", slow)
+    with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as told:
+        run_calibrate.find_delay(loop, ARM, ARM.home, ARM.home, lambda q: np.zeros(6))
+    assert "slower than 4 Hz" in str(told.value)
+
+
+def test_an_interrupt_does_not_wait_for_what_is_being_computed():
+    ended, waited = threading.Event(), []
+
+    def meanwhile(done):
+        assert not done()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        beside(lambda: waited.append(ended.wait(10.0)), meanwhile)
+    assert waited == []
+    ended.set()
+
+
+def test_what_makes_a_loop_wait_is_put_back_afterwards():
+    before = sys.getswitchinterval()
+    for in_time in (True, False):
+        with steady(in_time=in_time):
+            assert (sys.getswitchinterval() < before) == in_time
+            assert not gc.isenabled()
+        assert sys.getswitchinterval() == before
+        assert gc.isenabled()
+
+
+def test_interrupts_are_held_back_and_told():
+    with uninterrupted() as held:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.001)  # a place where it would have come
+    assert held == [signal.SIGINT]
+    with pytest.raises(KeyboardInterrupt):
+        raised()
+
+
+def raised():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10.0)

@@ -1,0 +1,226 @@
+"""Discs in images: centres against truth and against the bound of the model, what is no disc, and images of all kinds."""
+
+import numpy as np
+import pytest
+from disc_painter import grey, outline, share
+
+from armsight.vision.markers.disc.fit import REASONS
+from disc_views import discs_of
+
+BRIGHT, DARK = (discs_of(np.eye(3) * 0.05, bright=kind) for kind in (True, False))
+
+
+def bound(window, contrast, blur, noise, c, a, b, turn, step=1e-3):
+    """Cramer-Rao bound of the centre, px^2: derivatives of brute-force images by the centre and all nuisances."""
+    v, u = np.mgrid[: len(window), : len(window)]
+
+    def image(x):
+        return contrast * share([outline(x[:2], x[2], x[3], x[4])], x[5], np.zeros(2), len(window))
+
+    x0 = np.array([*c, a, b, turn, blur])
+    J = [
+        (image(x0 + e) - image(x0 - e)) / (2 * step * 10)
+        for e in np.diag(np.full(6, 10 * step))
+        if not (a == b and e[4])
+    ]
+    J += [window, np.ones_like(window), (u - c[0]) * (1 - window), (v - c[1]) * (1 - window)]
+    J = np.stack([j.ravel() for j in J], axis=1)
+    scale = np.linalg.norm(J, axis=0)
+    return np.linalg.inv((J / scale).T @ (J / scale))[:2, :2] / np.outer(scale[:2], scale[:2]) * (noise**2 + 1 / 12)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "blur", "contrast", "noise"),
+    [
+        (4.0, 4.0, 0.6, 60.0, 2.0),
+        (5.0, 2.6, 0.8, 150.0, 2.0),
+        (9.0, 8.0, 1.0, -100.0, 2.0),
+        (16.0, 9.0, 1.4, 80.0, 3.0),
+    ],
+)
+def test_centre_reaches_the_bound(a, b, blur, contrast, noise):
+    rng = np.random.default_rng(1)
+    size = 2 * int(a + 4 * blur + 6) + 2
+    errors, normed = [], []
+    target = BRIGHT if contrast > 0 else DARK
+    for _ in range(6):
+        c, turn = size / 2 + rng.uniform(-0.5, 0.5, 2), rng.uniform(0, np.pi)
+        window = share([outline(c, a, b, turn)], blur, np.zeros(2), size)
+        limit = bound(window, contrast, blur, noise, c, a, b, turn)
+        for _ in range(40):
+            found = target.find(grey((45.0 if contrast > 0 else 190.0) + contrast * window, noise, rng))
+            assert len(found.uv) == 1
+            e = found.uv[0] - c
+            errors.append(e @ np.linalg.solve(limit, e) / 2)
+            normed.append(e @ np.linalg.solve(found.cov_uv[0], e) / 2)
+    # Each is chi-square over its 2 degrees on average 1; of 240 the mean scatters by 1/sqrt(240) = 0.065.
+    assert np.sqrt(np.mean(errors)) < 1.3
+    assert 1 - 4 * 0.065 < np.mean(normed) < 1 + 4 * 0.065 + 0.1
+
+
+def test_an_uneven_surround_and_uneven_light_do_not_pull():
+    rng = np.random.default_rng(2)
+    size, c, b = 64, np.array([31.3, 31.7]), 1.0
+    v, u = np.mgrid[:size, :size] - 32.0
+    window = share([outline(c, 10, 9, 0.4)], b, np.zeros(2), size)
+    slope = 0.4 * u - 0.3 * v
+    kinds = {
+        "surround": 70 + slope * (1 - window) + 110 * window,
+        "light": (40 + 120 * window) * (1 + slope / 100),
+        "stray": 60 + 110 * window + slope,
+    }
+    for light in kinds.values():
+        e = np.array([BRIGHT.find(grey(light, 1.0, rng)).uv[0] - c for _ in range(60)])
+        assert np.abs(e.mean(axis=0)).max() < 0.003 + 4 * e.std() / np.sqrt(len(e))
+
+
+def test_motion_smears_a_disc_about_its_middle_or_is_told():
+    rng = np.random.default_rng(3)
+    size, c, r = 72, np.array([35.6, 35.2]), 8.0
+    for length in (4.0, 8.0, 12.0, 16.0):
+        way = np.linspace(-length / 2, length / 2, 25)
+        smear = np.mean(
+            [share([outline(c + s * np.array([0.8, 0.6]), r, r, 0)], 0.8, np.zeros(2), size) for s in way], 0
+        )
+        found = [BRIGHT.find(grey(50 + 120 * smear, 2.0, rng)) for _ in range(12)]
+        good = [d for d in found if len(d.uv)]
+        assert len(good) == 12 or length > r
+        assert all(len(d.rejected) >= 1 for d in found if not len(d.uv))
+        if good:  # what the model does not hold widens the covariance
+            e = np.array([d.uv[0] - c for d in good])
+            assert np.sqrt((e**2).mean()) < np.sqrt(np.mean([np.trace(d.cov_uv[0]) / 2 for d in good]))
+
+
+def square(c, half, turn):
+    return c + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ [
+        [np.cos(turn), np.sin(turn)],
+        [-np.sin(turn), np.cos(turn)],
+    ]
+
+
+def test_what_is_no_disc_is_rejected_with_its_reason():
+    rng = np.random.default_rng(4)
+    size, c = 96, np.array([47.4, 47.6])
+    two = [outline((c[0] - 7, c[1]), 8, 8, 0), outline((c[0] + 7, c[1]), 8, 8, 0)]
+    cut = outline(c, 12, 12, 0)
+    cut[:, 0] = np.minimum(cut[:, 0], c[0] + 5)
+    ring = share([outline(c, 14, 14, 0)], 0.8, np.zeros(2), size) - share([outline(c, 7, 7, 0)], 0.8, np.zeros(2), size)
+    shapes = {
+        "square": share([square(c, 10, 0.3)], 0.8, np.zeros(2), size),
+        "merged": share(two, 0.8, np.zeros(2), size),
+        "cut": share([cut], 0.8, np.zeros(2), size),
+        "bar": share(
+            [square(c, 1, 0.0) * [1, 1] + np.array([[20, 3], [20, -3], [-20, -3], [-20, 3]])], 0.8, np.zeros(2), size
+        ),
+        "ring": ring,
+        "border": share([outline((48.0, 4.0), 8, 8, 0)], 0.8, np.zeros(2), size),
+    }
+    for name, window in shapes.items():
+        found = BRIGHT.find(grey(50 + 120 * window, 2.0, rng))
+        assert len(found.uv) == 0, name
+        assert found.rejected, name
+        assert all(r.reason in REASONS.values() for r in found.rejected)
+
+
+def test_brightness_of_the_whole_does_not_matter():
+    rng = np.random.default_rng(5)
+    window = share([outline((31.2, 30.8), 9, 8, 0.2)], 0.9, np.zeros(2), 64)
+    for base, contrast, noise in ((3.0, 14.0, 0.7), (20.0, 40.0, 1.5), (120.0, 130.0, 2.0), (10.0, 400.0, 2.0)):
+        found = BRIGHT.find(grey(base + contrast * window, noise, rng))
+        assert len(found.uv) == 1
+        assert np.linalg.norm(found.uv[0] - (31.2, 30.8)) < 5 * np.sqrt(np.trace(found.cov_uv[0]))
+
+
+def test_both_kinds_at_once():
+    rng = np.random.default_rng(6)
+    light = np.full((80, 160), 120.0)
+    light[:, :80] += 90 * share([outline((40.2, 39.9), 10, 9, 0)], 0.8, np.zeros(2), 80)
+    light[:, 80:] -= 90 * share([outline((40.2, 39.9), 10, 9, 0)], 0.8, np.zeros(2), 80)
+    found = discs_of(np.eye(3) * 0.05, bright=[True, False, True]).find(grey(light, 2.0, rng))
+    order = np.argsort(found.uv[:, 0])
+    assert found.bright[order].tolist() == [True, False]
+    assert np.allclose(found.uv[order], [[40.2, 39.9], [120.2, 39.9]], atol=0.1)
+
+
+@pytest.mark.parametrize("size", [(720, 1280), (719, 1277), (40, 33), (7, 7), (2, 2), (1, 1)])
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_empty_images_of_any_size(size, level):
+    for target in (BRIGHT, DARK):
+        found = target.find(np.full(size, level, np.uint8))
+        assert len(found.uv) == 0
+        assert found.cov_uv.shape == (0, 2, 2)
+
+
+def test_a_width_that_is_no_multiple_of_eight_and_a_view_with_gaps():
+    rng = np.random.default_rng(7)
+    window = share([outline((40.3, 30.6), 9, 8, 0.2)], 0.9, np.zeros(2), 72)
+    image = grey(50 + 100 * window, 2.0, rng)
+    whole = BRIGHT.find(image)
+    for width in (71, 69, 67):
+        part = BRIGHT.find(image[:, :width])
+        assert np.allclose(part.uv, whole.uv, atol=1e-9)
+    doubled = np.repeat(image, 2, axis=1)
+    assert np.allclose(BRIGHT.find(doubled[:, ::2]).uv, whole.uv)
+
+
+def test_thousands_of_discs_are_all_found():
+    rng = np.random.default_rng(8)
+    tile = share([outline((7.6, 7.4), 4.2, 4.2, 0)], 0.7, np.zeros(2), 16)
+    image = grey(40 + 150 * np.tile(tile, (60, 90)), 1.5, rng)
+    found = BRIGHT.find(image)
+    v, u = np.divmod(np.arange(5400), 90)
+    truth = np.column_stack([16 * u + 7.6, 16 * v + 7.4])
+    order = np.lexsort((found.uv[:, 0].round(-1), (found.uv[:, 1] // 16)))
+    assert len(found.uv) == 5400
+    assert np.abs(found.uv[order][:, 1] - truth[:, 1]).max() < 0.2
+
+
+def test_noise_alone_shows_no_disc():
+    rng = np.random.default_rng(9)
+    for noise in (0.5, 3.0, 12.0):
+        assert len(BRIGHT.find(grey(np.full((480, 640), 100.0), noise, rng)).uv) == 0
+
+
+def test_an_image_with_too_many_places_is_said_to_be():
+    image = (255 * np.random.default_rng(12).integers(0, 2, (2160, 3840))).astype(np.uint8)
+
+    def full(part):
+        return "no more are looked at" in BRIGHT.find(part).rejected[0].reason
+
+    row = round(BRIGHT.find(image).rejected[0].uv[1])
+    assert full(image)
+    assert full(image[: row + 12])
+    assert not full(image[: row - 12])
+
+
+def test_discs_side_by_side_are_each_found_once():
+    rng = np.random.default_rng(10)
+    tile = share([outline((6.3, 6.1), 3.6, 3.6, 0)], 0.6, np.zeros(2), 13)
+    found = BRIGHT.find(grey(40 + 150 * np.tile(tile, (30, 40)), 1.5, rng))
+    assert 1190 <= len(found.uv) <= 1200  # neighbours stand in each other's surround; a few at the border are not taken
+    assert min(np.sort(np.linalg.norm(found.uv - uv, axis=1))[1] for uv in found.uv) > 10
+
+
+def test_a_disc_that_is_a_little_covered_is_rejected_or_knows_it():
+    rng = np.random.default_rng(11)
+    for radius, cut in ((8.0, 1.0), (15.0, 1.5), (25.0, 2.5), (12.0, 0.5)):
+        size = 2 * int(radius + 9)
+        c = np.array([size / 2 + 0.2, size / 2 - 0.3])
+        rim = outline(c, radius, radius, 0)
+        rim[:, 0] = np.minimum(rim[:, 0], c[0] + radius - cut)
+        window = share([rim], 0.8, np.zeros(2), size)
+        for _ in range(8):
+            found = BRIGHT.find(grey(50 + 120 * window, 2.0, rng))
+            for uv, cov in zip(found.uv, found.cov_uv, strict=True):
+                assert np.linalg.norm(uv - c) < 4 * np.sqrt(np.trace(cov) / 2)
+
+
+def test_a_saturated_disc_does_not_claim_too_much():
+    rng = np.random.default_rng(12)
+    window = share([outline((31.3, 30.8), 9, 9, 0)], 0.9, np.zeros(2), 64)
+    squares = []
+    for _ in range(80):
+        found = BRIGHT.find(grey(60 + 320 * window, 2.5, rng))
+        e = found.uv[0] - (31.3, 30.8)
+        squares.append(e @ np.linalg.solve(found.cov_uv[0], e) / 2)
+    assert np.mean(squares) < 1.3  # a clipped edge is not that of the model, and the covariance holds it
