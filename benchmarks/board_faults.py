@@ -19,8 +19,8 @@ What must hold, with the configuration's own times (no figure of this file's):
     stop       a fault that releases switches the drives off; one that holds brings the reference to rest within
                speed limit / deceleration; half a second later nothing moves at a twentieth of its limit
     code       a fault that lasts long enough is told by its own code and joint, a shorter one is not told at all
-    link       a command sent after the last bad byte is obeyed, and telemetry read, within 20 ms of it
-    known      afterwards the host's last obeyed and refused numbers are the board's
+    link       a command sent after the last bad byte is acknowledged, and telemetry read, within 20 ms of it
+    known      afterwards the host's last acknowledged and refused numbers are the board's
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import numpy as np
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, Order, Refusal, State
+from armsight.robot.boards.codes import Fault, Command, Rejection, State
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.sim.joints import JointPlant, PotFault
@@ -118,15 +118,15 @@ class Campaign:
         self.fault_tick = None  # when one latched
         self.fault_was = 0
         self.rest_tick = None
-        self.obeyed_after = None  # (sequence that counts, tick in which one was obeyed)
+        self.obeyed_after = None  # (sequence that counts, tick in which one was acknowledged)
         self.outputs = None
         self.period_ticks = PERIODS[0]
         self.sent = 0  # number of the last motion command
         self.config = lab_configuration()
-        board = Board(self.link)
+        board = Board.connect(self.link)
         board.store(self.config)
         self.link.restart()
-        self.board = Board(self.link)
+        self.board = Board.connect(self.link)
 
     def violate(self, what):
         self.out.violations.append(f"fault {sum(self.out.faults.values())} ({self.kind}): {what}")
@@ -153,7 +153,7 @@ class Campaign:
         if self.fault_was and self.rest_tick is None and not np.any(outputs["reference_rad_s"]):
             self.rest_tick = tick
         waiting = self.obeyed_after is not None and self.obeyed_after[1] is None
-        if waiting and int(outputs["obeyed_sequence"]) > self.obeyed_after[0]:
+        if waiting and int(outputs["acknowledged_sequence"]) > self.obeyed_after[0]:
             self.obeyed_after = (self.obeyed_after[0], tick)
 
     # The host.
@@ -192,7 +192,7 @@ class Campaign:
             state = self.board.status.state
             if state == State.ENABLED and not self.board.status.faults:
                 break
-            self.board.order(Order.ENABLE if state == State.DISABLED else Order.CLEAR_FAULTS)
+            self.board.command(Command.ENABLE if state == State.DISABLED else Command.CLEAR_FAULTS)
             self.board.receive(0.02)
             self.take_up()
         else:
@@ -291,7 +291,7 @@ class Campaign:
             ticks = 500
         self.plant.break_pot(joint, broken)
         if broken == PotFault.INVERTED:
-            self.board.confirm(self.board.order(Order.ENABLE))
+            self.board.confirm(self.board.command(Command.ENABLE))
         start_rad, travel_rad = float(self.outputs["reference_rad"][joint]), 0.0
         for _ in range(ticks):
             self.one_tick()
@@ -309,7 +309,7 @@ class Campaign:
 
     def rewire(self):
         """Bring the arm to rest with its drives off, for what nobody does to a moving one."""
-        self.board.confirm(self.board.order(Order.DISABLE))
+        self.board.confirm(self.board.command(Command.DISABLE))
         self.board.receive(1.0)
         self.take_up()
 
@@ -349,7 +349,7 @@ class Campaign:
         self.link.step(500)
         if on or self.outputs["drives_on"] or np.abs(self.plant.qd).max() > STANDING * self.limits.speed_rad_s:
             self.violate("the arm is driven by a board that started anew")
-        self.board = Board(self.link)
+        self.board = Board.connect(self.link)
         self.take_up()
         if watchdog:
             self.expect_fault(Fault.WATCHDOG, None)
@@ -407,11 +407,13 @@ class Campaign:
         self.periods(40, send=not self.fault_was)
         self.periods(30, send=False)
         status, core = self.board.status, self.outputs
-        if status.obeyed_sequence != int(core["obeyed_sequence"]):
-            self.violate(f"host knows {status.obeyed_sequence} as obeyed last, the core {core['obeyed_sequence']}")
-        of_core = status.refusal != Refusal.NO_HELLO  # the wire refuses those by itself
-        if of_core and status.refused_sequence != int(core["refused_sequence"]):
-            self.violate(f"host knows {status.refused_sequence} as refused last, the core {core['refused_sequence']}")
+        if status.acknowledged_sequence != int(core["acknowledged_sequence"]):
+            self.violate(
+                f"host knows {status.acknowledged_sequence} as acknowledged last, the core {core['acknowledged_sequence']}"
+            )
+        of_core = status.rejection != Rejection.NO_HELLO  # the wire refuses those by itself
+        if of_core and status.rejected_sequence != int(core["rejected_sequence"]):
+            self.violate(f"host knows {status.rejected_sequence} as refused last, the core {core['rejected_sequence']}")
 
 
 @dataclass(frozen=True)

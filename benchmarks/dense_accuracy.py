@@ -11,7 +11,7 @@ import numpy as np
 from armsight.data import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.example_rig import bench_rig
+from armsight.sim.example_rig import example_rig
 from armsight.sim.render.mesh import Solid, box, joined, moved, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
@@ -161,7 +161,7 @@ def a_tool() -> Solid:
 
 
 def tool(folder: Path) -> dict[str, Any]:
-    rng, rig, mesh = np.random.default_rng(TOOL_SEED), bench_rig((1280, 720)), a_tool()
+    rng, rig, mesh = np.random.default_rng(TOOL_SEED), example_rig((1280, 720)), a_tool()
     form, surface = rig.rectify(), Surface.of_mesh(mesh.vertices, mesh.triangles)
     wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, contrast=25.0, seed=9)
     behind = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.3]))

@@ -25,7 +25,7 @@ from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import plan_poses
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_machine
+from armsight.robot.boards.opening import configured, open_emulator
 from armsight.robot.models import open_arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import drawn, imperfections
@@ -65,7 +65,7 @@ def visited(seed: int, goals: list) -> tuple:
     parts = solids(model)
     motors, true = chosen(model, parts), drawn(model, imperfections("worn"), seed)
     plant = ArmPlant(model, true, seed)
-    board = configured(EmulatedLink(open_machine("host"), plant), configuration(model, parts, motors))
+    board = configured(EmulatedLink(open_emulator("host"), plant), configuration(model, parts, motors))
     board.enable()
     rows, q = [], model.home
 

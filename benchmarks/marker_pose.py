@@ -14,7 +14,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.optics import Optics, Sensor
 from armsight.sim.render.render import render_pair
-from armsight.sim.render.scene import Placed, plate
+from armsight.sim.render.scene import PosedBody, plate
 from armsight.vision.discs.bias import project_discs
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
@@ -50,7 +50,7 @@ def rendered(rig: StereoRig, target: DiscTarget, T: np.ndarray, rng: np.random.G
     return render_pair(
         rig.cameras,
         rig.T_left_right,
-        [Placed((pattern,), T)],
+        [PosedBody((pattern,), T)],
         (BACKGROUND / 255, BACKGROUND / 255),
         optics=Optics(psf_sigma_px=BLUR),
         sensor=Sensor(read_noise=NOISE),

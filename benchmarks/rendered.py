@@ -13,7 +13,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.optics import Sensor, exposed
 from armsight.sim.render.render import radiance, render_pair
-from armsight.sim.render.scene import Placed, chessboard
+from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
@@ -74,7 +74,7 @@ def point_sigma(trials: int = 100, pairs: int = 14) -> None:
     pattern = chessboard(COLUMNS, ROWS, SQUARE)
     light = []
     for T in board_poses(rig, pairs, rng):
-        placed = Placed((pattern,), T)
+        placed = PosedBody((pattern,), T)
         views = (placed, placed.seen_from(inverse(rig.T_left_right)))
         light.append([radiance(camera, [view], 0.4) for camera, view in zip(rig.cameras, views, strict=True)])
     grid = np.stack(np.meshgrid([-0.05, 0.1, 0.25], [-0.1, 0.1], [0.5, 0.7, 0.9]), axis=-1).reshape(-1, 3)
@@ -118,7 +118,7 @@ def calibrated(rig: StereoRig, rng: np.random.Generator, pairs: int = 14) -> Ste
     board, pattern = open_board(SPEC), chessboard(COLUMNS, ROWS, SQUARE)
     shots = []
     for j, T in enumerate(board_poses(rig, pairs, rng)):
-        images = render_pair(rig.cameras, rig.T_left_right, [Placed((pattern,), T)], sensor=SENSOR, rng=rng)
+        images = render_pair(rig.cameras, rig.T_left_right, [PosedBody((pattern,), T)], sensor=SENSOR, rng=rng)
         shots.append(Pair(str(j), *(board.detect(image) for image in images)))
     return calibrate_boards(board, shots, (rig.left.image_size_px, rig.right.image_size_px), models=("brown4",)).rig
 
@@ -135,7 +135,7 @@ def pose_coverage(count: int = 2000) -> None:
     board, pattern = open_board(SPEC), chessboard(COLUMNS, ROWS, SQUARE)
     d2, missed = [], 0
     for T in board_poses(truth, count, rng):
-        images = render_pair(truth.cameras, truth.T_left_right, [Placed((pattern,), T)], sensor=SENSOR, rng=rng)
+        images = render_pair(truth.cameras, truth.T_left_right, [PosedBody((pattern,), T)], sensor=SENSOR, rng=rng)
         drawn = truth.perturbed(root @ rng.normal(size=len(root)))
         rig = StereoRig(drawn.left, drawn.right, drawn.T_left_right, result.cov, result.sigma_px)
         estimate = measure(rig, board, Shot("", *images))
@@ -157,7 +157,9 @@ def time_beside_opencv(count: int = 200) -> None:
     rig, rng = true_rig(1280, 720, 900.0), np.random.default_rng(6)
     board, pattern = open_board(SPEC), chessboard(COLUMNS, ROWS, SQUARE)
     poses = board_poses(rig, 20, rng)
-    pairs = [render_pair(rig.cameras, rig.T_left_right, [Placed((pattern,), T)], sensor=SENSOR, rng=rng) for T in poses]
+    pairs = [
+        render_pair(rig.cameras, rig.T_left_right, [PosedBody((pattern,), T)], sensor=SENSOR, rng=rng) for T in poses
+    ]
     rig = StereoRig(rig.left, rig.right, rig.T_left_right, rig.cov, 0.02)
     cv2.setNumThreads(1)
     measure(rig, board, Shot("", *pairs[0]))  # compiles

@@ -18,9 +18,9 @@ import numpy as np
 
 from armsight import Follower, Missed, Shot, open_target
 from armsight.geometry.pose import exp_se3, pose
-from armsight.sim.example_rig import bench_rig
+from armsight.sim.example_rig import example_rig
 from armsight.sim.render.background import plain
-from armsight.sim.render.render import Placed, render_pair
+from armsight.sim.render.render import PosedBody, render_pair
 from armsight.sim.render.scene import plate
 
 SHOTS, RATE_HZ = 12, 60.0
@@ -32,7 +32,7 @@ START = pose(np.eye(3), np.array([0.08, -0.04, 0.75]))
 
 def main(folder: Path) -> list[tuple[float, float, float]]:
     """Render and follow; ``folder`` is where the body file is. Return time (s), sigma and error (mm) of each pose."""
-    rig, target = bench_rig(), open_target(str(folder / "plate.toml"))
+    rig, target = example_rig(), open_target(str(folder / "plate.toml"))
     rng = np.random.default_rng(1)
     behind = tuple(plain(camera.image_size_px, rng) for camera in rig.cameras)
     discs = [(x, y - 0.04, 0.008, 0.85) for x, y, _ in target.body.points]
@@ -44,7 +44,7 @@ def main(folder: Path) -> list[tuple[float, float, float]]:
     for k in range(SHOTS):
         T_true = START @ exp_se3(TWIST * k / RATE_HZ)
         looks = covered if k in COVERED else whole
-        images = render_pair(rig.cameras, rig.T_left_right, [Placed((looks,), T_true, TWIST)], behind, rng=rng)
+        images = render_pair(rig.cameras, rig.T_left_right, [PosedBody((looks,), T_true, TWIST)], behind, rng=rng)
         estimate = follower.measure(Shot(f"{k:02d}", *images, t_s=k / RATE_HZ))
         if isinstance(estimate, Missed):
             print(f"{k:02d}: {follower.way}: {estimate.reason}")

@@ -16,7 +16,7 @@ import numpy as np
 from armsight import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.example_rig import bench_rig
+from armsight.sim.example_rig import example_rig
 from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
@@ -31,7 +31,7 @@ WALL = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.4]))
 
 def main() -> np.ndarray:
     """Render, match, locate; return the depth (H, W) in m, NaN where it was not measured."""
-    rng, rig = np.random.default_rng(1), bench_rig((480, 360), focal_px=480.0, baseline_m=0.12, convergence_deg=6.0)
+    rng, rig = np.random.default_rng(1), example_rig((480, 360), focal_px=480.0, baseline_m=0.12, convergence_deg=6.0)
     thing = box(BOX_M, grain_m=0.02, seed=1)
     wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, seed=2)
     images = []

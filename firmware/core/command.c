@@ -28,15 +28,15 @@ static void start_joint(joint_state *joint, const joint_config *config)
 static uint32_t enable(core_state *core, bool inward)
 {
     if (core->state != STATE_DISABLED) {
-        return REFUSAL_WRONG_STATE;
+        return REJECTION_WRONG_STATE;
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
         const joint_config *config = &core->config.joint[i];
         if (!pot_is_read(&core->joint[i].pot)) {
-            return REFUSAL_POT_UNREAD;
+            return REJECTION_POT_UNREAD;
         }
         if (!inward && !number_within(core->joint[i].pot.angle_rad, config->soft_min_rad, config->soft_max_rad)) {
-            return REFUSAL_OUTSIDE_LIMITS;
+            return REJECTION_OUTSIDE_LIMITS;
         }
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
@@ -44,25 +44,25 @@ static uint32_t enable(core_state *core, bool inward)
     }
     core->state = STATE_ENABLED;
     core->silent_ticks = 0u;
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 static uint32_t disable(core_state *core)
 {
     if (core->state == STATE_STOPPED) {
-        return REFUSAL_WRONG_STATE;
+        return REJECTION_WRONG_STATE;
     }
     core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 static uint32_t clear_faults(core_state *core)
 {
     if (core->state == STATE_STOPPED || core->state == STATE_STOPPING) {
-        return REFUSAL_WRONG_STATE;
+        return REJECTION_WRONG_STATE;
     }
     if (core->standing != 0u) {
-        return REFUSAL_FAULT_STANDS;
+        return REJECTION_FAULT_STANDS;
     }
     safety_forget(core);
     if (core->state == STATE_FAULTED) {
@@ -71,35 +71,35 @@ static uint32_t clear_faults(core_state *core)
         core->state = STATE_ENABLED; /* the arm is held already; letting go of it would drop it */
         core->silent_ticks = 0u;
     }
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 static uint32_t clear_stop(core_state *core, bool pressed)
 {
     if (core->state != STATE_STOPPED) {
-        return REFUSAL_WRONG_STATE;
+        return REJECTION_WRONG_STATE;
     }
     if (pressed) {
-        return REFUSAL_STOP_PRESSED;
+        return REJECTION_STOP_PRESSED;
     }
     core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 static uint32_t check_move(const move_command *move)
 {
     const bool lasts = move->duration_ticks >= 1u && move->duration_ticks <= 10000u;
-    uint32_t refusal = lasts ? REFUSAL_NONE : REFUSAL_OUT_OF_RANGE;
+    uint32_t rejection = lasts ? REJECTION_NONE : REJECTION_OUT_OF_RANGE;
     for (uint32_t i = 0u; i < JOINTS; i++) {
         if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i]) ||
             !number_finite(move->gravity_duty[i])) {
-            return REFUSAL_NOT_FINITE;
+            return REJECTION_NOT_FINITE;
         }
         if (!number_within(move->gravity_duty[i], -1.0f, 1.0f)) {
-            refusal = REFUSAL_OUT_OF_RANGE;
+            rejection = REJECTION_OUT_OF_RANGE;
         }
     }
-    return refusal;
+    return rejection;
 }
 
 static void move_joint(joint_state *joint, const joint_config *config, const move_command *move, uint32_t i)
@@ -121,35 +121,35 @@ static void move_joint(joint_state *joint, const joint_config *config, const mov
 
 static uint32_t take_move(core_state *core, const move_command *move)
 {
-    const uint32_t refusal = core->state == STATE_ENABLED ? check_move(move) : REFUSAL_WRONG_STATE;
-    if (refusal != REFUSAL_NONE) {
-        return refusal;
+    const uint32_t rejection = core->state == STATE_ENABLED ? check_move(move) : REJECTION_WRONG_STATE;
+    if (rejection != REJECTION_NONE) {
+        return rejection;
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
         move_joint(&core->joint[i], &core->config.joint[i], move, i);
     }
     core->silent_ticks = 0u;
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 static uint32_t take_gains(core_state *core, const gain_set *gains)
 {
     for (uint32_t i = 0u; i < JOINTS; i++) {
         if (!pid_gains_finite(&gains->joint[i])) {
-            return REFUSAL_NOT_FINITE;
+            return REJECTION_NOT_FINITE;
         }
         if (!pid_gains_in_range(&gains->joint[i])) {
-            return REFUSAL_OUT_OF_RANGE;
+            return REJECTION_OUT_OF_RANGE;
         }
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
         pid_change_gains(&core->joint[i].pid, &core->config.joint[i].gains, &gains->joint[i]);
         core->config.joint[i].gains = gains->joint[i];
     }
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
-static uint32_t obey(core_state *core, const core_inputs *inputs)
+static uint32_t execute(core_state *core, const core_inputs *inputs)
 {
     const core_command *command = &inputs->command;
     switch (command->kind) {
@@ -168,7 +168,7 @@ static uint32_t obey(core_state *core, const core_inputs *inputs)
     case COMMAND_GAINS:
         return take_gains(core, &command->gains);
     default:
-        return REFUSAL_UNKNOWN_COMMAND;
+        return REJECTION_UNKNOWN_COMMAND;
     }
 }
 
@@ -177,13 +177,13 @@ void command_take(core_state *core, const core_inputs *inputs)
     if (inputs->command.kind == COMMAND_NONE) {
         return;
     }
-    const uint32_t refusal = obey(core, inputs);
-    if (refusal == REFUSAL_NONE) {
-        core->obeyed_sequence = inputs->command.sequence;
-        core->obeyed_count++;
+    const uint32_t rejection = execute(core, inputs);
+    if (rejection == REJECTION_NONE) {
+        core->acknowledged_sequence = inputs->command.sequence;
+        core->acknowledged_count++;
     } else {
-        core->refused_sequence = inputs->command.sequence;
-        core->refused_count++;
-        core->refusal = refusal;
+        core->rejected_sequence = inputs->command.sequence;
+        core->rejected_count++;
+        core->rejection = rejection;
     }
 }

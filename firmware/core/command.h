@@ -1,10 +1,10 @@
-/* What the host asks for, obeyed or refused. Tick context. */
+/* What the host asks for, acknowledged or rejected. Tick context. */
 #ifndef ARMSIGHT_COMMAND_H
 #define ARMSIGHT_COMMAND_H
 
 #include "types.h"
 
-/* Obey this tick's command wholly, or refuse it and change nothing; either is written down with its sequence number. */
+/* Execute this tick's command wholly, or reject it and change nothing; either is written down with its sequence number. */
 void command_take(core_state *core, const core_inputs *inputs);
 
 #endif

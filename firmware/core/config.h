@@ -13,7 +13,7 @@
 /* Return the CRC-32 (IEEE 802.3, as zlib's) of length bytes. */
 uint32_t config_crc(const void *bytes, uint32_t length);
 
-/* Fill in values that keep an unknown arm harmless: weak, slow, and with a fault that refuses enabling. */
+/* Fill in values that keep an unknown arm harmless: weak, slow, and with a fault that rejects enabling. */
 void config_factory(core_config *config);
 
 /* Tell whether every value is in the range types.h names. */

@@ -124,11 +124,11 @@ static void report(const core_state *core, core_outputs *outputs)
     outputs->faults = core->faults;
     outputs->first_fault = core->first_fault;
     outputs->first_joint = core->first_joint;
-    outputs->obeyed_sequence = core->obeyed_sequence;
-    outputs->obeyed_count = core->obeyed_count;
-    outputs->refused_sequence = core->refused_sequence;
-    outputs->refused_count = core->refused_count;
-    outputs->refusal = core->refusal;
+    outputs->acknowledged_sequence = core->acknowledged_sequence;
+    outputs->acknowledged_count = core->acknowledged_count;
+    outputs->rejected_sequence = core->rejected_sequence;
+    outputs->rejected_count = core->rejected_count;
+    outputs->rejection = core->rejection;
     for (uint32_t i = 0u; i < JOINTS; i++) {
         const joint_state *joint = &core->joint[i];
         outputs->joint_faults[i] = core->joint_faults[i];

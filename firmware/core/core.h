@@ -8,8 +8,8 @@
 
 /* Begin with the drives off. Call once, before the tick timer runs.
  *
- * config: a valid one is copied; an invalid one is replaced by the factory's values and refuses enabling.
- * source: what config_load returned; CONFIG_FACTORY refuses enabling too.
+ * config: a valid one is copied; an invalid one is replaced by the factory's values and rejects enabling.
+ * source: what config_load returned; CONFIG_FACTORY rejects enabling too.
  * watchdog_reset: the board was restarted by its watchdog; latches a fault that can be cleared.
  */
 void core_init(core_state *core, const core_config *config, uint32_t source, bool watchdog_reset);

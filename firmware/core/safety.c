@@ -14,15 +14,15 @@ static const char *const fault_texts[FAULT_COUNT] = {"no fault", FAULT_LIST(FAUL
 static const uint8_t fault_reactions[FAULT_COUNT] = {0, FAULT_LIST(FAULT_REACTION)};
 static const char *const state_names[STATE_COUNT] = {STATE_LIST(CODE_NAME)};
 static const char *const state_texts[STATE_COUNT] = {STATE_LIST(CODE_TEXT)};
-static const char *const refusal_names[REFUSAL_COUNT] = {"NONE", REFUSAL_LIST(CODE_NAME)};
-static const char *const refusal_texts[REFUSAL_COUNT] = {"obeyed", REFUSAL_LIST(CODE_TEXT)};
+static const char *const rejection_names[REJECTION_COUNT] = {"NONE", REJECTION_LIST(CODE_NAME)};
+static const char *const rejection_texts[REJECTION_COUNT] = {"acknowledged", REJECTION_LIST(CODE_TEXT)};
 
 const char *fault_name(uint32_t code) { return code < FAULT_COUNT ? fault_names[code] : "?"; }
 const char *fault_text(uint32_t code) { return code < FAULT_COUNT ? fault_texts[code] : "?"; }
 const char *state_name(uint32_t code) { return code < STATE_COUNT ? state_names[code] : "?"; }
 const char *state_text(uint32_t code) { return code < STATE_COUNT ? state_texts[code] : "?"; }
-const char *refusal_name(uint32_t code) { return code < REFUSAL_COUNT ? refusal_names[code] : "?"; }
-const char *refusal_text(uint32_t code) { return code < REFUSAL_COUNT ? refusal_texts[code] : "?"; }
+const char *rejection_name(uint32_t code) { return code < REJECTION_COUNT ? rejection_names[code] : "?"; }
+const char *rejection_text(uint32_t code) { return code < REJECTION_COUNT ? rejection_texts[code] : "?"; }
 
 bool safety_drives_on(const core_state *core)
 {

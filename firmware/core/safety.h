@@ -7,15 +7,15 @@
 
 #include "types.h"
 
-/* Return the short name of a fault, a state or a refusal ("POT_OPEN"), or "?" for a code that is none. */
+/* Return the short name of a fault, a state or a rejection ("POT_OPEN"), or "?" for a code that is none. */
 const char *fault_name(uint32_t code);
 const char *state_name(uint32_t code);
-const char *refusal_name(uint32_t code);
+const char *rejection_name(uint32_t code);
 
 /* Return its text for people, or "?" for a code that is none. */
 const char *fault_text(uint32_t code);
 const char *state_text(uint32_t code);
-const char *refusal_text(uint32_t code);
+const char *rejection_text(uint32_t code);
 
 /* Tell whether the drives are on in the present state. */
 bool safety_drives_on(const core_state *core);

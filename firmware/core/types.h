@@ -42,8 +42,8 @@
     X(FAULTED, 4, "faulted: a fault stands, drives off")                  \
     X(STOPPED, 5, "emergency stop: drives off until it is cleared")
 
-/* X(name, code, text): why a command was not obeyed. A refused command changes nothing. */
-#define REFUSAL_LIST(X)                                                                \
+/* X(name, code, text): why a command was not acknowledged. A rejected command changes nothing. */
+#define REJECTION_LIST(X)                                                                \
     X(NOT_FINITE, 1, "a number is NaN or infinite")                                    \
     X(OUT_OF_RANGE, 2, "a number is outside its range")                                \
     X(WRONG_STATE, 3, "not in this state")                                             \
@@ -52,19 +52,19 @@
     X(FAULT_STANDS, 6, "the cause of a fault still stands")                            \
     X(STOP_PRESSED, 7, "the emergency stop is still pressed")                          \
     X(UNKNOWN_COMMAND, 8, "unknown command")                                           \
-    X(NO_HELLO, 9, "no hello of the board's own version came: only STOP is obeyed")    \
+    X(NO_HELLO, 9, "no hello of the board's own version came: only STOP is acknowledged")    \
     X(TOO_MANY, 10, "too many commands at once")                                       \
     X(CONFIG_BROKEN, 11, "the configuration came incomplete, or could not be stored")
 
 #define FAULT_CODE(name, code, reaction, text) FAULT_##name = (code),
 #define STATE_CODE(name, code, text) STATE_##name = (code),
-#define REFUSAL_CODE(name, code, text) REFUSAL_##name = (code),
+#define REJECTION_CODE(name, code, text) REJECTION_##name = (code),
 enum { FAULT_NONE = 0, FAULT_LIST(FAULT_CODE) FAULT_COUNT };
 enum { STATE_LIST(STATE_CODE) STATE_COUNT };
-enum { REFUSAL_NONE = 0, REFUSAL_LIST(REFUSAL_CODE) REFUSAL_COUNT };
+enum { REJECTION_NONE = 0, REJECTION_LIST(REJECTION_CODE) REJECTION_COUNT };
 #undef FAULT_CODE
 #undef STATE_CODE
-#undef REFUSAL_CODE
+#undef REJECTION_CODE
 
 /* What a fault does to a moving arm. CHOSEN is the configuration's silence_reaction. */
 enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3 };
@@ -172,7 +172,7 @@ typedef struct move_command {
 /* One command of the host. */
 typedef struct core_command {
     uint32_t kind;     /* COMMAND_... */
-    uint32_t sequence; /* the host's number for it, given back when it is obeyed or refused */
+    uint32_t sequence; /* the host's number for it, given back when it is acknowledged or rejected */
     move_command move; /* read for COMMAND_MOVE only */
     gain_set gains;    /* read for COMMAND_GAINS only */
 } core_command;
@@ -198,11 +198,11 @@ typedef struct core_outputs {
     uint32_t joint_faults[JOINTS]; /* the same, those of each joint */
     uint32_t first_fault;         /* the fault that came first since the last clear, FAULT_NONE without */
     uint32_t first_joint;         /* its joint, NO_JOINT where it belongs to none */
-    uint32_t obeyed_sequence;     /* the last command obeyed */
-    uint32_t obeyed_count;        /* how many were, it wraps */
-    uint32_t refused_sequence;    /* the last command refused */
-    uint32_t refused_count;       /* how many were, it wraps */
-    uint32_t refusal;             /* why that one was, REFUSAL_... */
+    uint32_t acknowledged_sequence;     /* the last command acknowledged */
+    uint32_t acknowledged_count;        /* how many were, it wraps */
+    uint32_t rejected_sequence;    /* the last command rejected */
+    uint32_t rejected_count;       /* how many were, it wraps */
+    uint32_t rejection;             /* why that one was, REJECTION_... */
     uint32_t limited[JOINTS];     /* LIMITED_... bits of this tick */
     float duty[JOINTS];           /* to the motors, -1 to 1 */
     float angle_rad[JOINTS];      /* measured */
@@ -286,11 +286,11 @@ typedef struct core_state {
     uint32_t first_fault;
     uint32_t first_joint;
     uint32_t permanent;      /* faults only a restart takes away */
-    uint32_t obeyed_sequence;
-    uint32_t obeyed_count;
-    uint32_t refused_sequence;
-    uint32_t refused_count;
-    uint32_t refusal;
+    uint32_t acknowledged_sequence;
+    uint32_t acknowledged_count;
+    uint32_t rejected_sequence;
+    uint32_t rejected_count;
+    uint32_t rejection;
     uint32_t guard_tail;
 } core_state;
 

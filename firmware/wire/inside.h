@@ -11,21 +11,21 @@
 /* Return the tick of the newest report. */
 static inline uint32_t wire_tick(const wire_state *wire) { return wire->report.outputs.tick; }
 
-/* Obey a message whose checksum is right. */
+/* Execute a message whose checksum is right. */
 void message_take(wire_state *wire, const mavlink_message_t *message);
 
-/* Tell whether a command may be taken, by its number and by who sent it; refuses or drops it otherwise. */
-bool order_admit(wire_state *wire, uint32_t sequence);
+/* Tell whether a command may be taken, by its number and by who sent it; rejects or drops it otherwise. */
+bool command_admit(wire_state *wire, uint32_t sequence);
 
-/* Return the place at the queue's end for a command of this kind; NULL, and refuses it, where there is none. */
-core_command *order_append(wire_state *wire, uint32_t kind, uint32_t sequence);
+/* Return the place at the queue's end for a command of this kind; NULL, and rejects it, where there is none. */
+core_command *command_append(wire_state *wire, uint32_t kind, uint32_t sequence);
 
-/* Refuse a command before it reaches the core, or say that the wire itself obeyed it. */
-void order_refuse(wire_state *wire, uint32_t sequence, uint32_t refusal);
-void order_obeyed(wire_state *wire, uint32_t sequence);
+/* Reject a command before it reaches the core, or say that the wire itself acknowledged it. */
+void command_reject(wire_state *wire, uint32_t sequence, uint32_t rejection);
+void command_acknowledge(wire_state *wire, uint32_t sequence);
 
 /* Mail the oldest waiting command if the mailbox is empty and what became of the last one is known. */
-void order_mail(wire_state *wire);
+void command_deliver(wire_state *wire);
 
 /* Take a message that is no command: about the configuration, or a PING. */
 void settings_take(wire_state *wire, const mavlink_message_t *message);

@@ -16,9 +16,9 @@ void wire_stored(wire_state *wire, bool done)
     wire->staged.storing = 0u;
     if (done) {
         wire->counters.config_stored++;
-        order_obeyed(wire, wire->staged.sequence);
+        command_acknowledge(wire, wire->staged.sequence);
     } else {
-        order_refuse(wire, wire->staged.sequence, REFUSAL_CONFIG_BROKEN);
+        command_reject(wire, wire->staged.sequence, REJECTION_CONFIG_BROKEN);
     }
 }
 
@@ -26,11 +26,11 @@ void settings_store(wire_state *wire, uint32_t sequence)
 {
     wire_staged *staged = &wire->staged;
     if (wire->report.outputs.drives_on != 0u) {
-        order_refuse(wire, sequence, REFUSAL_WRONG_STATE);
+        command_reject(wire, sequence, REJECTION_WRONG_STATE);
     } else if (config_crc(&staged->config, sizeof staged->config) != staged->crc) {
-        order_refuse(wire, sequence, REFUSAL_CONFIG_BROKEN);
+        command_reject(wire, sequence, REJECTION_CONFIG_BROKEN);
     } else if (!config_is_valid(&staged->config)) {
-        order_refuse(wire, sequence, REFUSAL_OUT_OF_RANGE);
+        command_reject(wire, sequence, REJECTION_OUT_OF_RANGE);
     } else {
         staged->sequence = sequence;
         staged->storing = 1u;
@@ -39,10 +39,10 @@ void settings_store(wire_state *wire, uint32_t sequence)
 
 static void take_store(wire_state *wire, const mavlink_message_t *message)
 {
-    mavlink_config_store_t order;
-    mavlink_msg_config_store_decode(message, &order);
-    if (order_admit(wire, order.sequence) && order_append(wire, COMMAND_STORE, order.sequence) != NULL) {
-        wire->staged.crc = order.crc;
+    mavlink_config_store_t store;
+    mavlink_msg_config_store_decode(message, &store);
+    if (command_admit(wire, store.sequence) && command_append(wire, COMMAND_STORE, store.sequence) != NULL) {
+        wire->staged.crc = store.crc;
     }
 }
 
@@ -88,7 +88,7 @@ static void take_ping(wire_state *wire, const mavlink_message_t *message)
 void settings_take(wire_state *wire, const mavlink_message_t *message)
 {
     if (message->msgid == MAVLINK_MSG_ID_CONFIG_STORE) {
-        take_store(wire, message); /* refused by name before a HELLO, as every command */
+        take_store(wire, message); /* rejected by name before a HELLO, as every command */
     } else if (wire->greeted == 0u) {
         return;
     } else if (message->msgid == MAVLINK_MSG_ID_CONFIG_READ) {

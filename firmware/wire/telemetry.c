@@ -7,7 +7,7 @@
 #define JOINTS_EVERY 10u       /* JOINTS are as many times rarer than ANGLES */
 #define STATUS_TICKS 20u       /* 50 Hz where the wire carries it */
 #define STATUS_EVERY 4u        /* and not more often than every so many ANGLES */
-#define STATUS_GAP_DIVISOR 4u  /* STATUS of orders comes at most as many times more often than by itself */
+#define STATUS_GAP_DIVISOR 4u  /* STATUS of commands comes at most as many times more often than by itself */
 #define USED_PER_25_BAUD 2u    /* bytes a second to use: 80 % of what the wire carries */
 #define BACKLOG_PER_BAUD 1000u /* telemetry waits while more than 10 ms of it wait to go out, */
 #define BACKLOG_BYTES 512u     /* or more than this */
@@ -71,8 +71,8 @@ static void copy_report(wire_state *wire)
 bool telemetry_fetch(wire_state *wire)
 {
     const core_outputs *outputs = &wire->report.outputs;
-    const uint32_t obeyed = outputs->obeyed_count;
-    const uint32_t refused = outputs->refused_count;
+    const uint32_t acknowledged = outputs->acknowledged_count;
+    const uint32_t rejected = outputs->rejected_count;
     const uint32_t state = outputs->state;
     const uint32_t faults = outputs->faults;
     if (wire->reports_read == atomic_load(&wire->shared.report_count)) {
@@ -81,17 +81,17 @@ bool telemetry_fetch(wire_state *wire)
     copy_report(wire);
     if (wire->stop_waits != 0u && wire->reports_read != wire->stop_report) {
         wire->stop_waits = 0u;
-        order_obeyed(wire, wire->stop_sequence);
+        command_acknowledge(wire, wire->stop_sequence);
     }
-    if (outputs->obeyed_count != obeyed) {
-        wire->fate.obeyed_count += outputs->obeyed_count - obeyed;
-        wire->fate.obeyed_sequence = outputs->obeyed_sequence;
+    if (outputs->acknowledged_count != acknowledged) {
+        wire->fate.acknowledged_count += outputs->acknowledged_count - acknowledged;
+        wire->fate.acknowledged_sequence = outputs->acknowledged_sequence;
         wire->status_due |= wire->mailed_kind != COMMAND_MOVE;
     }
-    if (outputs->refused_count != refused) {
-        wire->fate.refused_count += outputs->refused_count - refused;
-        wire->fate.refused_sequence = outputs->refused_sequence;
-        wire->fate.refusal = outputs->refusal;
+    if (outputs->rejected_count != rejected) {
+        wire->fate.rejected_count += outputs->rejected_count - rejected;
+        wire->fate.rejected_sequence = outputs->rejected_sequence;
+        wire->fate.rejection = outputs->rejection;
         wire->status_due = 1u;
     }
     wire->status_urgent |= outputs->state != state || outputs->faults != faults;
@@ -107,11 +107,11 @@ static void write_status(wire_state *wire)
         .faults = outputs->faults,
         .first_fault = outputs->first_fault,
         .first_joint = outputs->first_joint,
-        .obeyed_sequence = wire->fate.obeyed_sequence,
-        .obeyed_count = wire->fate.obeyed_count,
-        .refused_sequence = wire->fate.refused_sequence,
-        .refused_count = wire->fate.refused_count,
-        .refusal = wire->fate.refusal,
+        .acknowledged_sequence = wire->fate.acknowledged_sequence,
+        .acknowledged_count = wire->fate.acknowledged_count,
+        .rejected_sequence = wire->fate.rejected_sequence,
+        .rejected_count = wire->fate.rejected_count,
+        .rejection = wire->fate.rejection,
         .supply_mv = wire->report.supply_mv,
         .crc_errors = wire->counters.crc_errors,
         .lost_bytes = wire->counters.lost_bytes,
@@ -165,7 +165,7 @@ static bool has_room(const wire_state *wire)
     return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
 }
 
-/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are refused, and no
+/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are rejected, and no
  * more. */
 static bool status_is_due(const wire_state *wire)
 {

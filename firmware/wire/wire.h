@@ -47,11 +47,11 @@ typedef struct wire_counters {
 
 /* The commands' fate, the core's and the wire's own. */
 typedef struct wire_fate {
-    uint32_t obeyed_sequence;
-    uint32_t obeyed_count;
-    uint32_t refused_sequence;
-    uint32_t refused_count;
-    uint32_t refusal;
+    uint32_t acknowledged_sequence;
+    uint32_t acknowledged_count;
+    uint32_t rejected_sequence;
+    uint32_t rejected_count;
+    uint32_t rejection;
 } wire_fate;
 
 /* What a tick leaves for the telemetry. */
@@ -127,7 +127,7 @@ typedef struct wire_state {
     uint32_t joints_tick;
     uint32_t status_tick;
     uint32_t status_urgent;   /* not 0: state or faults changed since the last STATUS */
-    uint32_t status_due;      /* not 0: an order was obeyed, or something refused */
+    uint32_t status_due;      /* not 0: a command was acknowledged, or something rejected */
 } wire_state;
 
 /* Begin with nothing come and nothing said. Before the first tick. */

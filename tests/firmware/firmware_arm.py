@@ -36,7 +36,7 @@ def declare(library: Library) -> Library:
         "config_load": (word, [pointer, pointer, pointer]),
         "config_next": (word, [pointer, pointer, ctypes.POINTER(word)]),
     }
-    for which in ("fault", "state", "refusal"):
+    for which in ("fault", "state", "rejection"):
         for what in ("name", "text"):
             signatures[f"{which}_{what}"] = (ctypes.c_char_p, [word])
     for name, (result, arguments) in signatures.items():
@@ -127,11 +127,11 @@ class LabArm:
             self.tick(period - 1)
         return self.outputs
 
-    def obeyed(self) -> bool:
-        """Tell whether the last command was obeyed; it was refused otherwise."""
-        obeyed = self.outputs.acknowledged_sequence == self.sequence
-        assert obeyed != (self.outputs.rejected_sequence == self.sequence)
-        return obeyed
+    def acknowledged(self) -> bool:
+        """Tell whether the last command was acknowledged; it was refused otherwise."""
+        acknowledged = self.outputs.acknowledged_sequence == self.sequence
+        assert acknowledged != (self.outputs.rejected_sequence == self.sequence)
+        return acknowledged
 
 
 def twin_of(arm):

@@ -40,7 +40,7 @@ def _records() -> dict[str, type[ctypes.Structure]]:
     return {name: record for name, record in known.items() if name not in BASIC}
 
 
-FAULTS, STATES, REFUSALS = _listed("FAULT"), _listed("STATE"), _listed("REFUSAL")
+FAULTS, STATES, REJECTIONS = _listed("FAULT"), _listed("STATE"), _listed("REJECTION")
 REACTIONS = dict(re.findall(r"X\((\w+), \d+, (RELEASE|HOLD|CHOSEN),", HEADER))
 RECORDS = _records()
 
@@ -51,5 +51,5 @@ c = SimpleNamespace(
     **_enumerated(),
     **{f"FAULT_{name}": code for name, code in FAULTS.items()},
     **{f"STATE_{name}": code for name, code in STATES.items()},
-    **{f"REFUSAL_{name}": code for name, code in REFUSALS.items()},
+    **{f"REJECTION_{name}": code for name, code in REJECTIONS.items()},
 )

@@ -85,8 +85,8 @@ class Host:
         sequence = self.next() if sequence is None else sequence
         return self.pack("move", sequence, ticks, [position_rad] * 6, [speed_rad_s] * 6, [0.0] * 6)
 
-    def order(self, kind: int, *, sequence=None) -> bytes:
-        return self.pack("order", self.next() if sequence is None else sequence, kind)
+    def command(self, kind: int, *, sequence=None) -> bytes:
+        return self.pack("command", self.next() if sequence is None else sequence, kind)
 
     def stop(self) -> bytes:
         return self.pack("stop", self.next())

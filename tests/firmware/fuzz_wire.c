@@ -47,7 +47,7 @@ static void tick(const uint8_t *bytes, uint32_t length)
     const core_outputs *outputs = &pil_answer_frame.outputs;
     require(pil_answer_frame.magic == FRAME_ANSWER && pil_answer_frame.length <= LINE_BYTES + 1u, "too much goes out");
     require(outputs->state < STATE_COUNT && outputs->first_fault < FAULT_COUNT, "no such state or fault");
-    require(outputs->refusal < REFUSAL_COUNT, "no such refusal");
+    require(outputs->rejection < REJECTION_COUNT, "no such rejection");
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
         require(number_within(outputs->duty[joint], -1.0f, 1.0f), "a duty out of range");
         require(number_finite(outputs->reference_rad[joint]), "a reference that is no number");
@@ -111,18 +111,18 @@ static void store(void)
     tick(nothing, 0u);
 }
 
-/* Greet, give one order, and see it obeyed or refused. */
+/* Greet, give one command, and see it acknowledged or rejected. */
 static void require_usable(void)
 {
-    const mavlink_order_t order = {.sequence = 1u, .kind = COMMAND_DISABLE};
+    const mavlink_command_t command = {.sequence = 1u, .kind = COMMAND_DISABLE};
     for (uint32_t i = 0u; i < USABLE_TICKS; i++) {
         tick(nothing, 0u);
     }
     greet();
-    const uint32_t before = pil_answer_frame.outputs.obeyed_count + pil_answer_frame.outputs.refused_count;
-    say(MAVLINK_MSG_ID_ORDER, &order, sizeof order);
+    const uint32_t before = pil_answer_frame.outputs.acknowledged_count + pil_answer_frame.outputs.rejected_count;
+    say(MAVLINK_MSG_ID_COMMAND, &command, sizeof command);
     tick(nothing, 0u);
-    const uint32_t after = pil_answer_frame.outputs.obeyed_count + pil_answer_frame.outputs.refused_count;
+    const uint32_t after = pil_answer_frame.outputs.acknowledged_count + pil_answer_frame.outputs.rejected_count;
     require(after == before + 1u, "the link is not usable again");
 }
 

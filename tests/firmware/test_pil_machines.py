@@ -153,7 +153,7 @@ def test_an_image_told_nonsense_says_so_on_every_machine(images, library_files):
     for name in ("host", "unicorn", "qemu"):
         machine = machine_of(name, next(iter(library_files.values())) if name == "host" else image)
         refused = c.pil_answer.from_buffer_copy(machine.tick(bytes(592)))
-        assert (refused.magic, refused.version) == (c.FRAME_REFUSED, c.FRAME_VERSION), name
+        assert (refused.magic, refused.version) == (c.FRAME_REJECTED, c.FRAME_VERSION), name
         assert c.pil_answer.from_buffer_copy(machine.tick(bytes(good))).magic == c.FRAME_ANSWER, name
         machine.close()
 

@@ -93,7 +93,7 @@ bool pil_begin(void)
     const pil_request *request = &pil_request_frame;
     const bool known =
         request->magic == FRAME_REQUEST && request->version == FRAME_VERSION && request->length <= FRAME_BYTES;
-    pil_answer_frame.magic = known ? FRAME_ANSWER : FRAME_REFUSED;
+    pil_answer_frame.magic = known ? FRAME_ANSWER : FRAME_REJECTED;
     pil_answer_frame.version = FRAME_VERSION;
     pil_answer_frame.tick = request->tick;
     pil_answer_frame.length = 0u;

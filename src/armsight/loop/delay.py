@@ -17,7 +17,7 @@ from armsight.data import Array, JointStates
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
-from armsight.loop.estimators import Delay, KalmanEstimator, Prior, Sighting, Verdict
+from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement, Prior, Verdict
 from armsight.robot.arm import Arm
 
 #: Lags that are looked at, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
@@ -39,7 +39,12 @@ _AHEAD_S = 0.1
 
 
 def estimate_delay(
-    arm: Arm, states: JointStates, sightings: Sequence[Sighting], *, prior: Prior | None = None, sync_s: float = 0.0
+    arm: Arm,
+    states: JointStates,
+    measurements: Sequence[PoseMeasurement],
+    *,
+    prior: Prior | None = None,
+    sync_s: float = 0.0,
 ) -> Delay:
     """Find how late the camera's stamps are, and how far they scatter.
 
@@ -55,7 +60,7 @@ def estimate_delay(
         CalibrationError: the motion does not determine the delay.
     """
     t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), 6), "states.q")
-    stamps = np.array([sighting.t_s for sighting in sightings])
+    stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
     if len(stamps) < LEAST or not (np.diff(stamps) > 0).all():
         raise InputError(f"a delay needs {LEAST} or more sightings in order of time, got {len(stamps)}")
     inside = LAGS_S[(stamps[0] - LAGS_S >= t[0]) & (stamps[-1] - LAGS_S <= t[-1])] if len(t) else LAGS_S[:0]
@@ -64,9 +69,9 @@ def estimate_delay(
             "the potentiometer readings do not cover the sightings; log them from a second before to a second after"
         )
     jitter_s = float(np.hypot(_jitter(stamps), 0.5 * sync_s))  # of the middle between the two exposures
-    delay = Delay(_coarse(arm, t, q, sightings, inside), FIRST_SIGMA_S, jitter_s)
+    delay = Delay(_coarse(arm, t, q, measurements, inside), FIRST_SIGMA_S, jitter_s)
     for _ in range(PASSES):
-        delay = _filtered(arm, states, sightings, Delay(delay.delay_s, FIRST_SIGMA_S, jitter_s), prior)
+        delay = _filtered(arm, states, measurements, Delay(delay.delay_s, FIRST_SIGMA_S, jitter_s), prior)
     if delay.sigma_s > MOST_SIGMA_S:
         raise CalibrationError(
             f"the sweep determines the camera's delay to {1e3 * delay.sigma_s:.1f} ms only, {1e3 * MOST_SIGMA_S:.0f} are "
@@ -87,10 +92,10 @@ def _jitter(stamps: Array) -> float:
     return float(np.sqrt(np.mean(usual**2) / 2))
 
 
-def _coarse(arm: Arm, t: Array, q: Array, sightings: Sequence[Sighting], lags: Array) -> float:
+def _coarse(arm: Arm, t: Array, q: Array, measurements: Sequence[PoseMeasurement], lags: Array) -> float:
     """Return the lag at which the joints turned the tool as the sightings did, by least squares on the turns' angles."""
-    stamps = np.array([sighting.t_s for sighting in sightings])
-    seen = _turns(np.array([sighting.T_base_tool for sighting in sightings]))
+    stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
+    seen = _turns(np.array([pose_measurement.T_base_tool for pose_measurement in measurements]))
     cost = np.empty(len(lags))
     for n, lag in enumerate(lags):
         at = np.stack([np.interp(stamps - lag, t, q[:, i]) for i in range(6)], axis=1)
@@ -107,19 +112,21 @@ def _turns(Ts: Array) -> Array:
     return np.asarray(np.linalg.norm(log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:]), axis=1))
 
 
-def _filtered(arm: Arm, states: JointStates, sightings: Sequence[Sighting], delay: Delay, prior: Prior | None) -> Delay:
+def _filtered(
+    arm: Arm, states: JointStates, measurements: Sequence[PoseMeasurement], delay: Delay, prior: Prior | None
+) -> Delay:
     """Return the delay as a filter that runs over the sweep knows it at the end."""
     estimator = KalmanEstimator(arm, prior=prior, delay=delay)
     given = used = 0
-    for sighting in sightings:
-        upto = int(np.searchsorted(states.t_s, sighting.t_s - delay.delay_s + _AHEAD_S))
+    for pose_measurement in measurements:
+        upto = int(np.searchsorted(states.t_s, pose_measurement.t_s - delay.delay_s + _AHEAD_S))
         if upto > given:
             estimator.joints(JointStates(states.t_s[given:upto], states.q[given:upto]))
             given = upto
-        used += estimator.vision(sighting) is Verdict.USED
-    if used < len(sightings) / 2:
+        used += estimator.vision(pose_measurement) is Verdict.USED
+    if used < len(measurements) / 2:
         raise CalibrationError(
-            f"vision and potentiometers do not describe the same motion: {used} of {len(sightings)} sightings fit; is the "
+            f"vision and potentiometers do not describe the same motion: {used} of {len(measurements)} sightings fit; is the "
             "hand-eye calibration this arm's, and are both stamped by one clock?"
         )
     return estimator.learned().delay

@@ -33,7 +33,7 @@ TAG_FAMILY, TAG_M = "tag36h11", 0.032
 TAG_MIDDLES_M = ((-0.034, -0.024), (0.034, -0.024), (0.034, 0.024), (-0.034, 0.024))
 
 
-def bench_rig(
+def example_rig(
     image_size_px: tuple[int, int] = (1280, 720),
     focal_px: float = 900.0,
     baseline_m: float = 0.2,
@@ -227,7 +227,7 @@ def demo_recording(
     Raises:
         InputError: a file cannot be written.
     """
-    rig = bench_rig(image_size_px, focal_px=900 / 1280 * image_size_px[0])
+    rig = example_rig(image_size_px, focal_px=900 / 1280 * image_size_px[0])
     board = chessboard(9, 6, 0.025)
     Ts = board_poses(np.random.default_rng(seed), rig, board, boards)
     of_board = Truth(rig, BOARD, shot_names(boards), np.arange(float(boards)), Ts)

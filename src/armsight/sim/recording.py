@@ -24,7 +24,7 @@ from armsight.geometry.check import checked
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.optics import Optics, Sensor
 from armsight.sim.render.render import Shutter, render_pair
-from armsight.sim.render.scene import Pattern, Placed
+from armsight.sim.render.scene import Pattern, PosedBody
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.folder import COLUMNS, INDEX
 
@@ -140,7 +140,7 @@ def record(
     backgrounds = [BACKGROUNDS[look.background](camera.image_size_px, rng) for camera in truth.rig.cameras]
 
     def shoot(n: int) -> None:
-        body = Placed(tuple(patterns), truth.Ts_left_body[n], twists[n])
+        body = PosedBody(tuple(patterns), truth.Ts_left_body[n], twists[n])
         images = render_pair(
             truth.rig.cameras,
             truth.rig.T_left_right,

@@ -14,7 +14,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import join
 from armsight.vision.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
-from armsight.vision.posefit import Sightings, fit_pose
+from armsight.vision.posefit import PixelObservations, fit_pose
 
 #: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
 LEAST_DETECTIONS, LEAST_AMBIGUOUS = 4, 6
@@ -119,7 +119,7 @@ def _polished(
         if sum(len(r) for r in rows) < 3:
             return None
         seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(rows)))
-        fit = fit_pose(cameras, T_left_right, points, Sightings.of(seen, _POLISH_SIGMA_PX), T, robust=True)
+        fit = fit_pose(cameras, T_left_right, points, PixelObservations.of(seen, _POLISH_SIGMA_PX), T, robust=True)
         if fit is None:
             return None
         T = fit.T_left_body

@@ -22,7 +22,7 @@ from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstim
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.vision.pnp import consensus_poses
-from armsight.vision.posefit import PoseFit, Sightings, fit_pose, whitened
+from armsight.vision.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
 _COLLINEAR = 1e-3
@@ -42,7 +42,9 @@ def on_one_line(points: Array) -> bool:
     return bool(spread[1] <= _COLLINEAR**2 * spread[2])
 
 
-def unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: Sightings, rigid: Array) -> str | None:
+def implausible(
+    rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: PixelObservations, rigid: Array
+) -> str | None:
     """Say why a fit is no measurement of the body, or None.
 
     Args:
@@ -68,7 +70,7 @@ def unbelievable(rig: StereoRig, body: Body, points: Points, fit: PoseFit, used:
     return _wrong_size(rig, body, Points(*arrays, points.seen), fit_rigid(body.points[arrays[0]], arrays[1]))
 
 
-def _unlike(body: Body, points: Points, fit: PoseFit, used: Sightings) -> str | None:
+def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -> str | None:
     """Say that the detections a pose was fitted to are further off it than those of a bent body would be, or None."""
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
@@ -139,18 +141,21 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     reason = _unlocatable(body, points)
     if reason is not None:
         return Missed(reason)
-    sightings, rigid = Sightings.of(points.seen, rig.sigma_px), fit_rigid(body.points[points.ids], points.p_left)
-    best = _best(rig, body, sightings, _starts(rig, body, points, rigid))
+    observations, rigid = (
+        PixelObservations.of(points.seen, rig.sigma_px),
+        fit_rigid(body.points[points.ids], points.p_left),
+    )
+    best = _best(rig, body, observations, _starts(rig, body, points, rigid))
     if best is None or _median(best.distance2) > _SUSPECT * _MEDIAN:
-        others = _best(rig, body, sightings, _agreed_starts(body, points))
+        others = _best(rig, body, observations, _agreed_starts(body, points))
         best = min((fit for fit in (best, others) if fit is not None), key=lambda fit: fit.cost, default=None)
     if best is None:
         return Missed("no pose of the body fits the detections")
-    good, fit = _without_outliers(rig, body, best, sightings)
+    good, fit = _without_outliers(rig, body, best, observations)
     if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
-    reason = unbelievable(rig, body, points, fit, _chosen(sightings, good), rigid)
-    return _estimate(rig, body, points, fit, sightings, good) if reason is None else Missed(reason)
+    reason = implausible(rig, body, points, fit, _chosen(observations, good), rigid)
+    return _estimate(rig, body, points, fit, observations, good) if reason is None else Missed(reason)
 
 
 def _unlocatable(body: Body, points: Points) -> str | None:
@@ -197,53 +202,53 @@ def _agreed_starts(body: Body, points: Points) -> list[Array]:
     return [T for _, T in sorted(fits, key=lambda fit: fit[0])[:_TRIED]]
 
 
-def _best(rig: StereoRig, body: Body, sightings: Sightings, starts: list[Array]) -> PoseFit | None:
+def _best(rig: StereoRig, body: Body, observations: PixelObservations, starts: list[Array]) -> PoseFit | None:
     """Minimise robustly from every start and return the lowest; None where no start leads anywhere."""
-    fits = [fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, start, robust=True) for start in starts]
+    fits = [fit_pose(rig.cameras, rig.T_left_right, body.points, observations, start, robust=True) for start in starts]
     return min((fit for fit in fits if fit is not None), key=lambda fit: fit.cost, default=None)
 
 
 def _without_outliers(
-    rig: StereoRig, body: Body, robust: PoseFit, sightings: Sightings
+    rig: StereoRig, body: Body, robust: PoseFit, observations: PixelObservations
 ) -> tuple[NDArray[np.bool_], PoseFit | None]:
     """Drop what the robust fit leaves far off, and fit the rest by plain least squares."""
     d2, T = robust.distance2, robust.T_left_body
     good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
         now = d2 <= _LIMIT * max(1.0, _median(d2) / _MEDIAN)
-        if now.sum() < max(3, _AGREEING * len(now)) or np.count_nonzero(np.bincount(sightings.point[now])) < 3:
+        if now.sum() < max(3, _AGREEING * len(now)) or np.count_nonzero(np.bincount(observations.point[now])) < 3:
             return now, None
         if fit is not None and (now == good).all():
             break
         good = now
-        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, _chosen(sightings, good), T, robust=False)
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, _chosen(observations, good), T, robust=False)
         if fit is None:
             return good, None
         T = fit.T_left_body
-        d2 = fit.distance2 if good.all() else _distances(rig, body, T, sightings)[1]
+        d2 = fit.distance2 if good.all() else _distances(rig, body, T, observations)[1]
     return good, fit
 
 
-def _distances(rig: StereoRig, body: Body, T: Array, sightings: Sightings) -> tuple[Array, Array]:
+def _distances(rig: StereoRig, body: Body, T: Array, observations: PixelObservations) -> tuple[Array, Array]:
     """Return (N,) distances of all sightings from a pose's projections, px, and their squares in standard deviations."""
-    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, sightings, T, robust=False, steps=0)
+    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, observations, T, robust=False, steps=0)
     if fit is None:
-        return np.full(len(sightings.point), np.inf), np.full(len(sightings.point), np.inf)
+        return np.full(len(observations.point), np.inf), np.full(len(observations.point), np.inf)
     return np.linalg.norm(fit.residuals_px, axis=1), fit.distance2
 
 
 def _estimate(
-    rig: StereoRig, body: Body, points: Points, fit: PoseFit, sightings: Sightings, good: NDArray[np.bool_]
+    rig: StereoRig, body: Body, points: Points, fit: PoseFit, observations: PixelObservations, good: NDArray[np.bool_]
 ) -> PoseEstimate:
     """Assemble the estimate with its covariance: pixel noise, and the rig's calibration through the same fit."""
-    used, T = _chosen(sightings, good), fit.T_left_body
+    used, T = _chosen(observations, good), fit.T_left_body
     W, A, B = whitened(rig.cameras, rig.T_left_right, body.points, used, T)
     noise = np.linalg.inv(fit.information).astype(np.float64)
     gain = noise @ (A.T @ B)
     misfit = 1.0
     if fit.cost > misfit_limit(2 * len(used.point) - 6):
         misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
-    points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, sightings, good)
+    points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, observations, good)
     gap = points.p_left - (body.points[points.ids] @ T[:3, :3].T + T[:3, 3])
     return PoseEstimate(
         T,
@@ -258,25 +263,25 @@ def _estimate(
 
 
 def _thinned(
-    rig: StereoRig, body: Body, points: Points, T: Array, sightings: Sightings, good: NDArray[np.bool_]
+    rig: StereoRig, body: Body, points: Points, T: Array, observations: PixelObservations, good: NDArray[np.bool_]
 ) -> tuple[Points, tuple[Dropped, ...]]:
     """Return the points whose detections are all good, and the others' names with how far off they are."""
-    distance = _distances(rig, body, T, sightings)[0]
+    distance = _distances(rig, body, T, observations)[0]
     dropped = tuple(
         Dropped(
-            body.point_names[sightings.point[i]],
-            f"{distance[i]:.1f} px off the body in the {SIDES[sightings.camera[i]]} image",
+            body.point_names[observations.point[i]],
+            f"{distance[i]:.1f} px off the body in the {SIDES[observations.camera[i]]} image",
         )
         for i in np.flatnonzero(~good)
     )
-    kept = ~np.isin(points.ids, sightings.point[~good])
+    kept = ~np.isin(points.ids, observations.point[~good])
     arrays = (points.ids[kept], points.p_left[kept], points.cov[kept], points.calibration[kept])
     return Points(*arrays, points.seen, points.dropped), dropped
 
 
-def _chosen(sightings: Sightings, good: NDArray[np.bool_]) -> Sightings:
+def _chosen(observations: PixelObservations, good: NDArray[np.bool_]) -> PixelObservations:
     """Return the good ones."""
-    return sightings if good.all() else sightings.select(good)
+    return observations if good.all() else observations.select(good)
 
 
 def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:

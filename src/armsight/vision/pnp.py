@@ -14,7 +14,7 @@ from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import pose, transform
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.vision.camera import Camera
-from armsight.vision.posefit import Sightings, fit_pose
+from armsight.vision.posefit import PixelObservations, fit_pose
 
 MIN_POINTS = 4
 
@@ -158,6 +158,6 @@ def _agreeing(points: Array, camera: Camera, T: Array, ids: Ids, uv: Array) -> t
 def _polished(p: Array, camera: Camera, T: Array, uv: Array) -> Array:
     """Minimise one camera's pixel distance from a good start."""
     n = len(p)
-    sightings = Sightings(np.zeros(n, np.int64), np.arange(n), uv, np.tile(np.eye(2), (n, 1, 1)))
-    fit = fit_pose((camera, camera), np.eye(4), p, sightings, T, robust=False, steps=_POLISH_STEPS)
+    observations = PixelObservations(np.zeros(n, np.int64), np.arange(n), uv, np.tile(np.eye(2), (n, 1, 1)))
+    fit = fit_pose((camera, camera), np.eye(4), p, observations, T, robust=False, steps=_POLISH_STEPS)
     return T if fit is None else fit.T_left_body

@@ -23,7 +23,7 @@ _DONE = 1e-8  # relative decrease of the cost
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings(Record):
+class PixelObservations(Record):
     """Detections of one body in one shot, one row each.
 
     Attributes:
@@ -39,15 +39,15 @@ class Sightings(Record):
     cov_uv: Array
 
     @staticmethod
-    def of(seen: Correspondences, sigma_px: float) -> Sightings:
+    def of(seen: Correspondences, sigma_px: float) -> PixelObservations:
         """Flatten a shot's correspondences; ``sigma_px`` adds to what the image tells."""
         rows, sides = np.nonzero(seen.seen)
         cov = seen.cov_uv[rows, sides] + max(sigma_px, 1e-6) ** 2 * np.eye(2)
-        return Sightings(sides.astype(np.int64), seen.ids[rows], seen.uv[rows, sides], cov)
+        return PixelObservations(sides.astype(np.int64), seen.ids[rows], seen.uv[rows, sides], cov)
 
-    def select(self, keep: NDArray[np.bool_]) -> Sightings:
+    def select(self, keep: NDArray[np.bool_]) -> PixelObservations:
         """Return the rows where ``keep`` (N,) is true."""
-        return Sightings(self.camera[keep], self.point[keep], self.uv[keep], self.cov_uv[keep])
+        return PixelObservations(self.camera[keep], self.point[keep], self.uv[keep], self.cov_uv[keep])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def fit_pose(
     cameras: tuple[Camera, Camera],
     T_left_right: Array,
     points: Array,
-    sightings: Sightings,
+    observations: PixelObservations,
     start: Array,
     *,
     robust: bool,
@@ -85,7 +85,7 @@ def fit_pose(
         cameras: left and right.
         T_left_right: (4, 4) pose of the right camera in the left one's frame.
         points: (M, 3) points of the body, m.
-        sightings: N detections.
+        observations: N detections.
         start: (4, 4) T_left_body to begin with.
         robust: Cauchy loss as in bundle adjustment, else plain least squares.
         steps: iterations at the most.
@@ -94,14 +94,14 @@ def fit_pose(
         The minimum next to the start, or None where the start puts a point behind its camera or the
         sightings do not determine a pose.
     """
-    T, p = np.array(start), np.ascontiguousarray(points[sightings.point])
+    T, p = np.array(start), np.ascontiguousarray(points[observations.point])
     n = len(p)
     weight = np.empty((n, 2, 2))
-    _invert(np.array(sightings.cov_uv), weight)
+    _invert(np.array(observations.cov_uv), weight)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
     arguments: tuple[Any, ...] = (
-        *pair_arguments(cameras), inverse(T_left_right), p, np.array(sightings.camera), np.array(sightings.uv), weight, T,
-        robust, steps, residuals, d2, H,
+        *pair_arguments(cameras), inverse(T_left_right), p, np.array(observations.camera), np.array(observations.uv), weight,
+        T, robust, steps, residuals, d2, H,
     )  # fmt: skip
     try:
         cost = _fit(*arguments)
@@ -111,7 +111,11 @@ def fit_pose(
 
 
 def whitened(
-    cameras: tuple[Camera, Camera], T_left_right: Array, points: Array, sightings: Sightings, T_left_body: Array
+    cameras: tuple[Camera, Camera],
+    T_left_right: Array,
+    points: Array,
+    observations: PixelObservations,
+    T_left_body: Array,
 ) -> tuple[Array, Array, Array]:
     """Differentiate the projections of all sightings, in standard deviations of each.
 
@@ -119,18 +123,18 @@ def whitened(
         cameras: left and right.
         T_left_right: (4, 4) pose of the right camera in the left one's frame.
         points: (M, 3) points of the body, m.
-        sightings: N detections.
+        observations: N detections.
         T_left_body: (4, 4) the pose, with every point before its camera.
 
     Returns:
         (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the
         pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
     """
-    n, counts = len(sightings.point), np.array([camera.distortion.size for camera in cameras])
+    n, counts = len(observations.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))
     _differentiate(
-        *pair_arguments(cameras), counts, inverse(T_left_right), np.ascontiguousarray(points[sightings.point]),
-        np.array(sightings.camera), np.array(sightings.cov_uv), np.array(T_left_body), W, by_pose, by_rig,
+        *pair_arguments(cameras), counts, inverse(T_left_right), np.ascontiguousarray(points[observations.point]),
+        np.array(observations.camera), np.array(observations.cov_uv), np.array(T_left_body), W, by_pose, by_rig,
     )  # fmt: skip
     return W, by_pose, by_rig
 

@@ -237,8 +237,8 @@ def predict(model: Model, state: State, observations: Observations) -> tuple[Arr
         by_body, turned = J_p @ by_body, J_p @ turned
         J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
         if side == 1 and len(state.motions):
-            by_turn = -turned @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
-            J_shot[rows, :, 6:] = np.concatenate([by_body, by_turn], axis=2)
+            by_rotation = -turned @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
+            J_shot[rows, :, 6:] = np.concatenate([by_body, by_rotation], axis=2)
         start = 0 if side == 0 else sizes[0]
         by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
         _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, turned, points, modes, J_shared)

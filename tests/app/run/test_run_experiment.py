@@ -49,7 +49,7 @@ def left_silent(board, link):
     board.send(JointCommand(np.full(6, 0.02), np.zeros(6), np.zeros(6), 0.05))
     board.receive(0.5)
     assert [each.fault for each in board.status.faults] == [Fault.HOST_SILENT]
-    return Board(link, name="the board")
+    return Board.connect(link, name="the board")
 
 
 def test_an_arm_that_is_held_is_taken_over_without_letting_go_of_it(made):

@@ -1,4 +1,4 @@
-"""Commands, obeyed or refused; limits that are no faults; the core's own soundness."""
+"""Commands, acknowledged or refused; limits that are no faults; the core's own soundness."""
 
 import ctypes
 
@@ -13,25 +13,25 @@ NAN, INF = float("nan"), float("inf")
 @pytest.mark.parametrize("field", ["position_rad", "speed_rad_s", "gravity_duty"])
 def test_a_number_that_is_none_is_refused_and_changes_nothing(moving, field, value):
     moving.move(0.1)
-    obeyed = moving.outputs.acknowledged_sequence
+    acknowledged = moving.outputs.acknowledged_sequence
     twin = twin_of(moving)
     getattr(moving.inputs.command.move, field)[3] = value
     moving.command(c.COMMAND_MOVE)
     twin.tick()  # the same tick without a command
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, c.REFUSAL_NOT_FINITE)
-    assert moving.outputs.acknowledged_sequence == obeyed
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_NOT_FINITE)
+    assert moving.outputs.acknowledged_sequence == acknowledged
     assert bytes(moving.core.joint) == bytes(twin.core.joint)
 
 
 @pytest.mark.parametrize(("gravity", "ticks"), [(1.01, 10), (-1.01, 10), (0.0, 0), (0.0, 10001), (0.0, 2**32 - 1)])
 def test_a_number_out_of_its_range_is_refused(moving, gravity, ticks):
     moving.move(0.1, gravity=gravity, ticks=ticks)
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, c.REFUSAL_OUT_OF_RANGE)
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_OUT_OF_RANGE)
 
 
 def test_an_unknown_command_is_refused(moving):
     moving.command(99)
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, c.REFUSAL_UNKNOWN_COMMAND)
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_UNKNOWN_COMMAND)
     assert moving.outputs.state == c.STATE_ENABLED
 
 
@@ -39,13 +39,13 @@ def test_a_fault_whose_cause_stands_cannot_be_cleared(moving):
     moving.spoil = supply(0)
     moving.tick(10)
     moving.command(c.COMMAND_CLEAR_FAULTS)
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, c.REFUSAL_FAULT_STANDS)
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_FAULT_STANDS)
 
 
 def test_every_command_is_counted_as_obeyed_or_refused(moving):
     before = moving.outputs.acknowledged_count, moving.outputs.rejected_count
     kinds = [c.COMMAND_MOVE, 99, c.COMMAND_ENABLE, c.COMMAND_DISABLE, c.COMMAND_CLEAR_FAULTS, c.COMMAND_CLEAR_STOP]
-    told = [(moving.command(kind), moving.obeyed())[1] for kind in kinds]
+    told = [(moving.command(kind), moving.acknowledged())[1] for kind in kinds]
     assert told == [True, False, False, True, True, False]
     assert (moving.outputs.acknowledged_count, moving.outputs.rejected_count) == (before[0] + 3, before[1] + 3)
 
@@ -54,22 +54,22 @@ GAIN_FIELDS = [name for name, _ in c.joint_gains._fields_]
 
 
 @pytest.mark.parametrize(
-    ("joint", "field", "value", "refusal"),
-    [(k, field, [NAN, INF, -INF][k % 3], c.REFUSAL_NOT_FINITE) for k, field in enumerate(GAIN_FIELDS)]
-    + [(5 - k, field, [-0.1, 1001.0][k % 2], c.REFUSAL_OUT_OF_RANGE) for k, field in enumerate(GAIN_FIELDS)],
+    ("joint", "field", "value", "rejection"),
+    [(k, field, [NAN, INF, -INF][k % 3], c.REJECTION_NOT_FINITE) for k, field in enumerate(GAIN_FIELDS)]
+    + [(5 - k, field, [-0.1, 1001.0][k % 2], c.REJECTION_OUT_OF_RANGE) for k, field in enumerate(GAIN_FIELDS)],
 )
-def test_a_gain_set_is_taken_whole_or_not_at_all(moving, joint, field, value, refusal):
+def test_a_gain_set_is_taken_whole_or_not_at_all(moving, joint, field, value, rejection):
     before = [bytes(entry.gains) for entry in moving.core.config.joint]
     gains = moving.inputs.command.gains
     for i in JOINTS:
         gains.joint[i] = c.joint_gains(5, 6, 0.05, 0.1, 0.01, 10)
     setattr(gains.joint[joint], field, value)
     moving.command(c.COMMAND_GAINS)
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, refusal)
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, rejection)
     assert [bytes(entry.gains) for entry in moving.core.config.joint] == before
     gains.joint[joint] = c.joint_gains(5, 6, 0.05, 0.1, 0.01, 10)
     moving.command(c.COMMAND_GAINS)
-    assert moving.obeyed()
+    assert moving.acknowledged()
     assert len({bytes(entry.gains) for entry in moving.core.config.joint}) == 1
 
 

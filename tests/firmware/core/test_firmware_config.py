@@ -82,7 +82,7 @@ def test_without_a_good_copy_the_factory_values_are_used_and_the_arm_stays_off(l
     assert library.config_is_valid(ctypes.byref(factory))
     arm = LabArm(library, factory, source=c.CONFIG_FACTORY)
     arm.enable()
-    assert not arm.obeyed()
+    assert not arm.acknowledged()
     assert arm.outputs.first_fault == c.FAULT_CONFIG
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from firmware_arm import LabArm, lab_config, read_as, supply
-from firmware_layout import FAULTS, REACTIONS, REFUSALS, STATES, c
+from firmware_layout import FAULTS, REACTIONS, REJECTIONS, STATES, c
 
 DOC = Path(__file__).resolve().parents[3] / "docs" / "reference" / "firmware.md"
 REACTION_STATE = {"RELEASE": c.STATE_FAULTED, "HOLD": c.STATE_STOPPING}
@@ -122,13 +122,13 @@ def test_a_fault_latches_names_its_joint_and_reacts(library, name, reaction):
     # It stays latched when its cause is gone, and nothing but a clear takes it away.
     arm.spoil, arm.blocked, arm.inputs.supply_mv = lambda arm: None, False, 12000
     arm.move(0.1)
-    assert not arm.obeyed()
+    assert not arm.acknowledged()
     arm.command(c.COMMAND_ENABLE)
-    assert not arm.obeyed()
+    assert not arm.acknowledged()
     assert arm.tick(3000).state in (c.STATE_FAULTED, c.STATE_HOLDING)
     assert arm.outputs.faults & 1 << FAULTS[name]
     arm.command(c.COMMAND_CLEAR_FAULTS)
-    assert arm.obeyed()
+    assert arm.acknowledged()
     assert (arm.outputs.faults, arm.outputs.first_fault, list(arm.outputs.joint_faults)) == (0, 0, [0] * 6)
 
 
@@ -136,10 +136,10 @@ def test_a_fault_latches_names_its_joint_and_reacts(library, name, reaction):
 def test_a_fault_of_the_start_keeps_the_arm_off(library, name):
     arm = LabArm(library, **AT_START[name])
     out = arm.enable()
-    assert not arm.obeyed()
+    assert not arm.acknowledged()
     assert (out.state, out.first_fault, out.drives_on) == (c.STATE_FAULTED, FAULTS[name], 0)
     arm.command(c.COMMAND_CLEAR_FAULTS)
-    assert arm.obeyed() == (name == "WATCHDOG")
+    assert arm.acknowledged() == (name == "WATCHDOG")
 
 
 def jitter(joint, counts):
@@ -190,7 +190,7 @@ def test_a_fault_with_the_drives_off_keeps_them_off(arm):
     overrun(arm)
     assert arm.outputs.state == c.STATE_FAULTED
     arm.command(c.COMMAND_ENABLE)
-    assert not arm.obeyed()
+    assert not arm.acknowledged()
 
 
 def test_a_jump_of_the_reading_is_no_speed(moving):
@@ -232,8 +232,8 @@ def test_a_hard_brake_is_no_inversion(moving):
 
 @pytest.mark.parametrize(
     ("which", "codes"),
-    [("fault", FAULTS), ("state", STATES), ("refusal", REFUSALS)],
-    ids=["faults", "states", "refusals"],
+    [("fault", FAULTS), ("state", STATES), ("rejection", REJECTIONS)],
+    ids=["faults", "states", "rejections"],
 )
 def test_every_code_has_a_name_a_text_and_a_line_in_the_docs(library, which, codes):
     section = DOC.read_text(encoding="utf-8").split(f"## {which.title()}s")[1].split("\n## ")[0]

@@ -12,7 +12,7 @@ NAN = float("nan")
 def test_power_up_is_disabled_and_only_enabling_changes_that(arm):
     for _ in range(20):
         arm.move(0.5)
-        assert not arm.obeyed()
+        assert not arm.acknowledged()
     assert (arm.outputs.state, arm.outputs.drives_on, list(arm.outputs.duty)) == (c.STATE_DISABLED, 0, [0.0] * 6)
 
 
@@ -55,14 +55,14 @@ def test_before_a_potentiometer_is_read_the_arm_cannot_be_enabled(arm):
     arm.spoil = read_as(3, 65535)
     arm.tick(2)
     arm.command(c.COMMAND_ENABLE)
-    assert (arm.obeyed(), arm.outputs.refusal) == (False, c.REFUSAL_POT_UNREAD)
+    assert (arm.acknowledged(), arm.outputs.rejection) == (False, c.REJECTION_POT_UNREAD)
 
 
 @pytest.mark.parametrize("outside_rad", [2.45, -2.45])
 def test_outside_its_soft_limits_the_arm_only_moves_back_in(library, outside_rad):
     arm = LabArm(library, angle_rad=outside_rad)
     arm.enable()
-    assert (arm.obeyed(), arm.outputs.refusal) == (False, c.REFUSAL_OUTSIDE_LIMITS)
+    assert (arm.acknowledged(), arm.outputs.rejection) == (False, c.REJECTION_OUTSIDE_LIMITS)
     arm.command(c.COMMAND_ENABLE_INWARD)
     assert arm.outputs.state == c.STATE_ENABLED
     start = arm.outputs.reference_rad[0]
@@ -108,7 +108,7 @@ def test_only_motion_commands_feed_the_silence_timer(moving):
     for _ in range(12):
         moving.command(c.COMMAND_GAINS)
         moving.tick(8)
-    assert moving.obeyed()
+    assert moving.acknowledged()
     assert moving.outputs.first_fault == c.FAULT_HOST_SILENT
 
 
@@ -128,7 +128,7 @@ def test_a_held_arm_is_not_dropped_by_clearing(moving):
     assert not moving.outputs.limited[0] & c.LIMITED_SPEED
     assert (moving.outputs.state, moving.outputs.drives_on) == (c.STATE_ENABLED, 1)
     moving.move(0.1)
-    assert moving.obeyed()
+    assert moving.acknowledged()
 
 
 def test_while_it_slows_down_a_fault_cannot_be_cleared_and_a_worse_one_releases(moving):
@@ -136,7 +136,7 @@ def test_while_it_slows_down_a_fault_cannot_be_cleared_and_a_worse_one_releases(
     moving.tick(101)
     assert moving.outputs.state == c.STATE_STOPPING
     moving.command(c.COMMAND_CLEAR_FAULTS)
-    assert (moving.obeyed(), moving.outputs.refusal) == (False, c.REFUSAL_WRONG_STATE)
+    assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_WRONG_STATE)
     moving.inputs.overrun = 1
     moving.tick()
     moving.inputs.overrun = 0
@@ -179,15 +179,15 @@ def test_the_emergency_stop_works_in_every_state_and_is_cleared_only_explicitly(
     out = arm.tick()
     assert (out.state, out.drives_on, list(out.duty)) == (c.STATE_STOPPED, 0, [0.0] * 6)
     arm.command(c.COMMAND_CLEAR_STOP)
-    assert (arm.obeyed(), arm.outputs.refusal) == (False, c.REFUSAL_STOP_PRESSED)
+    assert (arm.acknowledged(), arm.outputs.rejection) == (False, c.REJECTION_STOP_PRESSED)
     arm.inputs.stop_pressed = 0
     arm.tick(1000)
     for kind in (c.COMMAND_MOVE, c.COMMAND_ENABLE, c.COMMAND_ENABLE_INWARD, c.COMMAND_DISABLE, c.COMMAND_CLEAR_FAULTS):
         arm.command(kind)
-        assert (arm.obeyed(), arm.outputs.refusal) == (False, c.REFUSAL_WRONG_STATE)
+        assert (arm.acknowledged(), arm.outputs.rejection) == (False, c.REJECTION_WRONG_STATE)
         assert arm.outputs.state == c.STATE_STOPPED
     arm.command(c.COMMAND_CLEAR_STOP)
-    assert arm.obeyed()
+    assert arm.acknowledged()
     assert arm.outputs.faults == faults  # the stop hides no fault
     assert arm.outputs.state == (c.STATE_FAULTED if faults else c.STATE_DISABLED)
 
@@ -210,7 +210,7 @@ def test_a_fault_during_a_stop_is_latched_beneath_it(arm):
 def test_disabling_works_in_every_state_but_the_stop(arm, state):
     into(arm, state)
     arm.command(c.COMMAND_DISABLE)
-    assert arm.obeyed() == (state != "STOPPED")
+    assert arm.acknowledged() == (state != "STOPPED")
     assert arm.outputs.drives_on == 0
     if state in ("STOPPING", "HOLDING", "FAULTED"):
         assert arm.outputs.state == c.STATE_FAULTED

@@ -1,4 +1,4 @@
-"""The tick may come at any instruction of the main loop: nothing is torn, no command is lost or obeyed twice.
+"""The tick may come at any instruction of the main loop: nothing is torn, no command is lost or acknowledged twice.
 
 The real image runs under Unicorn; the main loop is stopped after so many instructions, the tick is called as an interrupt
 would call it, and the main loop goes on.
@@ -69,7 +69,7 @@ class Interrupted:
         for _ in range(30):
             self.whole()
         self.host.sequence = 0
-        self.whole(self.host.order(c.COMMAND_ENABLE))
+        self.whole(self.host.command(c.COMMAND_ENABLE))
 
     def call(self, name: str, stack: int, count: int = 0) -> None:
         self.uc.reg_write(self.arm.UC_ARM_REG_SP, stack)

@@ -7,12 +7,12 @@ from firmware_pil import BAUD
 
 #: The link must be usable again so long after the last bad byte.
 USABLE_TICKS = 20
-ORDERS = 6
+COMMANDS = 6
 
 
-def orders(host, count=ORDERS) -> list[bytes]:
-    """Messages whose obedience can be counted: each is obeyed once, in any state."""
-    return [host.order(c.COMMAND_DISABLE) for _ in range(count)]
+def disables(host, count=COMMANDS) -> list[bytes]:
+    """Messages whose obedience can be counted: each is acknowledged once, in any state."""
+    return [host.command(c.COMMAND_DISABLE) for _ in range(count)]
 
 
 def counters(board, host):
@@ -21,7 +21,7 @@ def counters(board, host):
 
 
 def settle(board, host) -> int:
-    """Let a second of nothing pass, greet again, and return how many commands were obeyed so far."""
+    """Let a second of nothing pass, greet again, and return how many commands were acknowledged so far."""
     board.run(50)
     board.run(5, host.hello())
     host.sequence = 0
@@ -29,13 +29,13 @@ def settle(board, host) -> int:
 
 
 def test_from_whatever_byte_it_begins_no_later_message_is_lost(working):
-    """Listening begins within a message: that one is lost, all others are obeyed."""
+    """Listening begins within a message: that one is lost, all others are acknowledged."""
     board, host = working
-    length = len(orders(host, 1)[0])
+    length = len(disables(host, 1)[0])
     for begin in range(1, length + 1):
         before = settle(board, host)
-        board.run(10, b"".join(orders(host))[begin:])
-        assert board.answer.outputs.acknowledged_count - before == ORDERS - 1, begin
+        board.run(10, b"".join(disables(host))[begin:])
+        assert board.answer.outputs.acknowledged_count - before == COMMANDS - 1, begin
 
 
 @pytest.mark.parametrize("kind", ["flip", "drop", "double"])
@@ -43,18 +43,18 @@ def test_a_disturbed_byte_costs_its_own_message_at_most(working, kind):
     board, host = working
     for at in range(20, 40):
         before = settle(board, host)
-        stream = b"".join(orders(host))
+        stream = b"".join(disables(host))
         bent = bytes([stream[at] ^ 0x40])
         put = {"flip": bent, "drop": b"", "double": stream[at : at + 1] * 2}[kind]
         board.run(20, stream[:at] + put + stream[at + 1 :])
         # A doubled first byte of a message is one lost byte before a whole message.
-        assert board.answer.outputs.acknowledged_count - before >= ORDERS - 1, at
+        assert board.answer.outputs.acknowledged_count - before >= COMMANDS - 1, at
 
 
 def test_a_flipped_bit_is_counted_as_a_wrong_checksum_with_its_bytes(working):
     board, host = working
     before = counters(board, host)
-    message = bytearray(host.order(c.COMMAND_DISABLE))
+    message = bytearray(host.command(c.COMMAND_DISABLE))
     message[12] ^= 1
     board.run(2, bytes(message))
     now = counters(board, host)
@@ -73,7 +73,7 @@ def test_bytes_of_no_message_are_counted(working):
 def test_messages_missing_in_between_are_counted_and_a_new_host_is_none(working):
     board, host = working
     before = counters(board, host)
-    first, *_, last = orders(host, 5)
+    first, *_, last = disables(host, 5)
     board.run(4, first + last)
     assert counters(board, host).lost_messages - before.lost_messages == 3
     host.out.seq = 100
@@ -85,40 +85,40 @@ def test_a_begin_of_a_long_message_in_noise_swallows_nothing(working):
     """0xFD and a length of 255, then good messages at once: read on as 280 bytes they would all be lost."""
     board, host = working
     before = settle(board, host)
-    board.run(10, b"\xfd\xff" + b"".join(orders(host)))
-    assert board.answer.outputs.acknowledged_count - before == ORDERS
+    board.run(10, b"\xfd\xff" + b"".join(disables(host)))
+    assert board.answer.outputs.acknowledged_count - before == COMMANDS
 
 
 @pytest.mark.parametrize("flag", [1, 2, 0x80])
 def test_signed_and_other_kinds_of_messages_are_refused_at_their_header(working, flag):
     board, host = working
     before = settle(board, host)
-    stream = bytearray(b"".join(orders(host)))
+    stream = bytearray(b"".join(disables(host)))
     stream[2] = flag
     board.run(10, bytes(stream))
-    assert board.answer.outputs.acknowledged_count - before == ORDERS - 1
+    assert board.answer.outputs.acknowledged_count - before == COMMANDS - 1
 
 
 @pytest.mark.parametrize("length", [0, 9, 200, 255])
 def test_a_length_no_message_has_is_refused_at_the_header(working, length):
     board, host = working
     before = settle(board, host)
-    stream = bytearray(b"".join(orders(host)))
+    stream = bytearray(b"".join(disables(host)))
     stream[1] = length
     board.run(10, bytes(stream))
-    assert board.answer.outputs.acknowledged_count - before == ORDERS - 1
+    assert board.answer.outputs.acknowledged_count - before == COMMANDS - 1
 
 
 @pytest.mark.parametrize("host_ticks", [1, 4, 16, 100])
 @pytest.mark.parametrize("cut", [1, 9, 10, 11, 50, 90])
 def test_a_cut_message_is_given_up_in_time(working, host_ticks, cut):
-    """A host is cut off within a message and comes back: what it sends 20 ms later is obeyed, however seldom."""
+    """A host is cut off within a message and comes back: what it sends 20 ms later is acknowledged, however seldom."""
     board, host = working
-    board.run(5, host.order(c.COMMAND_ENABLE))
+    board.run(5, host.command(c.COMMAND_ENABLE))
     board.run(5, host.move()[:cut])
     for waited in range(USABLE_TICKS - 5, 200, host_ticks):
         before = board.answer.outputs.acknowledged_count + board.answer.outputs.rejected_count
-        board.run(max(host_ticks, 2), host.order(c.COMMAND_DISABLE))
+        board.run(max(host_ticks, 2), host.command(c.COMMAND_DISABLE))
         if waited >= USABLE_TICKS:
             assert board.answer.outputs.acknowledged_count + board.answer.outputs.rejected_count == before + 1, waited
 
@@ -128,7 +128,7 @@ def noise(rng: np.random.Generator, host) -> bytes:
     length = int(rng.integers(1, 300))
     if rng.random() < 0.3:
         return rng.bytes(length)
-    stream = bytearray(b"".join([host.move(), host.pack("gains", 1, [1.0] * 36), *orders(host, 3)]))
+    stream = bytearray(b"".join([host.move(), host.pack("gains", 1, [1.0] * 36), *disables(host, 3)]))
     for at in rng.integers(0, len(stream), int(rng.integers(1, 9))):
         stream[at] = int(rng.integers(0, 256))
     begin = int(rng.integers(0, len(stream)))
@@ -142,10 +142,10 @@ def test_the_link_is_usable_20_ms_after_the_last_bad_byte(working):
         bad = noise(rng, host)
         board.run(len(bad) * 10_000 // BAUD + 2, bad)
         board.run(USABLE_TICKS - 2)
-        # What the noise carried by chance (a whole order) may have moved the numbers: a hello begins them anew.
+        # What the noise carried by chance (a whole command) may have moved the numbers: a hello begins them anew.
         board.run(2, host.hello())
         before = board.answer.outputs.acknowledged_count
-        board.run(2, host.order(c.COMMAND_DISABLE, sequence=1))
+        board.run(2, host.command(c.COMMAND_DISABLE, sequence=1))
         assert board.answer.outputs.acknowledged_count == before + 1, case
 
 

@@ -56,9 +56,9 @@ def test_what_comes_incomplete_is_not_stored(working):
     config = lab_config(board.library)
     config.joint[3].soft_max_rad = 1.0
     status = send(board, host, config, parts=host.parts(config)[:-1] and host.parts(config)[:3])
-    assert (status.rejected_sequence, status.refusal) == (host.sequence, c.REFUSAL_CONFIG_BROKEN)
+    assert (status.rejected_sequence, status.rejection) == (host.sequence, c.REJECTION_CONFIG_BROKEN)
     status = send(board, host, config, crc=12345)
-    assert (status.rejected_sequence, status.refusal) == (host.sequence, c.REFUSAL_CONFIG_BROKEN)
+    assert (status.rejected_sequence, status.rejection) == (host.sequence, c.REJECTION_CONFIG_BROKEN)
     assert status.config_stored == 0
 
 
@@ -68,7 +68,7 @@ def test_a_value_outside_its_range_is_not_stored(working, value):
     config = lab_config(board.library)
     config.joint[2].gains.kp_per_rad = value
     status = send(board, host, config)
-    assert (status.rejected_sequence, status.refusal) == (host.sequence, c.REFUSAL_OUT_OF_RANGE)
+    assert (status.rejected_sequence, status.rejection) == (host.sequence, c.REJECTION_OUT_OF_RANGE)
     assert restart(board, host).config_source == c.CONFIG_NEWEST
 
 
@@ -77,10 +77,10 @@ def test_nothing_is_stored_while_the_drives_are_on(working):
     config = lab_config(board.library)
     for part in host.parts(config):
         board.run(4, part)
-    board.run(2, host.order(c.COMMAND_ENABLE))
+    board.run(2, host.command(c.COMMAND_ENABLE))
     board.run(30, host.store(config))
     status = host.newest("BOARD_STATUS")
-    assert (status.rejected_sequence, status.refusal) == (host.sequence, c.REFUSAL_WRONG_STATE)
+    assert (status.rejected_sequence, status.rejection) == (host.sequence, c.REJECTION_WRONG_STATE)
 
 
 def test_storing_keeps_its_place_among_the_commands(working):
@@ -89,12 +89,12 @@ def test_storing_keeps_its_place_among_the_commands(working):
     config = lab_config(board.library)
     for part in host.parts(config):
         board.run(4, part)
-    board.tick(host.order(c.COMMAND_ENABLE) + host.store(config) + host.order(c.COMMAND_DISABLE))
+    board.tick(host.command(c.COMMAND_ENABLE) + host.store(config) + host.command(c.COMMAND_DISABLE))
     board.run(30)
     status = host.newest("BOARD_STATUS")
-    assert (status.rejected_sequence, status.refusal, status.config_stored) == (2, c.REFUSAL_WRONG_STATE, 0)
+    assert (status.rejected_sequence, status.rejection, status.config_stored) == (2, c.REJECTION_WRONG_STATE, 0)
     assert (status.acknowledged_sequence, status.state) == (3, c.STATE_DISABLED)
-    board.tick(host.store(config) + host.order(c.COMMAND_ENABLE))
+    board.tick(host.store(config) + host.command(c.COMMAND_ENABLE))
     board.run(30)
     status = host.newest("BOARD_STATUS")
     assert (status.acknowledged_sequence, status.state, status.config_stored) == (5, c.STATE_ENABLED, 1)
@@ -123,7 +123,7 @@ def test_reading_beyond_the_end_gives_an_empty_part(working, offset):
 
 def test_a_power_cut_takes_the_motion_but_not_the_configuration(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_ENABLE))
+    board.run(2, host.command(c.COMMAND_ENABLE))
     assert board.answer.outputs.state == c.STATE_ENABLED
     board.tick(restart=c.RESTART_POWER)
     assert (board.answer.outputs.state, board.answer.outputs.faults) == (c.STATE_DISABLED, 0)
@@ -138,7 +138,7 @@ def test_a_restart_by_the_watchdog_is_told_until_cleared(working):
     board, host = working
     restart(board, host, c.RESTART_WATCHDOG)
     assert (board.answer.outputs.state, board.answer.outputs.first_fault) == (c.STATE_FAULTED, c.FAULT_WATCHDOG)
-    board.run(2, host.order(c.COMMAND_CLEAR_FAULTS))
+    board.run(2, host.command(c.COMMAND_CLEAR_FAULTS))
     assert (board.answer.outputs.state, board.answer.outputs.faults) == (c.STATE_DISABLED, 0)
 
 
@@ -162,7 +162,7 @@ def test_what_could_not_be_stored_is_refused_and_what_comes_meanwhile_waits(fres
     wire.receive(host.hello())
     for part in host.parts(wire.config):
         wire.receive(part)
-    wire.receive(host.store(wire.config) + host.order(c.COMMAND_DISABLE))
+    wire.receive(host.store(wire.config) + host.command(c.COMMAND_DISABLE))
     spoilt = host.pack("config_part", 0, len(bytes(wire.config)), 4, [0xEE] * 200)
     assert not wire.to_store()
     wire.tick(3)
@@ -173,7 +173,7 @@ def test_what_could_not_be_stored_is_refused_and_what_comes_meanwhile_waits(fres
     wire.stored(False)
     wire.tick(30)
     status = host.newest("BOARD_STATUS")
-    assert (status.rejected_sequence, status.refusal, status.config_stored) == (1, c.REFUSAL_CONFIG_BROKEN, 0)
+    assert (status.rejected_sequence, status.rejection, status.config_stored) == (1, c.REJECTION_CONFIG_BROKEN, 0)
     assert status.acknowledged_sequence == 2
     wire.receive(host.store(wire.config))
     wire.tick(3)

@@ -76,14 +76,14 @@ def test_a_change_of_state_is_told_in_its_own_tick(working):
     board.run(37)
     host.listen()
     tick = board.request.tick
-    board.run(3, host.order(c.COMMAND_ENABLE))
+    board.run(3, host.command(c.COMMAND_ENABLE))
     first = next(message for message in host.listen() if message.get_type() == "BOARD_STATUS")
     assert (first.tick, first.state, first.acknowledged_sequence) == (tick, c.STATE_ENABLED, 1)
 
 
 def test_moves_alone_ask_for_no_status_out_of_turn(working):
     board, host = working
-    board.run(3, host.order(c.COMMAND_ENABLE))
+    board.run(3, host.command(c.COMMAND_ENABLE))
     host.listen()
     for _ in range(100):
         board.run(4, host.move())
@@ -95,7 +95,7 @@ def test_moves_alone_ask_for_no_status_out_of_turn(working):
 def test_a_flood_of_refused_commands_leaves_room_for_the_angles(working):
     board, host = working
     for _ in range(500):
-        board.run(1, host.order(99))
+        board.run(1, host.command(99))
     kinds = Counter(message.get_type() for message in host.listen())
     assert kinds["ANGLES"] >= 450
     assert 90 <= kinds["BOARD_STATUS"] <= 105
@@ -116,7 +116,7 @@ def test_a_flood_of_questions_does_not_choke_the_wire(working):
 
 def test_a_telemetry_message_says_what_the_core_said(working):
     board, host = working
-    board.run(3, host.order(c.COMMAND_ENABLE))
+    board.run(3, host.command(c.COMMAND_ENABLE))
     seen = {}
     for _ in range(60):
         board.run(1, host.move(0.3))
@@ -132,7 +132,7 @@ def test_a_telemetry_message_says_what_the_core_said(working):
                 for field in ("speed_rad_s", "reference_rad", "reference_rad_s", "duty", "limited"):
                     assert list(getattr(message, field)) == list(getattr(core, field)), field
             elif kind == "BOARD_STATUS":
-                for field in ("state", "faults", "first_fault", "first_joint", "acknowledged_sequence", "refusal"):
+                for field in ("state", "faults", "first_fault", "first_joint", "acknowledged_sequence", "rejection"):
                     assert getattr(message, field) == getattr(core, field), field
                 assert message.supply_mv == 12000
     assert host.newest("JOINTS").duty != [0.0] * 6

@@ -73,8 +73,8 @@ class Speaker:
         return self.say("welcome", dialect_version, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9")
 
     def status(self, tick=0, *, state=0, refused=(0, 0, 0)):
-        sequence, count, refusal = refused
-        head = (tick, state, 0, [0] * 6, 0, 255, 0, 0, sequence, count, refusal)
+        sequence, count, rejection = refused
+        head = (tick, state, 0, [0] * 6, 0, 255, 0, 0, sequence, count, rejection)
         return self.say("board_status", *head, 12000, 0, 0, 0, 0, 0, 0)
 
     def joints(self, tick=0):

@@ -7,7 +7,7 @@ from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Order, Rejection, State
+from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Command, Rejection, State
 from armsight.robot.boards.configuration import gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import open_emulator
@@ -38,10 +38,10 @@ def test_a_hello_tells_who_the_board_is():
 
 
 def test_a_fresh_board_runs_on_factory_values_and_cannot_be_enabled():
-    board = Board(EmulatedLink(open_emulator("host"), JointPlant()))
+    board = Board.connect(EmulatedLink(open_emulator("host"), JointPlant()))
     assert board.welcome.config_source == ConfigSource.FACTORY
     assert [each.fault for each in board.status.faults] == [Fault.CONFIG]
-    with pytest.raises(DeviceError, match="refused the command: not in this state"):
+    with pytest.raises(DeviceError, match="rejected the command: not in this state"):
         board.enable()
 
 
@@ -49,7 +49,7 @@ def test_a_fresh_board_runs_on_factory_values_and_cannot_be_enabled():
 def test_a_board_of_another_version_is_refused_by_name(versions):
     link = ScriptedLink(talking(Speaker(), **versions))
     with pytest.raises(DeviceError) as told:
-        Board(link, name="/dev/ttyACM0")
+        Board.connect(link, name="/dev/ttyACM0")
     text = str(told.value)
     for word in ("/dev/ttyACM0", "stm32f4", "9.9.9", "armsight board flash", *map(str, versions.values())):
         assert word in text
@@ -60,20 +60,20 @@ def test_a_board_of_another_version_is_refused_by_name(versions):
 def test_nothing_on_the_wire_is_told_as_such():
     link = ScriptedLink()
     with pytest.raises(DeviceError, match=r"no board answers .nothing comes.: is it the right port"):
-        Board(link)
+        Board.connect(link)
     assert link.closed
     assert link.waited_s == pytest.approx(1.0)  # 20 hellos, 50 ms each
 
 
 def test_something_else_on_the_wire_is_told_as_such():
     with pytest.raises(DeviceError, match="bytes come, but no answer"):
-        Board(ScriptedLink(lambda data: b"Marlin 2.1\nok\n\xfd\x00\xff"))
+        Board.connect(ScriptedLink(lambda data: b"Marlin 2.1\nok\n\xfd\x00\xff"))
 
 
 def test_a_board_without_telemetry_is_told_as_such():
     speaker = Speaker()
     with pytest.raises(DeviceError, match="answers the hello, but sends no telemetry"):
-        Board(ScriptedLink(lambda data: speaker.welcome()))
+        Board.connect(ScriptedLink(lambda data: speaker.welcome()))
 
 
 def test_motion_is_followed_and_every_reading_arrives_in_order():
@@ -141,14 +141,14 @@ def test_the_fate_of_each_command_is_known():
     board, _, _ = host_board()
     first = board.send(hold(ZERO))
     board.receive(0.03)
-    assert (board.status.rejected_sequence, board.status.refusal) == (first, Rejection.WRONG_STATE)
+    assert (board.status.rejected_sequence, board.status.rejection) == (first, Rejection.WRONG_STATE)
     board.enable()
     second = board.send(hold(ZERO))
     board.receive(0.03)
     assert board.status.acknowledged_sequence == second == first + 2
     board.confirm(second)
-    with pytest.raises(DeviceError, match="refused the command: not in this state"):
-        board.confirm(board.order(Order.CLEAR_STOP))
+    with pytest.raises(DeviceError, match="rejected the command: not in this state"):
+        board.confirm(board.command(Command.CLEAR_STOP))
 
 
 def test_numbers_go_on_behind_those_of_an_earlier_host():
@@ -157,7 +157,7 @@ def test_numbers_go_on_behind_those_of_an_earlier_host():
     for _ in range(5):
         last = board.send(hold(ZERO))
     board.receive(0.02)
-    other = Board(link)
+    other = Board.connect(link)
     assert other.send(hold(ZERO)) == last + 1
     other.receive(0.02)
     assert other.status.acknowledged_sequence == last + 1
@@ -185,7 +185,7 @@ def test_an_emergency_stop_survives_a_disturbed_copy_of_itself():
     assert board.status.crc_errors == 1
     with pytest.raises(DeviceError, match="not in this state"):
         board.enable()
-    board.confirm(board.order(Order.CLEAR_STOP))
+    board.confirm(board.command(Command.CLEAR_STOP))
     board.enable()
 
 
@@ -212,14 +212,14 @@ def test_a_stored_configuration_is_in_use_after_the_next_start():
     board.store(config)
     assert board.configuration()["joint"]["soft_max_rad"][2] == pytest.approx(2.4)
     link.restart()
-    board = Board(link)
+    board = Board.connect(link)
     assert board.configuration().tobytes() == config.tobytes()
 
 
 def test_a_configuration_is_not_stored_with_the_drives_on():
     board, _, _ = host_board()
     board.enable()
-    with pytest.raises(DeviceError, match="refused the command"):
+    with pytest.raises(DeviceError, match="rejected the command"):
         board.store(lab_configuration())
     broken = lab_configuration()
     broken["joint"]["duty_limit"][1] = 1.5
@@ -277,13 +277,13 @@ def test_a_board_that_started_anew_is_told():
     link.restart(watchdog=True)
     with pytest.raises(DeviceError, match="has started anew: its drives are off; connect to it again"):
         keep_on(board, sends=hold(ZERO), times=5)
-    assert [each.fault for each in Board(link).status.faults] == [Fault.WATCHDOG]
+    assert [each.fault for each in Board.connect(link).status.faults] == [Fault.WATCHDOG]
 
 
 def test_a_clock_that_starts_again_is_told():
     speaker = Speaker()
     link = ScriptedLink(talking(speaker, tick=50_000))
-    board = Board(link)
+    board = Board.connect(link)
     link.waiting = speaker.angles(50_100) + speaker.angles(50_099)
     assert board.receive().t_s.tolist() == [50.1, 50.099]
     link.waiting = speaker.angles(3)
@@ -294,7 +294,7 @@ def test_a_clock_that_starts_again_is_told():
 def test_the_clock_runs_on_where_ticks_wrap():
     speaker = Speaker()
     link = ScriptedLink(talking(speaker, tick=2**32 - 3))
-    board = Board(link)
+    board = Board.connect(link)
     link.waiting = b"".join(speaker.angles(tick) for tick in (2**32 - 2, 2**32 - 1, 0, 1))
     assert np.allclose(np.diff(board.receive().t_s), 1e-3)
 
@@ -303,7 +303,7 @@ def test_telemetry_is_found_behind_every_disturbed_byte():
     """Whatever single byte of a message is disturbed, all messages behind it arrive."""
     speaker = Speaker()
     link = ScriptedLink(talking(speaker))
-    board = Board(link)
+    board = Board.connect(link)
     whole = speaker.angles(10)
     tail = b"".join(speaker.angles(tick) for tick in range(11, 31))
     for at in range(len(whole)):
@@ -319,7 +319,7 @@ def test_telemetry_is_found_behind_every_disturbed_byte():
 def test_a_message_whose_code_nobody_knows_counts_as_broken():
     speaker = Speaker()
     link = ScriptedLink(talking(speaker))
-    board = Board(link)
+    board = Board.connect(link)
     before = board.broken_messages
     link.waiting = speaker.status(5, state=77) + speaker.angles(6)
     assert len(board.receive().t_s) == 1
@@ -329,6 +329,6 @@ def test_a_message_whose_code_nobody_knows_counts_as_broken():
 
 def test_a_board_is_closed_with_its_block():
     link = ScriptedLink(talking(Speaker()))
-    with Board(link) as board:
+    with Board.connect(link) as board:
         assert board.welcome.board == "stm32f4"
     assert link.closed

@@ -64,7 +64,7 @@ def listed(which, text=TYPES):
     [
         ("FAULT", codes.Fault, codes.FAULT_TEXTS),
         ("STATE", codes.State, codes.STATE_TEXTS),
-        ("REFUSAL", codes.Rejection, codes.REFUSAL_TEXTS),
+        ("REFUSAL", codes.Rejection, codes.REJECTION_TEXTS),
     ],
 )
 def test_codes_and_texts_are_the_headers(which, ours, texts):
@@ -80,7 +80,7 @@ def test_codes_and_texts_are_the_headers(which, ours, texts):
         ("LIMITED_", codes.Limited),
         ("CONFIG_", codes.ConfigSource),
         ("REACTION_", codes.Reaction),
-        ("COMMAND_", codes.Order),
+        ("COMMAND_", codes.Command),
     ],
 )
 def test_enumerations_are_the_headers(prefix, ours):

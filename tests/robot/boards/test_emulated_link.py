@@ -158,7 +158,7 @@ def test_a_power_cut_switches_the_drives_off():
     link.restart()
     link.step()
     assert not link.answer["outputs"]["drives_on"]
-    assert Board(link).status.faults == ()
+    assert Board.connect(link).status.faults == ()
 
 
 def test_boards_are_opened_by_name():

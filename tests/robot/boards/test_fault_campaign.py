@@ -73,7 +73,7 @@ def overdrives(frame):
     [
         ({"answer": never_releases}, "dip", "leaves the drives on"),
         ({"request": blind_to_supply}, "dip", "SUPPLY_LOW of joint None is told as None"),
-        ({"answer": forgets_numbers}, "flip", "as obeyed last, the core"),
+        ({"answer": forgets_numbers}, "flip", "as acknowledged last, the core"),
         ({"answer": overdrives}, "jump", "of its limit"),
     ],
 )

@@ -17,7 +17,7 @@ import numpy as np
 from armsight.data import Array, JointCommand
 from armsight.errors import ArmsightError, DeviceError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, Order, Refusal, State
+from armsight.robot.boards.codes import Fault, Command, Rejection, State
 from armsight.robot.boards.configuration import gains_array
 from armsight.robot.boards.link import Link
 from armsight.sim.joints import JointPlant, PotFault
@@ -77,7 +77,7 @@ class Bench:
         name: str = "the emulated board",
     ) -> None:
         self.wire = SpoiledLink(link)
-        self.board = Board(self.wire, name=name)
+        self.board = Board.connect(self.wire, name=name)
         self.plant = plant
         self._problems = problems
         self._amplitude_rad = amplitude_rad
@@ -135,15 +135,15 @@ class Bench:
     def clear(self) -> None:
         """Clear the emergency stop and the faults, and end with the drives off."""
         if self.board.status.state == State.STOPPED:
-            self.board.confirm(self.board.order(Order.CLEAR_STOP))
+            self.board.confirm(self.board.command(Command.CLEAR_STOP))
         if self.board.status.faults:
-            self.board.confirm(self.board.order(Order.CLEAR_FAULTS))
+            self.board.confirm(self.board.command(Command.CLEAR_FAULTS))
         if self.board.status.drives_on:
             self.disable()
 
     def disable(self) -> None:
         """Switch the drives off."""
-        self.board.confirm(self.board.order(Order.DISABLE))
+        self.board.confirm(self.board.command(Command.DISABLE))
 
     def end(self) -> None:
         """Let go of a real board; where its drives were used, leave them off and its faults cleared, if it listens."""
@@ -170,15 +170,15 @@ def nominal(bench: Bench) -> None:
     bench.expect(
         float(np.abs(errors).max()) < _NEAR_RAD, f"joints are up to {np.abs(errors).max():.3f} rad off their way"
     )
-    bench.expect(bench.board.status.refused_count == 0, "a command was refused")
+    bench.expect(bench.board.status.rejected_count == 0, "a command was refused")
     bench.disable()
     bench.readings(0.1)
-    bench.expect_state(State.DISABLED, "after the order to disable")
+    bench.expect_state(State.DISABLED, "after the command to disable")
     bench.expect(not bench.board.joints.duty.any(), "a duty stays on with the drives off")
 
 
 def crc_faults(bench: Bench) -> None:
-    """Swing while every sixth message to the board is disturbed: those are dropped and counted, the others obeyed."""
+    """Swing while every sixth message to the board is disturbed: those are dropped and counted, the others acknowledged."""
     bench.enable()
     _disturb(bench, lambda: bench.swing(1.0))
     bench.expect_state(State.ENABLED, "on a disturbed wire")
@@ -262,11 +262,11 @@ def gain_change(bench: Bench) -> None:
     jump = float(np.abs(bench.board.joints.duty - before).max())
     bench.expect(jump < 0.25, f"new gains move the duty by {jump:.2f}")
     bench.swing(0.4)
-    bench.expect(bench.board.status.refused_sequence != number, "good gains were refused")
+    bench.expect(bench.board.status.rejected_sequence != number, "good gains were refused")
     _bad_gains(bench, changed)
     bench.expect_state(State.ENABLED, "with other gains")
     bench.disable()
-    bench.expect(_has_gains(bench, changed), "the gains are not those that were sent last and obeyed")
+    bench.expect(_has_gains(bench, changed), "the gains are not those that were sent last and acknowledged")
     bench.board.confirm(bench.board.set_gains(gains))
 
 
@@ -275,7 +275,7 @@ def nominal_at_rest(bench: Bench) -> None:
     angles = bench.readings(0.5)
     bench.expect(len(angles) > 5, f"{len(angles)} readings in 0.5 s")
     bench.expect(not bench.board.status.drives_on, "the drives are on, though nobody switched them on")
-    bench.expect(_refused(bench) == Refusal.WRONG_STATE, "a motion command with the drives off was not refused")
+    bench.expect(_refused(bench) == Rejection.WRONG_STATE, "a motion command with the drives off was not refused")
     bench.expect(not bench.board.joints.duty.any(), "a duty is on with the drives off")
 
 
@@ -291,7 +291,7 @@ def e_stop_at_rest(bench: Bench) -> None:
     bench.readings(0.1)
     bench.expect_state(State.STOPPED, "after the emergency stop")
     _stopped(bench)
-    bench.board.confirm(bench.board.order(Order.CLEAR_STOP))
+    bench.board.confirm(bench.board.command(Command.CLEAR_STOP))
 
 
 def gain_change_at_rest(bench: Bench) -> None:
@@ -360,13 +360,13 @@ def _whole_again(bench: Bench) -> None:
         bench.expect(False, f"the wire does not come back: {error}")
 
 
-def _refused(bench: Bench) -> Refusal:
+def _refused(bench: Bench) -> Rejection:
     """Send a command to stay where the joints are and return why it was refused."""
     here = bench.readings(PERIOD_S)[-1]
     number = bench.board.send(JointCommand(here, np.zeros(6), np.zeros(6), PERIOD_S))
     bench.readings(0.05)
     status = bench.board.status
-    return status.refusal if status.refused_sequence == number else Refusal.NONE
+    return status.rejection if status.rejected_sequence == number else Rejection.NONE
 
 
 def _expect_fault(bench: Bench, fault: Fault, joint: int | None) -> None:
@@ -394,7 +394,7 @@ def _stops(bench: Bench) -> list[Callable[[bool], None]]:
 
 def _stopped(bench: Bench) -> None:
     """Expect a stopped board to refuse motion and enabling."""
-    bench.expect(_refused(bench) == Refusal.WRONG_STATE, "a stopped board took a motion command")
+    bench.expect(_refused(bench) == Rejection.WRONG_STATE, "a stopped board took a motion command")
     try:
         bench.board.enable()
     except DeviceError:
@@ -404,14 +404,14 @@ def _stopped(bench: Bench) -> None:
 
 def _bad_gains(bench: Bench, gains: Array) -> None:
     """Send gains a board must refuse, past the host's own check."""
-    for value, refusal in ((101.0, Refusal.OUT_OF_RANGE), (np.nan, Refusal.NOT_FINITE)):
+    for value, rejection in ((101.0, Rejection.OUT_OF_RANGE), (np.nan, Rejection.NOT_FINITE)):
         wrong = gains.copy()
         wrong[3, 0] = value
         number = bench.board.set_gains(wrong, checked=False)
         bench.swing(0.05) if bench.board.status.drives_on else bench.readings(0.05)
         status = bench.board.status
-        told = status.refusal if status.refused_sequence == number else Refusal.NONE
-        bench.expect(told == refusal, f"a gain of {value} is told as {told.name} in place of {refusal.name}")
+        told = status.rejection if status.rejected_sequence == number else Rejection.NONE
+        bench.expect(told == rejection, f"a gain of {value} is told as {told.name} in place of {rejection.name}")
 
 
 def _has_gains(bench: Bench, gains: Array) -> bool:

@@ -15,8 +15,8 @@ from armsight.errors import ArmsightError
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.link import Machine
-from armsight.robot.boards.opening import SERIAL, configured, emulated_machine, open_machine
+from armsight.robot.boards.link import Emulator
+from armsight.robot.boards.opening import SERIAL, configured, emulated_machine, open_emulator
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant
 
@@ -73,7 +73,7 @@ class Selftest:
         }
 
 
-def run_scenario(scenario: Scenario, machine: Machine) -> ScenarioResult:
+def run_scenario(scenario: Scenario, machine: Emulator) -> ScenarioResult:
     """Run a scenario on a fresh emulated board; the machine is closed after it."""
     trace, plant = hashlib.sha256(), JointPlant()
     link = EmulatedLink(machine, plant, watch=trace.update)
@@ -88,7 +88,7 @@ def run_scenario(scenario: Scenario, machine: Machine) -> ScenarioResult:
     return ScenarioResult(tuple(problems), trace.hexdigest())
 
 
-def speed(machine: Machine, ticks: int = _SPEED_TICKS) -> float:
+def speed(machine: Emulator, ticks: int = _SPEED_TICKS) -> float:
     """Return how many ticks a second an emulated board runs, plant and telemetry with it; the machine is closed."""
     link = EmulatedLink(machine, JointPlant())
     try:
@@ -119,11 +119,11 @@ def selftest(board: str, *, drives: bool = False, baud: int = BAUD, told: Callab
     scenarios = {}
     for name, scenario in DRIVEN.items():
         told(name)
-        scenarios[name] = run_scenario(scenario, open_machine(machine))
+        scenarios[name] = run_scenario(scenario, open_emulator(machine))
     told("speed")
     elf = read_elf(firmware.image())
     figures = {"flash_bytes": elf.flash_bytes, "ram_bytes": elf.ram_bytes, "hard_float": elf.hard_float}
-    return Selftest(board, scenarios, speed(open_machine(machine)), figures)
+    return Selftest(board, scenarios, speed(open_emulator(machine)), figures)
 
 
 def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -> Selftest:
@@ -152,7 +152,7 @@ def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -
 
 def _ticks_per_s(port: str, baud: int) -> float:
     """Return how many ticks a real board makes in a second of this computer's clock."""
-    with Board(SerialLink(port, baud), name=port) as board:
+    with Board.connect(SerialLink(port, baud), name=port) as board:
         board.receive(0.1)
         start, from_s = time.perf_counter(), board.joints.t_s
         board.receive(_SPEED_S)

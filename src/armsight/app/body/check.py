@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from armsight.app.body.finding import Finding, Grade, Outlook, Swap, Verdict, axis_words, pair_words, swap_words
+from armsight.app.body.finding import Finding, Grade, Outlook, Swap, Verdict, ambiguity_text, axis_text, pair_text
 from armsight.data import Array, Ids
 from armsight.geometry.rotation import skew
 from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
@@ -132,7 +132,7 @@ def pose_findings(layout: Layout, outlooks: tuple[Outlook, ...]) -> list[Finding
         p = layout.body.points[facing]
         reach = float(np.linalg.norm(np.cross(p - p.mean(axis=0), axis), axis=1).max())
         alike = values[-1] < 1.3 * values[-2]
-        about = "any axis across the direction of sight" if alike else axis_words(axis, one.forward, layout)
+        about = "any axis across the direction of sight" if alike else axis_text(axis, one.forward, layout)
         text = (
             f"known least: the turn about {about}, {sigma:.2g} deg at {one.distance_m:g} m: the markers reach "
             f"{1e3 * reach:.0f} mm from that axis"
@@ -207,7 +207,7 @@ def seen_together(discs: DiscTarget) -> list[Ids]:
     return list(found.values())
 
 
-def find_swaps(
+def find_symmetries(
     rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], seen: Ids, hidden: int = -1
 ) -> tuple[Swap, ...]:
     """Find what may be taken for what where a distance is not told apart, or only the normals tell.
@@ -255,7 +255,7 @@ def ambiguities(
         findings.append(Finding("note", "change", "", _what_separates(rig, discs, distances_m, unsettled)))
     for swap in swaps:
         if swap.by_side:
-            text = f"{swap_words(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
+            text = f"{ambiguity_text(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
             findings.append(Finding("note", "behind", text))
     most = seen_together(discs)[0]
     if unsettled or coded or not 4 <= len(most) <= SEARCHED_HIDDEN:
@@ -265,9 +265,11 @@ def ambiguities(
         if on_one_line(points[seen]):
             findings.append(Finding("weak", "hidden", f"where {names[hidden]} is hidden, the others lie on one line"))
             continue
-        lost = [swap for swap in find_swaps(rig, discs, distances_m, seen, int(hidden)) if (swap.told < TOLD).any()]
+        lost = [
+            swap for swap in find_symmetries(rig, discs, distances_m, seen, int(hidden)) if (swap.told < TOLD).any()
+        ]
         if lost:
-            what = swap_words(lost[0].relabeling, names)
+            what = ambiguity_text(lost[0].relabeling, names)
             at = distances_m[int(np.flatnonzero(lost[0].told < TOLD)[0])]
             text = f"where {names[hidden]} is hidden, {what} fits as well or nearly from {at:g} m on: it may be missed"
             findings.append(Finding("weak", "hidden", text))
@@ -276,14 +278,14 @@ def ambiguities(
 
 def _ambiguity(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swap: Swap, coded: bool) -> Finding:
     """Say what one way to take discs for others means."""
-    what = swap_words(swap.relabeling, discs.body.point_names) + (", seen from behind," if swap.behind else "")
+    what = ambiguity_text(swap.relabeling, discs.body.point_names) + (", seen from behind," if swap.behind else "")
     if swap.relabeling.off_m < 1e-6:
         text = f"{what} is the same body"
     else:
         k = int(np.flatnonzero(swap.told < TOLD)[-1])
         sigma = told_sigma_px(rig, discs, distances_m[k])
         wanted = f"; {1e3 * swap.relabeling.off_m * TOLD / swap.told[k]:.1f} mm would do" if swap.told[k] > 0.1 else ""
-        lengths = pair_words(swap.relabeling, discs.body)
+        lengths = pair_text(swap.relabeling, discs.body)
         known = f"{sigma * swap.told[k] / TOLD:.2g} px (reckoned with: {sigma:.2g} px){wanted}"
         only = f"told apart at {distances_m[k]:g} m only if a disc's place is known to {known}"
         text = f"{what.rstrip(',')}: {lengths}, {only}"
@@ -337,7 +339,7 @@ def single_camera(discs: DiscTarget) -> list[Finding]:
     mirrored = relabelings(points, alike(discs), everything, 1e-3, mirrored=True)
     if not mirrored:
         return []
-    what = swap_words(mirrored[0], discs.body.point_names)
+    what = ambiguity_text(mirrored[0], discs.body.point_names)
     return [Finding("note", "mirror", f"{what} is its mirror image: harmless to two cameras, not to one alone")]
 
 
@@ -362,7 +364,7 @@ def judge(layout: Layout, rig: StereoRig, distances_m: tuple[float, ...]) -> Ver
         grade: Grade = "note" if layout.coded else "bad"
         findings.append(Finding(grade, "ambiguous", text, "" if layout.coded else "take fewer discs, or add a tag"))
     elif discs is not None and layout.disc_count >= 3 and not any(f.kind in ("view", "overlap") for f in findings):
-        swaps = tuple(s for seen in seen_together(discs) for s in find_swaps(rig, discs, distances_m, seen))
+        swaps = tuple(s for seen in seen_together(discs) for s in find_symmetries(rig, discs, distances_m, seen))
         findings += ambiguities(rig, discs, distances_m, swaps, layout.coded)
         findings += [] if layout.coded else single_camera(discs)
     return Verdict(outlooks, swaps, (*findings, *pose_findings(layout, outlooks)))

@@ -11,7 +11,7 @@ import numpy as np
 
 from armsight.app.body.check import TOLD, judge, sigma_px
 from armsight.app.body.draw import PAPERS, draw_body
-from armsight.app.body.finding import Outlook, Verdict, swap_words
+from armsight.app.body.finding import Outlook, Verdict, ambiguity_text
 from armsight.errors import InputError
 from armsight.files import check_writable
 from armsight.vision.discs.predict import plain_rig
@@ -163,7 +163,7 @@ def _table(verdict: Verdict) -> list[str]:
         if np.isnan(one.cov).any():
             rows.append((f"{one.distance_m:g} m", "no pose", "", "", "", _pixels(one)))
             continue
-        (across, depth), (tilt, roll) = one.position_mm, one.turn_deg
+        (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
         rows.append(
             (
                 f"{one.distance_m:g} m",
@@ -194,12 +194,12 @@ def _facts(path: str, layout: Layout, rig: StereoRig, cameras: str, verdict: Ver
         {
             "seen": [layout.body.point_names[i] for i in swap.relabeling.seen],
             "taken_for": [layout.body.point_names[i] for i in swap.relabeling.taken_for],
-            "words": swap_words(swap.relabeling, layout.body.point_names),
+            "words": ambiguity_text(swap.relabeling, layout.body.point_names),
             "off_mm": 1e3 * swap.relabeling.off_m,
             "from_behind": swap.behind,
             "settled_by_normals": swap.by_side,
-            "told_apart_sigmas": [_number(sigmas) for sigmas in swap.told],
-            "told_apart": not bool((swap.told < TOLD).any()),
+            "separation_sigmas": [_number(sigmas) for sigmas in swap.told],
+            "distinguishable": not bool((swap.told < TOLD).any()),
         }
         for swap in verdict.swaps
     ]
@@ -224,7 +224,7 @@ def _facts(path: str, layout: Layout, rig: StereoRig, cameras: str, verdict: Ver
 
 def _expected(one: Outlook) -> dict[str, Any]:
     """Return the expected sigma at a distance as JSON."""
-    (across, depth), (tilt, roll) = one.position_mm, one.turn_deg
+    (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
     return {
         "distance_m": one.distance_m,
         "sigma_across_mm": _number(across),

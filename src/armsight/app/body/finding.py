@@ -19,7 +19,7 @@ from armsight.vision.markers.body_layout import Layout
 _ALONG = float(np.cos(np.radians(8.0)))
 
 
-def swap_words(relabeling: Relabeling, names: Sequence[str]) -> str:
+def ambiguity_text(relabeling: Relabeling, names: Sequence[str]) -> str:
     """Say which discs are taken for which: "P1 and P2 exchanged", "P1 P2 P3 taken for P2 P3 P1"."""
     pairs = [(i, j) for i, j in zip(relabeling.seen.tolist(), relabeling.taken_for.tolist(), strict=True) if i != j]
     if len(pairs) == 2 and pairs[0] == pairs[1][::-1]:
@@ -28,7 +28,7 @@ def swap_words(relabeling: Relabeling, names: Sequence[str]) -> str:
     return f"{' '.join(names[i] for i, _ in shown)}{more} taken for {' '.join(names[j] for _, j in shown)}{more}"
 
 
-def pair_words(relabeling: Relabeling, body: Body) -> str:
+def pair_text(relabeling: Relabeling, body: Body) -> str:
     """Say which distance tells a swap best: "P1-P3 is 63.20 mm and P2-P3 63.60 mm, 0.40 mm apart"."""
     p = body.points
     seen, taken = relabeling.seen, relabeling.taken_for
@@ -43,7 +43,7 @@ def pair_words(relabeling: Relabeling, body: Body) -> str:
     )
 
 
-def axis_words(axis: Array, forward: Array, layout: Layout) -> str:
+def axis_text(axis: Array, forward: Array, layout: Layout) -> str:
     """Name a direction (3,) of the body: one of its axes, the line of two markers, or numbers."""
     words = []
     for name, unit in zip("xyz", np.eye(3), strict=True):
@@ -105,7 +105,7 @@ class Outlook(Record):
         return _across_and_along(self.cov[:3, :3] * 1e6, self.forward)
 
     @property
-    def turn_deg(self) -> tuple[float, float]:
+    def rotation_deg(self) -> tuple[float, float]:
         """Standard deviation of the rotation, degrees: the worst axis across (tilt), and about the direction of depth."""
         return _across_and_along(self.cov[3:, 3:] * np.degrees(1.0) ** 2, self.forward)
 

@@ -15,7 +15,7 @@ from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import poses as iso9283
-from armsight.loop.iso9283.paths import circle_figures, path_figures, plane_axes
+from armsight.loop.iso9283.paths import circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.statistic import Figure
 
 #: So many poses tell something of the workspace where none was attained often enough to tell of itself.
@@ -43,8 +43,10 @@ def read_check(path: Path, *, closed: bool = False) -> Attained:
     if closed:
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
     rows = read_rows(path / "check.csv" if path.is_dir() else path)
-    untold = not any(row.cov.any() for row in rows)
-    return Attained(rows, ["no sigma_x_m .. are given: the instrument's noise is taken for none"] if untold else [], [])
+    unknown = not any(row.cov.any() for row in rows)
+    return Attained(
+        rows, ["no sigma_x_m .. are given: the instrument's noise is taken for none"] if unknown else [], []
+    )
 
 
 def judge(attained: Attained) -> dict[str, Any]:
@@ -158,16 +160,16 @@ def _strays(rows: list[Row]) -> list[str]:
 
 def _pose(rows: list[Row]) -> dict[str, Any]:
     """Return AP and RP of a pose; None for what asks for turns that are not known."""
-    figures = iso9283.pose_figures(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
+    figures = iso9283.pose_metrics(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
     turned = all(row.turned for row in rows)
-    aimed = turned and all(row.turn_commanded for row in rows)
+    aimed = turned and all(row.commanded_rotation for row in rows)
     return {
         "count": figures.count,
         "AP_m": figure(figures.accuracy),
         "AP_xyz_m": figures.accuracy_xyz.tolist(),
-        "AP_turn_rad": figures.accuracy_turn.tolist() if aimed else None,
+        "AP_rotation_rad": figures.accuracy_rotation.tolist() if aimed else None,
         "RP_m": figure(figures.repeatability),
-        "RP_turn_rad": figures.repeatability_turn.tolist() if turned else None,
+        "RP_rotation_rad": figures.repeatability_rotation.tolist() if turned else None,
     }
 
 
@@ -185,7 +187,7 @@ def _distance(first: list[Row], last: list[Row]) -> dict[str, Any] | None:
         return None
     a, b = (_places([p[k] for p in pairs]) for k in (0, 1))
     commanded = float(np.linalg.norm((first[0].T_command - last[0].T_command)[:3, 3]))
-    AD, RD = iso9283.distance_figures(a, b, commanded, _covs([p[0] for p in pairs]))
+    AD, RD = iso9283.distance_metrics(a, b, commanded, _covs([p[0] for p in pairs]))
     return {"commanded_m": commanded, "AD_m": figure(AD), "RD_m": figure(RD)}
 
 
@@ -203,7 +205,7 @@ def _path(name: str, rows: list[Row]) -> dict[str, Any]:
     attained = np.array([_places(group) for group in cycles.values()])
     cov = np.array([_covs(group) for group in cycles.values()])
     try:
-        figures = path_figures(attained, _commands(first), cov, _common(rows))
+        figures = path_metrics(attained, _commands(first), cov, _common(rows))
     except InputError as error:
         raise InputError(f"path {name}: {error}") from None
     return {
@@ -226,7 +228,7 @@ def _circle(rows: list[Row], turns: list[Turn]) -> dict[str, Any]:
     flat = np.array([turn.p - middle for turn in turns]).reshape(-1, 3) @ axes.T
     at = (np.degrees(np.arctan2(flat[:, 1], flat[:, 0])) % 360).tolist()
     asked = [(angle, turn.way) for angle, turn in zip(at, turns, strict=True)]
-    figures = circle_figures(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
+    figures = circle_metrics(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
     return {
         "centre_m": figures.centre.tolist(),
         "radius_m": figures.radius_m,

@@ -55,7 +55,7 @@ class Row(Record):
         cov: (3, 3) covariance of the place by the instrument, base's axes, m^2: what differs from row to row.
         cov_common: (3, 3) that of the instrument's constant error.
         turned: whether the attained turn is known.
-        turn_commanded: whether the commanded one is.
+        commanded_rotation: whether the commanded one is.
     """
 
     test: str
@@ -68,7 +68,7 @@ class Row(Record):
     cov: Array
     cov_common: Array
     turned: bool = True
-    turn_commanded: bool = True
+    commanded_rotation: bool = True
 
 
 class Turn(NamedTuple):
@@ -215,7 +215,7 @@ def rows_csv(rows: list[Row]) -> str:
     writer.writerow(_COLUMNS)
     for row in rows:
         cells = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
-        for T, known in ((row.T, row.turned), (row.T_command, row.turn_commanded)):
+        for T, known in ((row.T, row.turned), (row.T_command, row.commanded_rotation)):
             cells += _decimals(T[:3, 3])
             cells += _decimals(quaternion_wxyz(T[:3, :3])) if known else [""] * len(_TURN)
         for cov in (row.cov, row.cov_common):

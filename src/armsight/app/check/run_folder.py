@@ -75,7 +75,7 @@ class Noise:
         return self.own + np.diag(np.maximum((stretch.sigma**2).mean(axis=0) - self.claimed, 0.0))
 
 
-def stretches_of(folder: Path, closed: bool) -> list[Stretch]:
+def segments_of(folder: Path, closed: bool) -> list[Stretch]:
     """Cut a run into its motions and rests of one pass, in their order."""
     for name in ("wanted.csv", "vision.csv", "motion.toml"):
         if not (folder / name).is_file():
@@ -379,7 +379,7 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
     Raises:
         InputError: no run, or none of its motions comes again.
     """
-    stretches = stretches_of(folder, closed)
+    stretches = segments_of(folder, closed)
     if not stretches:
         which = "with the loop closed" if closed else "with potentiometers alone"
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")

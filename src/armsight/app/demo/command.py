@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import click
 import json
-from armsight.app.demo.demo import (Demo, run_demo)
-from armsight.app.progress import (steps)
-from armsight.app.report.plotting import (require_matplotlib)
-from armsight.app.run.record import (require_pyarrow)
-from armsight.app.run.text import (tell)
-from armsight.loop.identify.model_file import (open_model)
-from pathlib import (Path)
+from armsight.app.demo.demo import Demo, run_demo
+from armsight.app.progress import steps
+from armsight.app.report.plotting import require_matplotlib
+from armsight.app.run.record import require_pyarrow
+from armsight.app.run.text import tell
+from armsight.loop.identify.model_file import open_model
+from pathlib import Path
+
 
 @click.command("demo")
 @click.option("-o", "--out", default="demo", show_default=True, metavar="DIR", type=click.Path(path_type=Path))

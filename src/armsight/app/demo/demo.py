@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 import time
-from armsight.app.demo.studies import (Study, rate_study, vision_studies)
-from armsight.app.run.calibrate import (calibrated, handeye_poses)
-from armsight.app.run.experiment import (Outcome, Progress, run_experiment)
-from armsight.app.run.folder import (Finished, finish, make_room, open_folder)
-from armsight.app.run.motion_file import (CHAPTER, MotionPlan, QUICK, read_motions)
-from armsight.app.run.setup import (Station)
-from armsight.data import (Array)
-from armsight.errors import (ArmsightError)
-from armsight.files import (write_text)
-from armsight.geometry.pose import (inverse)
-from armsight.robot.arm import (Arm)
-from armsight.robot.models import (open_arm)
-from armsight.sim.workcell.cameras import (open_timing)
-from armsight.sim.workcell.workcell import (Workcell)
-from armsight.vision.calibrate.result import (Calibration)
-from concurrent.futures import (ThreadPoolExecutor)
-from dataclasses import (dataclass, replace)
-from pathlib import (Path)
-from typing import (Any)
+from armsight.app.demo.studies import Study, rate_study, vision_studies
+from armsight.app.run.calibrate import calibrated, handeye_poses
+from armsight.app.run.experiment import Outcome, Progress, run_experiment
+from armsight.app.run.folder import Finished, finish, make_room, open_folder
+from armsight.app.run.motion_file import DEFAULT_MOTION, MotionPlan, QUICK, read_motions
+from armsight.app.run.setup import Setup
+from armsight.data import Array
+from armsight.errors import ArmsightError
+from armsight.files import write_text
+from armsight.geometry.pose import inverse
+from armsight.robot.arm import Arm
+from armsight.robot.models import open_arm
+from armsight.sim.workcell.cameras import open_timing
+from armsight.sim.workcell.workcell import Workcell
+from armsight.vision.calibrate.result import Calibration
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 #: Pairs of the board, poses for the hand-eye calibration, shots for each value of a study: usually, and with --quick.
 _AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}
-_MOTIONS = {False: CHAPTER, True: QUICK}
+_MOTIONS = {False: DEFAULT_MOTION, True: QUICK}
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> dict[str,
         write_text(demo.folder / "body.toml", cell.body_text)
         write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))
         targets = handeye_poses(cell.model, np.vstack([cell.model.home, cell.poses]), handeyes, demo.seed)
-        outcome = run_experiment(station_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
+        outcome = run_experiment(setup_of(cell), calibration.rig, plan, targets, progress=progress, cover=cell.cover)
         studies: list[Study] = []
         try:
             studies = _studies(demo, cell, calibration, outcome, plan, study_shots, progress)
@@ -113,10 +113,10 @@ def _cell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcell:
     return Workcell(cameras=cameras, believed=believed, like=like, **named)
 
 
-def station_of(cell: Workcell) -> Station:
+def setup_of(cell: Workcell) -> Setup:
     """Return a workcell as a station like any other."""
     sync_s = float(np.hypot(cell.timing.sync_s / np.sqrt(3), cell.timing.skew_s))
-    return Station(cell.model, cell.board, cell.poll, cell.target, cell.gravity_duty, cell.timing.rate_hz, sync_s)
+    return Setup(cell.model, cell.board, cell.poll, cell.target, cell.gravity_duty, cell.timing.rate_hz, sync_s)
 
 
 def _truth(cell: Workcell, outcome: Outcome) -> tuple[Array, Array] | None:
@@ -156,4 +156,4 @@ def _studies(
         return _cell(demo, cameras_at(demo.cameras, rate_hz), cell)
 
     found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
-    return [*found, rate_study(at_rate, station_of, calibration.rig, outcome, plan, progress)]
+    return [*found, rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)]

@@ -10,35 +10,35 @@ How the error goes with the rate of vision in the loop: the circle, closed on vi
 from __future__ import annotations
 
 import numpy as np
-from armsight.app.run.controllers import (closed_on, drive)
-from armsight.app.run.experiment import (Outcome, PRIOR, Progress, timing)
-from armsight.app.run.loop import (Loop)
-from armsight.app.run.metrics import (track_figures)
-from armsight.app.run.motion_file import (MotionPlan)
-from armsight.app.run.record import (Log, RunData, assembled)
-from armsight.app.run.setup import (Station)
-from armsight.data import (Array, PoseEstimate, Record, Shot)
-from armsight.geometry.pose import (inverse, log_se3, pose)
-from armsight.geometry.rotation import (exp_so3)
-from armsight.loop.estimators import (KalmanEstimator)
-from armsight.loop.servo import (PoseServo)
-from armsight.sim.example_rig import (bench_rig, board_poses)
-from armsight.sim.render.background import (plain)
-from armsight.sim.render.optics import (Sensor)
-from armsight.sim.render.render import (render_pair)
-from armsight.sim.render.scene import (Placed, chessboard)
-from armsight.sim.workcell.body import (body_patterns, body_target)
-from armsight.sim.workcell.workcell import (Workcell)
-from armsight.vision.calibrate.boards import (Pair, calibrate_boards)
-from armsight.vision.follow.follower import (Follower)
-from armsight.vision.markers.board import (open_board)
-from armsight.vision.measure import (measure)
-from armsight.vision.rig import (StereoRig)
-from collections.abc import (Callable, Sequence)
-from concurrent.futures import (ThreadPoolExecutor)
-from dataclasses import (dataclass, replace)
-from functools import (lru_cache)
-from scipy.special import (chdtri)
+from armsight.app.run.controllers import closed_on, drive
+from armsight.app.run.experiment import Outcome, PRIOR, Progress, timing
+from armsight.app.run.loop import Loop
+from armsight.app.run.metrics import track_metrics
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import Log, RunData, assembled
+from armsight.app.run.setup import Setup
+from armsight.data import Array, PoseEstimate, Record, Shot
+from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.estimators import KalmanEstimator
+from armsight.loop.servo import PoseServo
+from armsight.sim.example_rig import example_rig, board_poses
+from armsight.sim.render.background import plain
+from armsight.sim.render.optics import Sensor
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import PosedBody, chessboard
+from armsight.sim.workcell.body import body_patterns, body_target
+from armsight.sim.workcell.workcell import Workcell
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.follow.follower import Follower
+from armsight.vision.markers.board import open_board
+from armsight.vision.measure import measure
+from armsight.vision.rig import StereoRig
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from scipy.special import chdtri
 
 _BOARD = "chessboard:9x6:25mm"
 _TILT = np.radians(30.0)
@@ -138,12 +138,12 @@ def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Error
 def _usual(width: int) -> StereoRig:
     """Return the true rig with images so wide; the same cameras each time, so that their rays are found once."""
     size = (width, width * 9 // 16)
-    return bench_rig(size, focal_px=_FOCAL * width / _SIZE[0], baseline_m=_BASELINE, convergence_deg=0.0)
+    return example_rig(size, focal_px=_FOCAL * width / _SIZE[0], baseline_m=_BASELINE, convergence_deg=0.0)
 
 
 def _rig(width: int = _SIZE[0], baseline_m: float = _BASELINE) -> StereoRig:
     """Return the true rig."""
-    return replace(_usual(width), T_left_right=bench_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right)
+    return replace(_usual(width), T_left_right=example_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right)
 
 
 def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: float) -> tuple[list[Shot], Array]:
@@ -158,7 +158,7 @@ def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: f
 
     def shot(k: int) -> Shot:
         own = np.random.default_rng([seed, 8, k])
-        placed = [Placed(patterns, Ts[k])]
+        placed = [PosedBody(patterns, Ts[k])]
         images = render_pair(
             rig.cameras, rig.T_left_right, placed, (behind[0], behind[1]), sensor=Sensor(read_noise=noise), rng=own
         )
@@ -190,7 +190,11 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
 
     def pair(k: int) -> Pair:
         images = render_pair(
-            true.cameras, true.T_left_right, [Placed((pattern,), Ts[k])], grey, rng=np.random.default_rng([seed, 10, k])
+            true.cameras,
+            true.T_left_right,
+            [PosedBody((pattern,), Ts[k])],
+            grey,
+            rng=np.random.default_rng([seed, 10, k]),
         )
         return Pair(f"{k}", board.detect(images[0]), board.detect(images[1]))
 
@@ -229,8 +233,8 @@ RATES_HZ = (4.0, 15.0, 30.0, 60.0, 120.0)
 
 
 def rate_study(
-    open_cell: Callable[[float], Workcell],
-    station_of: Callable[[Workcell], Station],
+    open_workcell: Callable[[float], Workcell],
+    setup_of: Callable[[Workcell], Setup],
     rig: StereoRig,
     outcome: Outcome,
     plan: MotionPlan,
@@ -239,8 +243,8 @@ def rate_study(
     """Make the last motions of a plan, up to its circle, with the loop closed at several rates.
 
     Args:
-        open_cell: opens a workcell whose cameras have a rate; all else as in the run.
-        station_of: makes a station of it.
+        open_workcell: opens a workcell whose cameras have a rate; all else as in the run.
+        setup_of: makes a station of it.
         rig: the calibrated cameras.
         outcome: of the run, for where everything is.
         plan: the motions of the run.
@@ -249,8 +253,8 @@ def rate_study(
 
     def at(rate: float) -> tuple[float, float, int]:
         progress(f"study: vision at {rate:g} Hz in the loop")
-        with open_cell(rate) as cell:
-            return _figures(_circle(cell, station_of(cell), rig, outcome, plan))
+        with open_workcell(rate) as cell:
+            return _figures(_circle(cell, setup_of(cell), rig, outcome, plan))
 
     with ThreadPoolExecutor(2) as both:  # the longest first
         rows = list(both.map(at, RATES_HZ[::-1]))[::-1]
@@ -269,34 +273,34 @@ def rate_study(
     )
 
 
-def _circle(cell: Workcell, station: Station, rig: StereoRig, outcome: Outcome, plan: MotionPlan) -> RunData:
+def _circle(cell: Workcell, setup: Setup, rig: StereoRig, outcome: Outcome, plan: MotionPlan) -> RunData:
     """Drive to the circle and along it, without a rest."""
     assert outcome.handeye is not None
-    station.board.enable()
+    setup.board.enable()
     log = Log()
     loop = Loop(
-        station,
-        Follower(rig, station.target),
+        setup,
+        Follower(rig, setup.target),
         log,
-        KalmanEstimator(station.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
+        KalmanEstimator(setup.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
     )
     loop.mounting = outcome.handeye.mounting
-    servo = PoseServo(station.arm, timing(station, outcome.delay))
+    servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     kinds = [motion.kind for motion in plan.motions]
     first = kinds.index("home") + 1 if "home" in kinds else 0
     last = kinds.index("circle") + 1
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
-    drive(loop, part, closed_on(servo, station.gravity), closed=True, progress=lambda line: None)
+    drive(loop, part, closed_on(servo, setup.gravity), closed=True, progress=lambda line: None)
     loop.close_record()
     truth, mounting = cell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
     Ts = mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
-    return assembled(log, station.arm, mounting, outcome.delay, (truth.t_s, Ts))
+    return assembled(log, setup.arm, mounting, outcome.delay, (truth.t_s, Ts))
 
 
 def _figures(run: RunData) -> tuple[float, float, int]:
     """Return the fused estimate's error on the circle, RMS, m; what it claimed; how many readings."""
     assert run.truth is not None
     rows = (run.fused.motion == "circle") & (run.fused.phase == "closed_loop")
-    found = track_figures(run.fused[rows], run.truth)
+    found = track_metrics(run.fused[rows], run.truth)
     return found["position_rms_m"], found["position_sigma_rms_m"], int(rows.sum())

@@ -19,7 +19,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, write_text
-from armsight.loop.identify.backlash import Play, plays
+from armsight.loop.identify.backlash import JointBacklash, plays
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.diagnose import BAD_M, BAD_RAD, check_plausible, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
@@ -88,7 +88,9 @@ def run_identify(
     found = identify(arm, measured, priors=priors, progress=progress)
     if other is not None:
         held_out = _validated(found, arm, other)
-        how = f"{len(other)} poses of another file" + (", base and tool placed anew" if held_out.placed_anew else "")
+        how = f"{len(other)} poses of another file" + (
+            ", base and tool placed anew" if held_out.placement_refitted else ""
+        )
         poses = other.q
     else:
         held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
@@ -174,7 +176,7 @@ def summary(run: Run) -> dict[str, Any]:
         "poses": len(run.measured),
         "left_out_lines": [int(run.lines[k]) for k in found.left_out],
         "validation": run.how,
-        "validation_placed_anew": run.held_out.placed_anew,
+        "validation_placement_refitted": run.held_out.placement_refitted,
         "nominal": run.held_out.nominal.summary(),
         "identified": run.held_out.identified.summary(),
         "residual_over_predicted": run.held_out.residual_over_predicted,
@@ -312,7 +314,7 @@ def _ripples(run: Run) -> list[str]:
     return lines
 
 
-def _play_text(play: Play) -> str:
+def _play_text(play: JointBacklash) -> str:
     """Return a joint's play, and what showed it."""
     if not np.isfinite(play.value_rad):
         return play.how

@@ -132,7 +132,7 @@ def find_mounting(
         DeviceError: the board or a camera failed.
     """
     q_seen, Ts, covs, approach, missed = [], [], [], [], []
-    q_from, look_s = q_start, max(LOOK_S, 3.0 / loop.station.rate_hz)
+    q_from, look_s = q_start, max(LOOK_S, 3.0 / loop.setup.rate_hz)
     for n, q_to in enumerate(targets):
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
         way = point_to_point(arm, q_from, q_to)
@@ -187,12 +187,12 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     way = point_to_point(arm, q_start, q_middle)
     there = Segment("calibration", "sweep's start", "joints", False, trajectory=way)
     loop.run(Planned(way, loop.t_s, gravity), way.duration_s + DELAY_REST_S, there, watch=False)
-    sweep = Sweep(arm, q_middle, duration_s=max(SWEEP_S, SWEEP_SHOTS / loop.station.rate_hz))
+    sweep = Sweep(arm, q_middle, duration_s=max(SWEEP_S, SWEEP_SHOTS / loop.setup.rate_hz))
     looked = len(loop.log.poses)
     controller = Planned(sweep, loop.t_s, gravity)
     loop.run(controller, sweep.duration_s, Segment("calibration", "sweep", "joints", False, trajectory=sweep))
     assert loop.mounting is not None
-    seen = [loop.mounting.sighting(p, t) for _, t, p in loop.log.poses[looked:] if isinstance(p, PoseEstimate)]
+    seen = [loop.mounting.pose_measurement(p, t) for _, t, p in loop.log.poses[looked:] if isinstance(p, PoseEstimate)]
     loop.run(controller, DELAY_REST_S, Segment("calibration", "", "", False), watch=False)
     states = JointStates(
         np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])
@@ -202,8 +202,8 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     if len(seen) < LEAST:
         raise CalibrationError(
             f"the body was seen {len(seen)} times in {sweep.duration_s:.1f} s of sweep, {LEAST} times at least are needed "
-            f"to tell how late the images come: are the cameras slower than {loop.station.rate_hz:g} Hz, or is the body "
+            f"to tell how late the images come: are the cameras slower than {loop.setup.rate_hz:g} Hz, or is the body "
             "out of view near the end of the first motion?"
         )
-    sync_s = loop.station.sync_s
+    sync_s = loop.setup.sync_s
     return loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))

@@ -7,30 +7,30 @@ import contextlib
 import json
 import numpy as np
 import time
-from armsight.app.demo.demo import (station_of)
-from armsight.app.progress import (steps)
-from armsight.app.report.plotting import (require_matplotlib)
-from armsight.app.run.calibrate import (handeye_poses)
-from armsight.app.run.experiment import (Progress, require_start, run_experiment)
-from armsight.app.run.folder import (Finished, finish, make_room, open_folder)
-from armsight.app.run.motion_file import (CHAPTER, MotionPlan, read_motions)
-from armsight.app.run.record import (require_pyarrow)
-from armsight.app.run.setup import (HostClock, LiveShots, Station)
-from armsight.app.run.text import (tell)
-from armsight.data import (Array)
-from armsight.errors import (InputError)
-from armsight.files import (read_text, write_text)
-from armsight.loop.identify.model_file import (open_model)
-from armsight.robot.arm import (Arm)
-from armsight.robot.boards.opening import (EMULATED, emulated_machine, open_board)
-from armsight.sim.workcell.workcell import (Workcell)
-from armsight.vision.follow.follower import (follows)
-from armsight.vision.markers.targets import (Composite, open_target)
-from armsight.vision.rig import (StereoRig)
-from armsight.vision.sources import (open_source)
-from dataclasses import (replace)
-from pathlib import (Path)
-from typing import (Any)
+from armsight.app.demo.demo import setup_of
+from armsight.app.progress import steps
+from armsight.app.report.plotting import require_matplotlib
+from armsight.app.run.calibrate import handeye_poses
+from armsight.app.run.experiment import Progress, require_start, run_experiment
+from armsight.app.run.folder import Finished, finish, make_room, open_folder
+from armsight.app.run.motion_file import DEFAULT_MOTION, MotionPlan, read_motions
+from armsight.app.run.record import require_pyarrow
+from armsight.app.run.setup import HostClock, LiveShots, Setup
+from armsight.app.run.text import tell
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_text, write_text
+from armsight.loop.identify.model_file import open_model
+from armsight.robot.arm import Arm
+from armsight.robot.boards.opening import EMULATED, emulated_machine, open_board
+from armsight.sim.workcell.workcell import Workcell
+from armsight.vision.follow.follower import follows
+from armsight.vision.markers.targets import Composite, open_target
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import open_source
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 _HANDEYE_POSES = 30
 _SIM = "sim:"
@@ -52,7 +52,7 @@ _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
     "--model", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
 @click.option(
-    "--motion", type=click.Path(path_type=Path), default=CHAPTER, help="What to do (TOML); the chapter's motion."
+    "--motion", type=click.Path(path_type=Path), default=DEFAULT_MOTION, help="What to do (TOML); the chapter's motion."
 )
 @click.option(
     "--rate",
@@ -104,14 +104,14 @@ def command(
     began = time.perf_counter()
     with contextlib.ExitStack() as stack, steps() as progress:
         progress("opening the devices")
-        station = _station(stack, source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
-        require_start(station, plan, targets)
+        setup = _station(stack, source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
+        require_start(setup, plan, targets)
         make_room(out)
         for name, text in files.items():
             write_text(out / name, text)
         rig.save(out / "rig.json")
         try:
-            summary = _run(station, rig, plan, targets, not open_loop, out, began, progress)
+            summary = _run(setup, rig, plan, targets, not open_loop, out, began, progress)
         except KeyboardInterrupt:
             click.echo(f"the arm was stopped; what was measured until then is in {out}", err=True)
             raise
@@ -123,7 +123,7 @@ def command(
 
 def _station(
     stack: contextlib.ExitStack, source: str, board: str, arm: Arm, target: Composite, rate_hz: float, sync_s: float
-) -> Station:
+) -> Setup:
     """Open the devices, or the workcell in their place; the stack closes them."""
     if source.startswith(_SIM) != board.startswith(EMULATED):
         raise InputError(
@@ -134,15 +134,15 @@ def _station(
         machine = "unicorn" if board == EMULATED else emulated_machine(board)
         cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
         cell = stack.enter_context(Workcell(arm=_SIM_ARM, cameras=cameras, machine=machine, model=arm))
-        return replace(station_of(cell), target=target)
+        return replace(setup_of(cell), target=target)
     opened = stack.enter_context(open_board(board))
     shots = LiveShots(open_source(source))
     stack.callback(shots.close)
-    return Station(arm, opened, shots.poll, target, lambda q: np.zeros(6), rate_hz, sync_s, HostClock())
+    return Setup(arm, opened, shots.poll, target, lambda q: np.zeros(6), rate_hz, sync_s, HostClock())
 
 
 def _run(
-    station: Station,
+    setup: Setup,
     rig: StereoRig,
     plan: MotionPlan,
     targets: Array,
@@ -152,7 +152,7 @@ def _run(
     progress: Progress,
 ) -> dict[str, Any]:
     """Run and write; raises what ended the run early after everything is written."""
-    outcome = run_experiment(station, rig, plan, targets, progress=progress, close_loop=close_loop)
+    outcome = run_experiment(setup, rig, plan, targets, progress=progress, close_loop=close_loop)
     progress("writing and drawing")
-    facts = {"arm": station.arm.name, "board": station.board.welcome.board}
-    return finish(Finished(station.arm, rig, outcome, plan, None, facts, began, [], None), out)
+    facts = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+    return finish(Finished(setup.arm, rig, outcome, plan, None, facts, began, [], None), out)

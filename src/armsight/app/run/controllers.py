@@ -6,15 +6,15 @@ The motions of a run, once with potentiometers alone and once with vision in the
 from __future__ import annotations
 
 import numpy as np
-from armsight.app.run.loop import (Controller, Loop, PERIOD_S)
-from armsight.app.run.motion_file import (MotionPlan)
-from armsight.app.run.record import (Segment)
-from armsight.data import (Array, JointCommand)
-from armsight.loop.estimators import (Estimator)
-from armsight.loop.servo import (Aim, PoseServo)
-from armsight.robot.arm import (Arm)
-from armsight.robot.trajectories import (Joints, Tabled, Trajectory)
-from collections.abc import (Callable)
+from armsight.app.run.loop import Controller, Loop, PERIOD_S
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import Segment
+from armsight.data import Array, JointCommand
+from armsight.loop.estimators import Estimator
+from armsight.loop.servo import Aim, PoseServo
+from armsight.robot.arm import Arm
+from armsight.robot.trajectories import Joints, Tabled, Trajectory
+from collections.abc import Callable
 
 #: A joint that lifts the tool by so much, m per rad, carries weight.
 LOADED_M = 0.15

@@ -1,6 +1,6 @@
 """The chapter's experiment: calibrate, find where everything is, drive the arm, see who is right, and close the loop.
 
-One sequence for the workcell and for real devices (:class:`~armsight.app.run.setup.Station`). What a device failure or
+One sequence for the workcell and for real devices (:class:`~armsight.app.run.setup.Setup`). What a device failure or
 an interrupt leaves is a :class:`Outcome` with everything measured until then; the arm is stopped first.
 
 What must be so before an arm moves: code compiled, the board free of faults, the joints where the motion starts.
@@ -10,25 +10,25 @@ from __future__ import annotations
 
 import contextlib
 import numpy as np
-from armsight.app.interrupts import (uninterrupted)
-from armsight.app.run.calibrate import (HandEyeRun, find_delay, find_mounting)
-from armsight.app.run.controllers import (Planned, closed_on, drive, planned)
-from armsight.app.run.loop import (Loop, PERIOD_S, steady)
-from armsight.app.run.motion_file import (MotionPlan)
-from armsight.app.run.record import (Log, Segment)
-from armsight.app.run.setup import (Station)
-from armsight.data import (Array, Body, JointStates, Missed, PoseEstimate, Shot)
-from armsight.errors import (ArmsightError, DeviceError, InputError)
-from armsight.loop.estimators import (Delay, KalmanEstimator, Prior, Sighting)
-from armsight.loop.servo import (PoseServo, Timing)
-from armsight.robot.arm import (Arm)
-from armsight.robot.boards.board import (Board)
-from armsight.robot.boards.codes import (Fault, Order, STATE_TEXTS, State)
-from armsight.robot.trajectories import (Trajectory, point_to_point)
-from armsight.vision.follow.follower import (Follower)
-from armsight.vision.rig import (StereoRig)
-from collections.abc import (Callable)
-from dataclasses import (dataclass, field)
+from armsight.app.interrupts import uninterrupted
+from armsight.app.run.calibrate import HandEyeRun, find_delay, find_mounting
+from armsight.app.run.controllers import Planned, closed_on, drive, planned
+from armsight.app.run.loop import Loop, PERIOD_S, steady
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import Log, Segment
+from armsight.app.run.setup import Setup
+from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior, PoseMeasurement
+from armsight.loop.servo import PoseServo, Timing
+from armsight.robot.arm import Arm
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import Fault, Command, STATE_TEXTS, State
+from armsight.robot.trajectories import Trajectory, point_to_point
+from armsight.vision.follow.follower import Follower
+from armsight.vision.rig import StereoRig
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 #: The joints must agree with where the motion is to start to so much before anything moves, rad.
 START_RAD = float(np.radians(2.0))
@@ -52,7 +52,7 @@ def enable(board: Board) -> None:
         waited_s += _STEP_S
     faults = board.status.faults
     if faults and all(each.fault is Fault.HOST_SILENT for each in faults):
-        board.confirm(board.order(Order.CLEAR_FAULTS))
+        board.confirm(board.command(Command.CLEAR_FAULTS))
     elif faults or board.status.state is State.STOPPED:
         causes = "; ".join(str(fault) for fault in faults) or "the emergency stop was pressed"
         raise DeviceError(
@@ -63,7 +63,7 @@ def enable(board: Board) -> None:
         board.enable()
 
 
-def rehearse(arm: Arm) -> None:
+def warm_up(arm: Arm) -> None:
     """Run once all that the loop runs in motion: nothing is compiled while an arm waits for its next command."""
     low, high = np.maximum(arm.home - _MOVE_RAD, arm.q_min), np.minimum(arm.home + _MOVE_RAD, arm.q_max)
     way = point_to_point(arm, low, high)
@@ -76,13 +76,15 @@ def rehearse(arm: Arm) -> None:
         estimator.joints(JointStates(t_s[rows], q[rows]))
         estimator.estimate()
         if first % 16 == 0:
-            estimator.vision(Sighting(float(t_s[first]), arm.forward(q[first]), 1e-8 * np.eye(6), 1e-8 * np.eye(6)))
+            estimator.vision(
+                PoseMeasurement(float(t_s[first]), arm.forward(q[first]), 1e-8 * np.eye(6), 1e-8 * np.eye(6))
+            )
         with contextlib.suppress(ArmsightError):
             servo.step(servo.aim(way, float(t_s[first])), estimator)
     estimator.smoothed(t_s[-100:])
 
 
-def require_start(station: Station, plan: MotionPlan, targets: Array) -> None:
+def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
     """Refuse to begin where the arm is not where the motion starts, or is no such arm at all.
 
     Args:
@@ -93,7 +95,7 @@ def require_start(station: Station, plan: MotionPlan, targets: Array) -> None:
     Raises:
         ArmsightError: which joint is where, and where it should be.
     """
-    states = station.board.receive(0.2)
+    states = setup.board.receive(0.2)
     if not len(states.q):
         raise DeviceError("the board tells no joint angles: is its wire's baud rate right?")
     q = states.q[-1]
@@ -103,9 +105,9 @@ def require_start(station: Station, plan: MotionPlan, targets: Array) -> None:
         raise InputError(
             f"joint {joint + 1} reads {np.degrees(q[joint]):.1f} deg, the motion starts at "
             f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
-            f"--model {station.arm.name} does not match the board's potentiometers (armsight board monitor)"
+            f"--model {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
-    _require_range(station, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
+    _require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 
 
 def passed(way: Trajectory) -> Array:
@@ -113,9 +115,9 @@ def passed(way: Trajectory) -> Array:
     return way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
 
 
-def _require_range(station: Station, q: Array) -> None:
+def _require_range(setup: Setup, q: Array) -> None:
     """Refuse joint angles (N, 6) that the board's own limits do not allow: it would hold the joint back on the way."""
-    config = station.board.configuration()["joint"]
+    config = setup.board.configuration()["joint"]
     low, high = config["soft_min_rad"].astype(float), config["soft_max_rad"].astype(float)
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
     if beyond.max() > 1e-3:
@@ -123,7 +125,7 @@ def _require_range(station: Station, q: Array) -> None:
         raise InputError(
             f"joint {joint + 1} is to go from {np.degrees(q[:, joint].min()):.1f} to {np.degrees(q[:, joint].max()):.1f} "
             f"deg, the board allows {np.degrees(low[joint]):.1f} to {np.degrees(high[joint]):.1f}: change the motion or "
-            f"the board's soft limits; or is --model {station.arm.name} another arm than the board's?"
+            f"the board's soft limits; or is --model {setup.arm.name} another arm than the board's?"
         )
 
 
@@ -181,7 +183,7 @@ class Outcome:
 
 
 def run_experiment(
-    station: Station,
+    setup: Setup,
     rig: StereoRig,
     plan: MotionPlan,
     targets: Array,
@@ -204,14 +206,14 @@ def run_experiment(
     Returns:
         All that was measured, also where something ended it early.
     """
-    outcome = Outcome(station.target.body)
-    with steady(in_time=station.clock is not None):
-        _run(station, rig, plan, targets, outcome, progress, cover, close_loop)
+    outcome = Outcome(setup.target.body)
+    with steady(in_time=setup.clock is not None):
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop)
     return outcome
 
 
 def _run(
-    station: Station,
+    setup: Setup,
     rig: StereoRig,
     plan: MotionPlan,
     targets: Array,
@@ -224,15 +226,15 @@ def _run(
     loop: Loop | None = None
     try:
         progress("making ready to follow the body")
-        follower = Follower(rig, station.target)
-        if station.clock is not None:
-            rehearse(station.arm)
-            station.board.receive(_STALE_S)  # what lay in the wire's buffer meanwhile
-        loop = Loop(station, follower, outcome.log, KalmanEstimator(station.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
-        enable(station.board)
-        _require_seen(loop, station, plan)
-        _prepare(loop, station, plan, targets, outcome, progress)
-        _passes(loop, station, plan, outcome, progress, cover, close_loop)
+        follower = Follower(rig, setup.target)
+        if setup.clock is not None:
+            warm_up(setup.arm)
+            setup.board.receive(_STALE_S)  # what lay in the wire's buffer meanwhile
+        loop = Loop(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        enable(setup.board)
+        _require_seen(loop, setup, plan)
+        _prepare(loop, setup, plan, targets, outcome, progress)
+        _passes(loop, setup, plan, outcome, progress, cover, close_loop)
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
@@ -252,12 +254,12 @@ def _stopped(loop: Loop) -> None:
         return  # told what it must, or gone: then its own silence reaction holds or releases the arm
 
 
-def _require_seen(loop: Loop, station: Station, plan: MotionPlan) -> None:
+def _require_seen(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
     """Raise where the body is not in view at the start: everything after would be for nothing."""
-    here = plan.start if station.clock is None else loop.log.joints[-1].q[-1]  # a real arm stands about there
-    there = point_to_point(station.arm, np.clip(here, station.arm.q_min, station.arm.q_max), plan.start)
-    look_s = there.duration_s + max(0.3, 3.0 / station.rate_hz)
-    loop.run_until_seen(Planned(there, loop.t_s, station.gravity), look_s, Segment("calibration", "", "", False))
+    here = plan.start if setup.clock is None else loop.log.joints[-1].q[-1]  # a real arm stands about there
+    there = point_to_point(setup.arm, np.clip(here, setup.arm.q_min, setup.arm.q_max), plan.start)
+    look_s = there.duration_s + max(0.3, 3.0 / setup.rate_hz)
+    loop.run_until_seen(Planned(there, loop.t_s, setup.gravity), look_s, Segment("calibration", "", "", False))
     results = [result for _, _, result in loop.log.poses]
     if any(isinstance(result, PoseEstimate) for result in results):
         return
@@ -265,16 +267,14 @@ def _require_seen(loop: Loop, station: Station, plan: MotionPlan) -> None:
         raise DeviceError("no shot came while the arm stood: are the cameras running?")
     missed = next(result for result in results if isinstance(result, Missed))
     raise ArmsightError(
-        f"the body {station.target.body.name} is not seen where the arm stands ({missed.reason}): bring it into the view "
+        f"the body {setup.target.body.name} is not seen where the arm stands ({missed.reason}): bring it into the view "
         "of both cameras before the run"
     )
 
 
-def _prepare(
-    loop: Loop, station: Station, plan: MotionPlan, targets: Array, outcome: Outcome, progress: Progress
-) -> None:
+def _prepare(loop: Loop, setup: Setup, plan: MotionPlan, targets: Array, outcome: Outcome, progress: Progress) -> None:
     """Find where cameras and body are, and how late the images come; the arm ends at the plan's start."""
-    arm, gravity = station.arm, station.gravity
+    arm, gravity = setup.arm, setup.gravity
     outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
     loop.mounting = outcome.handeye.mounting
     progress("how late the images come: a sweep of the joints")
@@ -288,7 +288,7 @@ def _prepare(
 
 def _passes(
     loop: Loop,
-    station: Station,
+    setup: Setup,
     plan: MotionPlan,
     outcome: Outcome,
     progress: Progress,
@@ -314,31 +314,31 @@ def _passes(
     begin = loop.t_s
     outcome.open_s = (begin, begin)
     try:
-        drive(loop, plan, planned(station.gravity), closed=False, progress=progress, started=started)
+        drive(loop, plan, planned(setup.gravity), closed=False, progress=progress, started=started)
     finally:
         outcome.open_s = (begin, loop.t_s)
     if not close_loop:
         return
-    _to_start(loop, station, plan)
-    servo = PoseServo(station.arm, timing(station, outcome.delay))
+    _to_start(loop, setup, plan)
+    servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     begin = loop.t_s
     try:
-        drive(loop, plan, closed_on(servo, station.gravity), closed=True, progress=progress)
+        drive(loop, plan, closed_on(servo, setup.gravity), closed=True, progress=progress)
     finally:
         outcome.closed_s = (begin, loop.t_s)
 
 
-def _to_start(loop: Loop, station: Station, plan: MotionPlan) -> None:
+def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
     """Take the arm from the end of the motions to their start: they need not end where they began."""
     last = plan.motions[-1].trajectory
     end = last.at(last.duration_s).q
     if np.allclose(end, plan.start, rtol=0.0, atol=1e-6):
         return
-    back = point_to_point(station.arm, end, plan.start)
+    back = point_to_point(setup.arm, end, plan.start)
     there = Segment("calibration", "back to the start", "joints", False, trajectory=back)
-    loop.run(Planned(back, loop.t_s + PERIOD_S, station.gravity), back.duration_s + 0.5, there)
+    loop.run(Planned(back, loop.t_s + PERIOD_S, setup.gravity), back.duration_s + 0.5, there)
 
 
-def timing(station: Station, delay: Delay) -> Timing:
+def timing(setup: Setup, delay: Delay) -> Timing:
     """Return the loop's timing as measured: its gain follows from it."""
-    return Timing(PERIOD_S, 1.0 / station.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)
+    return Timing(PERIOD_S, 1.0 / setup.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)

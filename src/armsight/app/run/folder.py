@@ -18,37 +18,38 @@ import os
 import shutil
 import tempfile
 import time
-from armsight.app.demo.studies import (Study)
-from armsight.app.interrupts import (uninterrupted)
-from armsight.app.measure.poses import (UPPER, csv_text, left_axes, pose_record)
-from armsight.app.record.recording import (record)
-from armsight.app.run.calibrate import (HandEyeRun)
-from armsight.app.run.experiment import (Outcome)
-from armsight.app.run.metrics import (judge, path_errors, rest_errors, rms, singular, spread, track_figures)
-from armsight.app.run.motion_file import (MotionPlan)
-from armsight.app.run.record import (RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track)
-from armsight.app.run.report import (NAMES, PAGE, RunReport, write_run_report)
-from armsight.data import (Array, Image, Missed, PoseEstimate, Shot)
-from armsight.errors import (ArmsightError, InputError)
-from armsight.files import (write_text)
-from armsight.geometry.rotation import (quaternion_wxyz)
-from armsight.robot.arm import (Arm)
-from armsight.vision.image import (grey)
-from armsight.vision.rig import (StereoRig)
-from collections import (Counter)
-from collections.abc import (Callable, Iterator, Mapping, Sequence)
-from concurrent.futures import (Future, ThreadPoolExecutor)
-from dataclasses import (dataclass)
-from numpy.typing import (NDArray)
-from pathlib import (Path)
-from typing import (Any)
+from armsight.app.demo.studies import Study
+from armsight.app.interrupts import uninterrupted
+from armsight.app.measure.poses import UPPER, csv_text, left_axes, pose_record
+from armsight.app.record.recording import record
+from armsight.app.run.calibrate import HandEyeRun
+from armsight.app.run.experiment import Outcome
+from armsight.app.run.metrics import judge, path_errors, rest_errors, rms, singular, spread, track_metrics
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
+from armsight.app.run.report import NAMES, PAGE, RunReport, write_run_report
+from armsight.data import Array, Image, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, InputError
+from armsight.files import write_text
+from armsight.geometry.rotation import quaternion_wxyz
+from armsight.robot.arm import Arm
+from armsight.vision.image import grey
+from armsight.vision.rig import StereoRig
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from numpy.typing import NDArray
+from pathlib import Path
+from typing import Any
 
-def joint_columns(t_s: Array, q: Array, q_wanted: Array) -> dict[str, Any]:
+
+def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
     """Return the joints' columns: measured and wanted angles."""
     named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
     for joint in range(6):
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
-        named[f"q{joint + 1}_wanted_rad"] = np.round(q_wanted[:, joint], 9)
+        named[f"q{joint + 1}_wanted_rad"] = np.round(q_ref[:, joint], 9)
     return named
 
 
@@ -153,7 +154,7 @@ def summary_of(
             "poses": len(outcome.handeye.q),
         },
         "camera_delay_s": {"value": outcome.delay.delay_s, "sigma": outcome.delay.sigma_s},
-        "shots": {"measured": len(run.vision), "missed": run.missed, "not_believed": run.outliers},
+        "shots": {"measured": len(run.vision), "missed": run.missed, "rejected": run.outliers},
         "studies": [_study(study) for study in studies],
         **facts,
         "ended_by": outcome.said,
@@ -181,13 +182,13 @@ def _against_truth(before: RunData, covered_s: tuple[float, float] | None) -> di
         seen = ~_hidden(track, covered_s)
         moving, resting = (track.phase == "open_loop") & seen, (track.phase == "rest") & seen
         if moving.any() and resting.any():
-            at_rest = track_figures(track[resting], before.truth)["position_rms_m"]
-            found[name] = {**track_figures(track[moving], before.truth), "rest_position_rms_m": at_rest}
+            at_rest = track_metrics(track[resting], before.truth)["position_rms_m"]
+            found[name] = {**track_metrics(track[moving], before.truth), "rest_position_rms_m": at_rest}
     if covered_s is not None and (before.t_s > covered_s[0]).any():
         found["occlusion"] = {"duration_s": float(np.ptp(covered_s))}
         for name in ("fused", "live"):
             track = getattr(before, name)
-            figures = track_figures(track[_hidden(track, covered_s)], before.truth)
+            figures = track_metrics(track[_hidden(track, covered_s)], before.truth)
             found["occlusion"] |= {
                 f"{name}_position_rms_m": figures["position_rms_m"],
                 f"{name}_position_max_m": figures["position_max_m"],
@@ -315,7 +316,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[dict[str, Any], R
         keep(write_handeye, folder, outcome.handeye)
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth)
-        keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_wanted))
+        keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
         for name, track in _tracks(run).items():
             keep(write_track, folder, name, track)
         before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))

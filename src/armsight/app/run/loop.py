@@ -14,19 +14,19 @@ import gc
 import numpy as np
 import sys
 import time
-from armsight.app.run.record import (Log, Segment, Skew, ToolTrack)
-from armsight.app.run.setup import (Station)
-from armsight.data import (Array, JointCommand, JointStates, Missed, PoseEstimate, Shot)
-from armsight.errors import (DeviceError)
-from armsight.loop.estimators import (Estimator, KalmanEstimator, Mounting)
-from armsight.loop.estimators.smoothing import (Stretch)
-from armsight.robot.boards.codes import (State)
-from armsight.vision.follow.follower import (Follower)
-from collections import (deque)
-from collections.abc import (Callable, Iterator, Sequence)
-from concurrent.futures import (Future, ThreadPoolExecutor, wait)
-from dataclasses import (replace)
-from typing import (Protocol, TypeVar)
+from armsight.app.run.record import Log, Segment, Skew, ToolTrack
+from armsight.app.run.setup import Setup
+from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
+from armsight.errors import DeviceError
+from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
+from armsight.loop.estimators.smoothing import Stretch
+from armsight.robot.boards.codes import State
+from armsight.vision.follow.follower import Follower
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from typing import Protocol, TypeVar
 
 #: How long one thread may keep the interpreter, s: a turn of the loop takes it back a dozen times, and with the usual 5 ms
 #: would last longer than boards wait for commands.
@@ -172,14 +172,14 @@ class Loop:
         t_s: time of the newest reading, board's clock.
     """
 
-    def __init__(self, station: Station, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
-        self.board, self.station, self.follower = station.board, station, follower
+    def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
+        self.board, self.setup, self.follower = setup.board, setup, follower
         self.estimator, self.log = estimator, log
         self.mounting: Mounting | None = None
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.t_s = 0.0
         self._shot_s = -np.inf
-        self._skew = Skew(follower.rig, station.sync_s)
+        self._skew = Skew(follower.rig, setup.sync_s)
         # Of the record: up to when it is noted what was heard around each reading, up to when it is written down, what is
         # between the two, and the first batch of readings that is not all noted.
         self._noted_s = self._written_s = -np.inf
@@ -203,7 +203,7 @@ class Loop:
                 estimator.joints(states)
                 while seen and seen[0][0] <= states.t_s[-1]:
                     t_s, pose = seen.popleft()
-                    estimator.vision(mounting.sighting(pose, t_s))
+                    estimator.vision(mounting.pose_measurement(pose, t_s))
 
         heard = list(self.log.joints)
         self.compute(lambda: learn(heard))
@@ -220,7 +220,7 @@ class Loop:
         Raises:
             DeviceError: the board failed meanwhile; and what the work raises.
         """
-        if self.station.clock is None:
+        if self.setup.clock is None:
             return work()
         held, calm = Still(self._at_rest(PERIOD_S)), Segment("calibration", "", "", False)
         return beside(work, lambda done: self._turns(held, done, calm, watch=False))
@@ -231,8 +231,8 @@ class Loop:
         if not len(states.t_s):
             return
         self.t_s = float(states.t_s[-1])
-        if self.station.clock is not None:
-            self.station.clock.heard(self.t_s)
+        if self.setup.clock is not None:
+            self.setup.clock.heard(self.t_s)
         self.log.joints.append(states)
         self.estimator.joints(states)
         self.log.live.append(self.estimator.estimate())
@@ -273,7 +273,7 @@ class Loop:
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
         """Measure the newest shot, where there is one; returns it, when it was taken up, and what came of it."""
-        if self.station.clock is None:
+        if self.setup.clock is None:
             newest = self._newest()
             looked = None if newest is None else (newest, self._measured(newest))
         else:
@@ -288,7 +288,7 @@ class Loop:
         elif isinstance(result, PoseEstimate):
             result = self._skew.widened(result, shot.t_s)
             if self.mounting is not None:
-                self.log.verdicts.append(self.estimator.vision(self.mounting.sighting(result, shot.t_s)))
+                self.log.verdicts.append(self.estimator.vision(self.mounting.pose_measurement(result, shot.t_s)))
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
         return shot, self._taken_s, result
 
@@ -297,7 +297,7 @@ class Loop:
 
     def _newest(self) -> Shot | None:
         """Return the newest shot, where there is one, on the board's clock."""
-        shot, clock = self.station.poll(), self.station.clock
+        shot, clock = self.setup.poll(), self.setup.clock
         self._taken_s = time.perf_counter()
         self._expected = None
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
@@ -357,7 +357,7 @@ class Loop:
 
     def _rest_of_period(self) -> float:
         """Return how long to wait for the loop's next turn, s: what the last one has left of its period."""
-        if self.station.clock is None:
+        if self.setup.clock is None:
             return PERIOD_S
         now = time.monotonic()
         self._due = max(self._due + PERIOD_S, now + _LEAST_WAIT_S)
@@ -368,7 +368,7 @@ class Loop:
         if self.board.status.state is not State.ENABLED or not self.log.commands:
             return
         still = replace(self._at_rest(_STOP_S), q_ref=self.board.joints.reference_rad)
-        turns = 1 if self.station.clock is None else round(_STOP_S / PERIOD_S)
+        turns = 1 if self.setup.clock is None else round(_STOP_S / PERIOD_S)
         for turn in range(turns):
             self.board.send(replace(still, duration_s=_STOP_S * (1 - turn / turns)))
             self.pass_time(_STOP_S / turns)
@@ -389,5 +389,5 @@ class Loop:
     def _check_cameras(self, since_s: float) -> None:
         """Raise where the cameras have been silent for too long."""
         silent_s = self.t_s - max(self._shot_s, since_s)
-        if silent_s > STALLED_S + 2.0 / self.station.rate_hz:
+        if silent_s > STALLED_S + 2.0 / self.setup.rate_hz:
             raise DeviceError(f"no shot has come for {silent_s:.1f} s: the cameras have stalled")

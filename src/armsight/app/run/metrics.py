@@ -7,13 +7,13 @@ it where motions are judged, and nothing is said about the error of the tracks t
 from __future__ import annotations
 
 import numpy as np
-from armsight.app.run.record import (RunData, ToolTrack, errors)
-from armsight.data import (Array)
-from armsight.loop.servo import (EASY)
-from armsight.robot.arm import (Arm)
-from scipy.spatial import (cKDTree)
-from scipy.special import (chdtri)
-from typing import (Any)
+from armsight.app.run.record import RunData, ToolTrack, errors
+from armsight.data import Array
+from armsight.loop.servo import EASY
+from armsight.robot.arm import Arm
+from scipy.spatial import cKDTree
+from scipy.special import chdtri
+from typing import Any
 
 #: Kinds of motion whose path in space is what counts.
 PATHS = ("line", "circle")
@@ -22,7 +22,7 @@ _SETTLED_S = 0.2  # at the end of a rest
 _PATH_STEP_M = 2e-5
 
 
-def track_figures(track: ToolTrack, truth: ToolTrack) -> dict[str, Any]:
+def track_metrics(track: ToolTrack, truth: ToolTrack) -> dict[str, Any]:
     """Return how far a track is from the truth.
 
     Args:

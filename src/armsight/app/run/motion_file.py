@@ -18,7 +18,7 @@ from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
 
 #: The chapter's motion: home to five poses and back, a line, a circle.
-CHAPTER = Path(__file__).with_name("default_motion.toml")
+DEFAULT_MOTION = Path(__file__).with_name("default_motion.toml")
 #: Less of it.
 QUICK = Path(__file__).with_name("quick_motion.toml")
 _REST_S = 2.0
@@ -27,7 +27,7 @@ _MOST = 1e9  # of any number; NaN is not below it
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "joints": ({"q_deg": 6}, ("q_deg",)),
     "home": ({}, ()),
-    "line": ({"by_mm": 3, "turn_deg": 3, "to_mm": 3, "roll_pitch_yaw_deg": 3}, ()),
+    "line": ({"by_mm": 3, "rotation_deg": 3, "to_mm": 3, "roll_pitch_yaw_deg": 3}, ()),
     "circle": ({"center_mm": 3, "axis": 3, "angle_deg": 1}, ("center_mm", "axis")),
 }
 _COMMON = {"kind": 0, "name": 0, "duration_s": 1, "rest_s": 1}
@@ -63,7 +63,7 @@ class MotionPlan(Record):
     motions: tuple[Motion, ...]
 
 
-def read_motions(arm: Arm, path: str | Path = CHAPTER) -> MotionPlan:
+def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
     """Read a motion file and plan all of it.
 
     Args:
@@ -139,7 +139,7 @@ def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Arra
     if ("by_mm" in values) == ("to_mm" in values):
         raise InputError(f"{where} (line): give either by_mm, a step in the base frame, or to_mm, a place in it")
     if "by_mm" in values:
-        turn = exp_so3(np.radians(values.get("turn_deg", np.zeros(3))))
+        turn = exp_so3(np.radians(values.get("rotation_deg", np.zeros(3))))
         return pose(turn @ T_base_tool[:3, :3], T_base_tool[:3, 3] + 1e-3 * values["by_mm"])
     R = T_base_tool[:3, :3]
     if "roll_pitch_yaw_deg" in values:

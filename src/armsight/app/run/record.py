@@ -13,19 +13,19 @@ A run as tables: its log brought onto one axis of time, beside what was wanted a
 from __future__ import annotations
 
 import numpy as np
-from armsight.data import (Array, JointCommand, JointStates, Missed, PoseEstimate, Record)
-from armsight.errors import (InputError)
-from armsight.files import (read_table, replacing)
-from armsight.geometry.pose import (inverse, log_se3)
-from armsight.loop.estimators import (ArmEstimate, Delay, Mounting, Sighting, Verdict)
-from armsight.robot.arm import (Arm)
-from armsight.robot.trajectories import (Trajectory)
-from armsight.vision.rig import (StereoRig)
-from dataclasses import (dataclass, field, replace)
-from numpy.typing import (NDArray)
-from pathlib import (Path)
-from scipy.spatial.transform import (Rotation)
-from typing import (Any)
+from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Record
+from armsight.errors import InputError
+from armsight.files import read_table, replacing
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators import ArmEstimate, Delay, Mounting, PoseMeasurement, Verdict
+from armsight.robot.arm import Arm
+from armsight.robot.trajectories import Trajectory
+from armsight.vision.rig import StereoRig
+from dataclasses import dataclass, field, replace
+from numpy.typing import NDArray
+from pathlib import Path
+from scipy.spatial.transform import Rotation
+from typing import Any
 
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 #: What a moment belongs to.
@@ -269,7 +269,7 @@ class RunData(Record):
     Attributes:
         t_s: (N,) times of the potentiometers' readings, board's clock.
         q: (N, 6) what they said, rad.
-        q_wanted: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
+        q_ref: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
         potentiometers: where the table of the arm has the tool with them.
         vision: where each used shot saw it.
         fused: where the estimator has it, a little later, with vision on both sides of each time.
@@ -285,7 +285,7 @@ class RunData(Record):
 
     t_s: Array
     q: Array
-    q_wanted: Array
+    q_ref: Array
     potentiometers: ToolTrack
     vision: ToolTrack
     fused: ToolTrack
@@ -311,15 +311,15 @@ def assembled(
         delay: how late the camera's stamps are: what is not known of that, too, spoils the pose of a tool that moves.
         truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
     """
-    t_s, q, q_wanted = joints_of(log)
-    planned = np.isfinite(q_wanted).all(axis=1)
+    t_s, q, q_ref = joints_of(log)
+    planned = np.isfinite(q_ref).all(axis=1)
     named = _Named(log.segments)
-    seen = [mounting.sighting(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
+    seen = [mounting.pose_measurement(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(
         t_s,
         q,
-        q_wanted,
+        q_ref,
         named.track(t_s, arm.forward(q)),
         named.track(
             np.array([s.t_s for s in seen]),
@@ -336,7 +336,7 @@ def assembled(
             np.array([e.T_base_tool for e in log.live]),
             np.array([e.cov for e in log.live]),
         ),
-        named.track(t_s[planned], arm.forward(q_wanted[planned])),
+        named.track(t_s[planned], arm.forward(q_ref[planned])),
         None if truth is None else named.track(*truth),
         tuple(log.segments),
         np.array(log.latency_s),
@@ -346,7 +346,7 @@ def assembled(
     )
 
 
-def _mistimed(seen: list[Sighting], delay: Delay) -> Array:
+def _mistimed(seen: list[PoseMeasurement], delay: Delay) -> Array:
     """Return what the stamps' errors add to the covariances (N, 6, 6) of poses of a moving tool."""
     if len(seen) < 2:
         return np.zeros((len(seen), 6, 6))
@@ -367,15 +367,13 @@ def joints_of(log: Log) -> tuple[Array, Array, Array]:
     """Return a log's times (N,) of readings, the joints (N, 6) then, and as planned, rad; NaN where nothing was."""
     t_s = np.concatenate([s.t_s for s in log.joints])
     q = np.concatenate([s.q for s in log.joints])
-    q_wanted = np.full_like(q, np.nan)
+    q_ref = np.full_like(q, np.nan)
     for segment in log.segments:
         rows = (t_s > segment.begin_s) & (t_s <= segment.end_s)
         if segment.trajectory is not None and rows.any():
             since = t_s[rows] - segment.begin_s
-            q_wanted[rows] = segment.trajectory.at(
-                since + (segment.trajectory.duration_s if _rests(segment) else 0.0)
-            ).q
-    return t_s, q, q_wanted
+            q_ref[rows] = segment.trajectory.at(since + (segment.trajectory.duration_s if _rests(segment) else 0.0)).q
+    return t_s, q, q_ref
 
 
 def _rests(segment: Segment) -> bool:
@@ -408,7 +406,7 @@ def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
         run,
         t_s=run.t_s[rows],
         q=run.q[rows],
-        q_wanted=run.q_wanted[rows],
+        q_ref=run.q_ref[rows],
         potentiometers=within(run.potentiometers),
         vision=within(run.vision),
         fused=within(run.fused),

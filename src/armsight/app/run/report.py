@@ -12,22 +12,22 @@ from __future__ import annotations
 import base64
 import cv2
 import numpy as np
-from armsight.app.calibrate.report import (bullets, table, text)
-from armsight.app.demo.studies import (Study)
-from armsight.app.report.page import (html_page, put_files)
-from armsight.app.report.plotting import (BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg)
-from armsight.app.run.metrics import (judge, path_errors, rest_errors)
-from armsight.app.run.record import (RunData, ToolTrack, errors)
-from armsight.data import (Array, Image)
-from collections.abc import (Callable, Mapping, Sequence)
-from dataclasses import (dataclass)
-from pathlib import (Path)
-from scipy.special import (ndtri)
-from typing import (Any, TYPE_CHECKING)
+from armsight.app.calibrate.report import bullets, table, text
+from armsight.app.demo.studies import Study
+from armsight.app.report.page import html_page, put_files
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg
+from armsight.app.run.metrics import judge, path_errors, rest_errors
+from armsight.app.run.record import RunData, ToolTrack, errors
+from armsight.data import Array, Image
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from scipy.special import ndtri
+from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from matplotlib.axes import (Axes)
-    from matplotlib.figure import (Figure)
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 GREEN, SOFT_BLUE, SOFT_GREEN = "#2f7d4f", "#cfe3f5", "#cfe8d8"
 _MM, _DEG = 1e3, float(np.degrees(1.0))
@@ -40,7 +40,7 @@ def joints_figure(run: RunData) -> Figure:
     figure = new_figure(6.2)
     rows = _thinned(len(run.t_s))
     for joint, plot in enumerate(figure.subplots(3, 2, sharex=True).T.flat):
-        plot.plot(run.t_s[rows], _DEG * run.q_wanted[rows, joint], color=ORANGE, lw=2.4, label="reference")
+        plot.plot(run.t_s[rows], _DEG * run.q_ref[rows, joint], color=ORANGE, lw=2.4, label="reference")
         plot.plot(run.t_s[rows], _DEG * run.q[rows, joint], color=BLUE, lw=0.9, label="potentiometer")
         plot.set_ylabel(f"joint {joint + 1}, deg")
         _shade(plot, run, named=joint in (0, 3))

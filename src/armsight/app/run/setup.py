@@ -66,7 +66,7 @@ class HostClock:
 
 
 @dataclass(frozen=True)
-class Station:
+class Setup:
     """Where a run happens.
 
     Attributes:

@@ -40,7 +40,7 @@ def tell(summary: Mapping[str, Any], out: Path) -> None:
     shots = summary.get("shots")
     if shots:
         console.print(
-            f"{shots['measured']} shots measured, {shots['missed']} missed, {shots['not_believed']} not believed by the "
+            f"{shots['measured']} shots measured, {shots['missed']} missed, {shots['rejected']} not believed by the "
             "estimator; run.log says why"
         )
     console.print(f"{out / 'report.html'} shows the run; {summary.get('wall_s', float('nan')):.0f} s")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, Sighting, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, PoseMeasurement, Track, Verdict
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.estimators.latest import LatestEstimator
 from armsight.loop.estimators.mounting import Mounting
@@ -19,8 +19,8 @@ __all__ = [
     "LatestEstimator",
     "Learned",
     "Mounting",
+    "PoseMeasurement",
     "Prior",
-    "Sighting",
     "Track",
     "Verdict",
 ]

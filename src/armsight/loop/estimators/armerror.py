@@ -26,7 +26,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.robot.kinematics.chain import Frame, after, after_link, after_turn, first_frame
+from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame
 from armsight.robot.kinematics.trig import sincos
 
 #: Harmonics of a potentiometer's linearity: an eccentric wiper has one turn's, its bow another.
@@ -139,7 +139,7 @@ def _loads(table: Array, q: Array, g: Array) -> None:
     for i in range(6):
         axes[i] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
-        F = after_link(table, i, after_turn(table, i, c, s, F))
+        F = after_link(table, i, after_rotation(table, i, c, s, F))
     F = after(table, 48, F)
     axes[6] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
     x = y = 0.0
@@ -202,7 +202,7 @@ def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Arra
         for k in range(LINEARITY, POSE):
             angle += B[i, k] * x[k]
         s, c = sincos(table[6 * i + 5] * angle + table[6 * i + 4])
-        F = after(motions, 12 * (i + 1), after_link(table, i, after_turn(table, i, c, s, F)))
+        F = after(motions, 12 * (i + 1), after_link(table, i, after_rotation(table, i, c, s, F)))
         frames.append(F)
     F = after(table, 48, F)
     for row in range(6):

@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.chain import after_link, after_turn, first_frame
+from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame
 from armsight.robot.kinematics.trig import sincos
 
 GRAVITY_M_S2 = 9.81
@@ -105,7 +105,7 @@ def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd:
         bz += zz * qdd[i] + qd[i] * (wx * zy - wy * zx)
         wx, wy, wz = wx + zx * qd[i], wy + zy * qd[i], wz + zz * qd[i]
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
-        F = after_turn(table, i, c, s, F)
+        F = after_rotation(table, i, c, s, F)
         while n < len(points) and points[n, 0] == i:
             mass, x, y, z = points[n, 1], points[n, 2], points[n, 3], points[n, 4]
             px = F[9] + F[0] * x + F[3] * y + F[6] * z

@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, COMPLIANCE, FLOAT, POSE, READING, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.estimator import Sighting
+from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.arm import Arm
 
@@ -33,17 +33,17 @@ _LEAST = 1e-9  # of a share
 
 
 class State(NamedTuple):
-    """The filter right after a sighting, or before the first.
+    """The filter right after a pose_measurement, or before the first.
 
     ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
-    readings smoothed them then, N = 1; ``sighting``: what went in last.
+    readings smoothed them then, N = 1; ``pose_measurement``: what went in last.
     """
 
     t_s: float
     x: Array
     P: Array
     joints: Smoothed
-    sighting: Sighting | None
+    pose_measurement: PoseMeasurement | None
 
 
 class Step(NamedTuple):
@@ -242,10 +242,10 @@ def chi_square(S: Array, z: Array) -> float:
     return total
 
 
-def shared(sighting: Sighting | None, Ts: Array) -> Array:
+def shared(pose_measurement: PoseMeasurement | None, Ts: Array) -> Array:
     """Return what all sightings share, (N, 6, 6), seen in the axes of poses (N, 4, 4)."""
-    if sighting is None:
+    if pose_measurement is None:
         return np.zeros((len(Ts), 6, 6))
     turn = np.zeros((len(Ts), 6, 6))
-    turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ sighting.T_base_tool[:3, :3]
-    return np.asarray(turn @ sighting.cov_common @ np.swapaxes(turn, 1, 2))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ pose_measurement.T_base_tool[:3, :3]
+    return np.asarray(turn @ pose_measurement.cov_common @ np.swapaxes(turn, 1, 2))

@@ -17,7 +17,7 @@ from armsight.data import Array, JointStates, Record
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting(Record):
+class PoseMeasurement(Record):
     """Where vision saw the tool.
 
     Attributes:
@@ -66,7 +66,7 @@ class Track(Record):
         t_s: (N,) times, s.
         Ts_base_tool: (N, 4, 4) poses of the tool, m.
         covs: (N, 6, 6) their covariance, all in.
-        covs_own: (N, 6, 6) the same without what all sightings share (``Sighting.cov_common``).
+        covs_own: (N, 6, 6) the same without what all sightings share (``PoseMeasurement.cov_common``).
         q: (N, 6) potentiometers, smoothed, rad.
         qd: (N, 6) their speeds, rad/s.
         vision_age_s: (N,) time since the newest sighting used, s; infinite before the first.
@@ -105,7 +105,7 @@ class ArmEstimate(Record):
         t_s: when, s.
         T_base_tool: (4, 4) pose of the tool, m.
         cov: (6, 6) its covariance, all in.
-        cov_own: (6, 6) the same without what all sightings share (``Sighting.cov_common``).
+        cov_own: (6, 6) the same without what all sightings share (``PoseMeasurement.cov_common``).
         q: (6,) potentiometers, smoothed, rad.
         qd: (6,) their speeds, rad/s.
         vision_age_s: time since the newest sighting used, s; infinite before the first.
@@ -148,7 +148,7 @@ class Estimator(Protocol):
         """Take readings of the potentiometers, in order of time."""
         ...
 
-    def vision(self, sighting: Sighting) -> Verdict:
+    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
         """Take what vision saw, in any order; returns what became of it."""
         ...
 

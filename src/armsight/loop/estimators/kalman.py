@@ -19,7 +19,7 @@ from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
 from armsight.loop.estimators.errormodel import LEARNING, NOISE, OPENED, ErrorModel, State, Step, chi_square, symmetric
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Sighting, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, PoseMeasurement, Track, Verdict
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Stretch, anew, blended, by_state, stretches
 from armsight.robot.arm import Arm
@@ -62,7 +62,7 @@ class KalmanEstimator:
         none, ones = np.zeros((1, 6)), np.ones((1, 6))
         nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, 6)), none, np.zeros((1, 2, 6)))
         self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
-        self._waiting: list[Sighting] = []
+        self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
         self._told = True  # whether the readings know how wide the backlash is, as far as that is known
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -83,30 +83,36 @@ class KalmanEstimator:
         self._readings.add(states)
         if self._waiting:
             waiting, self._waiting = self._waiting, []
-            for sighting in waiting:
-                self.vision(sighting)
+            for pose_measurement in waiting:
+                self.vision(pose_measurement)
 
-    def vision(self, sighting: Sighting) -> Verdict:
+    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
         """Take what vision saw, in any order; returns what became of it."""
         self._newest = self._here = None
         oldest, newest = self.span_s
         place = len(self._states)
-        while place > 1 and self._after(self._states[place - 1], sighting):
+        while place > 1 and self._after(self._states[place - 1], pose_measurement):
             place -= 1
         before = self._states[place - 1]
-        seen_s = self._seen_s(sighting, before)
+        seen_s = self._seen_s(pose_measurement, before)
         if seen_s > newest:
-            self._waiting = [*self._waiting, sighting][-MOST_WAITING:]
+            self._waiting = [*self._waiting, pose_measurement][-MOST_WAITING:]
             return Verdict.WAITING
-        if seen_s < oldest or (place == 1 and before.sighting is not None and self._after(before, sighting)):
+        if seen_s < oldest or (
+            place == 1 and before.pose_measurement is not None and self._after(before, pose_measurement)
+        ):
             return Verdict.TOO_LATE
         later = self._states[place:]
-        after, verdict = self._take(before, sighting)
+        after, verdict = self._take(before, pose_measurement)
         if after is None:
             return verdict
         self._states[place:] = [after]
         for state in later:
-            again, _ = self._take(self._states[-1], state.sighting) if state.sighting is not None else (None, verdict)
+            again, _ = (
+                self._take(self._states[-1], state.pose_measurement)
+                if state.pose_measurement is not None
+                else (None, verdict)
+            )
             if again is not None:
                 self._states.append(again)
         self._told = False
@@ -191,43 +197,43 @@ class KalmanEstimator:
         return np.asarray(known * (WIDTHS @ state.x) + (1 - known) * GAP_RAD)
 
     @staticmethod
-    def _after(state: State, sighting: Sighting) -> bool:
+    def _after(state: State, pose_measurement: PoseMeasurement) -> bool:
         """Say whether a state has seen what is newer than a sighting."""
-        return state.sighting is not None and state.sighting.t_s > sighting.t_s
+        return state.pose_measurement is not None and state.pose_measurement.t_s > pose_measurement.t_s
 
-    def _seen_s(self, sighting: Sighting, state: State) -> float:
+    def _seen_s(self, pose_measurement: PoseMeasurement, state: State) -> float:
         """Return when a sighting was, by the delay as a state knows it, s."""
-        return sighting.t_s - self._delay.delay_s - float(state.x[DELAY])
+        return pose_measurement.t_s - self._delay.delay_s - float(state.x[DELAY])
 
-    def _take(self, before: State, sighting: Sighting) -> tuple[State | None, Verdict]:
+    def _take(self, before: State, pose_measurement: PoseMeasurement) -> tuple[State | None, Verdict]:
         """Return the state after a sighting, None where it is an outlier."""
-        t_s = max(self._seen_s(sighting, before), before.t_s)
+        t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         x, P = before.x * step.kept[0], before.P.copy()
         P[FORGETS] *= step.kept[0, FORGETS, None]
         P[:, FORGETS] *= step.kept[0, FORGETS]
         P[DIAGONAL] += step.added[0]
-        z, H, R = first = self._innovation(x, joints, sighting)
+        z, H, R = first = self._innovation(x, joints, pose_measurement)
         PHt = P @ H.T
-        verdict = self._judge(z, H @ PHt + R + sighting.cov_common)
+        verdict = self._judge(z, H @ PHt + R + pose_measurement.cov_common)
         if verdict is Verdict.OUTLIER:
             return None, verdict
         if verdict is Verdict.REOPENED:
             P[DIAGONAL] += OPENED
             PHt = P @ H.T
-        x, P = self._update(x, P, joints, sighting, first, PHt)
-        return State(t_s, x, P, joints, sighting), verdict
+        x, P = self._update(x, P, joints, pose_measurement, first, PHt)
+        return State(t_s, x, P, joints, pose_measurement), verdict
 
-    def _innovation(self, x: Array, joints: Smoothed, sighting: Sighting) -> tuple[Array, Array, Array]:
+    def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
         """Return how far a sighting is from the model (6,), its derivative (6, SIZE) by x, and the noise (6, 6)."""
         Ts, Hs = self._model.poses(x[None], joints.q, joints.unseen)
         H = Hs[0]
         velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
         H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
-        R = sighting.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
+        R = pose_measurement.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
         z = np.empty(6)
-        armerror.tangent(Ts[0], sighting.T_base_tool, z)
+        armerror.tangent(Ts[0], pose_measurement.T_base_tool, z)
         return z, H, R
 
     def _update(
@@ -235,7 +241,7 @@ class KalmanEstimator:
         x: Array,
         P: Array,
         joints: Smoothed,
-        sighting: Sighting,
+        pose_measurement: PoseMeasurement,
         first: tuple[Array, Array, Array],
         PHt: Array,
     ) -> tuple[Array, Array]:
@@ -257,7 +263,7 @@ class KalmanEstimator:
             last, change = change, K @ z
             if left == 1 or np.abs(change - last).max() < SETTLED:
                 break
-            z, H, R = self._innovation(x + change, joints, sighting)
+            z, H, R = self._innovation(x + change, joints, pose_measurement)
             # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
             z += H[:, :DELAY] @ change[:DELAY]
             PHt = P @ H.T

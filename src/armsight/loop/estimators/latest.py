@@ -7,7 +7,7 @@ import numpy as np
 from armsight.data import Array, JointStates
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Sighting, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, PoseMeasurement, Track, Verdict
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.robot.arm import Arm
 
@@ -24,21 +24,21 @@ class LatestEstimator:
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
         self._arm, self._delay = arm, delay
         self._alone = KalmanEstimator(arm, prior=prior, delay=delay)  # never sees anything: potentiometers alone
-        self._newest: Sighting | None = None
+        self._newest: PoseMeasurement | None = None
         self._offset = np.eye(4)
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
         self._alone.joints(states)
 
-    def vision(self, sighting: Sighting) -> Verdict:
+    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
         """Take what vision saw; older than the newest, it is not used."""
-        if self._newest is not None and sighting.t_s <= self._newest.t_s:
+        if self._newest is not None and pose_measurement.t_s <= self._newest.t_s:
             return Verdict.TOO_LATE
-        seen_s = float(np.clip(sighting.t_s - self._delay.delay_s, *self._alone.span_s))
+        seen_s = float(np.clip(pose_measurement.t_s - self._delay.delay_s, *self._alone.span_s))
         at = self._alone.estimate(seen_s)
-        self._newest = sighting
-        self._offset = inverse(self._arm.forward(at.q)) @ sighting.T_base_tool
+        self._newest = pose_measurement
+        self._offset = inverse(self._arm.forward(at.q)) @ pose_measurement.T_base_tool
         return Verdict.USED
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:

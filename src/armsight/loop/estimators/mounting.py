@@ -11,7 +11,7 @@ from armsight.data import Array, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
-from armsight.loop.estimators.estimator import Sighting
+from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.handeye.handeye import HandEye, adjoint
 from armsight.robot.arm import Arm
 
@@ -47,7 +47,7 @@ class Mounting(Record):
         """Return T_left_body (4, 4) with the tool at a pose (4, 4), m."""
         return np.asarray(inverse(self.T_base_rig) @ T_base_tool @ self.T_tool_body)
 
-    def sighting(self, pose: PoseEstimate, t_s: float) -> Sighting:
+    def pose_measurement(self, pose: PoseEstimate, t_s: float) -> PoseMeasurement:
         """Carry what vision measured over to the tool.
 
         T_base_tool = T_base_rig T_rig_body T_tool_body^-1; with right tangents z of the first, b of the second and x of
@@ -67,7 +67,7 @@ class Mounting(Record):
         if self.cov.any():
             by_mounting = np.concatenate([adjoint(inverse(T_rig_body)), -np.eye(6)], axis=1)
             common = by_mounting @ self.cov @ by_mounting.T + common
-        return Sighting(
+        return PoseMeasurement(
             t_s,
             self.T_base_rig @ T_rig_body @ self._T_body_tool,
             to_tool @ pose.cov_noise @ to_tool.T,

@@ -44,7 +44,7 @@ def stretches(states: list[State], t_s: Array) -> list[Stretch]:
         states: the filter's, oldest first.
         t_s: the times, s.
     """
-    ends = [state for state in states if state.sighting is not None]
+    ends = [state for state in states if state.pose_measurement is not None]
     at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Stretch]()
     for k in np.unique(at).tolist():
         inner = 0 < k < len(ends)
@@ -95,7 +95,7 @@ def by_state(model: ErrorModel, state: State, t_s: Array, joints: Smoothed, step
     """Return where the tool is at times (N,), s, by one state, a step on."""
     Ts, Hs = model.poses(state.x * step.kept, joints.q, joints.unseen)
     own, age = model.covariances(state, step, Hs), t_s - state.t_s
-    return Track(t_s, Ts, own + shared(state.sighting, Ts), own, joints.q, joints.qd, age)
+    return Track(t_s, Ts, own + shared(state.pose_measurement, Ts), own, joints.q, joints.qd, age)
 
 
 def _alone(model: ErrorModel, readings: Readings, part: Stretch) -> Track:
@@ -133,7 +133,7 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Tra
         H = Hs[some].reshape(-1, SIZE)
         first, last = ((H @ P).reshape(-1, 6, SIZE) for P in (before.P[k], after.P[k]))
         own[some] = (first + share[some, None, None] * (last - first)) @ turned[some]
-        common[some] = shared(None if part.after is None else part.after.sighting, Ts[some])
+        common[some] = shared(None if part.after is None else part.after.pose_measurement, Ts[some])
     own += (Hs * bridge[:, None, :]) @ turned
     return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - before.t_s[rows])
 

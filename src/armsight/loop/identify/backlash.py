@@ -1,6 +1,6 @@
 """How much play each joint has, put together from all that shows it, or why these poses do not show it.
 
-Play shows where a joint comes to rest on both of its sides. Friction leaves a joint without weight on the side it came
+JointBacklash shows where a joint comes to rest on both of its sides. Friction leaves a joint without weight on the side it came
 from (``backlash``), at its stop or a little short of it; weight lays a joint on the side it pulls to (``slack``),
 whichever way it came; a joint that neither holds lies anywhere between its stops, and its play is read from how far apart
 it was found. A joint that weight holds on one side at all poses shows none: its play is a part of its zero.
@@ -29,7 +29,7 @@ BOTH_SIDES = 0.02
 SURE = 3.0
 
 
-class Play(NamedTuple):
+class JointBacklash(NamedTuple):
     """The play of a joint, stop to stop.
 
     Attributes:
@@ -45,7 +45,7 @@ class Play(NamedTuple):
     how: str
 
 
-def plays(found: Identified, measured: Measured) -> tuple[Play, ...]:
+def plays(found: Identified, measured: Measured) -> tuple[JointBacklash, ...]:
     """Return the play of every joint.
 
     Args:
@@ -62,14 +62,14 @@ def plays(found: Identified, measured: Measured) -> tuple[Play, ...]:
     for i in range(6):
         columns = [k for k, f in enumerate(model.features) if f.joint == i and f.kind in ("backlash", "slack")]
         carries = bool(phi[:, [k for k in columns if model.features[k].kind == "slack"]].any())
-        fitted = float(np.abs(x[[model.causes_at + k for k in columns]]).max(initial=0.0))
+        fitted = float(np.abs(x[[model.sources_at + k for k in columns]]).max(initial=0.0))
         chance = float(found.joint_sigma_rad[i])
         known = np.inf if off is None else LOOSE * float(np.median(off.sigma_off_rad[:, i]))
         if off is not None and not carries and chance > max(known, LOOSE_SHARE * fitted):
             # What was expected of it is taken back out of where it was found (Kalman's gain), and its own noise stays.
             left = off.sigma_off_rad[:, i] ** 2
             gain = 1 - left / chance**2
-            side = phi[:, columns] @ x[[model.causes_at + k for k in columns]]
+            side = phi[:, columns] @ x[[model.sources_at + k for k in columns]]
             noise = left / gain + _by_parameters(found, weighed, i)
             out.append(_between_stops(i, off.off_rad[:, i] / gain + side, np.sqrt(noise)))
         else:
@@ -87,7 +87,7 @@ def _come_from(joint: int, found: Identified, measured: Measured) -> tuple[int, 
     return int((side > 0).sum()), int((side < 0).sum())
 
 
-def _to_the_stops(play: Play, chance: float, told: float, sides: tuple[int, int]) -> Play:
+def _to_the_stops(play: JointBacklash, chance: float, told: float, sides: tuple[int, int]) -> JointBacklash:
     """Widen the play of a joint that friction holds near its stops, by how far short of them it was found.
 
     Where a link came to rest scatters, as the shaft goes back a little when it stops and leaves the link behind. A link is
@@ -122,7 +122,7 @@ def _by_parameters(found: Identified, weighed: Measured, joint: int) -> Array:
     return np.asarray(np.einsum("np,pq,nq->n", row, found.solution.cov, row))
 
 
-def _between_stops(joint: int, stood: Array, noise: Array) -> Play:
+def _between_stops(joint: int, stood: Array, noise: Array) -> JointBacklash:
     """Read the play of a joint that lies at its stops or anywhere between, by the greatest likelihood.
 
     Args:
@@ -154,22 +154,22 @@ def _between_stops(joint: int, stood: Array, noise: Array) -> Play:
     around = [beside(-step), beside(step)]
     curve = max((sum(around) - 2 * best.fun) / step**2, 1e-3)
     told = "how far apart it was found, as nothing holds it on one side"
-    return Play(joint, 2 * half, 2 * half / float(np.sqrt(curve)), told)
+    return JointBacklash(joint, 2 * half, 2 * half / float(np.sqrt(curve)), told)
 
 
-def _fitted(found: Identified, joint: int, columns: list[int], phi: Array) -> Play:
+def _fitted(found: Identified, joint: int, columns: list[int], phi: Array) -> JointBacklash:
     """Read the play from what was fitted, or say why it was not."""
     model, x = found.model, found.solution.x
     at = {model.features[k].kind: k for k in columns}
-    fitted = {kind: k for kind, k in at.items() if found.solution.free[model.causes_at + k]}
-    rows = np.array([model.causes_at + k for k in fitted.values()], np.int64)
+    fitted = {kind: k for kind, k in at.items() if found.solution.free[model.sources_at + k]}
+    rows = np.array([model.sources_at + k for k in fitted.values()], np.int64)
     value = float(np.sum(x[rows]))
     # Play is not negative, and what chance makes of none is none.
     if value > SURE * float(np.sqrt(found.cov[np.ix_(rows, rows)].sum())):
         how = " and ".join(
             {"backlash": "the side it came from", "slack": "the side weight pulls to"}[kind] for kind in fitted
         )
-        return Play(joint, value, float(np.sqrt(found.cov[np.ix_(rows, rows)].sum())), how)
+        return JointBacklash(joint, value, float(np.sqrt(found.cov[np.ix_(rows, rows)].sum())), how)
     side = phi[:, at["slack"]]
     if np.abs(side).max(initial=0.0) > 0 and min(np.mean(side > 0), np.mean(side < 0)) < BOTH_SIDES:
         how = "cannot be told: at all these poses weight holds it on one side, and its play is a part of its zero"
@@ -177,4 +177,4 @@ def _fitted(found: Identified, joint: int, columns: list[int], phi: Array) -> Pl
         how = "cannot be told: from which side it came is not known"
     else:
         how = found.reasons.get(f"slack{joint + 1}", found.reasons.get(f"backlash{joint + 1}", "does not show"))
-    return Play(joint, float("nan"), float("nan"), how)
+    return JointBacklash(joint, float("nan"), float("nan"), how)

@@ -21,7 +21,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import PLENTY, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import placed
-from armsight.loop.identify.selection import PLACEMENT, TOGETHER, Step, grown, scaled_prior
+from armsight.loop.identify.selection import PLACEMENT, TOGETHER, Step, forward_selection, scaled_prior
 from armsight.robot.arm import Arm
 
 #: Fewest poses: what places base and tool, with some to spare.
@@ -162,7 +162,7 @@ def _identified(
     candidates = tellable.free | (tellable.possible & _of(model, TOGETHER))
     few = len(part) * part.size < PLENTY * len(model.parameters)
     together = _of(model, TOGETHER) & few
-    growth = grown(model, whole, part, candidates if few else tellable.free, prior, together, progress)
+    growth = forward_selection(model, whole, part, candidates if few else tellable.free, prior, together, progress)
     x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
     progress("the fit")
     solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)

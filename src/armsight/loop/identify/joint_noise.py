@@ -97,14 +97,14 @@ def _of_sides(model: Model, x: Array, phi: Array) -> Array:
     out = np.zeros((len(phi), 6))
     for k, f in enumerate(model.features):
         if f.kind == "slack":
-            half = 0.5 * x[model.causes_at + k]
+            half = 0.5 * x[model.sources_at + k]
             out[:, f.joint] = half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
     return out
 
 
 def by_joints(model: Model, J: Array) -> Array:
     """Return the derivative (N, M, 6) by the joints' angles, out of that by all parameters."""
-    return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.causes_at : len(chain.COLUMNS)])
+    return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.sources_at : len(chain.COLUMNS)])
 
 
 def _expected(e: Array, B: Array, variance: Array, measured: Measured) -> tuple[Array, Array]:

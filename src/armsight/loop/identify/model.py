@@ -314,19 +314,19 @@ class Model(Record):
         return len(BASE) + 3 * self.points + 3 * self.full
 
     @property
-    def causes_at(self) -> int:
+    def sources_at(self) -> int:
         """Where the features' coefficients begin."""
         return self.table_at + 30
 
     def nominal(self) -> Array:
         """Return the vector of the nominal arm, its base at the rig and its tool at frame 6."""
         x = np.zeros(len(self.parameters))
-        x[self.table_at : self.causes_at] = nominal_table(self.arm).ravel()
+        x[self.table_at : self.sources_at] = nominal_table(self.arm).ravel()
         return x
 
     def table(self, x: Array) -> Array:
         """Return the table (6, 5) of a vector, by ``COLUMNS``."""
-        return x[self.table_at : self.causes_at].reshape(6, 5)
+        return x[self.table_at : self.sources_at].reshape(6, 5)
 
     def T_rig_base(self, x: Array) -> Array:
         """Return the base (4, 4) in the rig."""
@@ -358,8 +358,8 @@ class Model(Record):
         """Return what the joints turn beside their offsets (N, 6), rad; ``phi`` of :meth:`feature_values`."""
         out = self.arm.direction * q
         for k, f in enumerate(self.features):
-            if x[self.causes_at + k] != 0.0:
-                out[:, f.joint] += self.arm.direction[f.joint] * x[self.causes_at + k] * phi[:, k]
+            if x[self.sources_at + k] != 0.0:
+                out[:, f.joint] += self.arm.direction[f.joint] * x[self.sources_at + k] * phi[:, k]
         return np.asarray(out)
 
     def motion(self, x: Array, q: Array, phi: Array) -> Motion:
@@ -394,10 +394,10 @@ class Model(Record):
             J[:, rows, 3:6] = -skew(p - x[:3]) @ _left_jacobian(x[3:6])
             J[:, rows, self.tool_at + 3 * k : self.tool_at + 3 * k + 3] = m.R
             table = point_derivative(m, p)
-            J[:, rows, at : self.causes_at] = table.reshape(30, n, 3).transpose(1, 2, 0)
+            J[:, rows, at : self.sources_at] = table.reshape(30, n, 3).transpose(1, 2, 0)
             if self.features:
                 moved = table[ways, OFFSET] * (by_theta[:, None] * phi.T)[..., None]
-                J[:, rows, self.causes_at :] = moved.transpose(1, 2, 0)
+                J[:, rows, self.sources_at :] = moved.transpose(1, 2, 0)
         if measured.R_rig_body is not None:
             self._turn_rows(m, x, measured, phi, e, J)
         return e, J
@@ -412,10 +412,10 @@ class Model(Record):
         turn = turn_derivative(m)
         W = np.zeros((n, 3, J.shape[2]))
         W[:, :, 3:6] = _left_jacobian(x[3:6])
-        W[:, :, at : self.causes_at] = turn.reshape(30, n, 3).transpose(1, 2, 0)
+        W[:, :, at : self.sources_at] = turn.reshape(30, n, 3).transpose(1, 2, 0)
         if self.features:
             way = self.arm.direction[[f.joint for f in self.features]]
-            W[:, :, self.causes_at :] = (turn[ways, OFFSET] * (way[:, None] * phi.T)[..., None]).transpose(1, 2, 0)
+            W[:, :, self.sources_at :] = (turn[ways, OFFSET] * (way[:, None] * phi.T)[..., None]).transpose(1, 2, 0)
         J[:, 3:] = to_log @ W
         J[:, 3:, at - 3 : at] = (to_log @ R_hat) @ _left_jacobian(-x[at - 3 : at])
 

@@ -32,8 +32,8 @@ PROBES = 300
 #: Poses looked at; more change nothing.
 MOST_POSES = 3000
 #: Kinds that belong to no row of the table.
-CAUSES = ("gain", "wave", "ripple", "backlash", "slack", "sag")
-_ORDER = ("base", "tool", "offset", "a", "alpha", "d", "beta", *CAUSES)
+ERROR_SOURCES = ("gain", "wave", "ripple", "backlash", "slack", "sag")
+_ORDER = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURCES)
 
 
 class Observed(NamedTuple):
@@ -76,7 +76,7 @@ def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tu
     free = np.zeros(len(x), bool)
     free[kept] = True
     possible = free.copy()
-    possible[[*weak, *(k for k in ties if model.parameters[k].kind in CAUSES)]] = True
+    possible[[*weak, *(k for k in ties if model.parameters[k].kind in ERROR_SOURCES)]] = True
     return Observed(free, possible, reasons, np.asarray(np.linalg.svd(T[:, free], compute_uv=False)))
 
 

@@ -133,7 +133,7 @@ class Step(NamedTuple):
     rms: float
 
 
-class Growth(NamedTuple):
+class Selection(NamedTuple):
     """What pays.
 
     Attributes:
@@ -185,7 +185,7 @@ def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
     return np.asarray((np.random.default_rng(1).permutation(len(found)) % folds)[labels])
 
 
-def grown(
+def forward_selection(
     model: Model,
     start: Solution,
     measured: Measured,
@@ -193,7 +193,7 @@ def grown(
     prior: Array,
     together: Mask,
     progress: Callable[[str], None] = lambda line: None,
-) -> Growth:
+) -> Selection:
     """Grow the model from base and tool alone.
 
     Args:
@@ -224,7 +224,7 @@ def grown(
     if together.any():
         kept = _together(model, folds, groups, kept, steps)
     kept, given_back = _pruned(model, folds, kept, together, steps)
-    return Growth(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
+    return Selection(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
 
 
 def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[Step]) -> Mask:

@@ -18,7 +18,7 @@ LIMITS = {"q_min": "rad", "q_max": "rad", "qd_max": "rad_s", "qdd_max": "rad_s2"
 def table_text(found: Identified) -> str:
     """Return the corrected arm as TOML, m and rad; every value with its sigma."""
     model, x = found.model, found.solution.x
-    table, sigma = model.table(x), np.sqrt(np.diag(found.cov))[model.table_at : model.causes_at].reshape(6, 5)
+    table, sigma = model.table(x), np.sqrt(np.diag(found.cov))[model.table_at : model.sources_at].reshape(6, 5)
     lines = [
         f"name = {json.dumps(model.arm.name)}",
         f"convention = {json.dumps(model.arm.convention)}",
@@ -37,7 +37,7 @@ def table_text(found: Identified) -> str:
         for key, unit in LIMITS.items():
             lines.append(f"{key}_{unit} = {float(getattr(model.arm, key)[i])!r}")
     for k, feature in enumerate(model.features):
-        at = model.causes_at + k
+        at = model.sources_at + k
         if found.solution.free[at]:
             lines += ["", "[[cause]]", f"name = {json.dumps(feature.name)}", f"kind = {json.dumps(feature.kind)}"]
             lines += [f"joint = {feature.joint + 1}", f"unit = {json.dumps(feature.unit)}"]

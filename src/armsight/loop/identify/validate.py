@@ -55,13 +55,13 @@ class Validation(NamedTuple):
     Attributes:
         nominal: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's.
         identified: errors of the identified arm.
-        placed_anew: whether base and tool were fitted to these very poses.
+        placement_refitted: whether base and tool were fitted to these very poses.
         residual_over_predicted: RMS residual over the predicted sigma; 1 where the sigmas are honest.
     """
 
     nominal: Errors
     identified: Errors
-    placed_anew: bool
+    placement_refitted: bool
     residual_over_predicted: float
 
 
@@ -92,14 +92,14 @@ def validate(found: Identified, measured: Measured) -> Validation:
     kept_m = float(np.median(kept[1].position_m))
     if len(measured) < LEAST or kept_m < OTHER_M:
         return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
-    new_model, nominal, x = placed_anew(found, measured)
+    new_model, nominal, x = placement_refitted(found, measured)
     new = [errors(new_model, nominal, measured), errors(new_model, x, measured)]
     if kept_m < OTHER * float(np.median(new[1].position_m)):
         return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
     return Validation(new[0], new[1], True, _over(new_model, found, x, measured))
 
 
-def placed_anew(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
+def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
     """Return the model, the nominal and the identified vector with base and tool fitted to other poses."""
     model, start = placed(found.model, measured)
     place = np.array([p.kind in PLACEMENT for p in model.parameters])

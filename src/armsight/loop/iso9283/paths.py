@@ -25,7 +25,7 @@ _BIN_DEG = 4.0
 _TRIALS = 200
 
 
-class PathFigures(NamedTuple):
+class PathMetrics(NamedTuple):
     """A path followed several times.
 
     Attributes:
@@ -39,7 +39,7 @@ class PathFigures(NamedTuple):
     off: Array
 
 
-def path_figures(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathFigures:
+def path_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathMetrics:
     """Judge a path (8.2, 8.3).
 
     Args:
@@ -63,7 +63,7 @@ def path_figures(attained: Array, command: Array, cov: Array, common: Array | No
     limits = _limits(seen - middle)
     worst = int(np.argmax(limits))
     RT = repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst])
-    return PathFigures(
+    return PathMetrics(
         beyond_noise(lengths, middle, errors),
         _picked(RT, _chosen(seen - middle, rng)),
         np.linalg.norm(middle, axis=1),
@@ -109,7 +109,7 @@ def _picked(figure: Figure, factor: float) -> Figure:
     return replace(figure, clean=clean, low=low)
 
 
-class CircleFigures(NamedTuple):
+class CircleMetrics(NamedTuple):
     """A circle run both ways.
 
     Attributes:
@@ -135,9 +135,9 @@ class CircleFigures(NamedTuple):
     radii_m: Array
 
 
-def circle_figures(
+def circle_metrics(
     ccw: Array, cw: Array, axes: Array, cov: Array | None = None, turns: Sequence[tuple[float, float]] = ()
-) -> CircleFigures:
+) -> CircleMetrics:
     """Judge a circle, and read play off where an axis turns back.
 
     Where the path crosses an axis of the circle, the motion along that axis turns back: it lagged by half the play before,
@@ -176,7 +176,7 @@ def circle_figures(
     seen = np.array([[_place_to_place(angle, r)] for angle, r in ways])
     sigma = np.sqrt(np.maximum(seen, known) / counts)
     errors = sigma * np.random.default_rng(0).normal(size=(DRAWS, *sigma.shape))
-    return CircleFigures(
+    return CircleMetrics(
         axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0),
         radius,
         _widest(lambda r: np.asarray(np.ptp(r, axis=-1).max(axis=-1)), radii, errors),
@@ -233,7 +233,7 @@ def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
 def _play(steps: Array, variances: Array) -> Figure:
     """Return the mean of jumps (1, k) of variances (1, k) with its interval; negative where the radius falls.
 
-    Play cannot make it fall: its interval has a sign, and can reach below 0.
+    JointBacklash cannot make it fall: its interval has a sign, and can reach below 0.
 
     Where the jumps differ by more than their sigmas allow, the interval is that of their own scatter (Birge, Phys. Rev. 40,
     1932): then something else than the play of that axis is at work, on arms of turning joints the usual case.

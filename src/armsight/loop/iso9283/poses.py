@@ -24,27 +24,27 @@ _U = np.linspace(-28.0, 28.0, 113)
 
 
 @dataclass(frozen=True, eq=False)
-class PoseFigures(Record):
+class PoseMetrics(Record):
     """Clause 7.2: one commanded pose.
 
     Attributes:
         count: how many attained poses.
         accuracy: AP of the place, m: distance of the attained poses' barycentre from the command.
         accuracy_xyz: (3,) its parts, m.
-        accuracy_turn: (3,) the turn from the command to the mean, rad, about the command's axes.
+        accuracy_rotation: (3,) the turn from the command to the mean, rad, about the command's axes.
         repeatability: RP of the place, m: mean distance from the barycentre plus three of its standard deviations.
-        repeatability_turn: (3,) RP of the turn about the command's axes, rad: three standard deviations.
+        repeatability_rotation: (3,) RP of the turn about the command's axes, rad: three standard deviations.
     """
 
     count: int
     accuracy: Figure
     accuracy_xyz: Array
-    accuracy_turn: Array
+    accuracy_rotation: Array
     repeatability: Figure
-    repeatability_turn: Array
+    repeatability_rotation: Array
 
 
-def pose_figures(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PoseFigures:
+def pose_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PoseMetrics:
     """Judge one commanded pose (7.2.1 and 7.2.2).
 
     Args:
@@ -67,7 +67,7 @@ def pose_figures(attained: Array, command: Array, cov: Array, common: Array | No
     errors = mean_errors(p[:, None], rng)
     if common is not None:
         errors = errors + drawn(common[None], rng)
-    return PoseFigures(
+    return PoseMetrics(
         n,
         beyond_noise(lengths, off[None], errors),
         off,
@@ -145,7 +145,7 @@ def _errors_of_means(groups: list[Array]) -> Array:
     return np.stack([mean_errors(p, rng) for p in groups], axis=1)
 
 
-def distance_figures(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Figure, Figure]:
+def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Figure, Figure]:
     """Return AD and RD (7.3): error of the mean distance between two poses, and three deviations of it.
 
     Args:

@@ -1,12 +1,10 @@
 """The host's end of a board: joint commands become messages, telemetry becomes records.
 
 In: :class:`~armsight.data.JointCommand`. Out: :class:`~armsight.data.JointStates` and what the board says of itself. The
-messages are ``firmware/wire/armsight.xml``'s. Commands are numbered; the board names the last one it obeyed and the last
-one it refused, so that the fate of each is known. Time passes only in :meth:`Board.receive` and in the methods that wait.
-
-A session with a board: the hello, the clock, and the newest of everything it said.
-
-Whatever goes wrong with the link is told together with what the board's arm does now by itself.
+messages are ``firmware/wire/armsight.xml``'s. Commands are numbered; the board names the last one it acknowledged and the
+last one it rejected, so that the host learns what became of each. Time passes only in :meth:`Board.connect`,
+:meth:`Board.receive` and the methods that wait. :class:`Session` has the hello, the clock and the newest of every report; an error of the link says
+what the arm does without a host.
 """
 
 from __future__ import annotations
@@ -14,6 +12,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Self
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import dialect
-from armsight.robot.boards.codes import REFUSAL_TEXTS, Order, Reaction, Refusal
+from armsight.robot.boards.codes import REJECTION_TEXTS, Command, Reaction, Rejection
 from armsight.robot.boards.configuration import (
     CONFIG,
     CONFIG_VERSION,
@@ -44,7 +44,7 @@ _WRAP = 1 << 32
 
 
 class Session:
-    """A board that answered.
+    """A conversation with a board; :meth:`open` begins it.
 
     Args:
         link: the wire to it.
@@ -54,10 +54,6 @@ class Session:
         welcome: who it is.
         status: its newest status.
         joints: its newest report of how the joints are driven.
-        angles: readings since they were last taken, (s, six angles).
-
-    Raises:
-        DeviceError: it does not answer, or is of another version.
     """
 
     welcome: Welcome
@@ -67,7 +63,7 @@ class Session:
     def __init__(self, link: Link, name: str) -> None:
         self.name = name
         self.wire = Wire(link)
-        self.angles: list[tuple[float, list[float]]] = []
+        self._angles: list[tuple[float, list[float]]] = []
         self.ticks_per_s = 1000
         self._tick = 0
         self._started = False
@@ -75,23 +71,34 @@ class Session:
         self._reaction = ""
         self._greeting: Message | None = None
         self._parts: dict[int, bytes] = {}
+
+    def open(self) -> None:
+        """Say hello and wait for the first telemetry.
+
+        Raises:
+            DeviceError: the board does not answer, or is of another version.
+        """
         self._hello()
         self._first_telemetry()
         self._reaction = self._ask_reaction()
 
-    def transmit(self, kind: str, *fields: object) -> None:
-        """Send a message."""
+    @contextmanager
+    def reached(self) -> Iterator[Wire]:
+        """Give the wire; an error of the link then says what the arm does without a host."""
         try:
-            self.wire.send(kind, *fields)
+            yield self.wire
         except DeviceError as error:
             raise DeviceError(f"{error}{self._reaction}") from None
 
+    def take_angles(self) -> list[tuple[float, list[float]]]:
+        """Return the readings since the last call: time, s, and six angles, rad, each."""
+        taken, self._angles = self._angles, []
+        return taken
+
     def pump(self, wait_s: float) -> None:
         """Let time pass and take what comes."""
-        try:
-            messages = self.wire.receive(wait_s)
-        except DeviceError as error:
-            raise DeviceError(f"{error}{self._reaction}") from None
+        with self.reached() as wire:
+            messages = wire.receive(wait_s)
         self._quiet_s = 0.0 if messages else self._quiet_s + wait_s
         for message in messages:
             try:
@@ -107,17 +114,18 @@ class Session:
         """Ask for the configuration in use from this byte on; returns as much of it as one message holds."""
         self._parts.clear()
         for _ in range(_HELLOS):
-            self.transmit("config_read", offset)
+            with self.reached() as wire:
+                wire.config_read(offset)
             for _ in range(_STEPS):
                 self.pump(STEP_S)
                 if offset in self._parts:
                     return self._parts[offset]
-        raise DeviceError(f"{self.name} does not tell its configuration")
+        raise DeviceError(f"{self.name} does not report its configuration")
 
     def _take(self, message: Message) -> None:
         kind = message.get_type()
         if kind == "ANGLES":
-            self.angles.append((self._time_s(message.tick), message.angle_rad))
+            self._angles.append((self._time_s(message.tick), message.angle_rad))
         elif kind == "JOINTS":
             self.joints = joints_of(message, self._time_s(message.tick))
         elif kind == "BOARD_STATUS":
@@ -128,10 +136,10 @@ class Session:
             self._parts[message.offset] = bytes(message.bytes[: message.length])
 
     def _take_status(self, status: BoardStatus) -> None:
-        """Keep a status; one that newly refuses us for want of a hello is of a board that forgot ours."""
-        if self._started and status.refusal == Refusal.NO_HELLO:
+        """Keep a status; one that newly rejects commands for want of a hello is of a board that has restarted."""
+        if self._started and status.rejection == Rejection.NO_HELLO:
             before = self.status
-            if (before.refused_count, before.refused_sequence) != (status.refused_count, status.refused_sequence):
+            if (before.rejected_count, before.rejected_sequence) != (status.rejected_count, status.rejected_sequence):
                 raise self._anew()
         self.status = status
 
@@ -149,7 +157,8 @@ class Session:
     def _hello(self) -> None:
         ours = dialect().ARMSIGHT_DIALECT_VERSION
         for nonce in range(1, _HELLOS + 1):
-            self.transmit("hello", ours, CONFIG_VERSION, nonce)
+            with self.reached() as wire:
+                wire.hello(ours, CONFIG_VERSION, nonce)
             for _ in range(_STEPS):
                 self.pump(STEP_S)
                 if self._greeting is not None:
@@ -177,7 +186,7 @@ class Session:
         for _ in range(_TELEMETRY_STEPS):
             self.pump(STEP_S)
             if hasattr(self, "status") and hasattr(self, "joints"):
-                self.angles.clear()
+                self._angles.clear()
                 self._started = True
                 return
         raise DeviceError(f"{self.name}: board {self.welcome.board} answers the hello, but sends no telemetry")
@@ -198,30 +207,40 @@ _PART = 200  # bytes of a CONFIG_PART
 
 
 class Board:
-    """A board behind a link; says hello and refuses boards of other versions.
+    """A board behind a link, connected by :meth:`connect`.
 
     Args:
-        link: the wire to it; closed with the board, also where this raises.
-        name: what errors call it, such as its port.
+        link: the wire to it; closed with the board.
+        session: the conversation over it, open.
 
     Attributes:
         welcome: who it is.
-
-    Raises:
-        DeviceError: it does not answer, or is of another version.
     """
 
-    def __init__(self, link: Link, *, name: str = "the board") -> None:
-        self._link = link
+    def __init__(self, link: Link, session: Session) -> None:
+        self._link, self._session = link, session
+        self.welcome: Welcome = session.welcome
+        # The board may remember commands of an earlier host: ours are newer than all of them.
+        self._sequence = max(session.status.acknowledged_sequence, session.status.rejected_sequence)
+
+    @classmethod
+    def connect(cls, link: Link, *, name: str = "the board") -> Self:
+        """Say hello to the board behind a link.
+
+        Args:
+            link: the wire to it; closed where this raises.
+            name: what errors call the board, such as its port.
+
+        Raises:
+            DeviceError: it does not answer, or is of another version.
+        """
+        session = Session(link, name)
         try:
-            self._session = Session(link, name)
+            session.open()
         except BaseException:
             link.close()
             raise
-        self.welcome: Welcome = self._session.welcome
-        # The board may remember commands of an earlier host: ours are newer than all of them.
-        status = self._session.status
-        self._sequence = max(status.obeyed_sequence, status.refused_sequence)
+        return cls(link, session)
 
     @property
     def status(self) -> BoardStatus:
@@ -239,7 +258,7 @@ class Board:
         return self._session.wire.broken + self._session.wire.lost
 
     def send(self, command: JointCommand) -> int:
-        """Send a motion command and return its number; whether it was obeyed, :attr:`status` tells.
+        """Send a motion command and return its number; whether it was acknowledged, :attr:`status` tells.
 
         Raises:
             InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks.
@@ -251,56 +270,64 @@ class Board:
                 f"duration_s is {command.duration_s}; a whole number of the board's ticks is needed,"
                 f" of 1/{self._session.ticks_per_s} s, {_LONGEST_TICKS} at most"
             )
-        fields = [_six(name, getattr(command, name)) for name in ("q_ref", "qd_ref", "gravity_duty")]
-        return self._numbered("move", round(ticks), *fields)
+        q_ref, qd_ref = _six("q_ref", command.q_ref), _six("qd_ref", command.qd_ref)
+        gravity_duty = _six("gravity_duty", command.gravity_duty)
+        with self._session.reached() as wire:
+            wire.move(self._next(), round(ticks), q_ref, qd_ref, gravity_duty)
+        return self._sequence
 
-    def order(self, order: Order) -> int:
-        """Send an order and return its number; :meth:`confirm` waits for its fate."""
-        return self._numbered("order", int(order))
+    def command(self, command: Command) -> int:
+        """Send a command and return its number; :meth:`confirm` waits for what became of it."""
+        with self._session.reached() as wire:
+            wire.command(self._next(), int(command))
+        return self._sequence
 
     def stop(self) -> None:
-        """Stop in an emergency: the drives go off until ``Order.CLEAR_STOP``."""
-        self._sequence = (self._sequence + 1) % _WRAP
+        """Stop in an emergency: the drives go off until ``Command.CLEAR_STOP``."""
+        sequence = self._next()
         for _ in range(_STOPS):
-            self._session.transmit("stop", self._sequence)
+            with self._session.reached() as wire:
+                wire.stop(sequence)
 
     def set_gains(self, gains: Array, *, checked: bool = True) -> int:
         """Send a gain set and return its number.
 
         Args:
             gains: (6, 6) a row per joint of kp, ki, kd, kv, derivative filter, anti-windup.
-            checked: False leaves it to the board alone to refuse what is out of range.
+            checked: False leaves it to the board alone to reject what is out of range.
 
         Raises:
             InputError: a gain is outside its range; nothing was sent.
         """
         values = check_gains(gains) if checked else np.asarray(gains, dtype=float)
-        return self._numbered("gains", values.ravel().tolist())
+        with self._session.reached() as wire:
+            wire.gains(self._next(), values.ravel().tolist())
+        return self._sequence
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
-        """Wait until the board obeyed the command of this number.
+        """Wait until the board acknowledged the command of this number.
 
         Raises:
-            DeviceError: it was refused (and why), or nothing was heard of it.
+            DeviceError: it was rejected (and why), or nothing was heard of it.
         """
         for _ in range(max(1, round(wait_s / STEP_S))):
             self._session.pump(STEP_S)
             status = self.status
-            if status.refused_sequence == sequence and status.refused_count:
-                raise DeviceError(f"{self._session.name} refused the command: {REFUSAL_TEXTS[status.refusal]}")
-            if status.obeyed_count and not _older(status.obeyed_sequence, sequence):
+            if status.rejected_sequence == sequence and status.rejected_count:
+                raise DeviceError(f"{self._session.name} rejected the command: {REJECTION_TEXTS[status.rejection]}")
+            if status.acknowledged_count and not _older(status.acknowledged_sequence, sequence):
                 return
         raise DeviceError(
-            f"{self._session.name} did not say within {wait_s:g} s whether it obeyed; it is {self.status.state.name}"
+            f"{self._session.name} did not say within {wait_s:g} s whether it acknowledged; it is {self.status.state.name}"
         )
 
     def enable(self, *, inward: bool = False) -> None:
         """Switch the drives on and wait until they are; ``inward`` where a joint is outside its soft limits.
 
         Raises:
-            DeviceError: it was refused, and why.
+            DeviceError: it was rejected, and why.
         """
-        self.confirm(self.order(Order.ENABLE_INWARD if inward else Order.ENABLE))
+        self.confirm(self.command(Command.ENABLE_INWARD if inward else Command.ENABLE))
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Let ``wait_s`` pass and return all readings of the potentiometers since the last call.
@@ -309,7 +336,7 @@ class Board:
             DeviceError: the board is gone or started anew; the message tells what its arm does.
         """
         self._session.pump(wait_s)
-        taken, self._session.angles = self._session.angles, []
+        taken = self._session.take_angles()
         t_s = np.array([t for t, _ in taken])
         return JointStates(t_s, np.array([q for _, q in taken], dtype=float).reshape(-1, JOINTS))
 
@@ -325,15 +352,18 @@ class Board:
 
         Raises:
             InputError: a value is outside its range; nothing was changed.
-            DeviceError: the board refused it.
+            DeviceError: the board rejected it.
         """
         check_configuration(config)
         data, session = config.tobytes(), self._session
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]
-            session.transmit("config_part", offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
+            with session.reached() as wire:
+                wire.config_part(offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
             session.pump(STEP_S)  # no faster than a slow wire and the board take it
-        self.confirm(self._numbered("config_store", zlib.crc32(data)), _STORE_S)
+        with session.reached() as wire:
+            wire.config_store(self._next(), zlib.crc32(data))
+        self.confirm(self._sequence, _STORE_S)
 
     def close(self) -> None:
         """Let go of the link; a driven arm then does what its board does without commands."""
@@ -345,9 +375,9 @@ class Board:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _numbered(self, kind: str, *fields: object) -> int:
+    def _next(self) -> int:
+        """Count a command on and return its number."""
         self._sequence = (self._sequence + 1) % _WRAP
-        self._session.transmit(kind, self._sequence, *fields)
         return self._sequence
 
 

@@ -1,4 +1,4 @@
-"""What a board's numbers mean: its states, faults, refusals and limits, as ``firmware/core/types.h`` lists them.
+"""What a board's numbers mean: its states, faults, rejections and limits, as ``firmware/core/types.h`` lists them.
 
 The texts are the firmware's own; a test reads the header and holds both together.
 """
@@ -39,8 +39,8 @@ class Fault(IntEnum):
     CONFIG = 14
 
 
-class Refusal(IntEnum):
-    """Why a command was not obeyed."""
+class Rejection(IntEnum):
+    """Why a command was not acknowledged."""
 
     NONE = 0
     NOT_FINITE = 1
@@ -66,7 +66,7 @@ class Limited(IntFlag):
     SPEED = 16
 
 
-class Order(IntEnum):
+class Command(IntEnum):
     """What a board can be told beside motion; the numbers are the wire's."""
 
     ENABLE = 2
@@ -115,19 +115,19 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.WATCHDOG: "restarted by the watchdog",
     Fault.CONFIG: "no valid configuration: factory values are in use",
 }
-REFUSAL_TEXTS: Mapping[Refusal, str] = {
-    Refusal.NONE: "obeyed",
-    Refusal.NOT_FINITE: "a number is NaN or infinite",
-    Refusal.OUT_OF_RANGE: "a number is outside its range",
-    Refusal.WRONG_STATE: "not in this state",
-    Refusal.OUTSIDE_LIMITS: "a joint is outside its soft limits: enable to move back in",
-    Refusal.POT_UNREAD: "a potentiometer is not read",
-    Refusal.FAULT_STANDS: "the cause of a fault still stands",
-    Refusal.STOP_PRESSED: "the emergency stop is still pressed",
-    Refusal.UNKNOWN_COMMAND: "unknown command",
-    Refusal.NO_HELLO: "no hello of the board's own version came: only STOP is obeyed",
-    Refusal.TOO_MANY: "too many commands at once",
-    Refusal.CONFIG_BROKEN: "the configuration came incomplete, or could not be stored",
+REJECTION_TEXTS: Mapping[Rejection, str] = {
+    Rejection.NONE: "acknowledged",
+    Rejection.NOT_FINITE: "a number is NaN or infinite",
+    Rejection.OUT_OF_RANGE: "a number is outside its range",
+    Rejection.WRONG_STATE: "not in this state",
+    Rejection.OUTSIDE_LIMITS: "a joint is outside its soft limits: enable to move back in",
+    Rejection.POT_UNREAD: "a potentiometer is not read",
+    Rejection.FAULT_STANDS: "the cause of a fault still stands",
+    Rejection.STOP_PRESSED: "the emergency stop is still pressed",
+    Rejection.UNKNOWN_COMMAND: "unknown command",
+    Rejection.NO_HELLO: "no hello of the board's own version came: only STOP is acknowledged",
+    Rejection.TOO_MANY: "too many commands at once",
+    Rejection.CONFIG_BROKEN: "the configuration came incomplete, or could not be stored",
 }
 
 

@@ -28,7 +28,7 @@ from armsight.robot.boards.frames import (
     VERSION,
     WIRE_BYTES,
 )
-from armsight.robot.boards.link import Machine, Plant
+from armsight.robot.boards.link import Emulator, Plant
 
 TICK_S = 0.001
 _BITS_PER_BYTE = 10
@@ -63,7 +63,7 @@ class EmulatedLink:
 
     def __init__(
         self,
-        machine: Machine,
+        machine: Emulator,
         plant: Plant,
         baud: int = 921600,
         faults: Faults | None = None,

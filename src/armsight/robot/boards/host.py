@@ -12,8 +12,8 @@ from armsight.errors import InputError
 from armsight.robot.boards.frames import ANSWER, REQUEST
 
 
-class HostMachine:
-    """The board's code in a shared library, behind :class:`~armsight.robot.boards.link.Machine`.
+class HostEmulator:
+    """The board's code in a shared library, behind :class:`~armsight.robot.boards.link.Emulator`.
 
     Args:
         library: of the board ``host``.

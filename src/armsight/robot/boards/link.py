@@ -41,7 +41,7 @@ class Plant(Protocol):
         ...
 
 
-class Machine(Protocol):
+class Emulator(Protocol):
     """Runs the firmware's ``pil`` board in lock-step: one frame in, one tick, one frame out."""
 
     def tick(self, request: bytes) -> bytes:

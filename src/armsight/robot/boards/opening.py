@@ -13,34 +13,34 @@ from armsight.errors import InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.configuration import Configuration, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.host import HostMachine
-from armsight.robot.boards.link import Machine, Plant
-from armsight.robot.boards.qemu import QemuMachine
+from armsight.robot.boards.host import HostEmulator
+from armsight.robot.boards.link import Emulator, Plant
+from armsight.robot.boards.qemu import QemuEmulator
 from armsight.robot.boards.serial import BAUD, SerialLink
-from armsight.robot.boards.unicorn import UnicornMachine
+from armsight.robot.boards.unicorn import UnicornEmulator
 
 #: Name -> what makes the machine of a file, and the file the package carries for it.
-MACHINES: Mapping[str, tuple[Callable[[Path], Machine], Callable[[], Path]]] = {
-    "unicorn": (UnicornMachine, firmware.image),
-    "qemu": (QemuMachine, firmware.image),
-    "host": (HostMachine, firmware.host_library),
+EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] = {
+    "unicorn": (UnicornEmulator, firmware.image),
+    "qemu": (QemuEmulator, firmware.image),
+    "host": (HostEmulator, firmware.host_library),
 }
 
 
-def open_machine(name: str, image: Path | None = None) -> Machine:
+def open_emulator(name: str, image: Path | None = None) -> Emulator:
     """Start a machine on a fresh board: nothing is stored on it.
 
     Args:
-        name: one of :data:`MACHINES`.
+        name: one of :data:`EMULATORS`.
         image: another image (for host: library) than the package's.
 
     Raises:
         InputError: there is no such machine, or what it needs is not installed.
         DeviceError: the firmware was not built.
     """
-    if name not in MACHINES:
-        raise InputError(f"no machine {name!r}; there are {', '.join(MACHINES)}")
-    make, built = MACHINES[name]
+    if name not in EMULATORS:
+        raise InputError(f"no machine {name!r}; there are {', '.join(EMULATORS)}")
+    make, built = EMULATORS[name]
     return make(image or built())
 
 
@@ -64,11 +64,11 @@ def open_board(
     """
     if name.startswith(SERIAL):
         port = name.removeprefix(SERIAL)
-        return Board(SerialLink(port, baud), name=port)
+        return Board.connect(SerialLink(port, baud), name=port)
     machine = emulated_machine(name)
     if plant is None:
         raise InputError(f"{name} needs a plant: the arm at its motors, such as armsight.sim.joints.JointPlant()")
-    return configured(EmulatedLink(open_machine(machine), plant), config)
+    return configured(EmulatedLink(open_emulator(machine), plant), config)
 
 
 def emulated_machine(name: str) -> str:
@@ -78,8 +78,8 @@ def emulated_machine(name: str) -> str:
         InputError: there is no such board; the message names those there are.
     """
     machine = name.removeprefix(EMULATED)
-    if not name.startswith(EMULATED) or machine not in MACHINES:
-        known = ", ".join(f"{EMULATED}{machine}" for machine in MACHINES)
+    if not name.startswith(EMULATED) or machine not in EMULATORS:
+        known = ", ".join(f"{EMULATED}{machine}" for machine in EMULATORS)
         raise InputError(f"no board {name!r}; there are {known} and {SERIAL}PORT, such as serial:/dev/ttyACM0")
     return machine
 
@@ -90,11 +90,11 @@ def configured(link: EmulatedLink, config: Configuration | None = None) -> Board
     Raises:
         InputError: a value of the configuration is outside its range.
     """
-    board = Board(link, name="the emulated board")
+    board = Board.connect(link, name="the emulated board")
     try:
         board.store(lab_configuration() if config is None else config)
     except BaseException:
         board.close()
         raise
     link.restart()
-    return Board(link, name="the emulated board")
+    return Board.connect(link, name="the emulated board")

@@ -23,8 +23,8 @@ _MACHINE = (
 _END_S = 5.0
 
 
-class QemuMachine:
-    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Machine`.
+class QemuEmulator:
+    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Emulator`.
 
     Args:
         image: ELF file of the board ``pil``.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.robot.boards.codes import FAULT_TEXTS, ConfigSource, Fault, Limited, Refusal, State, faults_in
+from armsight.robot.boards.codes import FAULT_TEXTS, ConfigSource, Fault, Limited, Rejection, State, faults_in
 from armsight.robot.boards.wire import Message
 
 _NO_JOINT = 255
@@ -58,11 +58,11 @@ class BoardStatus:
         state: what it does with its drives.
         faults: all that are latched.
         first_fault: the one that came first since the last clear; None without.
-        obeyed_sequence: number of the last command obeyed.
-        obeyed_count: how many were.
-        refused_sequence: number of the last command refused.
-        refused_count: how many were.
-        refusal: why that one was.
+        acknowledged_sequence: number of the last command acknowledged.
+        acknowledged_count: how many were.
+        rejected_sequence: number of the last command refused.
+        rejected_count: how many were.
+        rejection: why that one was.
         supply_v: motor supply, V.
         crc_errors: messages from the host that were broken.
         lost_bytes: bytes from the host that belonged to no message.
@@ -76,11 +76,11 @@ class BoardStatus:
     state: State
     faults: tuple[JointFault, ...]
     first_fault: JointFault | None
-    obeyed_sequence: int
-    obeyed_count: int
-    refused_sequence: int
-    refused_count: int
-    refusal: Refusal
+    acknowledged_sequence: int
+    acknowledged_count: int
+    rejected_sequence: int
+    rejected_count: int
+    rejection: Rejection
     supply_v: float
     crc_errors: int
     lost_bytes: int
@@ -139,11 +139,11 @@ def status_of(message: Message, t_s: float) -> BoardStatus:
         state=State(message.state),
         faults=_faults(message.faults, message.joint_faults),
         first_fault=first,
-        obeyed_sequence=message.obeyed_sequence,
-        obeyed_count=message.obeyed_count,
-        refused_sequence=message.refused_sequence,
-        refused_count=message.refused_count,
-        refusal=Refusal(message.refusal),
+        acknowledged_sequence=message.acknowledged_sequence,
+        acknowledged_count=message.acknowledged_count,
+        rejected_sequence=message.rejected_sequence,
+        rejected_count=message.rejected_count,
+        rejection=Rejection(message.rejection),
         supply_v=message.supply_mv * 1e-3,
         crc_errors=message.crc_errors,
         lost_bytes=message.lost_bytes,

@@ -27,8 +27,8 @@ _CALL, _CALLER = _FLASH_BYTES - 16, b"\xa0\x47\x30\xbf\x02\xe0"
 _END = _CALL + 12
 
 
-class UnicornMachine:
-    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.link.Machine`.
+class UnicornEmulator:
+    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.link.Emulator`.
 
     Args:
         image: ELF file of the board ``pil``.

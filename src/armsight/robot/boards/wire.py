@@ -46,7 +46,7 @@ class Wire:
 
     Attributes:
         heard: whether any byte came at all.
-        broken: places in what came that are no message.
+        broken: parts of what came that are no message.
         lost: messages that are missing in the count of the frames.
     """
 
@@ -61,9 +61,39 @@ class Wire:
         self.broken = self.lost = 0
         self._count: int | None = None
 
-    def send(self, kind: str, *fields: object) -> None:
-        """Send a message of this kind (lower case) with its fields in the order of the dialect."""
-        getattr(self._mav, f"{kind}_send")(*fields)
+    def hello(self, dialect_version: int, config_version: int, nonce: int) -> None:
+        """Ask who the board is."""
+        self._mav.hello_send(dialect_version, config_version, nonce)
+
+    def move(
+        self, sequence: int, ticks: int, q_ref: list[float], qd_ref: list[float], gravity_duty: list[float]
+    ) -> None:
+        """Send a motion command: joint angles (6,), rad, and speeds (6,), rad/s, to be reached after so many ticks."""
+        self._mav.move_send(sequence, ticks, q_ref, qd_ref, gravity_duty)
+
+    def command(self, sequence: int, kind: int) -> None:
+        """Send a command without arguments: enable, disable, clear."""
+        self._mav.command_send(sequence, kind)
+
+    def stop(self, sequence: int) -> None:
+        """Send the emergency stop."""
+        self._mav.stop_send(sequence)
+
+    def gains(self, sequence: int, gains: list[float]) -> None:
+        """Send a gain set: six joints of kp, ki, kd, kv, derivative filter, anti-windup (36,)."""
+        self._mav.gains_send(sequence, gains)
+
+    def config_read(self, offset: int) -> None:
+        """Ask for the part of the configuration in use that begins at this byte."""
+        self._mav.config_read_send(offset)
+
+    def config_part(self, offset: int, total: int, length: int, data: list[int]) -> None:
+        """Send a part of a configuration to be stored."""
+        self._mav.config_part_send(offset, total, length, data)
+
+    def config_store(self, sequence: int, crc: int) -> None:
+        """Ask the board to check and store the configuration that the parts made up."""
+        self._mav.config_store_send(sequence, crc)
 
     def receive(self, wait_s: float) -> list[Message]:
         """Let ``wait_s`` pass and return the whole messages that came."""

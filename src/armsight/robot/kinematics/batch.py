@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.robot.kinematics.chain import Frame, after, after_link, after_turn, first_frame, verdict
+from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, verdict
 from armsight.robot.kinematics.table import TOOL
 from armsight.robot.kinematics.trig import sincos_each
 
@@ -25,7 +25,7 @@ _kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz
 @_kernel
 def _joint(table: Array, i: int, sines: Array, cosines: Array, lane: int, F: Frame) -> Frame:
     """Carry one lane's frame over joint i and its link."""
-    return after_link(table, i, after_turn(table, i, cosines[8 * i + lane], sines[8 * i + lane], F))
+    return after_link(table, i, after_rotation(table, i, cosines[8 * i + lane], sines[8 * i + lane], F))
 
 
 @_kernel

@@ -43,7 +43,7 @@ def first_frame(table: Array) -> Frame:
 
 
 @_kernel
-def after_turn(table: Array, i: int, c: float, s: float, F: Frame) -> Frame:
+def after_rotation(table: Array, i: int, c: float, s: float, F: Frame) -> Frame:
     """Carry a frame over joint i's turn and its shift d along the axis: Rz(theta) Tz(d)."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
     d = table[6 * i + 1]
@@ -145,7 +145,7 @@ def tool_frame(table: Array, q: Array) -> Frame:
     F = first_frame(table)
     for i in range(6):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
-        F = after_link(table, i, after_turn(table, i, c, s, F))
+        F = after_link(table, i, after_rotation(table, i, c, s, F))
     return after(table, 48, F)
 
 
@@ -164,7 +164,7 @@ def links(table: Array, q: Array, Ts: Array) -> int:
     store(F, Ts[0])
     for i in range(6):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
-        turned = after_turn(table, i, c, s, F)
+        turned = after_rotation(table, i, c, s, F)
         F = after_link(table, i, turned)
         store(turned if modified else F, Ts[i + 1])
     store(after(table, 48, F), Ts[7])
@@ -180,7 +180,7 @@ def _axes(table: Array, q: Array, J: Array) -> Frame:
         J[0, i], J[1, i], J[2, i] = F[9], F[10], F[11]
         J[3, i], J[4, i], J[5, i] = way * F[6], way * F[7], way * F[8]
         s, c = sincos(way * q[i] + table[6 * i + 4])
-        F = after_link(table, i, after_turn(table, i, c, s, F))
+        F = after_link(table, i, after_rotation(table, i, c, s, F))
     return after(table, 48, F)
 
 

@@ -9,13 +9,13 @@ from armsight.robot.trajectories.line import line
 from armsight.robot.trajectories.point_to_point import point_to_point
 from armsight.robot.trajectories.resolved_rate import resolved_rate
 from armsight.robot.trajectories.tabled import Tabled
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory
+from armsight.robot.trajectories.trajectory import Joints, MotionRejected, Trajectory
 from armsight.robot.trajectories.waypoints import waypoints
 
 __all__ = [
     "TRAJECTORIES",
     "Joints",
-    "MotionRefused",
+    "MotionRejected",
     "Tabled",
     "Trajectory",
     "arc",

@@ -15,7 +15,7 @@ from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, ti
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.lookahead import Obstacle, Walk, derivatives, refined, walk
 from armsight.robot.trajectories.path import Path
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, check_duration, check_times, clamped, pieces
+from armsight.robot.trajectories.trajectory import Joints, MotionRejected, check_duration, check_times, clamped, pieces
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -78,7 +78,7 @@ def follow(
         cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
 
     Raises:
-        MotionRefused: the path leaves the reach or the joint limits, or meets a singularity.
+        MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, a start that does not move along the path, or a duration that cannot be met.
     """
     check_duration(duration_s)
@@ -142,10 +142,10 @@ def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
     return motion
 
 
-def _refused(path: Path, obstacle: Obstacle, t_s: float) -> MotionRefused:
+def _refused(path: Path, obstacle: Obstacle, t_s: float) -> MotionRejected:
     """Return the refusal of a motion at an obstacle."""
     p_base = path.at(np.array([obstacle.share])).T_base_tool[0, :3, 3]
-    return MotionRefused(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
+    return MotionRejected(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
 
 
 def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
@@ -168,7 +168,7 @@ def _check_whole(motion: PathMotion) -> Worst:
     """Return where a motion comes nearest to a limit of speed, acceleration or jerk at 1 kHz.
 
     Raises:
-        MotionRefused: its joints leave their limits or jump from one configuration to another.
+        MotionRejected: its joints leave their limits or jump from one configuration to another.
     """
     return max((_check_piece(motion, t_s) for t_s in pieces(check_times(motion.duration_s))), key=lambda w: w.stretch)
 

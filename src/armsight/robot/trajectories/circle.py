@@ -13,7 +13,7 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.robot.trajectories.cartesian import PathMotion, follow
-from armsight.robot.trajectories.path import Places, checked_pose
+from armsight.robot.trajectories.path import PathPoints, checked_pose
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -30,24 +30,24 @@ class ArcPath(Record):
         T_base_start: (4, 4) where it starts.
         center_base: (3,) a point of the axis, m.
         sweep: (3,) the axis times the angle travelled, rad, base axes.
-        turn_base: (3,) how far the tool turns, rad, base axes.
+        rotation_base: (3,) how far the tool turns, rad, base axes.
     """
 
     T_base_start: Array
     center_base: Array
     sweep: Array
-    turn_base: Array
+    rotation_base: Array
 
-    def at(self, share: Array) -> Places:
+    def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""
         arm_base = exp_so3(share[:, None] * self.sweep) @ (self.T_base_start[:3, 3] - self.center_base)
         T = np.tile(self.T_base_start, (len(share), 1, 1))
         T[:, :3, 3] = self.center_base + arm_base
-        T[:, :3, :3] = exp_so3(share[:, None] * self.turn_base) @ self.T_base_start[:3, :3]
+        T[:, :3, :3] = exp_so3(share[:, None] * self.rotation_base) @ self.T_base_start[:3, :3]
         speed = np.cross(self.sweep, arm_base)
-        twist = np.hstack([speed, np.tile(self.turn_base, (len(share), 1))])
+        twist = np.hstack([speed, np.tile(self.rotation_base, (len(share), 1))])
         bend = np.hstack([np.cross(self.sweep, speed), np.zeros((len(share), 3))])
-        return Places(T, twist, bend)
+        return PathPoints(T, twist, bend)
 
 
 def circle(
@@ -57,7 +57,7 @@ def circle(
     axis_base: ArrayLike,
     angle_rad: float = 2 * np.pi,
     *,
-    turn_base: ArrayLike = (0.0, 0.0, 0.0),
+    rotation_base: ArrayLike = (0.0, 0.0, 0.0),
     qd_start: ArrayLike | None = None,
     qdd_start: ArrayLike | None = None,
     duration_s: float | None = None,
@@ -70,14 +70,14 @@ def circle(
         center_base: (3,) a point of the axis, m, base frame: the centre where it lies in the circle's plane.
         axis_base: (3,) direction of the axis, any length, base frame; the tool moves about it by the right hand.
         angle_rad: how far round, rad; a full circle by default, negative for the other way.
-        turn_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
+        rotation_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
             axis times ``angle_rad`` turns the tool with the circle.
         qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the circle. None for rest.
         qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
-        MotionRefused: the circle leaves the reach or the joint limits, or meets a singularity.
+        MotionRejected: the circle leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, the tool on the axis, or a duration that cannot be met.
     """
     center, axis = checked(center_base, (3,), "center_base"), checked(axis_base, (3,), "axis_base")
@@ -89,7 +89,7 @@ def circle(
     T_base_start = arm.forward(q_start)
     if np.linalg.norm(np.cross(axis, T_base_start[:3, 3] - center)) < TOO_SMALL:
         raise InputError("the tool is on the circle's axis: there is no circle to travel")
-    path = ArcPath(T_base_start, center, axis * angle_rad, checked(turn_base, (3,), "turn_base"))
+    path = ArcPath(T_base_start, center, axis * angle_rad, checked(rotation_base, (3,), "rotation_base"))
     return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
 
 
@@ -115,14 +115,14 @@ def arc(
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
-        MotionRefused: the arc leaves the reach or the joint limits, or meets a singularity.
+        MotionRejected: the arc leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, three points on one line, or a duration that cannot be met.
     """
     T_base_start = arm.forward(q_start)
     goal = checked_pose(T_base_goal, "T_base_goal")
     center, sweep = through(T_base_start[:3, 3], checked(via_base, (3,), "via_base"), goal[:3, 3])
-    turn_base = log_so3(np.ascontiguousarray(goal[:3, :3] @ T_base_start[:3, :3].T))
-    path = ArcPath(T_base_start, center, sweep, turn_base)
+    rotation_base = log_so3(np.ascontiguousarray(goal[:3, :3] @ T_base_start[:3, :3].T))
+    path = ArcPath(T_base_start, center, sweep, rotation_base)
     return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
 
 

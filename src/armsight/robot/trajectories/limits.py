@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.robot.trajectories.trajectory import Joints, MotionRefused, Trajectory, check_times, pieces
+from armsight.robot.trajectories.trajectory import Joints, MotionRejected, Trajectory, check_times, pieces
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -120,7 +120,7 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
     """Hold a motion in joints against every limit of the arm at 1 kHz.
 
     Raises:
-        MotionRefused: at the first instant outside the joint limits, or where another limit is passed.
+        MotionRejected: at the first instant outside the joint limits, or where another limit is passed.
     """
     for t_s in pieces(check_times(trajectory.duration_s)):
         joints = trajectory.at(t_s)
@@ -133,7 +133,7 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
             raise _refused(arm, trajectory, most.what, most.t_s)
 
 
-def _refused(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRefused:
+def _refused(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRejected:
     """Return the refusal of a motion in joints at a time."""
     share = t_s / trajectory.duration_s if trajectory.duration_s > 0 else 0.0
-    return MotionRefused(reason, share=share, t_s=t_s, p_base=arm.forward(trajectory.at(t_s).q)[:3, 3])
+    return MotionRejected(reason, share=share, t_s=t_s, p_base=arm.forward(trajectory.at(t_s).q)[:3, 3])

@@ -12,7 +12,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.trajectories.cartesian import PathMotion, follow
-from armsight.robot.trajectories.path import Places, checked_pose, way
+from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -44,13 +44,13 @@ class LinePath(Record):
             raise InputError("T_base_goal is where the tool already is: there is nothing to travel")
         return LinePath(T_base_start, step, turn)
 
-    def at(self, share: Array) -> Places:
+    def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""
         T = np.tile(self.T_base_start, (len(share), 1, 1))
         T[:, :3, 3] += share[:, None] * self.step
         T[:, :3, :3] = self.T_base_start[:3, :3] @ exp_so3(share[:, None] * self.turn)
         twist = np.tile(np.concatenate([self.step, self.T_base_start[:3, :3] @ self.turn]), (len(share), 1))
-        return Places(T, twist, np.zeros_like(twist))
+        return PathPoints(T, twist, np.zeros_like(twist))
 
 
 def line(
@@ -73,7 +73,7 @@ def line(
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
-        MotionRefused: the line leaves the reach or the joint limits, or meets a singularity.
+        MotionRejected: the line leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, nothing to travel, or a duration that cannot be met.
     """
     path = LinePath.between(arm.forward(q_start), checked_pose(T_base_goal, "T_base_goal"))

@@ -13,7 +13,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.trajectories.limits import outside
-from armsight.robot.trajectories.path import TURN_M, Path, Places
+from armsight.robot.trajectories.path import TURN_M, Path, PathPoints
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -104,7 +104,7 @@ def behind(T_goal: Array, T: Array) -> Array:
     return off
 
 
-def derivatives(arm: Arm, q: Array, places: Places) -> tuple[Array, Array]:
+def derivatives(arm: Arm, q: Array, places: PathPoints) -> tuple[Array, Array]:
     """Return q', q'' (N, 6) by the share of the way at joint angles (N, 6)."""
     J = arm.jacobian(q)
     q1 = np.asarray(np.linalg.solve(J, places.twist[..., None])[..., 0], np.float64)
@@ -151,7 +151,7 @@ def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obst
         obstacle = obstacle._replace(clear=max(1, int(np.argmax(slow)) if slow.any() else good))
     if good == 0:
         return Walk(share[:0], q[:0], q[:0], q[:0]), obstacle
-    kept = Places(*(part[:good] for part in places))
+    kept = PathPoints(*(part[:good] for part in places))
     q1, q2 = derivatives(arm, q[:good], kept)
     return Walk(share[:good], q[:good], q1, q2), obstacle
 
@@ -166,7 +166,7 @@ def _steps(path: Path, bends: Array) -> Array:
     )
 
 
-def _chain(arm: Arm, places: Places, q_start: Array) -> tuple[Array, str | None]:
+def _chain(arm: Arm, places: PathPoints, q_start: Array) -> tuple[Array, str | None]:
     """Return joint angles (K, 6) from place to place, and why they end where the reach does; they end at a limit too."""
     chain = [q_start]
     for T in places.T_base_tool[1:]:

@@ -22,7 +22,7 @@ TURN_M = 0.25
 POSE_TOLERANCE = 1e-6
 
 
-class Places(NamedTuple):
+class PathPoints(NamedTuple):
     """A path at N shares of its way.
 
     Attributes:
@@ -39,7 +39,7 @@ class Places(NamedTuple):
 class Path(Protocol):
     """A way of the tool, from share 0 to share 1."""
 
-    def at(self, share: Array) -> Places:
+    def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""
 
 

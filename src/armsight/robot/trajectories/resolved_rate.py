@@ -21,12 +21,12 @@ from armsight.errors import InputError
 from armsight.geometry.rotation import log_so3
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.lookahead import behind
-from armsight.robot.trajectories.path import Path, Places
+from armsight.robot.trajectories.path import Path, PathPoints
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import (
     CHECK_RATE_HZ,
     Joints,
-    MotionRefused,
+    MotionRejected,
     check_duration,
     clamped,
 )
@@ -109,7 +109,7 @@ def resolved_rate(
         tolerance_m: how far the tool may leave the path where damping sets in, m.
 
     Raises:
-        MotionRefused: a joint limit is passed, or the tool leaves the path further than allowed.
+        MotionRejected: a joint limit is passed, or the tool leaves the path further than allowed.
         InputError: bad numbers, or a duration within which the limits cannot be kept.
     """
     check_duration(duration_s, LONGEST_S)
@@ -230,7 +230,7 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
     return _Run(np.linspace(0, (len(qs) - 1) * dt, len(qs)), qs, off_m, off_rad, leasts)
 
 
-def _step(arm: Arm, q: Array, places: Places, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
+def _step(arm: Arm, q: Array, places: PathPoints, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
     """Return the joint speeds (6,) wanted now, how far the tool is behind (6,), and the smallest singular value."""
     off = behind(places.T_base_tool[row], arm.forward(q))
     qd, least = _speeds(arm.jacobian(q), V_ref[row] + GAIN * off, scale)
@@ -266,8 +266,8 @@ def _check(arm: Arm, path: Path, law: Profile, run: _Run, tolerance_m: float) ->
         raise _refused(path, law, reason, float(run.t_s[int(np.argmax(off))]))
 
 
-def _refused(path: Path, law: Profile, reason: str, t_s: float) -> MotionRefused:
+def _refused(path: Path, law: Profile, reason: str, t_s: float) -> MotionRejected:
     """Return the refusal of a tracked motion at a time."""
     share = float(law.at(t_s).q[0])
     p_base = path.at(np.array([share])).T_base_tool[0, :3, 3]
-    return MotionRefused(reason, share=share, t_s=t_s, p_base=p_base)
+    return MotionRejected(reason, share=share, t_s=t_s, p_base=p_base)

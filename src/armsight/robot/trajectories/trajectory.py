@@ -1,7 +1,7 @@
 """The contract of a trajectory: joint angles over time, known and checked before the first step is taken.
 
 A member of this family is a function ``(arm, q_start, ...) -> Trajectory``. It looks at the whole motion first, at 1 kHz,
-and raises :class:`MotionRefused` with the place and the time where an arm's limit would be passed, so that what it returns
+and raises :class:`MotionRejected` with the place and the time where an arm's limit would be passed, so that what it returns
 can be run as it is. To write a new one: return a frozen object with ``duration_s`` and ``at``, hand it to
 :func:`armsight.robot.trajectories.limits.check_limits`, and add it to the registry in ``__init__``.
 """
@@ -52,7 +52,7 @@ class Trajectory(Protocol):
         """
 
 
-class MotionRefused(InputError):
+class MotionRejected(InputError):
     """A motion that cannot be made, found before it starts.
 
     Attributes:

@@ -20,7 +20,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.rotation import exp_so3, skew
 from armsight.robot.trajectories.cartesian import PathMotion, follow
-from armsight.robot.trajectories.path import Places, checked_pose, way
+from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
@@ -44,7 +44,7 @@ class BlendedPath(Record):
     blends_m: Array
     length_m: float
 
-    def at(self, share: Array) -> Places:
+    def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""
         s = share * self.length_m
         nearest = np.searchsorted((self.corners_m[1:] + self.corners_m[:-1]) / 2, s)
@@ -63,7 +63,7 @@ class BlendedPath(Record):
         R = T[:, :3, :3]
         twist = np.hstack([before[:, :3] * f1 + after[:, :3] * g1, (R @ omega[..., None])[..., 0]])
         bend = np.hstack([before[:, :3] * f2 + after[:, :3] * g2, (R @ omega1[..., None])[..., 0]])
-        return Places(T, twist * self.length_m, bend * self.length_m**2)
+        return PathPoints(T, twist * self.length_m, bend * self.length_m**2)
 
 
 def _fade(s: Array, reach: Array) -> tuple[Array, Array, Array, Array]:
@@ -97,7 +97,7 @@ def waypoints(
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
-        MotionRefused: the path leaves the reach or the joint limits, or meets a singularity.
+        MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, a way-point that repeats the one before, or a duration that cannot be met.
     """
     try:

@@ -86,9 +86,9 @@ def open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: i
     if slot[v, u] >= 0:
         return fine, slot[v, u], count
     if count == fine.shape[0]:
-        grown = np.empty((2 * count, SUB, SUB))
-        grown[:count] = fine
-        fine = grown
+        forward_selection = np.empty((2 * count, SUB, SUB))
+        forward_selection[:count] = fine
+        fine = forward_selection
     for a in range(SUB):  # numba is slow at filling such a small part of an array
         for b in range(SUB):
             fine[count, a, b] = coarse[v, u]

@@ -19,7 +19,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.render.optics import Optics, Radiance, Sensor, blurred, exposed, shaded
 from armsight.sim.render.paint import SUB, Box, paint, paint_disc
-from armsight.sim.render.scene import CLEAR, Pattern, Placed
+from armsight.sim.render.scene import CLEAR, Pattern, PosedBody
 from armsight.vision.camera import Camera
 
 #: Points along each side of a pattern whose projections bound it in the image.
@@ -125,7 +125,7 @@ class _Canvas:
         return int(low[0]), int(low[1]), int(high[2]), int(high[3])
 
 
-def _sub_exposures(camera: Camera, bodies: Sequence[Placed], exposure_s: float) -> list[tuple[float, float]]:
+def _sub_exposures(camera: Camera, bodies: Sequence[PosedBody], exposure_s: float) -> list[tuple[float, float]]:
     """Return the times (s, from the middle) and weights of the sub-exposures that make up one exposure.
 
     They are Gauss and Legendre's: the blurred image of a moving edge is smooth over a pixel, so about one for each
@@ -146,7 +146,7 @@ def _sub_exposures(camera: Camera, bodies: Sequence[Placed], exposure_s: float) 
     return [(0.5 * exposure_s * float(x), 0.5 * float(w)) for x, w in zip(nodes, weights, strict=True)]
 
 
-def _distance(body: Placed) -> float:
+def _distance(body: PosedBody) -> float:
     """Return how far the middle of a body's patterns is from the camera, m."""
     centres = np.mean([pattern.T_body_pattern[:3, 3] for pattern in body.patterns], axis=0)
     return float(np.linalg.norm(transform(body.T_camera_body, centres)))
@@ -154,7 +154,7 @@ def _distance(body: Placed) -> float:
 
 def radiance(
     camera: Camera,
-    bodies: Sequence[Placed],
+    bodies: Sequence[PosedBody],
     background: Image | float = 0.4,
     *,
     psf_sigma_px: float = 0.7,
@@ -179,7 +179,7 @@ def radiance(
 
 def render(
     camera: Camera,
-    bodies: Sequence[Placed],
+    bodies: Sequence[PosedBody],
     background: Image | float = 0.4,
     *,
     optics: Optics | None = None,
@@ -212,7 +212,7 @@ def render(
 def render_pair(
     cameras: tuple[Camera, Camera],
     T_left_right: Array,
-    bodies: Sequence[Placed],
+    bodies: Sequence[PosedBody],
     backgrounds: tuple[Image | float, Image | float] = (0.4, 0.4),
     *,
     optics: Optics | None = None,

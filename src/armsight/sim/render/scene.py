@@ -57,7 +57,7 @@ class Pattern(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Placed(Record):
+class PosedBody(Record):
     """A rigid body in front of a camera.
 
     Attributes:
@@ -70,9 +70,9 @@ class Placed(Record):
     T_camera_body: Array
     twist: Array = field(default_factory=lambda: np.zeros(6))
 
-    def seen_from(self, T_other_camera: Array) -> Placed:
+    def seen_from(self, T_other_camera: Array) -> PosedBody:
         """Return the body in another camera's frame; the twist is the body's own and stays."""
-        return Placed(self.patterns, T_other_camera @ self.T_camera_body, self.twist)
+        return PosedBody(self.patterns, T_other_camera @ self.T_camera_body, self.twist)
 
 
 def plate(

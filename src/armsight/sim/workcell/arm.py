@@ -34,7 +34,7 @@ class Imperfections:
         angle_rad: error of link twists, rad.
         zero_rad: error of the joints' zeros, rad.
         backlash_rad: least and greatest play between a gear's shaft and its link, rad, from stop to stop.
-        sag_rad: twist of a joint under the greatest weight it carries, rad.
+        compliance_rad: twist of a joint under the greatest weight it carries, rad.
         pot_linearity: greatest deviation of a potentiometer from its straight line, share of its travel.
         pot_offset_rad: error of a potentiometer's zero, rad.
         pot_noise_lsb: noise of one conversion, steps of the converter.
@@ -47,7 +47,7 @@ class Imperfections:
     angle_rad: float = 0.0
     zero_rad: float = 0.0
     backlash_rad: tuple[float, float] = (0.0, 0.0)
-    sag_rad: float = 1e-4
+    compliance_rad: float = 1e-4
     pot_linearity: float = 0.0
     pot_offset_rad: float = 0.0
     pot_noise_lsb: float = 1.0
@@ -61,7 +61,7 @@ _USED = Imperfections(
     angle_rad=np.deg2rad(0.15),
     zero_rad=np.deg2rad(0.25),
     backlash_rad=(np.deg2rad(0.05), np.deg2rad(0.15)),
-    sag_rad=np.deg2rad(0.05),
+    compliance_rad=np.deg2rad(0.05),
     pot_linearity=1e-4,
     pot_offset_rad=np.deg2rad(0.05),
 )
@@ -74,7 +74,7 @@ PRESETS = {
         angle_rad=np.deg2rad(0.3),
         zero_rad=np.deg2rad(0.5),
         backlash_rad=(np.deg2rad(0.1), np.deg2rad(0.3)),
-        sag_rad=np.deg2rad(0.1),
+        compliance_rad=np.deg2rad(0.1),
         pot_linearity=2e-4,
         pot_offset_rad=np.deg2rad(0.1),
         pot_noise_lsb=1.5,
@@ -87,7 +87,7 @@ _KEYS: dict[str, tuple[str, float, float, float]] = {
     "angle_deg": ("angle_rad", np.pi / 180, 0.0, 5.0),
     "zero_deg": ("zero_rad", np.pi / 180, 0.0, 10.0),
     "backlash_deg": ("backlash_rad", np.pi / 180, 0.0, 5.0),
-    "sag_deg": ("sag_rad", np.pi / 180, 0.005, 2.0),
+    "compliance_deg": ("compliance_rad", np.pi / 180, 0.005, 2.0),
     "pot_linearity_percent": ("pot_linearity", 1e-2, 0.0, 5.0),
     "pot_offset_deg": ("pot_offset_rad", np.pi / 180, 0.0, 10.0),
     "pot_noise_lsb": ("pot_noise_lsb", 1.0, 0.0, 50.0),

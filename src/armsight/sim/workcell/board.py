@@ -15,7 +15,7 @@ from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Reaction
 from armsight.robot.boards.configuration import CONFIG, Configuration, check_configuration
 from armsight.sim.workcell.arm import pot_travel
-from armsight.sim.workcell.motors import Motors, Solids, inertia, weight_torque
+from armsight.sim.workcell.motors import Motors, Solids, gravity_torque, inertia
 from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 
 #: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
@@ -68,4 +68,4 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
 
 def gravity_duty(model: Arm, parts: Solids, motors: Motors, q: Array) -> Array:
     """Return the duty (6,) that carries the weight of the nominal arm at joint angles q (6,), rad."""
-    return np.asarray(np.clip(-weight_torque(model, parts, q) / motors.stall_nm, -1.0, 1.0))
+    return np.asarray(np.clip(-gravity_torque(model, parts, q) / motors.stall_nm, -1.0, 1.0))

@@ -21,11 +21,11 @@ from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.robot.arm import Arm
-from armsight.sim.example_rig import bench_rig
+from armsight.sim.example_rig import example_rig
 from armsight.sim.render.optics import noise_start, noise_strip
 from armsight.sim.render.render import Shutter, outline
-from armsight.sim.render.scene import Pattern, Placed, plate
-from armsight.sim.workcell.images import ArmSeen, CellCamera
+from armsight.sim.render.scene import Pattern, PosedBody, plate
+from armsight.sim.workcell.images import ArmSeen, WorkcellCamera
 from armsight.sim.workcell.motors import row_frames
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
@@ -155,11 +155,11 @@ def open_rig(name: str, size: tuple[int, int], baseline_m: float = BASELINE_M) -
         raise InputError(f"rig {name!r} is unknown; known are {', '.join(RIGS)}")
     if not 0.02 <= baseline_m <= 1.0:
         raise InputError(f"baseline_m is {baseline_m}; the cameras must be 0.02 to 1 m apart")
-    turn_deg = RIGS[name] * float(np.degrees(np.arctan2(baseline_m, DISTANCE_M)))
-    return bench_rig(size, _FOCAL * size[0], baseline_m, turn_deg)
+    rotation_deg = RIGS[name] * float(np.degrees(np.arctan2(baseline_m, DISTANCE_M)))
+    return example_rig(size, _FOCAL * size[0], baseline_m, rotation_deg)
 
 
-def placed_rig(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance_m: float = DISTANCE_M) -> Array:
+def rig_pose(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance_m: float = DISTANCE_M) -> Array:
     """Return where the rig's left camera stands, T_base_rig (4, 4), m: it looks at the body of an arm at home.
 
     Args:
@@ -203,7 +203,7 @@ _SPARE_TICKS = 3
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-class CellSource:
+class WorkcellSource:
     """The cell's cameras.
 
     Fulfils :class:`armsight.vision.sources.source.Source`: ``read`` waits for the next shot, in the cell's time.
@@ -212,7 +212,7 @@ class CellSource:
     def __init__(
         self,
         plant: ArmPlant,
-        cameras: tuple[CellCamera, CellCamera],
+        cameras: tuple[WorkcellCamera, WorkcellCamera],
         timing: Timing,
         body: tuple[tuple[Pattern, ...], Array],
         clock: tuple[Callable[[], float], Callable[[float], None]],
@@ -309,7 +309,7 @@ class CellSource:
             number: of the shot; its noise follows from it.
         """
         now = ShotTimes(self._now(), self._now(), self._now())
-        left, right = self._rendering(now, Shutter(), -1 - number, Placed(patterns, T_left_body))
+        left, right = self._rendering(now, Shutter(), -1 - number, PosedBody(patterns, T_left_body))
         return Shot(f"{number:03d}", left.result(), right.result(), now.stamp_s)
 
     def _times(self, shot: int) -> ShotTimes:
@@ -332,7 +332,9 @@ class CellSource:
         """Return how long an image looks from its first row's beginning to its last row's end, s."""
         return self._timing.exposure_s + self._timing.row_s * self._timing.image_size_px[1]
 
-    def _rendering(self, times: ShotTimes, shutter: Shutter, number: int, held: Placed | None) -> list[Future[Image]]:
+    def _rendering(
+        self, times: ShotTimes, shutter: Shutter, number: int, held: PosedBody | None
+    ) -> list[Future[Image]]:
         """Begin to render both images, each in a thread of its own: they share nothing that changes."""
         t_s = np.array([times.left_s, times.right_s])
         frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
@@ -343,7 +345,14 @@ class CellSource:
         ]
 
     def _image(
-        self, side: int, t_s: float, frames: Array, body: Placed, shutter: Shutter, number: int, held: Placed | None
+        self,
+        side: int,
+        t_s: float,
+        frames: Array,
+        body: PosedBody,
+        shutter: Shutter,
+        number: int,
+        held: PosedBody | None,
     ) -> Image:
         """Render one camera's image of the arm in the middle of an exposure."""
         camera = self._cameras[side]
@@ -372,7 +381,7 @@ class CellSource:
         )
         return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
 
-    def _bodies(self, t_s: Array, shutter: Shutter) -> list[Placed]:
+    def _bodies(self, t_s: Array, shutter: Shutter) -> list[PosedBody]:
         """Return where the body is to each camera in an exposure about its time (2,).
 
         That is its mean place during the exposure of its own rows, and its velocity.
@@ -396,14 +405,14 @@ class CellSource:
         shifts = 0.5 * (_WEIGHTS @ turned[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
         to_mean, to_row = exp_se3(np.stack([shifts, -rows_s[:, None] * twists]))
         Ts_camera_body = Ts[:, 1] @ to_mean @ to_row
-        return [Placed(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]
+        return [PosedBody(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]
 
 
-def _card(T_camera_body: Array) -> Placed:
+def _card(T_camera_body: Array) -> PosedBody:
     """Return a card that faces the camera, before the body."""
     p = T_camera_body[:3, 3]
     z = p / np.linalg.norm(p)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
     at = p - _CARD_BEFORE_M * z
-    return Placed((plate(*_CARD_M, _CARD_GREY),), pose(np.column_stack([x, np.cross(z, x), z]), at))
+    return PosedBody((plate(*_CARD_M, _CARD_GREY),), pose(np.column_stack([x, np.cross(z, x), z]), at))

@@ -27,7 +27,7 @@ from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.sim.render.faces import Exposure, paint_faces, palette
 from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
 from armsight.sim.render.render import OUTLINE, Shutter, outline
-from armsight.sim.render.scene import Pattern, Placed
+from armsight.sim.render.scene import Pattern, PosedBody
 from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import ArmPlant
 from armsight.sim.workcell.raycast import (
@@ -219,12 +219,12 @@ def _edges(patterns: tuple[Pattern, ...]) -> Array:
 _nodes = lru_cache(np.polynomial.legendre.leggauss)
 
 
-def _moved(body: Placed, t_s: Array) -> Array:
+def _moved(body: PosedBody, t_s: Array) -> Array:
     """Return a body's poses (N, 4, 4) so long (N,) after the middle of an exposure."""
     return np.asarray(body.T_camera_body @ exp_se3(np.outer(t_s, body.twist)))
 
 
-class CellCamera:
+class WorkcellCamera:
     """A camera that stands in the cell.
 
     Attributes:
@@ -266,7 +266,7 @@ class CellCamera:
         self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
 
     def image(
-        self, arm: ArmSeen | None, bodies: Sequence[Placed], shutter: Shutter, strip: Radiance, start: int
+        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter, strip: Radiance, start: int
     ) -> Image:
         """Return what the camera hands out.
 
@@ -321,7 +321,7 @@ class CellCamera:
         u1, v1 = np.minimum(full[:, 2:].max(axis=0) + margin, self.camera.image_size_px)
         return int(u0), int(v0), int(u1), int(v1)
 
-    def _exposure(self, bodies: Sequence[Placed], shutter: Shutter) -> Exposure | None:
+    def _exposure(self, bodies: Sequence[PosedBody], shutter: Shutter) -> Exposure | None:
         """Return what is painted: all that faces the camera, with boxes in the whole image; None where nothing does."""
         patterns = tuple(pattern for body in bodies for pattern in body.patterns)
         if not patterns:
@@ -338,7 +338,7 @@ class CellCamera:
         nodes, weights = _nodes(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
         t_s = np.add.outer(0.5 * shutter.exposure_s * nodes, rows_s)
 
-        def placed(body: Placed) -> Array:
+        def placed(body: PosedBody) -> Array:
             Ts = _moved(body, t_s.ravel()).reshape(*t_s.shape, 4, 4)
             on = np.array([pattern.T_body_pattern for pattern in body.patterns])
             return np.asarray(Ts[:, None] @ on[:, None])
@@ -352,7 +352,7 @@ class CellCamera:
         return Exposure(palette(patterns), 0.5 * weights, order, Ms, boxes)
 
     @staticmethod
-    def _each(of: Callable[[Placed], Array], bodies: Sequence[Placed]) -> Array:
+    def _each(of: Callable[[PosedBody], Array], bodies: Sequence[PosedBody]) -> Array:
         """Return what each body gives, side by side along the second axis."""
         found = [of(body) for body in bodies if body.patterns]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
@@ -428,10 +428,10 @@ def picture(
     x /= np.linalg.norm(x)
     T_base_eye = pose(np.column_stack([x, np.cross(z, x), z]), _EYE)
     more = _rig_boxes(*rig)
-    eye = CellCamera(camera, T_base_eye, plant.parts, seed, sensor=Sensor(read_noise=0.0), more=more)
+    eye = WorkcellCamera(camera, T_base_eye, plant.parts, seed, sensor=Sensor(read_noise=0.0), more=more)
     q = plant.path[-1, 6:]
     arm = ArmSeen(plant.parts, row_frames(plant.arm, q))
-    placed = Placed(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
+    placed = PosedBody(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
     grey = eye.image(arm, [placed], Shutter(), np.zeros(width * height, np.float32), 0)
     bare = eye.image(arm, [], Shutter(), np.zeros(width * height, np.float32), 0)
     tints = _tints(len(furniture(seed)[0]), len(more))

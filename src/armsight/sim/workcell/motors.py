@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.chain import after_link, after_turn, first_frame, store
+from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, store
 from armsight.robot.kinematics.trig import sincos
 
 GRAVITY_M_S2 = 9.81
@@ -92,7 +92,7 @@ def _row_frames(table: Array, q: Array, Ts: Array) -> None:
     F = first_frame(table)
     for i in range(6):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
-        F = after_turn(table, i, c, s, F)
+        F = after_rotation(table, i, c, s, F)
         store(F, Ts[i + 1])
         d = table[6 * i + 1]
         for k in range(3):
@@ -120,7 +120,7 @@ def _weight(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> Non
             out[i] += -mass[k] * GRAVITY_M_S2 * (z[0] * ry - z[1] * rx)
 
 
-def weight_torque(arm: Arm, parts: Solids, q: Array) -> Array:
+def gravity_torque(arm: Arm, parts: Solids, q: Array) -> Array:
     """Return the torque (6,), N m, with which the weight of an arm's solids turns its joints at angles q (6,), rad."""
     out = np.zeros(6)
     _weight(row_frames(arm, q), parts.link, parts.ends.mean(axis=1), parts.mass, out)
@@ -167,7 +167,7 @@ class Motors(Record):
         bearing_nm: (6,) dry friction of the link's own bearing, N m.
         brake_nm: (6,) what the brake holds, N m; closed while the drivers are off.
         needed_nm: (6,) torque that the joint needs, N m: of weight and of its greatest acceleration.
-        weight_nm: (6,) greatest torque of the weight, N m.
+        gravity_nm: (6,) greatest torque of the weight, N m.
     """
 
     gear_ratio: Array
@@ -180,7 +180,7 @@ class Motors(Record):
     bearing_nm: Array
     brake_nm: Array
     needed_nm: Array
-    weight_nm: Array
+    gravity_nm: Array
 
     @property
     def stall_nm(self) -> Array:
@@ -208,7 +208,7 @@ def chosen(model: Arm, parts: Solids, friction: float = 1.0) -> Motors:
     """
     rng = np.random.default_rng(0)
     poses = rng.uniform(model.q_min, model.q_max, (_POSES, 6))
-    weight = np.max([np.abs(weight_torque(model, parts, q)) for q in poses], axis=0)
+    weight = np.max([np.abs(gravity_torque(model, parts, q)) for q in poses], axis=0)
     load = np.max([inertia(model, parts, q) for q in poses], axis=0)
     needed = weight + _ACCELERATION_SPARE * load * model.qdd_max
     needed = np.maximum(needed, _LEAST * needed.max())

@@ -231,8 +231,8 @@ class ArmPlant:
         self.stop_pressed, self.supply_mv = False, round(1e3 * SUPPLY_V)
         self.pots = Potentiometers(true, pot_travel(model), seed)
         # The twist under the greatest weight; joints that carry none are as stiff for the torque they need.
-        load = np.maximum(self.motors.weight_nm, 0.5 * self.motors.needed_nm)
-        self.stiffness = load / true.imperfections.sag_rad
+        load = np.maximum(self.motors.gravity_nm, 0.5 * self.motors.needed_nm)
+        self.stiffness = load / true.imperfections.compliance_rad
         damping = 2 * _DAMPING * np.sqrt(self.stiffness * inertia(model, self.parts, model.home))
         text = mjcf(true.arm, self.parts, self.motors, true.backlash_rad, self.stiffness, damping)
         self._model = mujoco.MjModel.from_xml_string(text)

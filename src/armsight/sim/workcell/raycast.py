@@ -317,12 +317,12 @@ class View(Record):
 def block(
     middle: tuple[float, float, float],
     size: tuple[float, float, float],
-    turn_deg: float = 0.0,
+    rotation_deg: float = 0.0,
     albedo: float = 0.5,
     texture: int = PLAIN,
 ) -> Array:
     """Return a row of boxes (BOX,): middle and size, m; turn about z; albedo and texture."""
-    turn = np.radians(turn_deg)
+    turn = np.radians(rotation_deg)
     return np.array([*middle, *(0.5 * s for s in size), np.cos(turn), np.sin(turn), albedo, texture])
 
 

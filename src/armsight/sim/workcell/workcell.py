@@ -22,7 +22,7 @@ from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_machine
+from armsight.robot.boards.opening import configured, open_emulator
 from armsight.robot.models import open_arm
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.optics import Sensor
@@ -30,8 +30,8 @@ from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.arm import drawn, imperfections
 from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.body import body_patterns, body_target, body_text
-from armsight.sim.workcell.cameras import BASELINE_M, DISTANCE_M, CellSource, open_rig, open_timing, placed_rig
-from armsight.sim.workcell.images import CellCamera, picture
+from armsight.sim.workcell.cameras import BASELINE_M, DISTANCE_M, WorkcellSource, open_rig, open_timing, rig_pose
+from armsight.sim.workcell.images import WorkcellCamera, picture
 from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.vision.markers.targets import Composite
@@ -53,7 +53,7 @@ _POSES = (
 
 
 @dataclass(frozen=True, eq=False)
-class CellTruth(Record):
+class WorkcellTruth(Record):
     """What is true of a cell up to now. No estimator gets it.
 
     Attributes:
@@ -146,7 +146,7 @@ class Workcell:
         self._stand(distance_m, noise, like)
         self.target: Composite = body_target()
         self.body_text, self.board_spec = body_text(), BOARD
-        self.link = EmulatedLink(open_machine(machine), self.plant)
+        self.link = EmulatedLink(open_emulator(machine), self.plant)
         self.board = configured(self.link, configuration(self._built_to, self._parts, self._motors))
 
     def _stand(self, distance_m: float, noise: float, like: Workcell | None) -> None:
@@ -158,19 +158,19 @@ class Workcell:
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         self._T_tool_body = mount @ exp_se3(off)
-        self._T_base_rig = placed_rig(self._built_to, self._rig, mount, seed, distance_m)
+        self._T_base_rig = rig_pose(self._built_to, self._rig, mount, seed, distance_m)
         if like is not None:
             cameras = like._cameras
         else:
             places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
-            stand = partial(CellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
+            stand = partial(WorkcellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
             with ThreadPoolExecutor(2) as pool:
                 left, right = pool.map(stand, self._rig.cameras, places)
             cameras = left, right
-        self._cameras: tuple[CellCamera, CellCamera] = cameras
+        self._cameras: tuple[WorkcellCamera, WorkcellCamera] = cameras
         clock = (lambda: self.t_s, self.advance)
         body = (body_patterns(), self._T_tool_body)
-        self.source = CellSource(self.plant, cameras, self.timing, body, clock, seed)
+        self.source = WorkcellSource(self.plant, cameras, self.timing, body, clock, seed)
 
     @property
     def t_s(self) -> float:
@@ -229,11 +229,11 @@ class Workcell:
         return picture(size_px, self.plant, body, (self._T_base_rig, self._rig), self._seed)
 
     @property
-    def truth(self) -> CellTruth:
+    def truth(self) -> WorkcellTruth:
         """What is true up to now; for judging only."""
         path = self.plant.path.copy()
         taken = {name: times.left_s for name, times in self.source.taken.items()}
-        return CellTruth(
+        return WorkcellTruth(
             self.plant.arm,
             self._rig,
             self._T_base_rig,

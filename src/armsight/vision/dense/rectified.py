@@ -72,7 +72,7 @@ def vertical_offset_px(corners: Array) -> Array:
     return np.asarray(A @ plane)
 
 
-def check_standard(left: Image, right: Image) -> str | None:
+def check_rectified(left: Image, right: Image) -> str | None:
     """Tell whether two images are a pair in standard form, as far as corners tell.
 
     Args:
@@ -164,7 +164,7 @@ def match_pair(
     for image, side in zip((a, b), SIDES, strict=True):
         if (problem := untextured(image, side)) is not None:
             return Disparity.none((image.shape[0], image.shape[1]), search, problem)
-    remark = check_standard(a, b)
+    remark = check_rectified(a, b)
     if remark is not None:
         note(remark)
     return method.match(a, b, search)

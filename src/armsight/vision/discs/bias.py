@@ -242,10 +242,10 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
         uv[:, side], shape[:, side], J_P, J_n = project_discs(camera, p, n, target.radii_m)
         uv[~known, side] = centre[~known]
         J_P[~known], J_n[~known] = J_p[~known], 0.0
-        by_place = np.concatenate([np.broadcast_to(R, (count, 3, 3)), -R @ skew(points)], axis=2)
-        J[:, side] = J_P @ by_place
+        by_position = np.concatenate([np.broadcast_to(R, (count, 3, 3)), -R @ skew(points)], axis=2)
+        J[:, side] = J_P @ by_position
         J[:, side, :, 3:] -= J_n @ (R @ skew(np.where(known[:, None], normals, 0.0)))
-        bias[:, side], J_bias[:, side] = uv[:, side] - centre, J[:, side] - J_p @ by_place
+        bias[:, side], J_bias[:, side] = uv[:, side] - centre, J[:, side] - J_p @ by_position
         reach2 = (target.radii_m**2 / p[:, 2]) ** 2
         moved = reach2[:, None, None] * np.diag([1.0, 1.0, 8.0]) / 15
         cov[~known, side] = (J_p @ moved @ np.swapaxes(J_p, 1, 2))[~known]

@@ -31,7 +31,7 @@ from armsight.vision.discs.assign import assign
 from armsight.vision.discs.bias import centred
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
-from armsight.vision.markers.disc.target import MOST_TOLD, DiscTarget
+from armsight.vision.markers.disc.target import MOST_REPORTED, DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: Distances that differ by more standard deviations than this are different.
@@ -265,7 +265,7 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
     """Grow every triple into a hypothesis, those that another has grown into already left out."""
     target, discs, count = view.target, view.discs, len(view.target.radii_m)
     reasons: Counter[str] = Counter()
-    grown: list[Hypothesis] = []
+    forward_selection: list[Hypothesis] = []
     both = np.stack([pairs.left, pairs.right], axis=1)
     possible = np.flatnonzero(_turned_to(view, found)).tolist()
     many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} in more than {MOST_HYPOTHESES} places or turns")
@@ -273,10 +273,10 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
         return many
     tried = 0
     for n in possible:
-        if _settled(grown, int(found.most[n])):
-            return grown
+        if _settled(forward_selection, int(found.most[n])):
+            return forward_selection
         ids, detections = found.ids[n], both[found.rows[n]]
-        if any((h.rows[ids] == detections).all() for h in grown):
+        if any((h.rows[ids] == detections).all() for h in forward_selection):
             continue
         if tried == MOST_HYPOTHESES:
             return many
@@ -286,12 +286,12 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
         result = hypothesis(view, pairs, found.Ts_left_body[n], rows)
         if isinstance(result, str):
             reasons[result] += 1
-        elif not any((h.rows == result.rows).all() for h in grown):
-            grown.append(result)
-    if found.left_out and not _settled(grown, found.left_out):
+        elif not any((h.rows == result.rows).all() for h in forward_selection):
+            forward_selection.append(result)
+    if found.left_out and not _settled(forward_selection, found.left_out):
         return many
-    if grown:
-        return grown
+    if forward_selection:
+        return forward_selection
     what = f"{len(pairs.left)} pairs of discs may be of {target.body.name}"
     if reasons:
         return Missed(f"{what}, and three have its distances, but {reasons.most_common(1)[0][0]}")
@@ -301,12 +301,12 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
     return Missed(hint or f"{what}, but no three have its distances; {_too_few(target, discs)}")
 
 
-def _settled(grown: list[Hypothesis], most: int) -> bool:
+def _settled(forward_selection: list[Hypothesis], most: int) -> bool:
     """Whether no hypothesis of at most so many discs can come near the best one.
 
     A score is about proportional to the number of discs, less what the pose costs; half as much again is allowed for.
     """
-    best = max(grown, key=lambda h: h.score, default=None)
+    best = max(forward_selection, key=lambda h: h.score, default=None)
     if best is None:
         return False
     count = int((best.rows >= 0).all(axis=1).sum())
@@ -369,7 +369,7 @@ def _too_few(target: DiscTarget, discs: tuple[Discs, Discs]) -> str:
         text = f"{side}: {len(seen.uv)} disc{'' if len(seen.uv) == 1 else 's'} found"
         if seen.rejected:
             many, first = len(seen.rejected), seen.rejected[0].reason  # the one that looks most like a disc
-            count = f"{many} or more" if many >= MOST_TOLD else f"{many}"
+            count = f"{many} or more" if many >= MOST_REPORTED else f"{many}"
             text += f" ({count} other place{'' if many == 1 else 's'} looked at; the most likely: {first})"
         parts.append(text)
     return f"{'; '.join(parts)}; {target.body.name} has {len(target.radii_m)}"

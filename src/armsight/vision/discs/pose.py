@@ -141,8 +141,8 @@ def _linearise(scene: Scene, T_left: Array, found: Found, rig: bool) -> float:
             cost += found.whitened[row] ** 2 + found.whitened[row + 1] ** 2
             for i in range(2):
                 for j in range(3):
-                    by_place = J_P[i, 0] * T[0, j] + J_P[i, 1] * T[1, j] + J_P[i, 2] * T[2, j]
-                    found.J[row + i, j] = by_place
+                    by_position = J_P[i, 0] * T[0, j] + J_P[i, 1] * T[1, j] + J_P[i, 2] * T[2, j]
+                    found.J[row + i, j] = by_position
                     e[j] = J_n[i, 0] * T[0, j] + J_n[i, 1] * T[1, j] + J_n[i, 2] * T[2, j]
                 g = found.J[row + i]
                 g[3] = g[2] * p[1] - g[1] * p[2] + e[2] * b[1] - e[1] * b[2]

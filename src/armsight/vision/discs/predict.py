@@ -17,7 +17,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.vision.bundle import Model, Observations, State, predict
 from armsight.vision.camera import Camera
 from armsight.vision.discs.symmetry import Relabeling
-from armsight.vision.posefit import Sightings, fit_pose
+from armsight.vision.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 
 #: A face turned away from a camera by more than this is not relied on, cosine.
@@ -202,10 +202,10 @@ def separation(
         p = transform(true.T_left_body, points[seen])
         uv = np.concatenate([rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))])
         count = len(seen)
-        sightings = Sightings(
+        observations = PixelObservations(
             np.repeat([0, 1], count), np.tile(taken, 2), uv, np.tile(sigma_px**2 * np.eye(2), (2 * count, 1, 1))
         )
-        fit = fit_pose(rig.cameras, rig.T_left_right, points, sightings, start, robust=False)
+        fit = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=False)
         if fit is not None:
             worst = np.fmin(worst, np.sqrt(fit.cost))
     return float(worst)

@@ -58,7 +58,7 @@ from armsight.vision.rig import StereoRig
 _AWAY, _SIGMA_PX = 5.0, 0.05
 
 
-def rehearse(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
+def warm_up(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
     """Search for a body in black images, and name and locate it where its discs are given.
 
     Args:
@@ -193,7 +193,7 @@ class Follower:
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
         self._work, self._outline = workspace(), disc_outline.workspace()
         # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
-        rehearse(rig, target, discs)
+        warm_up(rig, target, discs)
         black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
         track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
         track.predicted(1.0)

@@ -27,7 +27,7 @@ _TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedBoard(Record):
+class MountedBoard(Record):
     """One board on a body, seen from its face.
 
     Attributes:
@@ -53,7 +53,7 @@ class BoardTarget(Record):
     """
 
     name: str
-    boards: tuple[PlacedBoard, ...]
+    boards: tuple[MountedBoard, ...]
 
     @staticmethod
     def from_markers(name: str, markers: Sequence[Marker]) -> BoardTarget:
@@ -63,7 +63,7 @@ class BoardTarget(Record):
             InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is turned, or two
                 boards of one body that may be taken for one another.
         """
-        boards: list[PlacedBoard] = []
+        boards: list[MountedBoard] = []
         for marker in markers:
             marker.check_keys("board", required=("spec",))
             board = open_board(marker.converted("spec", _checked))
@@ -80,7 +80,7 @@ class BoardTarget(Record):
                     )
             T = marker.pose()
             boards.append(
-                PlacedBoard(marker.name, board, T @ _TURNED_OVER if isinstance(board, AprilGrid) else T, -T[:3, 2])
+                MountedBoard(marker.name, board, T @ _TURNED_OVER if isinstance(board, AprilGrid) else T, -T[:3, 2])
             )
         return BoardTarget(name, tuple(boards))
 

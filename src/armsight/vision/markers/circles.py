@@ -3,7 +3,7 @@
 As OpenCV's ``findCirclesGrid`` takes them, which finds the discs; the points are the discs' middles, row by row, z = 0.
 In the staggered grid rows lie a pitch apart, discs of a row two pitches, and every other row is moved on by one pitch.
 
-Places are the centroids of darkness, with the covariance of the image's noise. Mind the perspective: the centroid of a
+PathPoints are the centroids of darkness, with the covariance of the image's noise. Mind the perspective: the centroid of a
 tilted disc's image is not the image of its middle. A disc of radius r at distance z, tilted by t, is off by about
 ``f r^2 sin(t) cos(t) / z^2`` pixels, some hundredths on a board of many small discs and more on large ones; nothing here
 corrects it. Chessboards have no such error.

@@ -90,7 +90,7 @@ class Nucleo:
         self.tell(dialect().MAVLink_hello_message(version, 1, 77))
         self.run(2)
 
-    def order(self, kind: int) -> None:
+    def command(self, kind: int) -> None:
         self.sequence += 1
         self.tell(dialect().MAVLink_order_message(self.sequence, kind))
         self.arm.inputs.command.kind, self.arm.inputs.command.sequence = kind, self.sequence
@@ -121,7 +121,7 @@ def nucleo(request, library):
 def moving(nucleo):
     """One whose arm is under way."""
     nucleo.hello()
-    nucleo.order(c.COMMAND_ENABLE)
+    nucleo.command(c.COMMAND_ENABLE)
     nucleo.move(0.3, 100)
     nucleo.run(60)
     assert nucleo.arm.outputs.state == c.STATE_ENABLED
@@ -178,8 +178,8 @@ def test_the_emergency_stop_acts_before_the_tick_and_is_told(moving):
     moving.chip.set_input("PA6", 0)
     moving.chip.set_input("PB12", 0)
     moving.run(20)
-    moving.order(c.COMMAND_CLEAR_STOP)
-    moving.order(c.COMMAND_ENABLE)
+    moving.command(c.COMMAND_CLEAR_STOP)
+    moving.command(c.COMMAND_ENABLE)
     moving.move(0.1, 50)
     moving.run(60)
     assert moving.status.state == c.STATE_ENABLED
@@ -209,7 +209,7 @@ def test_a_tick_that_takes_too_long_is_told_and_its_millisecond_counted(moving):
     moving.run(200)
     assert moving.status.faults == 1 << c.FAULT_TICK_MISSED | 1 << c.FAULT_TICK_OVERRUN
     assert moving.status.state == c.STATE_HOLDING
-    moving.order(c.COMMAND_CLEAR_FAULTS)  # refused as long as a cause stands: told once, it does not
+    moving.command(c.COMMAND_CLEAR_FAULTS)  # refused as long as a cause stands: told once, it does not
     moving.run(10)
     assert (moving.status.state, moving.status.faults) == (c.STATE_ENABLED, 0)
 
@@ -232,9 +232,9 @@ def test_a_restart_by_the_watchdog_keeps_the_drives_off_until_it_is_cleared(comp
     nucleo.hello()
     nucleo.run(30)
     assert nucleo.status.first_fault == c.FAULT_WATCHDOG
-    nucleo.order(c.COMMAND_ENABLE)
+    nucleo.command(c.COMMAND_ENABLE)
     nucleo.run(30)
-    assert nucleo.status.refusal == c.REFUSAL_WRONG_STATE
+    assert nucleo.status.rejection == c.REJECTION_WRONG_STATE
     assert nucleo.chip.output("PC9") == 0.0
 
 

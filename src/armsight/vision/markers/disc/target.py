@@ -24,7 +24,7 @@ from armsight.vision.markers.disc import search as disc_outline
 from armsight.vision.markers.disc import search as disc_search
 
 #: Most rejected places of an image that are told.
-MOST_TOLD = 100
+MOST_REPORTED = 100
 #: Most places looked at in an image.
 _MOST_PLACES, _NEVER = 16384, 99
 _KEPT = threading.local()
@@ -108,5 +108,5 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, 
 def _rejected(theta: Array, codes: NDArray[np.int64]) -> tuple[Rejected, ...]:
     """Say what is no disc and why: places with a closed rim, most like a disc first, or the others where there is none."""
     order = np.array([disc_fit.LOOK_ALIKES.index(c) if c in disc_fit.LOOK_ALIKES else _NEVER for c in codes.tolist()])
-    told = np.argsort(order, kind="stable")[: min(MOST_TOLD, max(int((order < _NEVER).sum()), 1))]
+    told = np.argsort(order, kind="stable")[: min(MOST_REPORTED, max(int((order < _NEVER).sum()), 1))]
     return tuple(Rejected((float(theta[i, 0]), float(theta[i, 1])), disc_fit.REASONS[int(codes[i])]) for i in told)

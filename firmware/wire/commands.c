@@ -6,18 +6,18 @@
 
 _Static_assert(sizeof(gain_set) == sizeof(((mavlink_gains_t *)NULL)->gains), "GAINS carries a whole gain set");
 
-void order_refuse(wire_state *wire, uint32_t sequence, uint32_t refusal)
+void command_reject(wire_state *wire, uint32_t sequence, uint32_t rejection)
 {
-    wire->fate.refused_sequence = sequence;
-    wire->fate.refused_count++;
-    wire->fate.refusal = refusal;
+    wire->fate.rejected_sequence = sequence;
+    wire->fate.rejected_count++;
+    wire->fate.rejection = rejection;
     wire->status_due = 1u;
 }
 
-void order_obeyed(wire_state *wire, uint32_t sequence)
+void command_acknowledge(wire_state *wire, uint32_t sequence)
 {
-    wire->fate.obeyed_sequence = sequence;
-    wire->fate.obeyed_count++;
+    wire->fate.acknowledged_sequence = sequence;
+    wire->fate.acknowledged_count++;
     wire->status_due = 1u;
 }
 
@@ -28,10 +28,10 @@ static bool is_newer(const wire_state *wire, uint32_t sequence)
     return wire->sequence_known == 0u || (ahead != 0u && ahead < 0x80000000u);
 }
 
-bool order_admit(wire_state *wire, uint32_t sequence)
+bool command_admit(wire_state *wire, uint32_t sequence)
 {
     if (wire->greeted == 0u) {
-        order_refuse(wire, sequence, REFUSAL_NO_HELLO);
+        command_reject(wire, sequence, REJECTION_NO_HELLO);
         return false;
     }
     if (!is_newer(wire, sequence)) {
@@ -60,14 +60,14 @@ static void drop(wire_state *wire, uint32_t kind)
     queue->count = kept;
 }
 
-core_command *order_append(wire_state *wire, uint32_t kind, uint32_t sequence)
+core_command *command_append(wire_state *wire, uint32_t kind, uint32_t sequence)
 {
     wire_queue *queue = &wire->queue;
     if (kind == COMMAND_MOVE) {
         drop(wire, COMMAND_MOVE);
     }
     if (queue->count == WIRE_QUEUE) {
-        order_refuse(wire, sequence, REFUSAL_TOO_MANY);
+        command_reject(wire, sequence, REJECTION_TOO_MANY);
         return NULL;
     }
     core_command *command = &queue->command[queue->count];
@@ -77,7 +77,7 @@ core_command *order_append(wire_state *wire, uint32_t kind, uint32_t sequence)
     return command;
 }
 
-void order_mail(wire_state *wire)
+void command_deliver(wire_state *wire)
 {
     wire_queue *queue = &wire->queue;
     const bool busy = atomic_load(&wire->shared.mail_full) != 0u || wire->staged.storing != 0u;
@@ -130,8 +130,8 @@ static void take_move(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_move_t move;
     mavlink_msg_move_decode(message, &move);
-    const bool admitted = order_admit(wire, move.sequence);
-    core_command *command = admitted ? order_append(wire, COMMAND_MOVE, move.sequence) : NULL;
+    const bool admitted = command_admit(wire, move.sequence);
+    core_command *command = admitted ? command_append(wire, COMMAND_MOVE, move.sequence) : NULL;
     if (command == NULL) {
         return;
     }
@@ -141,26 +141,26 @@ static void take_move(wire_state *wire, const mavlink_message_t *message)
     command->move.duration_ticks = move.duration_ticks;
 }
 
-static void take_order(wire_state *wire, const mavlink_message_t *message)
+static void take_command(wire_state *wire, const mavlink_message_t *message)
 {
-    mavlink_order_t order;
-    mavlink_msg_order_decode(message, &order);
-    if (!order_admit(wire, order.sequence)) {
+    mavlink_command_t command;
+    mavlink_msg_command_decode(message, &command);
+    if (!command_admit(wire, command.sequence)) {
         return;
     }
-    if (order.kind < COMMAND_ENABLE || order.kind > COMMAND_CLEAR_STOP) {
-        order_refuse(wire, order.sequence, REFUSAL_UNKNOWN_COMMAND);
+    if (command.kind < COMMAND_ENABLE || command.kind > COMMAND_CLEAR_STOP) {
+        command_reject(wire, command.sequence, REJECTION_UNKNOWN_COMMAND);
         return;
     }
-    order_append(wire, order.kind, order.sequence);
+    command_append(wire, command.kind, command.sequence);
 }
 
 static void take_gains(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_gains_t gains;
     mavlink_msg_gains_decode(message, &gains);
-    const bool admitted = order_admit(wire, gains.sequence);
-    core_command *command = admitted ? order_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
+    const bool admitted = command_admit(wire, gains.sequence);
+    core_command *command = admitted ? command_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
     if (command != NULL) {
         memcpy(&command->gains, gains.gains, sizeof command->gains);
     }
@@ -190,8 +190,8 @@ void message_take(wire_state *wire, const mavlink_message_t *message)
     case MAVLINK_MSG_ID_MOVE:
         take_move(wire, message);
         break;
-    case MAVLINK_MSG_ID_ORDER:
-        take_order(wire, message);
+    case MAVLINK_MSG_ID_COMMAND:
+        take_command(wire, message);
         break;
     case MAVLINK_MSG_ID_STOP:
         take_stop(wire, message);

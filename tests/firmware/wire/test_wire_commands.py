@@ -11,9 +11,9 @@ from armsight import firmware
 
 
 def fate(host):
-    """What the board said last of its commands: obeyed, refused, why."""
+    """What the board said last of its commands: acknowledged, refused, why."""
     status = host.newest("BOARD_STATUS")
-    return status.acknowledged_sequence, status.rejected_sequence, status.refusal
+    return status.acknowledged_sequence, status.rejected_sequence, status.rejection
 
 
 def test_every_hello_is_answered_with_who_the_board_is(fresh):
@@ -34,28 +34,28 @@ def test_a_host_of_another_version_is_told_who_the_board_is_and_may_only_stop_it
     board, host = working
     board.run(2, host.hello(nonce=9, **other))
     host.listen()
-    board.run(30, host.order(c.COMMAND_ENABLE))
+    board.run(30, host.command(c.COMMAND_ENABLE))
     assert host.newest("WELCOME").nonce == 9
     assert {message.get_type() for message in host.listen()} <= {"BOARD_STATUS"}
-    assert fate(host) == (0, host.sequence, c.REFUSAL_NO_HELLO)
+    assert fate(host) == (0, host.sequence, c.REJECTION_NO_HELLO)
     board.run(2, host.stop())
     assert board.answer.outputs.state == c.STATE_STOPPED
     board.run(2, host.hello())
-    board.run(30, host.order(c.COMMAND_CLEAR_STOP))
+    board.run(30, host.command(c.COMMAND_CLEAR_STOP))
     assert board.answer.outputs.state == c.STATE_DISABLED
 
 
-@pytest.mark.parametrize("message", ["move", "order", "gains", "store"])
+@pytest.mark.parametrize("message", ["move", "command", "gains", "store"])
 def test_nothing_is_obeyed_before_a_hello(fresh, message):
     board, host = fresh
     sent = {
         "move": host.move,
-        "order": lambda: host.order(c.COMMAND_DISABLE),
+        "command": lambda: host.command(c.COMMAND_DISABLE),
         "gains": lambda: host.pack("gains", host.next(), [0.0] * 36),
         "store": lambda: host.store(b""),
     }[message]()
     board.run(30, sent)
-    assert fate(host) == (0, host.sequence, c.REFUSAL_NO_HELLO)
+    assert fate(host) == (0, host.sequence, c.REJECTION_NO_HELLO)
     assert board.answer.outputs.acknowledged_count == 0
 
 
@@ -67,14 +67,14 @@ def test_what_asks_for_no_command_is_not_answered_before_a_hello(fresh):
 
 def test_commands_are_obeyed_by_number_and_old_ones_dropped(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_ENABLE, sequence=5))
+    board.run(2, host.command(c.COMMAND_ENABLE, sequence=5))
     assert board.answer.outputs.state == c.STATE_ENABLED
     for old in (5, 4, 1, 2**32 - 3):
-        board.run(2, host.order(c.COMMAND_DISABLE, sequence=old))
+        board.run(2, host.command(c.COMMAND_DISABLE, sequence=old))
     assert board.answer.outputs.state == c.STATE_ENABLED
     board.run(30)
     assert host.newest("BOARD_STATUS").stale_commands == 4
-    board.run(2, host.order(c.COMMAND_DISABLE, sequence=6))
+    board.run(2, host.command(c.COMMAND_DISABLE, sequence=6))
     assert board.answer.outputs.state == c.STATE_DISABLED
     assert board.answer.outputs.acknowledged_sequence == 6
 
@@ -82,78 +82,78 @@ def test_commands_are_obeyed_by_number_and_old_ones_dropped(working):
 def test_numbers_go_round(working):
     board, host = working
     for sequence in (2**31 - 5, 2**32 - 10, 0, 1):
-        board.run(2, host.order(c.COMMAND_DISABLE, sequence=sequence))
+        board.run(2, host.command(c.COMMAND_DISABLE, sequence=sequence))
         assert board.answer.outputs.acknowledged_sequence == sequence
 
 
 def test_a_hello_begins_the_numbers_anew(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_DISABLE, sequence=900))
-    board.run(2, host.hello() + host.order(c.COMMAND_DISABLE, sequence=1))
+    board.run(2, host.command(c.COMMAND_DISABLE, sequence=900))
+    board.run(2, host.hello() + host.command(c.COMMAND_DISABLE, sequence=1))
     assert board.answer.outputs.acknowledged_sequence == 1
 
 
 def test_one_command_a_tick_in_their_order_and_only_the_newest_move(working):
     board, host = working
     host.sequence = 10
-    burst = host.order(c.COMMAND_ENABLE) + host.move(0.1) + host.order(c.COMMAND_DISABLE) + host.move(0.2)
-    burst += host.order(c.COMMAND_ENABLE) + host.move(0.3)
-    obeyed = []
+    burst = host.command(c.COMMAND_ENABLE) + host.move(0.1) + host.command(c.COMMAND_DISABLE) + host.move(0.2)
+    burst += host.command(c.COMMAND_ENABLE) + host.move(0.3)
+    acknowledged = []
     for data in (burst, b"", b"", b"", b""):
         outputs = board.tick(data)
-        obeyed.append((outputs.acknowledged_sequence, outputs.rejected_sequence))
-    assert obeyed == [(11, 0), (13, 0), (15, 0), (16, 0), (16, 0)]
+        acknowledged.append((outputs.acknowledged_sequence, outputs.rejected_sequence))
+    assert acknowledged == [(11, 0), (13, 0), (15, 0), (16, 0), (16, 0)]
     board.run(30)
     assert host.newest("BOARD_STATUS").stale_commands == 2
 
 
 def test_more_commands_than_can_wait_are_refused(working):
     board, host = working
-    board.tick(b"".join(host.order(c.COMMAND_DISABLE) for _ in range(10)))
+    board.tick(b"".join(host.command(c.COMMAND_DISABLE) for _ in range(10)))
     board.run(30)
-    assert fate(host) == (8, 10, c.REFUSAL_TOO_MANY)
+    assert fate(host) == (8, 10, c.REJECTION_TOO_MANY)
     assert host.newest("BOARD_STATUS").rejected_count == 2
 
 
 def test_a_stop_is_taken_in_its_tick_and_drops_what_waits(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_ENABLE))
-    waiting = host.order(c.COMMAND_DISABLE) + host.order(c.COMMAND_ENABLE)
+    board.run(2, host.command(c.COMMAND_ENABLE))
+    waiting = host.command(c.COMMAND_DISABLE) + host.command(c.COMMAND_ENABLE)
     outputs = board.tick(waiting + host.stop())
     assert (outputs.state, outputs.drives_on) == (c.STATE_STOPPED, 0)
     board.run(30)
     assert board.answer.outputs.state == c.STATE_STOPPED
     assert fate(host) == (host.sequence, 0, 0)
     assert host.newest("BOARD_STATUS").stale_commands == 2
-    board.run(2, host.order(c.COMMAND_CLEAR_STOP))
+    board.run(2, host.command(c.COMMAND_CLEAR_STOP))
     assert board.answer.outputs.state == c.STATE_DISABLED
 
 
 def test_a_stop_is_taken_whatever_its_number_and_told_only_when_taken(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_ENABLE, sequence=100))
+    board.run(2, host.command(c.COMMAND_ENABLE, sequence=100))
     board.tick(host.pack("stop", 3))
     board.run(6)
     statuses = [message for message in host.listen() if message.get_type() == "BOARD_STATUS"]
     told = [message.state for message in statuses if message.acknowledged_sequence == 3]
     assert told
     assert set(told) == {c.STATE_STOPPED}
-    board.run(2, host.order(c.COMMAND_CLEAR_STOP, sequence=50))
+    board.run(2, host.command(c.COMMAND_CLEAR_STOP, sequence=50))
     assert board.answer.outputs.state == c.STATE_STOPPED, "an older number than 100 is stale still"
 
 
 @pytest.mark.parametrize("kind", [0, c.COMMAND_MOVE, c.COMMAND_GAINS, 8, 0x100, 2**32 - 1])
 def test_an_order_of_an_unknown_kind_is_refused(working, kind):
     board, host = working
-    board.run(30, host.order(kind))
-    assert fate(host) == (0, host.sequence, c.REFUSAL_UNKNOWN_COMMAND)
+    board.run(30, host.command(kind))
+    assert fate(host) == (0, host.sequence, c.REJECTION_UNKNOWN_COMMAND)
 
 
 def test_a_refusal_of_the_core_is_told_with_its_reason(working):
     board, host = working
-    board.run(2, host.order(c.COMMAND_ENABLE))
+    board.run(2, host.command(c.COMMAND_ENABLE))
     board.run(30, host.move(float("nan")))
-    assert fate(host) == (1, 2, c.REFUSAL_NOT_FINITE)
+    assert fate(host) == (1, 2, c.REJECTION_NOT_FINITE)
 
 
 def test_gains_come_whole(working):
@@ -191,7 +191,7 @@ def test_the_dialects_version_is_the_one_the_board_knows():
 def test_a_new_host_does_not_find_the_last_ones_commands(working):
     board, host = working
     later = Host(board)
-    board.tick(host.order(c.COMMAND_DISABLE) + host.order(c.COMMAND_ENABLE) + later.hello())
+    board.tick(host.command(c.COMMAND_DISABLE) + host.command(c.COMMAND_ENABLE) + later.hello())
     board.run(30)
     assert board.answer.outputs.acknowledged_count == 0
     assert later.newest("BOARD_STATUS").stale_commands == 2
