@@ -7,8 +7,8 @@ with it. Not part of ``make test``: all forty take about twenty minutes on one c
     --list           show the table and run nothing
     --json FILE      write one record per mutant
 
-The exit code is 1 where a mutant survives, and 2 where one cannot be judged: its text is not in the file once, or its
-tests fail without it.
+The exit code is 1 where a mutant survives, and 2 where one is invalid: its text does not stand in the file exactly once,
+or its tests fail without it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("src", "tests", "firmware", "docs", "pyproject.toml", "setup.py", "README.md", "CHANGELOG.md")
 #: Tests that run longer than this, s, never end because of the mutant: that is seen, too.
 LONGEST_S = 900.0
-CORE = "firmware/core/"
-SOURCE = "src/armsight/"
+GEOMETRY, VISION, KINEMATICS = "src/armsight/geometry", "src/armsight/vision", "src/armsight/robot/kinematics"
+LOOP, HANDEYE, IDENTIFY = "src/armsight/loop", "src/armsight/loop/handeye", "src/armsight/loop/identify"
+ESTIMATORS, CORE = "src/armsight/loop/estimators", "firmware/core"
 
 
 class Mutant(NamedTuple):
@@ -44,8 +45,8 @@ class Mutant(NamedTuple):
         file: path from the root of the checkout.
         text: what stands in the file, once.
         becomes: what the mutant has instead.
-        tests: names of test files, looked up under tests/.
-        choose: pytest's ``-k`` expression; empty for all tests of the files.
+        test: name of the test file that must fail, looked up under tests/.
+        choose: pytest's ``-k`` expression; empty for all tests of the file.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Mutant(NamedTuple):
     file: str
     text: str
     becomes: str
-    tests: tuple[str, ...]
+    test: str
     choose: str = ""
 
 
@@ -62,8 +63,8 @@ class Outcome(NamedTuple):
 
     Attributes:
         name: of the mutant.
-        state: "killed", "survived" or "not judged".
-        by: the first test that failed, or why it was not judged.
+        state: "killed", "survived" or "invalid".
+        by: the first test that failed, or why it is invalid.
         seconds: how long its tests ran.
     """
 
@@ -73,11 +74,94 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-class NotJudged(Exception):
+class Invalid(Exception):
     """The mutant or its tests are not what the table says."""
 
 
-MUTANTS: tuple[Mutant, ...] = ()
+# fmt: off
+MUTANTS = (
+    Mutant("geometry-inverse", "sign", f"{GEOMETRY}/pose.py",
+           "= -(Rt @ T", "= (Rt @ T", "test_pose.py"),
+    Mutant("geometry-exp", "sign", f"{GEOMETRY}/pose.py",
+           "(angle - s) / (safe", "(angle + s) / (safe", "test_pose.py"),
+    Mutant("geometry-fit", "transposed", f"{GEOMETRY}/rigid.py",
+           "mean_a - R @ mean_b", "mean_a - R.T @ mean_b", "test_rigid.py"),
+    Mutant("geometry-quaternion", "off by one", f"{GEOMETRY}/rotation.py",
+           "np.roll(q, -1)", "np.roll(q, 0)", "test_rotation.py"),
+    Mutant("match-essential", "sign", f"{VISION}/match.py",
+           "[b, j] - t[b]", "[b, j] + t[b]", "test_match.py"),
+    Mutant("match-line", "transposed", f"{VISION}/match.py",
+           "line[1, j] += a[i] * E[i, j]", "line[1, j] += a[i] * E[j, i]", "test_match.py"),
+    Mutant("match-gate", "unit", f"{VISION}/match.py",
+           "np.sqrt(2 * variance)", "(2 * variance)", "test_match.py"),
+    Mutant("match-focal", "off by one", f"{VISION}/match.py",
+           "intrinsics[:2]", "intrinsics[1:3]", "test_match.py"),
+    Mutant("triangulate-midpoint", "sign", f"{VISION}/triangulate.py",
+           "(ab * at - bt)", "(ab * at + bt)", "test_triangulate.py"),
+    Mutant("triangulate-weight", "transposed", f"{VISION}/triangulate.py",
+           "= C[1, 1] / det, C[0, 0] / det", "= C[0, 0] / det, C[1, 1] / det", "test_triangulate.py"),
+    Mutant("triangulate-by-rig", "off by one", f"{VISION}/triangulate.py",
+           "start += 4 + counts[c]", "start += 3 + counts[c]", "test_triangulate.py"),
+    Mutant("triangulate-noise", "unit", f"{VISION}/triangulate.py",
+           "1e-6) ** 2 * np.eye(2)", "1e-6) * np.eye(2)", "test_triangulate.py"),
+    Mutant("locate-jacobian", "sign", f"{VISION}/posefit.py",
+           "J[i, 3] = J[i, 2] * p[n, 1] - ", "J[i, 3] = J[i, 2] * p[n, 1] + ", "test_posefit.py"),
+    Mutant("locate-by-rig", "sign", f"{VISION}/posefit.py",
+           "shared[i, rig + j] = -J_p[i, j]", "shared[i, rig + j] = J_p[i, j]", "test_locate.py"),
+    Mutant("locate-misfit", "unit", f"{VISION}/locate.py",
+           "float(np.sqrt(misfit))", "float(misfit)", "test_locate.py"),
+    Mutant("pnp-rotation", "transposed", f"{VISION}/pnp.py",
+           "(rotation, np.float64).ravel())", "(rotation, np.float64).ravel()).T", "test_pnp.py"),
+    Mutant("handeye-adjoint", "transposed", f"{HANDEYE}/handeye.py",
+           "skew(T[..., :3, 3]) @ R", "R @ skew(T[..., :3, 3])", "test_handeye.py"),
+    Mutant("handeye-derivative", "sign", f"{HANDEYE}/handeye.py",
+           "np.eye(6) + 0.5 *", "np.eye(6) - 0.5 *", "test_handeye.py"),
+    Mutant("handeye-start", "transposed", f"{HANDEYE}/handeye.py",
+           "@ RZ.T - A[:, :3, 3]", "@ RZ - A[:, :3, 3]", "test_handeye.py"),
+    Mutant("handeye-offset", "off by one", f"{HANDEYE}/streams.py",
+           "- (len(b) - 1)", "- (len(b) - 2)", "test_handeye_streams.py"),
+    Mutant("identify-chain", "sign", f"{IDENTIFY}/model.py",
+           "c * v - s * u", "c * v + s * u", "test_identify_model.py"),
+    Mutant("identify-residual", "transposed", f"{IDENTIFY}/model.py",
+           "back = measured.R_rig_body.swapaxes(1, 2)", "back = measured.R_rig_body", "test_identify_model.py"),
+    Mutant("identify-joints", "off by one", f"{IDENTIFY}/joint_noise.py",
+           ".OFFSET :", ".OFFSET + 1 :", "test_identify_arm.py", "spoils_only"),
+    Mutant("identify-prior", "sign", f"{IDENTIFY}/fit.py",
+           "J.T @ e + pull *", "J.T @ e - pull *", "test_identify_arm.py", "least_squares or perfect"),
+    Mutant("identify-noise", "unit", f"{IDENTIFY}/joint_noise.py",
+           "= sigma_rad**2 +", "= sigma_rad +", "test_identify_arm.py", "spoils_only"),
+    Mutant("kinematics-jacobian", "sign", f"{KINEMATICS}/chain.py",
+           "= zy * rz - zz * ry,", "= zy * rz + zz * ry,", "test_forward.py"),
+    Mutant("kinematics-tool-axes", "transposed", f"{KINEMATICS}/chain.py",
+           "= F[0] * x + F[1] * y + F[2] * z", "= F[0] * x + F[3] * y + F[6] * z", "test_forward.py"),
+    Mutant("kinematics-elbow", "sign", f"{KINEMATICS}/closed.py",
+           "- upper * upper - fore * fore)", "- upper * upper + fore * fore)", "test_inverse.py", "known_one"),
+    Mutant("kinematics-whole-turn", "off by one", f"{KINEMATICS}/inverse.py",
+           "np.floor((goal - q)", "1.0 + np.floor((goal - q)", "test_inverse.py", "near_orders"),
+    Mutant("kinematics-reach", "unit", f"{KINEMATICS}/closed.py",
+           "= math.sqrt(far2),", "= far2,", "test_inverse.py", "known_one"),
+    Mutant("servo-gain", "off by one", f"{LOOP}/servo.py",
+           "d**d / (d + 1) ** (d + 1)", "d**d / (d + 1) ** d", "test_servo.py", "gain_rule"),
+    Mutant("servo-correction", "sign", f"{LOOP}/servo.py",
+           "= q_ref - ahead.q", "= ahead.q - q_ref", "test_servo.py", "within_every_limit"),
+    Mutant("servo-rate", "unit", f"{LOOP}/servo.py",
+           "qd_max * period_s, np.maximum(", "qd_max, np.maximum(", "test_servo.py", "within_every_limit"),
+    Mutant("estimators-backlash", "sign", f"{ESTIMATORS}/armerror.py",
+           "= -0.5 * unseen[0, i]", "= 0.5 * unseen[0, i]", "test_arm_error.py"),
+    Mutant("estimators-adjoint", "transposed", f"{ESTIMATORS}/armerror.py",
+           "out[row, col] = out[3 + row, 3 + col] =", "out[col, row] = out[3 + col, 3 + row] =", "test_arm_error.py"),
+    Mutant("estimators-window", "off by one", f"{ESTIMATORS}/parabola.py",
+           'side="right") - 1', 'side="right") - 2', "test_readings.py"),
+    Mutant("estimators-jitter", "unit", f"{ESTIMATORS}/kalman.py",
+           "jitter_s**2 *", "jitter_s *", "test_kalman.py"),
+    Mutant("firmware-derivative", "sign", f"{CORE}/pid.c",
+           "- gains->kd_s_per_rad *", "+ gains->kd_s_per_rad *", "test_firmware_pid.py"),
+    Mutant("firmware-glitch", "off by one", f"{CORE}/pot.c",
+           "bad_ticks < confirm_ticks", "bad_ticks <= confirm_ticks", "test_firmware_pot.py"),
+    Mutant("firmware-current", "unit", f"{CORE}/core.c",
+           "* 0.001f;", "* 0.000001f;", "test_firmware_commands.py", "current"),
+)
+# fmt: on
 
 
 def copy_checkout(root: Path, folder: Path) -> None:
@@ -90,15 +174,12 @@ def copy_checkout(root: Path, folder: Path) -> None:
             shutil.copy2(root / part, folder / part)
 
 
-def test_paths(folder: Path, names: tuple[str, ...]) -> list[str]:
-    """Return the paths of test files, wherever they stand under tests/."""
-    paths = []
-    for name in names:
-        found = sorted((folder / "tests").rglob(name))
-        if len(found) != 1:
-            raise NotJudged(f"{len(found)} files under tests/ are called {name}")
-        paths.append(str(found[0].relative_to(folder)))
-    return paths
+def find_test(folder: Path, name: str) -> str:
+    """Return the path of a test file, wherever it stands under tests/."""
+    found = sorted((folder / "tests").rglob(name))
+    if len(found) != 1:
+        raise Invalid(f"{len(found)} files under tests/ are called {name}")
+    return str(found[0].relative_to(folder))
 
 
 def environment(folder: Path) -> dict[str, str]:
@@ -111,12 +192,12 @@ def require_copy(folder: Path) -> None:
     command = [sys.executable, "-c", "import armsight.errors as e; print(e.__file__)"]
     path = subprocess.run(command, cwd=folder, env=environment(folder), capture_output=True, text=True, check=True)
     if not Path(path.stdout.strip()).resolve().is_relative_to(folder.resolve()):
-        raise NotJudged(f"Python imports {path.stdout.strip()}, not the copy")
+        raise Invalid(f"Python imports {path.stdout.strip()}, not the copy")
 
 
 def run_tests(folder: Path, mutant: Mutant) -> tuple[int, str, float]:
     """Run a mutant's tests in a copy; return pytest's exit code, its first failure or its last line, and the time, s."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *test_paths(folder, mutant.tests)]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", find_test(folder, mutant.test)]
     command += ["-k", mutant.choose] if mutant.choose else []
     start = time.monotonic()
     try:
@@ -133,15 +214,21 @@ def run_tests(folder: Path, mutant: Mutant) -> tuple[int, str, float]:
     return done.returncode and 2, lines[-1] if lines else "pytest said nothing", time.monotonic() - start
 
 
+def mutated(folder: Path, mutant: Mutant) -> str:
+    """Return what the file contains with the mutant."""
+    path = folder / mutant.file
+    if not path.is_file():
+        raise Invalid(f"there is no file {mutant.file}")
+    text = path.read_text()
+    if text.count(mutant.text) != 1:
+        raise Invalid(f"{mutant.text!r} stands {text.count(mutant.text)} times in {mutant.file}")
+    return text.replace(mutant.text, mutant.becomes)
+
+
 def apply(folder: Path, mutant: Mutant) -> None:
     """Change the file in a copy."""
     path = folder / mutant.file
-    if not path.is_file():
-        raise NotJudged(f"there is no file {mutant.file}")
-    text = path.read_text()
-    if text.count(mutant.text) != 1:
-        raise NotJudged(f"{mutant.text!r} stands {text.count(mutant.text)} times in {mutant.file}")
-    path.write_text(text.replace(mutant.text, mutant.becomes))
+    path.write_text(mutated(folder, mutant))
     forget_kernels(folder, path)
 
 
@@ -184,7 +271,7 @@ def may_pass_on(path: Path) -> bool:
     return path.name == "__init__.py" or "numba" in path.read_text()
 
 
-def judge(clean: Path, work: Path, mutant: Mutant) -> Outcome:
+def evaluate(clean: Path, work: Path, mutant: Mutant) -> Outcome:
     """Run one mutant's tests on a copy of the clean tree, which has the compiled kernels."""
     if work.exists():
         shutil.rmtree(work)
@@ -193,44 +280,52 @@ def judge(clean: Path, work: Path, mutant: Mutant) -> Outcome:
         apply(work, mutant)
         require_copy(work)
         code, by, seconds = run_tests(work, mutant)
-    except NotJudged as error:
-        return Outcome(mutant.name, "not judged", str(error), 0.0)
-    state = {0: "survived", 1: "killed"}.get(code, "not judged")
+    except Invalid as error:
+        return Outcome(mutant.name, "invalid", str(error), 0.0)
+    state = {0: "survived", 1: "killed"}.get(code, "invalid")
     return Outcome(mutant.name, state, "" if code == 0 else by, seconds)
 
 
 def run(mutants: tuple[Mutant, ...], root: Path, folder: Path) -> list[Outcome]:
-    """Judge mutants of a checkout one after the other, working in a folder."""
+    """Evaluate mutants of a checkout one after the other, working in a folder."""
     clean, work = folder / "clean", folder / "mutant"
     if not clean.exists():
         copy_checkout(root, clean)
     require_copy(clean)
-    passed: dict[tuple[tuple[str, ...], str], str] = {}  # why the unmutated tests do not pass, empty where they do
+    passed: dict[tuple[str, str], str] = {}  # why the unmutated tests do not pass, empty where they do
     outcomes = []
     for mutant in mutants:
-        selection = (mutant.tests, mutant.choose)
+        selection = (mutant.test, mutant.choose)
         if selection not in passed:
             try:
                 code, by, _ = run_tests(clean, mutant)
                 passed[selection] = f"its tests do not pass without it: {by}" if code else ""
-            except NotJudged as error:
+            except Invalid as error:
                 passed[selection] = str(error)
         reason = passed[selection]
-        outcome = Outcome(mutant.name, "not judged", reason, 0.0) if reason else judge(clean, work, mutant)
-        print(f"{outcome.name:32} {outcome.state:10} {outcome.seconds:5.0f} s  {outcome.by}", flush=True)
+        outcome = Outcome(mutant.name, "invalid", reason, 0.0) if reason else evaluate(clean, work, mutant)
+        print(f"{outcome.name:24} {outcome.state:9} {outcome.seconds:5.0f} s  {outcome.by}", flush=True)
         outcomes.append(outcome)
     return outcomes
 
 
-def show(mutants: tuple[Mutant, ...]) -> None:
-    """Print the table."""
+def show(mutants: tuple[Mutant, ...], root: Path) -> bool:
+    """Print the table; return whether every text stands in its file exactly once and every test file is there."""
+    good = True
     for m in mutants:
-        tests = " ".join(m.tests) + (f" -k '{m.choose}'" if m.choose else "")
-        print(f"{m.name:32} {m.kind:10} {m.file}\n    - {m.text}\n    + {m.becomes}\n    {tests}")
+        tests = m.test + (f" -k '{m.choose}'" if m.choose else "")
+        print(f"{m.name:24} {m.kind:12} {m.file}\n    - {m.text}\n    + {m.becomes}\n    {tests}")
+        try:
+            mutated(root, m)
+            find_test(root, m.test)
+        except Invalid as error:
+            print(f"    INVALID: {error}")
+            good = False
+    return good
 
 
 def main(mutants: tuple[Mutant, ...] = MUTANTS, root: Path = ROOT) -> int:
-    """Judge the mutants that the command line names, or all."""
+    """Evaluate the mutants that the command line names, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="mutants to run; all where none is named")
     parser.add_argument("--list", action="store_true", help="show the table and run nothing")
@@ -241,8 +336,7 @@ def main(mutants: tuple[Mutant, ...] = MUTANTS, root: Path = ROOT) -> int:
         parser.error(f"unknown: {', '.join(unknown)}; known are {', '.join(known)}")
     chosen = tuple(known[name] for name in asked.names) or mutants
     if asked.list:
-        show(chosen)
-        return 0
+        return 0 if show(chosen, root) else 2
     with tempfile.TemporaryDirectory() as temporary:
         outcomes = run(chosen, root, Path(temporary))
     states = [outcome.state for outcome in outcomes]
@@ -250,7 +344,7 @@ def main(mutants: tuple[Mutant, ...] = MUTANTS, root: Path = ROOT) -> int:
     if asked.json:
         records = [known[outcome.name]._asdict() | outcome._asdict() for outcome in outcomes]
         asked.json.write_text(json.dumps(records, indent=2) + "\n")
-    return 2 if "not judged" in states else int("survived" in states)
+    return 2 if "invalid" in states else int("survived" in states)
 
 
 if __name__ == "__main__":
