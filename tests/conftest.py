@@ -2,8 +2,11 @@
 
 import os
 import signal
+import subprocess
+import tempfile
 from pathlib import Path
 
+import cv2
 import pytest
 from hypothesis import settings
 
@@ -18,6 +21,11 @@ settings.load_profile("ci")
 
 # A shell's job in the background is started with interrupts ignored; tests of interrupts, and what they start, need them.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_report_header() -> str:
+    """Name what differs between the environments in which the tests run."""
+    return f"OpenCV {cv2.__version__}"
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +44,41 @@ def host_firmware() -> None:
         open_emulator("host").close()
     except (DeviceError, InputError) as error:
         pytest.skip(f"the firmware is not built: {error}")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """Mount file systems of a few kB: ``small_disk("64k")`` returns the folder of one. Skips where that is not allowed."""
+    mounted = []
+
+    def mount(size):
+        place = tmp_path / f"disk{len(mounted)}"
+        place.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"cannot mount a small tmpfs here: {done.stderr.strip()}")
+        mounted.append(place)
+        return place
+
+    yield mount
+    for place in mounted:
+        subprocess.run(["umount", place], check=True)
+
+
+@pytest.fixture
+def forbidden():
+    """Yield a folder in which this process may not write. Root may write anywhere, so it is nobody for the test."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if os.geteuid() == 0:
+            folder.chmod(0o755)
+            os.seteuid(65534)
+            try:
+                yield folder
+            finally:
+                os.seteuid(0)
+        else:
+            folder.chmod(0o500)
+            yield folder
+            folder.chmod(0o700)

@@ -1,6 +1,5 @@
 """A rendered recording with truth, made and calibrated once for all tests of the command line."""
 
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,17 +62,8 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture
-def full_disk(tmp_path):
+def full_disk(small_disk):
     """A file system of one page, full."""
-    place = tmp_path / "tiny"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    try:
-        (place / "ballast").write_bytes(bytes(4096))
-        yield place
-    finally:
-        subprocess.run(["umount", place], check=True)
+    place = small_disk("4k")
+    (place / "ballast").write_bytes(bytes(4096))
+    return place

@@ -10,12 +10,11 @@ import threading
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from armsight.app.main import main
-from armsight.app.record import recording
+from armsight.app.record import command, recording
 from armsight.app.record.recording import record
 from armsight.data import Shot
 from armsight.errors import DeviceError, InputError
@@ -181,20 +180,13 @@ def test_another_thread_can_record(tmp_path):
     assert results[0].shots == 2
 
 
-def test_a_full_disk_keeps_what_fitted(tmp_path):
-    disk = tmp_path / "small"
-    disk.mkdir()
-    if os.geteuid() != 0 or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "none", disk]).returncode:
-        pytest.skip("only root can mount a small disk; the same is tested with a failing write")
-    try:
-        shots = some(40, (64, 64, 3))  # two files of 12 kB each: about ten fit
-        result = record(Played(shots), disk / "a")
-        assert 5 <= result.shots < 11
-        assert result.stopped.endswith("cannot be written: No space left on device")
-        assert_same(read_back(result.directory), shots[: result.shots])
-        assert_nothing_else(result.directory, shots[: result.shots])
-    finally:
-        subprocess.run(["umount", disk], check=True)
+def test_a_full_disk_keeps_what_fitted(small_disk):
+    disk, shots = small_disk("256k"), some(40, (64, 64, 3))  # two files of 12 kB each: about ten fit
+    result = record(Played(shots), disk / "a")
+    assert 5 <= result.shots < 11
+    assert result.stopped.endswith("cannot be written: No space left on device")
+    assert_same(read_back(result.directory), shots[: result.shots])
+    assert_nothing_else(result.directory, shots[: result.shots])
 
 
 def test_a_folder_in_use_is_not_touched(tmp_path):
@@ -262,14 +254,11 @@ def test_the_commands_mistakes_are_one_line_and_code_2(monkeypatch, capsys, stor
 
 
 def test_a_stop_in_the_middle_is_a_partial_result_that_says_so(monkeypatch, capsys, tmp_path):
-    module = sys.modules.get("armsight.app.record.command") or __import__(
-        "armsight.app.record.command", fromlist=["command"]
-    )
     for stop, expected, said in (
         (DeviceError("/dev/video0: gone"), 2, "armsight: error: /dev/video0: gone; 3 shots are stored in"),
         (KeyboardInterrupt(), 130, "armsight: interrupted; 3 shots are stored in"),
     ):
-        monkeypatch.setattr(module, "open_source", lambda _, stop=stop: Played([*some(3), stop]))
+        monkeypatch.setattr(command, "open_source", lambda _, stop=stop: Played([*some(3), stop]))
         folder = tmp_path / str(expected)
         code, out, err = run(monkeypatch, capsys, "record", "any", "-o", folder, "--json")
         assert code == expected
@@ -278,17 +267,33 @@ def test_a_stop_in_the_middle_is_a_partial_result_that_says_so(monkeypatch, caps
         assert len(read_back(folder)) == 3
 
 
+#: A process that records from cameras that never stop by themselves: only the interrupt ends it.
+ENDLESS = """
+import itertools, time
+import numpy as np
+from armsight.app.main import main
+from armsight.app.record import command
+from armsight.data import Shot
+
+class Endless:
+    def __init__(self):
+        self.names = map(str, itertools.count())
+    def read(self):
+        time.sleep(0.01)
+        return Shot(next(self.names), *np.full((2, 24, 32), 7, np.uint8), 0.0)
+    def close(self):
+        print("closed")
+
+command.open_source = lambda spec: Endless()
+main()
+"""
+
+
 def test_ctrl_c_in_a_real_process(tmp_path):
-    """A long recording of a video, interrupted as soon as some of it is stored."""
-    video = tmp_path / "both.avi"
-    writer = cv2.VideoWriter(str(video), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (640, 240))
-    for _ in range(300):
-        writer.write(noise((240, 640, 3)))
-    writer.release()
+    """A recording without an end, interrupted as soon as some of it is stored."""
     folder = tmp_path / "a"
-    command = [sys.executable, "-c", "from armsight.app.main import main; main()", "record", f"video:{video}"]
     process = subprocess.Popen(
-        [*command, "-o", folder],
+        [sys.executable, "-c", ENDLESS, "record", "any", "-o", folder],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -303,5 +308,6 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     assert process.returncode == 130
     assert f"armsight: interrupted; {len(found)} shots are stored in" in err
     assert "Traceback" not in out + err
-    assert 4 <= len(found) < 300
+    assert "closed" in out
+    assert len(found) >= 4
     assert_nothing_else(folder, found)

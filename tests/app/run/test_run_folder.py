@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import signal
-import subprocess
 import time
 from types import SimpleNamespace
 
@@ -13,7 +12,7 @@ import pytest
 
 from armsight.app.run import folder as run_files
 from armsight.app.run import folder as run_folder
-from armsight.app.run.experiment import Outcome
+from armsight.app.run.experiment import RunResult
 from armsight.app.run.folder import Finished, finish, make_room, write_run, write_shots
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
@@ -23,7 +22,7 @@ BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
 def finished(readings=400, **said):
     """A run that was broken off before the cameras were found."""
-    outcome = Outcome(BODY)
+    outcome = RunResult(BODY)
     t_s = 1e-3 * np.arange(readings)
     outcome.log.joints.append(JointStates(t_s, np.random.default_rng(0).standard_normal((readings, 6))))
     outcome.log.poses.append(("000000", 0.1, Missed("nothing is seen")))
@@ -31,21 +30,6 @@ def finished(readings=400, **said):
         setattr(outcome, name, value)
     facts = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
     return Finished(SimpleNamespace(), None, outcome, SimpleNamespace(), None, facts, time.perf_counter(), [], None)
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 96 kB."""
-    place = tmp_path / "small"
-    place.mkdir()
-    told = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", place]
-    mounted = subprocess.run(told, capture_output=True, text=True, check=False)
-    if mounted.returncode:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", place], check=True)
 
 
 def test_what_is_not_known_is_null(tmp_path):
@@ -70,17 +54,17 @@ def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
-    gone = DeviceError("left camera: gone")
+    disk, gone = small_disk("96k"), DeviceError("left camera: gone")
     with pytest.raises(InputError) as told:
-        finish(finished(readings=4000, ended_by=gone), small_disk)
+        finish(finished(readings=4000, ended_by=gone), disk)
     said = str(told.value)
     assert "\n" not in said
     assert said.startswith("left camera: gone; the arm was stopped, and not all could be written: ")
-    assert f"{small_disk / 'joints.csv'}: cannot be written: No space left on device" in said
-    assert said.endswith(f"what was written before is in {small_disk}")
-    assert json.loads((small_disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
-    assert list(csv.reader((small_disk / "poses.csv").read_text().splitlines()))
-    assert {path.name for path in small_disk.iterdir()} == {"summary.json", "poses.csv"}
+    assert f"{disk / 'joints.csv'}: cannot be written: No space left on device" in said
+    assert said.endswith(f"what was written before is in {disk}")
+    assert json.loads((disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
+    assert list(csv.reader((disk / "poses.csv").read_text().splitlines()))
+    assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv"}
 
 
 def shots(count):
@@ -89,11 +73,12 @@ def shots(count):
 
 
 def test_shots_are_a_recording_or_are_not_there(small_disk, tmp_path):
+    disk = small_disk("96k")
     write_shots(tmp_path / "shots", shots(3))
     assert len((tmp_path / "shots" / "shots.csv").read_text().splitlines()) == 4
-    with pytest.raises(InputError, match=rf"{small_disk}/shots/\S+\.png: cannot be written: No space left"):
-        write_shots(small_disk / "shots", shots(30))
-    assert list(small_disk.iterdir()) == []
+    with pytest.raises(InputError, match=rf"{disk}/shots/\S+\.png: cannot be written: No space left"):
+        write_shots(disk / "shots", shots(30))
+    assert list(disk.iterdir()) == []
     write_shots(tmp_path / "none", [])
     assert not (tmp_path / "none").exists()
 

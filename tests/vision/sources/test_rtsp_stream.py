@@ -5,13 +5,14 @@ import itertools
 import socketserver
 import struct
 import threading
+from functools import partial
 
 import cv2
 import pytest
 
 from armsight.errors import DeviceError
 from armsight.vision.sources import open_source
-from armsight.vision.sources.url import RtspStream
+from armsight.vision.sources.url import STREAMS, RtspStream
 
 PERIOD = 0.04
 SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\nm=video 0 RTP/AVP 26\r\na=control:t\r\n"
@@ -95,7 +96,7 @@ def serve(picture):
 
 
 def test_two_streams_then_one_stalls(serve, told, monkeypatch):
-    monkeypatch.setattr(RtspStream.__init__, "__defaults__", (2.0,))
+    monkeypatch.setitem(STREAMS, "rtsp", partial(RtspStream, timeout_s=2.0))
     left, right = serve("left"), serve("right")
     with contextlib.closing(open_source(f"url:{left.url},{right.url}")) as source:
         found = [source.read() for _ in range(8)]

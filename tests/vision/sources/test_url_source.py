@@ -7,6 +7,7 @@ import queue
 import socket
 import threading
 import time
+from functools import partial
 
 import cv2
 import numpy as np
@@ -77,9 +78,9 @@ class Server:
 @pytest.fixture
 def server(monkeypatch):
     """A server, and time-outs short enough to wait for."""
-    monkeypatch.setattr(MjpegStream.__init__, "__defaults__", (0.6,))
-    monkeypatch.setattr(RtspStream.__init__, "__defaults__", (0.6,))
-    monkeypatch.setattr(UrlSource.__init__, "__defaults__", (1.5,))
+    monkeypatch.setitem(url.STREAMS, "http", partial(MjpegStream, timeout_s=0.6))
+    monkeypatch.setitem(url.STREAMS, "rtsp", partial(RtspStream, timeout_s=0.6))
+    monkeypatch.setattr(url, "UrlSource", partial(UrlSource, timeout_s=1.5))
     made = Server()
     yield made
     made.close()
