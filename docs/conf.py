@@ -34,6 +34,10 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!armsight\b).*"),
     # Type aliases and private names that appear in signatures only.
     (r"py:(class|obj|data|attr)", r"armsight\.data\.(Array|Image)"),
+    # Records inside one subject, named in signatures of public functions; the reference has the public names only.
+    (r"py:.*", r"armsight\.vision\.(bundle|detections|projection|rectify)\.\w+"),
+    (r"py:.*", r"armsight\.(loop\.estimators\.readings|robot\.trajectories\.limits)\.\w+"),
+    (r"py:.*", r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|disc\.target|spec))\.\w+"),
 ]
 suppress_warnings = ["config.cache"]  # sphinx-gallery keeps functions in its configuration
 
@@ -49,6 +53,7 @@ autodoc_preserve_defaults = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True
 python_use_unqualified_type_names = True
 add_module_names = False
 
@@ -96,6 +101,12 @@ def fill_in_pictures(app: Sphinx) -> None:
                 Image.new("L", (640, 120), 220).save(picture)
 
 
+def skip_plain_fields(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
+    """Leave out the fields of named tuples: the section Attributes of the class describes them."""
+    return True if type(member).__name__ == "_tuplegetter" else None
+
+
 def setup(app: Sphinx) -> None:
     """Hook what the site needs beyond its extensions."""
     app.connect("builder-inited", fill_in_pictures)
+    app.connect("autodoc-skip-member", skip_plain_fields)
