@@ -8,8 +8,10 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held against its truth
 	$(BIN)/armsight demo -o demo
 
-test: $(VENV)/.armsight-test lint  ## everything that must hold
+test: $(VENV)/.armsight-test $(VENV)/.opencv4 lint  ## everything that must hold
 	$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile
+	PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
+	PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile -m opencv
 
 lint: $(VENV)/.armsight-test
 	$(BIN)/ruff check .
@@ -32,6 +34,11 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 
 $(VENV)/.armsight-test: $(VENV)/.armsight
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	touch $@
+
+# OpenCV 4 in a folder of its own, which PYTHONPATH puts before the newer one; everything else is the environment's.
+$(VENV)/.opencv4: $(VENV)/.armsight-test
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"
 	touch $@
 
 clean:

@@ -8,10 +8,12 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.sim.example_rig import example_rig, board_poses, demo_recording, in_view, path, tag_plate
+from armsight.sim.example_rig import board_poses, demo_recording, example_rig, in_view, path, tag_plate
 from armsight.sim.recording import Look, Truth, record, shot_names
 from armsight.sim.render.scene import aprilgrid, chessboard
 from armsight.vision.sources.folder import FolderSource
+
+pytestmark = pytest.mark.opencv
 
 
 @pytest.fixture(scope="module")

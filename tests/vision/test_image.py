@@ -10,6 +10,8 @@ import pytest
 from armsight.errors import InputError
 from armsight.vision.image import grey, read_image
 
+pytestmark = pytest.mark.opencv
+
 RNG = np.random.default_rng(0)
 GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)
 COLOUR = cv2.resize(RNG.integers(0, 256, (10, 15, 3), dtype=np.uint8), (60, 40))

@@ -9,6 +9,8 @@ from armsight.vision.pnp import body_poses, consensus_poses
 from strategies import CAMERAS
 from views import board, pixels
 
+pytestmark = pytest.mark.opencv
+
 RNG = np.random.default_rng(0)
 TURNED = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
 BODIES = {

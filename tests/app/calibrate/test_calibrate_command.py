@@ -15,6 +15,8 @@ from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import listening, refused
 
+pytestmark = pytest.mark.opencv
+
 QUICK = ("--model", "brown5", "--folds", "3", "--flat-board")
 
 

@@ -15,6 +15,8 @@ from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
 from cli_runs import Said, refused, run
 
+pytestmark = pytest.mark.opencv
+
 
 @pytest.fixture
 def dense(capsys):

@@ -20,6 +20,8 @@ from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
 from cli_runs import refused
 
+pytestmark = pytest.mark.opencv
+
 KEYS = {
     "shot", "status", "reason", "t_s", "position_m", "quaternion_wxyz", "roll_pitch_yaw_deg", "covariance",
     "residual_rms_m", "reprojection_rms_px", "points_m",

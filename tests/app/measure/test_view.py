@@ -35,6 +35,8 @@ from armsight.vision.rig import StereoRig
 from cli_runs import refused
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 
+pytestmark = pytest.mark.opencv
+
 matplotlib = pytest.importorskip("matplotlib", reason="the chart needs matplotlib: pip install armsight[report]")
 
 FIVE = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0.085, 0], [-0.03, 0.05, 0], [0.02, -0.06, 0]])

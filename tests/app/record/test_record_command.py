@@ -21,6 +21,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import FolderSource, open_source
 from cli_runs import listening
 
+pytestmark = pytest.mark.opencv
+
 rng = np.random.default_rng(20240611)
 
 

@@ -5,10 +5,12 @@ from handeye_motions import SIGMA_FLANGE_M, SIGMA_FLANGE_RAD, error, recording
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse
+from armsight.geometry.pose import adjoint, exp_se3, inverse
 from armsight.loop.handeye import handeye as handeye_start
-from armsight.loop.handeye.handeye import Poses, adjoint, calibrate_handeye, residuals
+from armsight.loop.handeye.handeye import Poses, calibrate_handeye, residuals
 from asserts import assert_jacobian
+
+pytestmark = pytest.mark.opencv
 
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])

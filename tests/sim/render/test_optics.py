@@ -7,6 +7,8 @@ from armsight.errors import InputError
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.optics import Optics, Sensor, exposed, psf_taps, shaded
 
+pytestmark = pytest.mark.opencv
+
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0])
 @pytest.mark.parametrize("parts", [1, 4])

@@ -18,6 +18,8 @@ from armsight.sim.render.scene import (
     tag,
 )
 
+pytestmark = pytest.mark.opencv
+
 
 def at(pattern, x, y):
     """Reflectance of the cell at a point of the pattern's own plane."""

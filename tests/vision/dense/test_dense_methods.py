@@ -13,6 +13,8 @@ from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.opencv import OpenCV
 from armsight.vision.dense.semiglobal import Semiglobal
 
+pytestmark = pytest.mark.opencv
+
 SEARCH = Search(0, 32)
 VARIANTS = {
     **{name: make() for name, make in METHODS.items()},

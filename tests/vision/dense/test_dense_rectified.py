@@ -10,6 +10,8 @@ from armsight.vision.dense.method import Search
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.rectified import match_pair
 
+pytestmark = pytest.mark.opencv
+
 SEARCH = Search(0, 32)
 
 

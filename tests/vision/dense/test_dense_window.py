@@ -10,6 +10,8 @@ from armsight.vision.dense.block import Block
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.window import RAW_MAX
 
+pytestmark = pytest.mark.opencv
+
 
 def raw_costs(left, right, first, count):
     """Twice the census bits that differ and half of the absolute difference, pixel by pixel."""

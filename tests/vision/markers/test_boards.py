@@ -17,6 +17,8 @@ from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, open_board
 
+pytestmark = pytest.mark.opencv
+
 SPECS = {
     "chessboard": "chessboard:9x6:25mm",
     "charuco": "charuco:8x6:30mm:22mm:DICT_5X5_100",
@@ -104,7 +106,7 @@ def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):
     parts = SPECS[kind].split(":")
     target = open_board(":".join([parts[0], columns_rows, *parts[2:]]))
     points = target.body.points[:, :2] - target.body.points[:, :2].mean(axis=0)
-    for flip in target.flips:
+    for flip in target.symmetries:
         assert sorted(flip.tolist()) == list(range(len(points)))
         assert flip.tolist() != list(range(len(points)))
         # A rotation keeps all scalar and cross products.
@@ -115,7 +117,7 @@ def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):
 
 
 @pytest.mark.parametrize(
-    ("spec", "flips"),
+    ("spec", "symmetries"),
     [
         ("chessboard:9x6:25mm", 0),  # one end dark, one bright
         ("chessboard:9x7:25mm", 1),
@@ -129,8 +131,8 @@ def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):
         ("aprilgrid:6x6:88mm:0.3", 0),
     ],
 )
-def test_what_a_board_leaves_open(spec, flips):
-    assert len(open_board(spec).flips) == flips
+def test_what_a_board_leaves_open(spec, symmetries):
+    assert len(open_board(spec).symmetries) == symmetries
 
 
 @pytest.mark.parametrize("kind", BOARDS)
@@ -182,11 +184,11 @@ def test_colours_decide_where_a_chessboard_begins(spec, turn):
 def test_what_colours_leave_open_is_a_flip(spec, turn):
     target, image, truth = painted("chessboard", 0.2, turn, samples=4, spec=spec)
     found = target.detect(expose(image, 150, 1, np.random.default_rng(5)))
-    names = [found.ids, *(flip[found.ids] for flip in target.flips)]
+    names = [found.ids, *(flip[found.ids] for flip in target.symmetries)]
     off = [np.abs(found.uv - truth[ids]).max() for ids in names]
     assert min(off) < 0.1
     across = truth[1] - truth[0]
-    if abs(turn) < 0.7 or len(target.flips) == 3:  # the order that runs to the right is taken
+    if abs(turn) < 0.7 or len(target.symmetries) == 3:  # the order that runs to the right is taken
         assert (off[0] < 0.1) == (across[0] > np.abs(across[1]) or abs(turn) < 0.7)
 
 

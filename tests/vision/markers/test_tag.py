@@ -10,8 +10,10 @@ from supersampled import expose, paint, picture, project, view
 from armsight.geometry.pose import pose
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.aruco import APRILTAGS, FAMILIES, cells, family_name, family_size, find_squares
-from armsight.vision.markers.square import place_square
+from armsight.vision.markers.square import fit_square
 from armsight.vision.markers.tag import Tag, TagTarget
+
+pytestmark = pytest.mark.opencv
 
 OUTLINE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
@@ -41,7 +43,7 @@ def test_corners_are_placed_as_well_as_predicted(side_px, tilt, blur_px, noise):
     for turn in (0.2, 1.1, 2.6, -1.9):
         painted, truth = scene(side_px, tilt, turn, blur_px, code)
         for _ in range(12):
-            fit = place_square(expose(painted, 130, noise, rng), truth + rng.normal(0, 0.6, (4, 2)), code)
+            fit = fit_square(expose(painted, 130, noise, rng), truth + rng.normal(0, 0.6, (4, 2)), code)
             assert fit.problem is None
             error = fit.uv - truth
             errors.append(error)
@@ -57,7 +59,7 @@ def test_gamma_and_bleeding_print_do_not_move_the_outline():
     bright = 255 * ((128 + 80 * painted) / 255) ** 0.5
     rng = np.random.default_rng(1)
     fits = [
-        place_square(np.clip(np.rint(bright + rng.normal(0, 2, bright.shape)), 0, 255).astype(np.uint8), truth, code)
+        fit_square(np.clip(np.rint(bright + rng.normal(0, 2, bright.shape)), 0, 255).astype(np.uint8), truth, code)
         for _ in range(10)
     ]
     outward = np.mean([fit.uv for fit in fits], axis=0) - truth
@@ -71,7 +73,7 @@ def test_corners_found_most_of_a_cell_off_come_home_or_are_refused(side_px):
     for _ in range(12):
         start = truth + rng.uniform(-0.3, 0.3, (4, 2)) * side_px / 8
         start[rng.integers(4)] += rng.choice([-0.75, 0.75], 2) * side_px / 8
-        fit = place_square(expose(painted, 130, 2, rng), start, code)
+        fit = fit_square(expose(painted, 130, 2, rng), start, code)
         if fit.problem is None:
             sigma = np.sqrt(np.trace(fit.cov_uv, axis1=1, axis2=2))
             assert (np.linalg.norm(fit.uv - truth, axis=1) < 6 * sigma + 0.05).all()
@@ -90,7 +92,7 @@ def test_what_is_not_the_marker_is_refused(what):
         image[:, image.shape[1] // 2 :] = 128
     else:
         truth = truth - 60
-    assert place_square(image, truth, code).problem
+    assert fit_square(image, truth, code).problem
 
 
 def test_upright_is_whose_name_it_bears():
@@ -172,7 +174,7 @@ def test_photographs_agree_with_the_apriltag_library(data_dir):
             total += 1
             near = [c for number, c in found if number == 0 and np.linalg.norm((c - theirs).mean(axis=0)) < 4]
             if near:
-                fit = place_square(image, near[0], cells("tag36h11", 0))
+                fit = fit_square(image, near[0], cells("tag36h11", 0))
                 if fit.problem is None:
                     ours.append(fit.uv - theirs)
                     rough.append(near[0] - theirs)

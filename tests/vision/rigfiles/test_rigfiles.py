@@ -21,6 +21,8 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
 from strategies import CAMERAS, ordinary_rig
 
+pytestmark = pytest.mark.opencv
+
 FILES = {
     "opencv": ["intrinsics.yml", "extrinsics.yml"],
     "ros": ["left.yaml", "right.yaml"],

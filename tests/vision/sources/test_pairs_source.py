@@ -10,6 +10,8 @@ from armsight.errors import InputError
 from armsight.vision.sources import FolderSource, PairsSource, open_source
 from armsight.vision.sources.pairs import match, natural_key
 
+pytestmark = pytest.mark.opencv
+
 
 def shots(source):
     found = []

@@ -14,6 +14,8 @@ from armsight.errors import DeviceError
 from armsight.vision.sources import open_source
 from armsight.vision.sources.url import STREAMS, RtspStream
 
+pytestmark = pytest.mark.opencv
+
 PERIOD = 0.04
 SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\nm=video 0 RTP/AVP 26\r\na=control:t\r\n"
 ANSWERS = {

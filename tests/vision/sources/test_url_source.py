@@ -17,6 +17,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, url
 from armsight.vision.sources.url import MjpegStream, RtspStream, UrlSource
 
+pytestmark = pytest.mark.opencv
+
 PERIOD = 0.03
 BOUNDARY = "frameboundary"
 

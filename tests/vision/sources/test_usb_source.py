@@ -7,6 +7,8 @@ import pytest
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, usb
 
+pytestmark = pytest.mark.opencv
+
 PERIOD = 1 / 30
 
 

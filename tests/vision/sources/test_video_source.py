@@ -7,6 +7,8 @@ import pytest
 from armsight.errors import InputError
 from armsight.vision.sources import open_source
 
+pytestmark = pytest.mark.opencv
+
 
 @pytest.fixture
 def film(tmp_path):
