@@ -9,7 +9,7 @@ import pytest
 
 from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import Said, refused, run
 
@@ -26,7 +26,7 @@ def said(capsys, *arguments):
 
 
 def rows_of(sigma_arm=1e-4, noise=5e-5):
-    """Five poses by 30 cycles from two directions, a path and a circle with 0.2 mm of play along x."""
+    """Five poses by 30 cycles from two directions, a path and a circle with 0.2 mm of backlash along x."""
     rng = np.random.default_rng(1)
     rows, still = [], [1, 0, 0, 0]
     commands = rng.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.7], (5, 3))
@@ -54,30 +54,30 @@ def file_of(path, rows):
     return path
 
 
-def test_every_figure(tmp_path, capsys):
+def test_every_metric(tmp_path, capsys):
     (tmp_path / "run").mkdir()
     file_of(tmp_path / "run" / "check.csv", rows_of())
     answer = said(capsys, tmp_path / "run", "--json", "-o", tmp_path / "report")
     assert answer.code == 0
-    (facts,) = answer.lines
-    assert json.loads((tmp_path / "report" / "check.json").read_text()) == facts
-    assert set(facts["poses"]) == {f"P{k}" for k in range(1, 6)}
-    for p in facts["poses"].values():
+    (found,) = answer.lines
+    assert json.loads((tmp_path / "report" / "check.json").read_text()) == found
+    assert set(found["poses"]) == {f"P{k}" for k in range(1, 6)}
+    for p in found["poses"].values():
         assert p["count"] == 30
         assert p["AP_m"]["clean"] == pytest.approx(1e-3, abs=1e-4)
         assert p["RP_m"]["clean"] < p["RP_m"]["raw"]
-    assert facts["vAP_m"]["P1"]["raw"] == pytest.approx(2e-4, abs=1.5e-4)
-    assert facts["distance"]["AD_m"]["raw"] < 1e-4
-    assert facts["paths"]["path"]["AT_m"]["raw"] == pytest.approx(5e-4, abs=1e-9)
-    assert [play["raw"] for play in facts["circle"]["backlash_m"]] == pytest.approx([2e-4, 0], abs=2e-5)
-    assert len(facts["drift"]["dAP_m"]) == 5
+    assert found["vAP_m"]["P1"]["raw"] == pytest.approx(2e-4, abs=1.5e-4)
+    assert found["distance"]["AD_m"]["raw"] < 1e-4
+    assert found["paths"]["path"]["AT_m"]["raw"] == pytest.approx(5e-4, abs=1e-9)
+    assert [backlash["raw"] for backlash in found["circle"]["backlash_m"]] == pytest.approx([2e-4, 0], abs=2e-5)
+    assert len(found["drift"]["dAP_m"]) == 5
     page = (tmp_path / "report" / "report.html").read_text()
     for name in ("scatter", "drift", "paths", "circle"):
         assert f'id="{name}"' in page
         assert (tmp_path / "report" / f"check-{name}.png").read_bytes().startswith(b"\x89PNG")
     assert "://" not in page
     again = said(capsys, tmp_path / "report" / "check.csv", "--json")
-    assert again.lines[0]["poses"]["P1"]["AP_m"]["raw"] == pytest.approx(facts["poses"]["P1"]["AP_m"]["raw"], abs=2e-9)
+    assert again.lines[0]["poses"]["P1"]["AP_m"]["raw"] == pytest.approx(found["poses"]["P1"]["AP_m"]["raw"], abs=2e-9)
 
 
 def test_what_is_below_the_noise_is_said(tmp_path, capsys):
@@ -85,8 +85,8 @@ def test_what_is_below_the_noise_is_said(tmp_path, capsys):
     answer = said(capsys, file_of(tmp_path / "c.csv", rows), "-o", tmp_path / "report")
     assert answer.code == 0
     assert "not resolvable: below" in answer.out
-    assert "could have been told" in answer.out
-    assert re.search(r"^play +along x +0\.2\d\d mm", answer.out, re.MULTILINE)
+    assert "could have been resolved" in answer.out
+    assert re.search(r"^backlash +along x +0\.2\d\d mm", answer.out, re.MULTILINE)
     assert "not resolvable" in (tmp_path / "report" / "report.html").read_text()
 
 
@@ -96,10 +96,10 @@ def test_a_constant_error_of_the_instrument_is_in_the_accuracy(tmp_path, capsys)
     with open(tmp_path / "b.csv", "w", newline="") as file:
         common = [f"sigma_common_{a}_m" for a in "xyz"]
         csv.writer(file).writerows([[*COLUMNS, *COMMAND, *SIGMA, *common], *([*row, 1e-4, 1e-4, 1e-4] for row in rows)])
-    facts = said(capsys, tmp_path / "b.csv", "--json").lines[0]["poses"]["P1"]
-    assert facts["AP_m"]["sigma"] == pytest.approx(np.hypot(1e-4, plain["AP_m"]["sigma"]), rel=0.1)
+    found = said(capsys, tmp_path / "b.csv", "--json").lines[0]["poses"]["P1"]
+    assert found["AP_m"]["sigma"] == pytest.approx(np.hypot(1e-4, plain["AP_m"]["sigma"]), rel=0.1)
     assert plain["AP_m"]["sigma"] < 5e-5
-    assert facts["RP_m"] == plain["RP_m"]
+    assert found["RP_m"] == plain["RP_m"]
 
 
 def test_the_wide_test(tmp_path, capsys):
@@ -110,28 +110,28 @@ def test_the_wide_test(tmp_path, capsys):
         off = rng.normal(0, 1e-3, 3)
         rows.append(["pose", f"P{k}", 1, "", k, *(command + off), 1, 0, 0, 0, *command, 1, 0, 0, 0, 1e-5, 1e-5, 1e-5])
     answer = said(capsys, file_of(tmp_path / "wide.csv", rows), "--json", "-o", tmp_path / "report")
-    (facts,) = answer.lines
-    assert facts["anywhere"]["count"] == 100
-    assert facts["anywhere"]["mean_m"]["clean"] == pytest.approx(1e-3 * np.sqrt(8 / np.pi), rel=0.2)
-    assert "poses" not in facts
+    (found,) = answer.lines
+    assert found["anywhere"]["count"] == 100
+    assert found["anywhere"]["mean_m"]["clean"] == pytest.approx(1e-3 * np.sqrt(8 / np.pi), rel=0.2)
+    assert "poses" not in found
     assert (tmp_path / "report" / "check-anywhere.png").exists()
     assert not (tmp_path / "report" / "check-scatter.png").exists()
 
 
 def test_the_plan(tmp_path, capsys):
-    answer = said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.csv")
+    answer = said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.csv")
     assert answer.code == 0
     assert "cycles: 30" in answer.out
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
-    refused(said(capsys, "plan", "--model", "six_r", "--centre", "5000", "0", "0"), "within reach")
-    nowhere = said(capsys, "plan", "--model", "six_r", "--test", "line", "--centre", "nan", "0", "0")
+    refused(said(capsys, "plan", "--arm", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    nowhere = said(capsys, "plan", "--arm", "six_r", "--test", "line", "--centre", "nan", "0", "0")
     refused(nowhere, "finite numbers")
     assert "--speed" not in nowhere.err
-    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
-    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
-    refused(said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
-    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
-    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "rig.json", "no such file")
+    refused(said(capsys, "plan", "--arm", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
+    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
+    refused(said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
+    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
+    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "rig.json", "no such file")
     assert "--test" in said(capsys, "plan", "--help").out
     assert "RUN|POSES.csv" in said(capsys, "--help").out
 
@@ -141,10 +141,10 @@ def test_the_plan(tmp_path, capsys):
 )
 def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
     out = tmp_path / "check.toml"
-    answer = said(capsys, "plan", "--model", "six_r", "--test", test, "--cycles", cycles, "-o", out, "--json")
+    answer = said(capsys, "plan", "--arm", "six_r", "--test", test, "--cycles", cycles, "-o", out, "--json")
     arm, plan = open_arm("six_r"), read_motions(open_arm("six_r"), out)
     assert len(plan.motions) == count
-    (facts,) = answer.lines
+    (found,) = answer.lines
     attained = {}
     for motion in plan.motions:
         q = motion.trajectory.at(np.linspace(0, motion.trajectory.duration_s, 100)).q
@@ -152,27 +152,27 @@ def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
         attained.setdefault(motion.name.split(" cycle ")[0], []).append(arm.forward(q[-1]))
         p = arm.forward(q)[:, :3, 3]
         if motion.kind == "circle":
-            radii = np.linalg.norm(p - facts["centre_m"], axis=1)
-            np.testing.assert_allclose(radii, 0.4 * facts["side_m"], atol=1e-8)
-            turned = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()  # 100 chords, each shorter than its arc by 1e-3
-            assert turned == pytest.approx(np.radians(420) * 0.4 * facts["side_m"], rel=2e-3)
+            radii = np.linalg.norm(p - found["centre_m"], axis=1)
+            np.testing.assert_allclose(radii, 0.4 * found["side_m"], atol=1e-8)
+            arc_m = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()  # 100 chords, each shorter than its arc by 1e-3
+            assert arc_m == pytest.approx(np.radians(420) * 0.4 * found["side_m"], rel=2e-3)
     if test == "poses":
-        for name, T in zip(facts["poses"], facts["T_base_tool"], strict=True):
+        for name, T in zip(found["poses"], found["T_base_tool"], strict=True):
             np.testing.assert_allclose(attained[name], [T, T], atol=1e-7)  # angles are written to 1e-6 deg
 
 
 def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
-    with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
-        cell.truth.rig.save(tmp_path / "rig.json")
-        (tmp_path / "body.toml").write_text(cell.body_text)
-        near = cell.truth.T_base_rig @ pose(np.eye(3), np.array([0, 0, 0.6]))  # so near that not all fits in
-        mounting = {"T_base_rig": near.tolist(), "T_tool_body": cell.truth.T_tool_body.tolist()}
+    with Workcell(arm="worn", cameras="640x360@12", machine="host") as workcell:
+        workcell.truth.rig.save(tmp_path / "rig.json")
+        (tmp_path / "body.toml").write_text(workcell.body_text)
+        near = workcell.truth.T_base_rig @ pose(np.eye(3), np.array([0, 0, 0.6]))  # so near that not all fits in
+        mounting = {"T_base_rig": near.tolist(), "T_tool_body": workcell.truth.T_tool_body.tolist()}
     (tmp_path / "handeye.json").write_text(json.dumps(mounting))
-    rig, T_base_rig = cell.truth.rig, np.array(mounting["T_base_rig"])
+    rig, T_base_rig = workcell.truth.rig, np.array(mounting["T_base_rig"])
 
     def share_seen(*options):
-        """Of the tool's places of a plan, how many both cameras have in their images."""
-        plan = said(capsys, "plan", "--model", "six_r", "--test", "wide", "--json", *options).lines[0]
+        """Of the tool's positions in a plan, how many both cameras have in their images."""
+        plan = said(capsys, "plan", "--arm", "six_r", "--test", "wide", "--json", *options).lines[0]
         p_left = (np.array(plan["T_base_tool"])[:, :3, 3] - T_base_rig[:3, 3]) @ T_base_rig[:3, :3]
         p_right = (p_left - rig.T_left_right[:3, 3]) @ rig.T_left_right[:3, :3]
         good = np.ones(len(p_left), bool)
@@ -182,11 +182,11 @@ def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
         return good.mean()
 
     assert share_seen() < 0.95  # else it would say nothing that all of it is seen:
-    assert share_seen("--seen-in", tmp_path) == 1
+    assert share_seen("--visible-in", tmp_path) == 1
     (tmp_path / "handeye.json").write_text("{}")
-    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_base_rig")
+    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_base_rig")
     (tmp_path / "handeye.json").write_text(json.dumps(mounting | {"T_tool_body": [1, 2, 3]}))
-    refused(said(capsys, "plan", "--model", "six_r", "--seen-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)")
+    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)")
 
 
 def test_without_a_sigma_errors_have_no_interval(tmp_path, capsys):
@@ -199,14 +199,14 @@ def test_without_a_sigma_errors_have_no_interval(tmp_path, capsys):
             writer.writerow([f"P{k}", *(command + rng.normal(0, 1e-3, 3)), *command])
     answer = said(capsys, tmp_path / "wide.csv", "-o", tmp_path / "report")
     assert answer.out.count("no interval without the instrument's sigma") == 2
-    facts = json.loads((tmp_path / "report" / "check.json").read_text())
-    assert facts["anywhere"]["mean_m"]["low"] is facts["anywhere"]["mean_m"]["sigma"] is None
+    found = json.loads((tmp_path / "report" / "check.json").read_text())
+    assert found["anywhere"]["mean_m"]["low"] is found["anywhere"]["mean_m"]["sigma"] is None
 
 
-def test_a_few_poses_too_seldom_are_told(tmp_path, capsys):
+def test_poses_attained_too_seldom_are_reported(tmp_path, capsys):
     rows = [row for row in rows_of() if row[0] == "pose" and (row[1] != "P3" or row[2] < 2)]
-    (facts,) = said(capsys, file_of(tmp_path / "c.csv", rows), "--json").lines
-    assert facts["notes"] == ["left out: P3, attained too seldom (2)"]
+    (found,) = said(capsys, file_of(tmp_path / "c.csv", rows), "--json").lines
+    assert found["notes"] == ["left out: P3, attained too seldom (2)"]
 
 
 def test_another_reports_page_is_not_written_over(tmp_path, capsys):
@@ -217,15 +217,15 @@ def test_another_reports_page_is_not_written_over(tmp_path, capsys):
     assert (tmp_path / "other" / "report.html").read_text() == "another's"
 
 
-def test_paths_whose_stations_differ(tmp_path, capsys):
+def test_paths_whose_path_points_differ(tmp_path, capsys):
     rows, bad = [row for row in rows_of() if row[0] == "path"], tmp_path / "bad.csv"
     moved = [[*row[:12], row[12] + 1e-3 * (row[1] == 4 and row[2] == 2), *row[13:]] for row in rows]
-    refused(said(capsys, file_of(bad, moved)), "path path", "same stations", "cycle 2")
-    swapped = [[row[0], {3: 4, 4: 3}.get(row[1], row[1]) if row[2] == 1 else row[1], *row[2:]] for row in rows]
-    refused(said(capsys, file_of(bad, swapped)), "same stations", "cycle 1")
-    refused(said(capsys, file_of(bad, rows[:-1])), "same stations", "19 rows")
+    refused(said(capsys, file_of(bad, moved)), "path path", "same path points", "cycle 2")
+    exchanged = [[row[0], {3: 4, 4: 3}.get(row[1], row[1]) if row[2] == 1 else row[1], *row[2:]] for row in rows]
+    refused(said(capsys, file_of(bad, exchanged)), "same path points", "cycle 1")
+    refused(said(capsys, file_of(bad, rows[:-1])), "same path points", "19 rows")
     still = [[*row[:12], 0.4 if row[1] in (4, 5, 6) else row[12], *row[13:]] for row in rows]
-    refused(said(capsys, file_of(bad, still)), "path path", "station 6", "does not go on")
+    refused(said(capsys, file_of(bad, still)), "path path", "path point 6", "does not go on")
 
 
 def test_mistakes(tmp_path, capsys):
@@ -255,14 +255,14 @@ def test_mistakes(tmp_path, capsys):
     refused(said(capsys, bad), "y_m", "missing")
 
 
-def changed(row, **cells):
-    """A row with other cells."""
+def changed(row, **entries):
+    """A row with other entries."""
     names = [*COLUMNS, *COMMAND, *SIGMA]
-    return [cells.get(name, cell) for name, cell in zip(names, row, strict=True)]
+    return [entries.get(name, entry) for name, entry in zip(names, row, strict=True)]
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "parts"),
     [
         (lambda rows: [changed(r, sigma_y_m=-1e-4) for r in rows], ["line 2", "sigma_y_m", "below zero"]),
         (lambda rows: [changed(r, sigma_y_m="") for r in rows], ["line 2", "sigma_y_m is missing"]),
@@ -275,9 +275,9 @@ def changed(row, **cells):
         (lambda rows: [changed(r, x_m=r[6], y_m=r[5]) for r in rows], ["mm from their commands", "frame"]),
     ],
 )
-def test_what_no_arm_attains_is_refused(tmp_path, capsys, change, words):
+def test_what_no_arm_attains_is_rejected(tmp_path, capsys, change, parts):
     rows = [row for row in rows_of() if row[0] == "pose" and row[2] < 5]
-    refused(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *words)
+    refused(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *parts)
 
 
 def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp_path, capsys):
@@ -288,12 +288,12 @@ def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp
     assert "noise is taken for none" in answer.err
 
 
-def test_a_motion_file_is_told_from_what_was_attained(tmp_path, capsys):
-    assert said(capsys, "plan", "--model", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
+def test_a_motion_file_is_distinguished_from_attained_poses(tmp_path, capsys):
+    assert said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
     refused(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
 
 
-def test_a_row_far_from_its_pose_is_named_and_the_order_of_rows_picks_nothing(tmp_path, capsys):
+def test_a_row_far_from_its_pose_is_named_and_the_sequence_of_rows_has_no_effect(tmp_path, capsys):
     rows = [row for row in rows_of() if row[0] == "pose"]
     before = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)
     assert not any("counts" in note for note in before["notes"])
@@ -302,12 +302,12 @@ def test_a_row_far_from_its_pose_is_named_and_the_order_of_rows_picks_nothing(tm
     assert (after["distance"]["to"], after["drift"]["pose"]) == ("P4", "P1")
     n = next(n for n, row in enumerate(rows) if row[1] == "P3" and row[2] == 7)
     rows[n][7] += 5e-3
-    (told,) = [
+    (outlier,) = [
         note
         for note in json.loads(said(capsys, file_of(tmp_path / "c.csv", rows), "--json").out)["notes"]
         if "counts" in note
     ]
-    assert "P3, cycle 7: 4.93 mm" in told
+    assert "P3, cycle 7: 4.93 mm" in outlier
     rows = [row for row in rows_of(2e-6, 2e-6) if row[0] == "pose"]
     for row in rows:  # a table rounded so far that most agree, and an odd name
         row[1], row[5:8] = row[1].replace("P1", "P1²"), [round(float(v), 5) for v in row[5:8]]
@@ -316,9 +316,9 @@ def test_a_row_far_from_its_pose_is_named_and_the_order_of_rows_picks_nothing(tm
     assert "P1²" in rounded["poses"]
 
 
-def test_turns_that_are_not_given_have_no_figures(tmp_path, capsys):
-    turns = [n for n, name in enumerate([*COLUMNS, *COMMAND]) if "q" in name]
-    for left, known in (([], (True, True)), (turns[4:], (False, True)), (turns, (False, False))):
+def test_rotations_that_are_not_given_have_no_metrics(tmp_path, capsys):
+    rotations = [n for n, name in enumerate([*COLUMNS, *COMMAND]) if "q" in name]
+    for left, known in (([], (True, True)), (rotations[4:], (False, True)), (rotations, (False, False))):
         rows = [["" if n in left else v for n, v in enumerate(row)] for row in rows_of() if row[0] == "pose"]
         pose_1 = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)["poses"]["P1"]
         assert (pose_1["AP_rotation_rad"] is not None, pose_1["RP_rotation_rad"] is not None) == known

@@ -6,14 +6,15 @@ import json
 import numpy as np
 import pytest
 
+from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
-from armsight.app.check.run_folder import _turn_times
+from armsight.app.check.run_folder import _reversal_times
 from cli_runs import Said, refused, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
 OFF_M = np.array([1.5e-3, -8e-4, 4e-4])
-PLACES = {
+POSITIONS = {
     "P1": (0.5, 0.0, 0.4),
     "P2": (0.6, -0.1, 0.5),
     "P3": (0.6, 0.1, 0.5),
@@ -22,7 +23,7 @@ PLACES = {
 }
 COLUMNS = ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 SIGMAS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
-CENTRE, RADIUS, PLAY = np.array([0.5, 0.0, 0.4]), 0.08, 3e-4
+CENTRE, RADIUS, BACKLASH = np.array([0.5, 0.0, 0.4]), 0.08, 3e-4
 
 
 class Folder:
@@ -31,14 +32,14 @@ class Folder:
     def __init__(self, folder, seed=0):
         self.folder, self.rng, self.t = folder, np.random.default_rng(seed), 0.0
         self.common = self.rng.normal(0, COMMON_M, 3)
-        self.wanted, self.seen, self.motions = [], [], []
+        self.reference, self.seen, self.motions = [], [], []
 
-    def stretch(self, phase, name, places, off, *, hidden=False):
-        for k, (place, away) in enumerate(zip(places, off, strict=True)):
+    def segment(self, phase, name, positions, off, *, hidden=False):
+        for k, (position, away) in enumerate(zip(positions, off, strict=True)):
             self.t += 0.01
-            self.wanted.append([self.t, *place, 1, 0, 0, 0, phase, name])
+            self.reference.append([self.t, *position, 1, 0, 0, 0, phase, name])
             if k % 2 == 1 and not hidden:
-                at = place + away + self.common + self.rng.normal(0, NOISE_M, 3)
+                at = position + away + self.common + self.rng.normal(0, NOISE_M, 3)
                 claimed = [np.hypot(NOISE_M, COMMON_M)] * 3
                 self.seen.append([self.t - 0.001, *at, 1, 0, 0, 0, *claimed, phase, name])
 
@@ -46,13 +47,13 @@ class Folder:
         """A motion along a path with offsets, and the rest at its end."""
         if phase == "open_loop":
             self.motions.append((kind, name))
-        self.stretch(phase, name, path, off)
-        self.stretch("rest", name, np.repeat(path[-1:], 50, axis=0), np.repeat(off[-1:], 50, axis=0), **options)
+        self.segment(phase, name, path, off)
+        self.segment("rest", name, np.repeat(path[-1:], 50, axis=0), np.repeat(off[-1:], 50, axis=0), **options)
 
     def poses(self, phase, cycles, off=OFF_M, hidden=()):
-        before = np.array(PLACES["P3"])
-        for name, cycle in [("P5", 0)] + [(name, c + 1) for c in range(cycles) for name in PLACES]:
-            there = np.array(PLACES[name])
+        before = np.array(POSITIONS["P3"])
+        for name, cycle in [("P5", 0)] + [(name, c + 1) for c in range(cycles) for name in POSITIONS]:
+            there = np.array(POSITIONS[name])
             path = before + np.linspace(0, 1, 40)[:, None] * (there - before)
             away = np.repeat((off + self.rng.normal(0, ARM_M, 3))[None], 40, axis=0)
             called = f"{name} cycle {cycle}" if cycle else f"to {name}"
@@ -61,7 +62,7 @@ class Folder:
 
     def write(self):
         for name, header, rows in (
-            ("wanted.csv", [*COLUMNS, "phase", "motion"], self.wanted),
+            ("reference.csv", [*COLUMNS, "phase", "motion"], self.reference),
             ("vision.csv", [*COLUMNS, *SIGMAS, "phase", "motion"], self.seen),
         ):
             with open(self.folder / name, "w", newline="") as file:
@@ -80,36 +81,36 @@ def said(capsys, *arguments):
 
 def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):
     made = Folder(tmp_path)
-    made.stretch("calibration", "hand-eye 1", np.zeros((40, 3)), np.zeros((40, 3)))
+    made.segment("calibration", "hand-eye 1", np.zeros((40, 3)), np.zeros((40, 3)))
     made.poses("open_loop", 30, hidden=("P2 cycle 7",))
     made.poses("closed_loop", 5, off=np.zeros(3))
     answer = said(capsys, made.write(), "--json", "-o", tmp_path / "report")
-    (facts,) = answer.lines
-    assert {name: p["count"] for name, p in facts["poses"].items()} == {
+    (found,) = answer.lines
+    assert {name: p["count"] for name, p in found["poses"].items()} == {
         "P1": 30,
         "P2": 29,
         "P3": 30,
         "P4": 30,
         "P5": 30,
     }
-    assert facts["notes"] == [
+    assert found["notes"] == [
         "1 rests were not seen, and are left out",
-        "left out: P5 come to from the start, too seldom (1)",
+        "left out: P5 approached from the start, too seldom (1)",
     ]
     unit = 3 * np.sqrt(3 - 8 / np.pi) + np.sqrt(8 / np.pi)  # E l + 3 sd l of a normal vector, known in closed form
-    held = [p["RP_m"]["low"] < unit * ARM_M < p["RP_m"]["high"] for p in facts["poses"].values()]
+    held = [p["RP_m"]["low"] < unit * ARM_M < p["RP_m"]["high"] for p in found["poses"].values()]
     assert sum(held) >= 4
     true = np.linalg.norm(OFF_M)
-    for p in facts["poses"].values():
+    for p in found["poses"].values():
         assert p["AP_m"]["low"] < true < p["AP_m"]["high"]
         assert (
             0.8 * COMMON_M < p["AP_m"]["sigma"] < 1.2 * np.hypot(COMMON_M, ARM_M)
         )  # what is common is not averaged out
         assert p["RP_m"]["raw"] == pytest.approx(p["RP_m"]["clean"], rel=0.02)  # of 15 shots' mean little is noise
-    assert facts["distance"] | {"AD_m": 0, "RD_m": 0} == {
+    assert found["distance"] | {"AD_m": 0, "RD_m": 0} == {
         "from": "P2", "to": "P4", "commanded_m": pytest.approx(np.sqrt(0.12)), "AD_m": 0, "RD_m": 0
     }  # fmt: skip
-    assert facts["drift"]["pose"] == "P1"
+    assert found["drift"]["pose"] == "P1"
     with open(tmp_path / "report" / "check.csv") as file:
         rows = list(csv.DictReader(file))
     assert [row["cycle"] for row in rows if row["pose"] == "P2"] == [str(c) for c in range(1, 31) if c != 7]
@@ -128,8 +129,8 @@ def test_a_repeatability_below_the_noise(tmp_path, capsys, monkeypatch):
     made = Folder(tmp_path)
     made.poses("open_loop", 10)
     answer = said(capsys, made.write(), "--json")
-    told = [p["RP_m"]["clean"] for p in answer.lines[0]["poses"].values()]
-    assert sum(clean is None for clean in told) >= 4  # 2.5 % each by chance
+    resolved = [p["RP_m"]["clean"] for p in answer.lines[0]["poses"].values()]
+    assert sum(clean is None for clean in resolved) >= 4  # 2.5 % each by chance
 
 
 def line(made, phase, cycles):
@@ -144,12 +145,12 @@ def line(made, phase, cycles):
 
 
 def circle(made, phase, radius=RADIUS, names=("ccw", "cw")):
-    """Both ways with a third more than a turn, play along y."""
+    """Both ways with a sixth more than a revolution, backlash along y."""
     a = np.radians(np.linspace(15, 435, 1000))
     for name, angle in zip(names, (a, a[::-1]), strict=True):
         path = CENTRE + radius * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
         way = np.sign(angle[1] - angle[0])
-        off = np.stack([0 * a, -0.5 * PLAY * np.sign(-way * np.sin(angle)), 0 * a], axis=1)
+        off = np.stack([0 * a, -0.5 * BACKLASH * np.sign(-way * np.sin(angle)), 0 * a], axis=1)
         made.motion(phase, f"{name} cycle 1", "circle", path, off)
 
 
@@ -158,21 +159,21 @@ def test_paths_and_the_circle(tmp_path, capsys):
     line(made, "open_loop", 4)
     circle(made, "open_loop")
     answer = said(capsys, made.write(), "--json", "-o", tmp_path / "report")
-    (facts,) = answer.lines
-    assert "poses" not in facts
-    assert set(facts["paths"]) == {"out", "back"}
+    (found,) = answer.lines
+    assert "poses" not in found
+    assert set(found["paths"]) == {"out", "back"}
     bow = np.array([0.0, 5e-4, 0.0]) + made.common * [0, 1, 1]
-    for p in facts["paths"].values():
+    for p in found["paths"].values():
         assert p["count"] == 4
         assert p["AT_m"]["raw"] == pytest.approx(np.linalg.norm(bow), abs=4 * NOISE_M)
         assert p["AT_m"]["low"] < 5e-4 < p["AT_m"]["high"]
         assert p["RT_m"]["clean"] is None or p["RT_m"]["low"] < 2 * NOISE_M  # all of it is the instrument's
-    c = facts["circle"]
+    c = found["circle"]
     assert c["radius_m"] == pytest.approx(RADIUS, abs=2e-5)
     np.testing.assert_allclose(c["axes"], [[0, 1, 0], [0, 0, 1]], atol=1e-9)
-    play, none = c["backlash_m"]
-    assert play["low"] < PLAY < play["high"]
-    assert play["clean"] is not None
+    backlash, none = c["backlash_m"]
+    assert backlash["low"] < BACKLASH < backlash["high"]
+    assert backlash["clean"] is not None
     assert none["clean"] is None
     assert (tmp_path / "report" / "check-circle.png").exists()
     assert said(capsys, tmp_path / "report" / "check.csv", "--json").lines[0]["circle"]["radius_m"] == pytest.approx(
@@ -203,10 +204,16 @@ def test_two_lines_of_one_name_are_two(tmp_path, capsys):
     for first in (1, 3, 5):
         lines(made, [f"go cycle {first}"])
         lines(made, [f"go cycle {first + 1}"], to=(0.5, 0.1, 0.4))
-    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
-    assert {name: p["count"] for name, p in facts["paths"].items()} == {"go": 3, "go cycle 2": 3}
-    drawn = paths_figure(facts, read_rows(tmp_path / "report" / "check.csv")).axes[0].lines
-    assert len(drawn) == 2 * (1 + 3)  # each mean path, and its own times round
+    (found,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    assert {name: p["count"] for name, p in found["paths"].items()} == {"go": 3, "go cycle 2": 3}
+    plotted = (
+        paths_figure(
+            evaluate(read_check(tmp_path / "report" / "check.csv")), read_rows(tmp_path / "report" / "check.csv")
+        )
+        .axes[0]
+        .lines
+    )
+    assert len(plotted) == 2 * (1 + 3)  # each mean path, and its own cycles
 
 
 def test_what_nobody_saw_is_not_made_up(tmp_path, capsys):
@@ -218,39 +225,39 @@ def test_what_nobody_saw_is_not_made_up(tmp_path, capsys):
         "go cycle 5": [(0.0, 1.9)],
     }
     lines(made, [f"go cycle {n}" for n in range(1, 8)], unseen=unseen)
-    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
-    assert facts["paths"]["go"]["count"] == 3
-    notes = " ".join(facts["notes"])
+    (found,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    assert found["paths"]["go"]["count"] == 3
+    notes = " ".join(found["notes"])
     assert "go cycle 2, not seen over 4" in notes  # 0.4 s of 100 mm/s
-    assert "go cycle 3, not seen from its first station to its last" in notes
-    assert "go cycle 4, not seen from its first station to its last" in notes
+    assert "go cycle 3, not seen from its first path point to its last" in notes
+    assert "go cycle 4, not seen from its first path point to its last" in notes
     assert "go cycle 5, seen in 5 shots; 10 are needed" in notes
     with open(tmp_path / "report" / "check.csv") as file:
         assert {row["cycle"] for row in csv.DictReader(file) if row["test"] == "path"} == {"1", "5", "6"}
 
 
-def test_of_two_circles_both_ways_one_is_judged(tmp_path, capsys):
+def test_of_two_circles_both_ways_one_is_evaluated(tmp_path, capsys):
     made = Folder(tmp_path)
     circle(made, "open_loop")
     circle(made, "open_loop", radius=0.05, names=("small ccw", "small cw"))
-    (facts,) = said(capsys, made.write(), "--json").lines
-    assert facts["circle"]["radius_m"] == pytest.approx(RADIUS, abs=2e-5)
-    assert any("small ccw cycle 1, small cw cycle 1" in note for note in facts["notes"])
+    (found,) = said(capsys, made.write(), "--json").lines
+    assert found["circle"]["radius_m"] == pytest.approx(RADIUS, abs=2e-5)
+    assert any("small ccw cycle 1, small cw cycle 1" in note for note in found["notes"])
 
 
 def test_circles_that_differ_are_no_pair(tmp_path, capsys):
     made = Folder(tmp_path)
     circle(made, "open_loop", names=("ccw", "cw"))
     made.motions = [(kind, name) for kind, name in made.motions if name != "cw cycle 1"]
-    for track in (made.wanted, made.seen):
+    for track in (made.reference, made.seen):
         track[:] = [row for row in track if row[-1] != "cw cycle 1"]
     lone = Folder(tmp_path, seed=1)
     circle(lone, "open_loop", radius=0.05, names=("no", "small cw"))
     late = made.t
-    for mine, other in ((made.wanted, lone.wanted), (made.seen, lone.seen)):
+    for mine, other in ((made.reference, lone.reference), (made.seen, lone.seen)):
         mine += [[late + row[0], *row[1:]] for row in other if row[-1] == "small cw cycle 1"]
     made.motions.append(("circle", "small cw cycle 1"))
-    refused(said(capsys, made.write()), "nothing can be judged", "ccw, followed too seldom (1)")
+    refused(said(capsys, made.write()), "nothing can be evaluated", "ccw, followed too seldom (1)")
 
 
 def test_visits_are_counted_by_pose_and_ways_over_all_rests(tmp_path, capsys):
@@ -258,63 +265,63 @@ def test_visits_are_counted_by_pose_and_ways_over_all_rests(tmp_path, capsys):
     made.poses("open_loop", 4)
     lines(made, ["go cycle 1", "go cycle 2", "go cycle 3"])
     made.poses("open_loop", 0)
-    (facts,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
+    (found,) = said(capsys, made.write(), "--json", "-o", tmp_path / "report").lines
     # P5 from the start once, from P4 four times, and after the lines from where they end.
-    assert "left out: P5 come to from go, too seldom (1)" in facts["notes"]
+    assert "left out: P5 approached from go, too seldom (1)" in found["notes"]
     with open(tmp_path / "report" / "check.csv") as file:
         rows = [row for row in csv.DictReader(file) if row["pose"] == "P5"]
     assert [row["cycle"] for row in rows] == ["2", "3", "4", "5"]  # the first was from the start
 
 
-def test_poses_attained_once_are_told_where_others_are_judged(tmp_path, capsys):
+def test_poses_attained_once_are_reported_where_others_are_evaluated(tmp_path, capsys):
     made = Folder(tmp_path)
     made.poses("open_loop", 3)
     there = np.repeat([[0.55, 0.0, 0.35]], 40, axis=0)
     made.motion("open_loop", "aside", "joints", there, 0 * there)
-    (facts,) = said(capsys, made.write(), "--json").lines
-    assert facts["notes"].count("left out: aside, attained too seldom (1)") == 1
+    (found,) = said(capsys, made.write(), "--json").lines
+    assert found["notes"].count("left out: aside, attained too seldom (1)") == 1
 
 
-def test_a_joint_that_stands_where_it_turns_back():
+def test_a_joint_that_stands_where_it_reverses():
     t_s = np.arange(9.0)
     q = np.array([0.0, 0.1, 0.2, 0.2, 0.1, 0.0, 0.0, -0.1, -0.2])
-    assert _turn_times(t_s, q) == [2.0]
-    assert _turn_times(t_s, np.abs(t_s - 4)) == [4.0]
-    assert _turn_times(t_s, 0 * q) == []
+    assert _reversal_times(t_s, q) == [2.0]
+    assert _reversal_times(t_s, np.abs(t_s - 4)) == [4.0]
+    assert _reversal_times(t_s, 0 * q) == []
 
 
-def test_where_joints_turn_back(tmp_path, capsys):
+def test_where_joints_reverse(tmp_path, capsys):
     made = Folder(tmp_path)
     circle(made, "open_loop")
     spans = [
-        [t for t, *_, phase, name in made.wanted if name == f"{w} cycle 1" and phase == "open_loop"]
+        [t for t, *_, phase, name in made.reference if name == f"{w} cycle 1" and phase == "open_loop"]
         for w in ("ccw", "cw")
     ]
     made.write()
     with open(tmp_path / "joints.csv", "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t_s", *(f"q{joint}_wanted_rad" for joint in range(1, 7))])
+        writer.writerow(["t_s", *(f"q{joint}_ref_rad" for joint in range(1, 7))])
         for span in spans:
             for t in span:
                 a = 15 + 420 * (t - span[0]) / (span[-1] - span[0])
                 a = a if span is spans[0] else 450 - a
-                # Joint 2 turns back at 0 and 180 degrees, as the play does; joint 4 by too little; the others never.
+                # Joint 2 reverses at 0 and 180 degrees, as the backlash does; joint 4 by too little; the others never.
                 writer.writerow([t, t, np.cos(np.radians(a)), 0, 1e-3 * np.cos(np.radians(a)), -t, 0])
-    facts = said(capsys, tmp_path, "--json", "-o", tmp_path / "report").lines[0]
-    turns = facts["circle"]["turns"]
-    assert all(turn["joints"] == [2] for turn in turns)
-    found = sorted((turn["way"], round(turn["angle_deg"] / 180) % 2) for turn in turns)
+    found = said(capsys, tmp_path, "--json", "-o", tmp_path / "report").lines[0]
+    reversals = found["circle"]["reversals"]
+    assert all(reversal["joints"] == [2] for reversal in reversals)
+    found = sorted((reversal["way"], round(reversal["angle_deg"] / 180) % 2) for reversal in reversals)
     assert found == [(-1, 0), (-1, 1), (1, 0), (1, 1)]
-    for turn in turns:
-        assert turn["jump_m"]["raw"] == pytest.approx(PLAY, abs=5 * turn["jump_m"]["sigma"])
-        assert turn["jump_m"]["sigma"] < 5e-5
+    for reversal in reversals:
+        assert reversal["jump_m"]["raw"] == pytest.approx(BACKLASH, abs=5 * reversal["jump_m"]["sigma"])
+        assert reversal["jump_m"]["sigma"] < 5e-5
     assert "joint 2 at 180 deg, counter-clockwise" in said(capsys, tmp_path).out
     (tmp_path / "joints.csv").write_text("t_s\n1\n")
-    refused(said(capsys, tmp_path), "joints.csv", "q1_wanted_rad")
+    refused(said(capsys, tmp_path), "joints.csv", "q1_ref_rad")
 
 
-def test_folders_that_cannot_be_judged(tmp_path, capsys):
-    refused(said(capsys, tmp_path), tmp_path, "no run", "wanted.csv")
+def test_folders_that_cannot_be_evaluated(tmp_path, capsys):
+    refused(said(capsys, tmp_path), tmp_path, "no run", "reference.csv")
     made = Folder(tmp_path)
     made.poses("open_loop", 1)
     circle(made, "open_loop")
@@ -331,15 +338,15 @@ def test_folders_that_cannot_be_judged(tmp_path, capsys):
     refused(said(capsys, made.write(), "-o", tmp_path / "report"), "5 poses", "no repeatability", "armsight check plan")
     assert not (tmp_path / "report").exists()
     lines = (tmp_path / "vision.csv").read_text().splitlines()
-    for bad, words in (
+    for bad, parts in (
         (lines[0].replace("sigma_y_m", "sigma_q"), ("line 1", "sigma_y_m")),
         (lines[1].replace(lines[1].split(",")[1], "nan"), ("line 2", "finite")),
         (lines[1].replace(lines[1].split(",")[1], "x"), ("line 2", "numbers")),
         ("0.1,0.2", ("line 2", "numbers")),
     ):
-        first = "line 1" in words
+        first = "line 1" in parts
         (tmp_path / "vision.csv").write_text("\n".join([bad, *lines[1:]] if first else [lines[0], bad, *lines[2:]]))
-        refused(said(capsys, tmp_path), "vision.csv", *words)
+        refused(said(capsys, tmp_path), "vision.csv", *parts)
     (tmp_path / "vision.csv").write_text("\n".join([*lines[:4], lines[2], *lines[4:]]))
     refused(said(capsys, tmp_path), "vision.csv", "line 5", "times must rise")
     (tmp_path / "vision.csv").write_text(lines[0] + "\n")
@@ -351,5 +358,5 @@ def test_folders_that_cannot_be_judged(tmp_path, capsys):
 def test_json_has_no_nan(tmp_path, capsys):
     made = Folder(tmp_path)
     made.poses("open_loop", 3)
-    facts = said(capsys, made.write(), "--json").lines[0]  # read strictly
-    assert json.dumps(facts, allow_nan=False)
+    found = said(capsys, made.write(), "--json").lines[0]  # read strictly
+    assert json.dumps(found, allow_nan=False)

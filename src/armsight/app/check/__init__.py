@@ -1,1 +1,12 @@
-"""TODO."""
+"""``armsight check``: evaluate an arm by ISO 9283 and ISO 230-4, or plan the motions of such a test.
+
+In: a run's folder or a CSV of attained poses. Out: metrics of poses, distance, paths, drift and a circle, as text, JSON and
+a report.
+
+- ``command``: the command line, ``armsight check DATA`` and ``armsight check plan``.
+- ``rows``: one attained pose a row, and the CSV of rows.
+- ``run_folder``: a run's folder to rows.
+- ``evaluate``: rows to metrics; ``result``: the records that hold the metrics, and their JSON.
+- ``report``: metrics as text, figures and an HTML page.
+- ``plan``: poses, line and circle of a test as a motion file.
+"""

@@ -1,16 +1,24 @@
-"""Judge an arm from what it attained: sort the rows into the standard's tests and compute its figures."""
+"""Evaluate an arm from the poses it attained: sort the rows into the standard's tests and compute the metrics of each."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from armsight.app.check.rows import SAME_M, TESTS, Attained, Row, Turn, natural, read_rows
+from armsight.app.check.result import (
+    CheckResult,
+    CircleResult,
+    DistanceResult,
+    DriftResult,
+    JumpResult,
+    PathResult,
+    PoseResult,
+    WorkspaceResult,
+)
+from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, natural, read_rows
 from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
 from armsight.errors import InputError
@@ -18,14 +26,19 @@ from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.statistic import Figure
 
-#: So many poses tell something of the workspace where none was attained often enough to tell of itself.
+#: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
 _WIDE = 10
-#: So many times must the first pose have been attained for its drift.
+#: The first pose must have been attained this many times for its drift.
 _DRIFTS = 10
-#: Of so many rows and more one is told that lies so many times further from the middle than half of them: normal scatter
-#: along a line, the longest there is, does so in one pose of 200 with ten rows, and in one of 30,000 with thirty. What is
-#: usual is no less than tables are rounded to, m.
-_SEVERAL, _STRAY, _LEAST_M = 10, 12.0, 1e-5
+#: A pose attained fewer times than this is not searched for outliers.
+_OUTLIER_ROWS = 10
+#: A row is named an outlier where its distance from the median position is more than this many times the median distance.
+#: Smaller names more rows. Normal scatter along a line, the longest-tailed case, does so in one pose of 200 with ten rows,
+#: in one of 30,000 with thirty.
+_OUTLIER_RATIO = 12.0
+#: The median distance counts as this much at least, m: tables are rounded to about that, and rows that agree to the last
+#: digit would make every other row an outlier.
+_OUTLIER_LEAST_M = 1e-5
 
 
 def read_check(path: Path, *, closed: bool = False) -> Attained:
@@ -36,7 +49,7 @@ def read_check(path: Path, *, closed: bool = False) -> Attained:
         closed: of a run, take the motions with the loop closed on vision.
 
     Raises:
-        InputError: it cannot be read, or holds nothing that can be judged.
+        InputError: it cannot be read, or holds nothing that can be evaluated.
     """
     if path.is_dir() and not (path / "check.csv").exists():
         return attained_in(path, closed=closed)
@@ -49,38 +62,38 @@ def read_check(path: Path, *, closed: bool = False) -> Attained:
     )
 
 
-def judge(attained: Attained) -> dict[str, Any]:
-    """Return all figures that the rows allow, SI units.
+def evaluate(attained: Attained) -> CheckResult:
+    """Return all metrics that the rows allow, SI units.
 
     Args:
-        attained: the rows, and what was left out of them: that is told where nothing is left.
-
-    Returns:
-        poses (by name), anywhere (where each was attained too seldom), vAP_m, distance, drift, paths (by name), circle,
-        notes.
+        attained: the rows, and what was left out of them: the error message says so where nothing is left.
 
     Raises:
-        InputError: too few rows for any figure.
+        InputError: too few rows for any metric.
     """
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
-    facts: dict[str, Any] = {}
     notes = list(attained.notes)
     seldom = _too_seldom(by_test["pose"])
-    if by_test["pose"] and seldom is None:
-        facts |= _poses(by_test["pose"], notes)
-    if by_test["path"]:
-        paths = _groups(by_test["path"], lambda row: row.approach or "path")
-        facts["paths"] = {name: _path(name, group) for name, group in paths.items()}
-    if by_test["circle"]:
-        facts["circle"] = _circle(by_test["circle"], attained.turns)
-    if not facts:
-        raise InputError("; ".join(["nothing can be judged", *([seldom] if seldom else []), *notes]))
+    groups = _groups(by_test["pose"], lambda row: row.pose) if seldom is None else {}
+    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.LEAST}
+    if often:
+        notes += [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
+        notes += [note for group in often.values() for note in _outliers(group)]
+    poses = {name: _pose(group) for name, group in often.items()}
+    distance = _distance_of_two(often)
+    drift = _drift_of_first(often)
+    workspace = _workspace(by_test["pose"]) if groups and not often else None
+    paths = _groups(by_test["path"], lambda row: row.approach or "path")
+    followed = {name: _path(name, group) for name, group in paths.items()}
+    circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
+    if not (poses or workspace or followed or circle):
+        raise InputError("; ".join(["nothing can be evaluated", *([seldom] if seldom else []), *notes]))
     notes += [f"left out: all poses, as none was attained {iso9283.LEAST} times"] if seldom else []
-    return facts | {"notes": notes}
+    return CheckResult(poses, workspace, distance, drift, followed, circle, notes)
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
-    """Say why there is neither a repeatability nor enough of the workspace; None where there is, or no pose at all."""
+    """Return why there is neither a repeatability nor enough of the workspace; None where there is, or no pose at all."""
     counts = Counter(row.pose for row in rows).values()
     if not rows or max(counts) >= iso9283.LEAST or len(counts) >= _WIDE:
         return None
@@ -97,16 +110,12 @@ def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
     return out
 
 
-def _places(rows: list[Row]) -> Array:
+def _positions(rows: list[Row]) -> Array:
     return np.array([row.T[:3, 3] for row in rows])
 
 
 def _commands(rows: list[Row]) -> Array:
     return np.array([row.T_command[:3, 3] for row in rows])
-
-
-def _off(rows: list[Row]) -> Array:
-    return np.asarray(_places(rows) - _commands(rows))
 
 
 def _common(rows: list[Row]) -> Array:
@@ -117,106 +126,101 @@ def _covs(rows: list[Row]) -> Array:
     return np.array([row.cov for row in rows])
 
 
-def _poses(rows: list[Row], notes: list[str]) -> dict[str, Any]:
-    """Return the figures of poses; what is left out is added to the notes."""
-    groups = _groups(rows, lambda row: row.pose)
-    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.LEAST}
-    facts: dict[str, Any] = {}
-    if not often:
-        mean, largest = iso9283.anywhere(_off(rows), _covs(rows), _common(rows))
-        facts["anywhere"] = {"count": len(rows), "mean_m": figure(mean), "max_m": figure(largest)}
-        return facts
-    notes += [
-        f"left out: {name}, attained too seldom ({len(group)})" for name, group in groups.items() if name not in often
-    ]
-    notes += [told for group in often.values() for told in _strays(group)]
-    facts["poses"] = {name: _pose(group) for name, group in often.items()}
-    several = {name: _ways(group) for name, group in often.items()}
-    facts |= {"vAP_m": known} if (known := {name: f for name, f in several.items() if f}) else {}
+def _workspace(rows: list[Row]) -> WorkspaceResult:
+    """Return the errors over the workspace."""
+    mean, largest = iso9283.anywhere(_positions(rows) - _commands(rows), _covs(rows), _common(rows))
+    return WorkspaceResult(len(rows), mean, largest)
+
+
+def _distance_of_two(often: dict[str, list[Row]]) -> DistanceResult | None:
+    """Return the metrics of the distance from the second pose to the fourth, the standard's P2 and P4."""
     names = list(often)
-    if len(names) > 2:  # the standard's five: P2 and P4
-        first, last = names[1], names[3] if len(names) > 3 else names[-1]
-        distance = _distance(often[first], often[last])
-        facts |= {"distance": {"from": first, "to": last, **distance}} if distance else {}
-    timed = [row for row in often[names[0]] if row.t_s is not None]
-    if len(timed) >= _DRIFTS:
-        times, wander, largest = iso9283.drift(np.array([row.t_s for row in timed]), _places(timed))
-        facts["drift"] = {"pose": names[0], "t_s": times.tolist(), "dAP_m": wander.tolist(), "max_m": figure(largest)}
-    return facts
+    if len(names) <= 2:
+        return None
+    first, last = names[1], names[3] if len(names) > 3 else names[-1]
+    return _distance(first, often[first], last, often[last])
 
 
-def _strays(rows: list[Row]) -> list[str]:
+def _drift_of_first(often: dict[str, list[Row]]) -> DriftResult | None:
+    """Return the drift of the first pose; None where too few of its rows have a time."""
+    if not often:
+        return None
+    name, rows = next(iter(often.items()))
+    timed = [row for row in rows if row.t_s is not None]
+    if len(timed) < _DRIFTS:
+        return None
+    times, wander, largest = iso9283.drift(np.array([row.t_s for row in timed]), _positions(timed))
+    return DriftResult(name, times, wander, largest)
+
+
+def _outliers(rows: list[Row]) -> list[str]:
     """Name the rows of a pose that lie far from the others."""
-    p = _places(rows)
+    p = _positions(rows)
     away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
-    usual = max(float(np.median(away)), _LEAST_M)
+    usual = max(float(np.median(away)), _OUTLIER_LEAST_M)
     return [
         f"{row.pose}, {f'cycle {row.cycle}' if row.cycle else f'row {n + 1} of it'}: {1e3 * off:.2f} mm from the middle of "
         f"them all, half of which are within {1e3 * usual:.2f} mm of it; it counts, unless you take it out"
         for n, (row, off) in enumerate(zip(rows, away, strict=True))
-        if len(rows) >= _SEVERAL and off > _STRAY * usual
+        if len(rows) >= _OUTLIER_ROWS and off > _OUTLIER_RATIO * usual
     ]
 
 
-def _pose(rows: list[Row]) -> dict[str, Any]:
-    """Return AP and RP of a pose; None for what asks for turns that are not known."""
-    figures = iso9283.pose_metrics(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
-    turned = all(row.turned for row in rows)
-    aimed = turned and all(row.commanded_rotation for row in rows)
-    return {
-        "count": figures.count,
-        "AP_m": figure(figures.accuracy),
-        "AP_xyz_m": figures.accuracy_xyz.tolist(),
-        "AP_rotation_rad": figures.accuracy_rotation.tolist() if aimed else None,
-        "RP_m": figure(figures.repeatability),
-        "RP_rotation_rad": figures.repeatability_rotation.tolist() if turned else None,
-    }
+def _pose(rows: list[Row]) -> PoseResult:
+    """Return the metrics of a pose; None for what needs rotations that are not known."""
+    metrics = iso9283.pose_metrics(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
+    measured = all(row.measured_rotation for row in rows)
+    commanded = measured and all(row.commanded_rotation for row in rows)
+    return PoseResult(
+        metrics.count,
+        metrics.accuracy,
+        metrics.accuracy_xyz,
+        metrics.accuracy_rotation if commanded else None,
+        metrics.repeatability,
+        metrics.repeatability_rotation if measured else None,
+        _multi_directional(rows),
+    )
 
 
-def _ways(rows: list[Row]) -> dict[str, float | None] | None:
-    """Return vAP of a pose; None where it was come to often from one direction only."""
+def _multi_directional(rows: list[Row]) -> Figure | None:
+    """Return vAP of a pose; None where it was approached repeatedly from one direction only."""
     ways = [way for way in _groups(rows, lambda row: row.approach).values() if len(way) > 1]
-    return figure(iso9283.multi_directional([_places(way) for way in ways])) if len(ways) > 1 else None
+    return iso9283.multi_directional([_positions(way) for way in ways]) if len(ways) > 1 else None
 
 
-def _distance(first: list[Row], last: list[Row]) -> dict[str, Any] | None:
+def _distance(first: str, first_rows: list[Row], last: str, last_rows: list[Row]) -> DistanceResult | None:
     """Return AD and RD between two poses, in the cycles that have both."""
-    there = {row.cycle: row for row in last}
-    pairs = [(row, there[row.cycle]) for row in first if row.cycle and row.cycle in there]
+    there = {row.cycle: row for row in last_rows}
+    pairs = [(row, there[row.cycle]) for row in first_rows if row.cycle and row.cycle in there]
     if len(pairs) < iso9283.LEAST:
         return None
-    a, b = (_places([p[k] for p in pairs]) for k in (0, 1))
-    commanded = float(np.linalg.norm((first[0].T_command - last[0].T_command)[:3, 3]))
+    a, b = (_positions([p[k] for p in pairs]) for k in (0, 1))
+    commanded = float(np.linalg.norm((first_rows[0].T_command - last_rows[0].T_command)[:3, 3]))
     AD, RD = iso9283.distance_metrics(a, b, commanded, _covs([p[0] for p in pairs]))
-    return {"commanded_m": commanded, "AD_m": figure(AD), "RD_m": figure(RD)}
+    return DistanceResult(first, last, commanded, AD, RD)
 
 
-def _path(name: str, rows: list[Row]) -> dict[str, Any]:
-    """Return AT and RT of a path; every time along it has the stations of the first."""
+def _path(name: str, rows: list[Row]) -> PathResult:
+    """Return AT and RT of a path; every cycle along it has the path points of the first."""
     cycles = _groups(rows, lambda row: row.cycle)
     (first_cycle, first), *others = cycles.items()
     for cycle, group in others:
         same = [row.pose for row in group] == [row.pose for row in first]
         if not same or np.abs(_commands(group) - _commands(first)).max() > SAME_M:
             raise InputError(
-                f"path {name}: every cycle must have the same stations, commanded to the same places and in the same "
-                f"order; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
+                f"path {name}: every cycle must have the same path points, with the same commanded positions, in the same "
+                f"sequence; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
             )
-    attained = np.array([_places(group) for group in cycles.values()])
+    attained = np.array([_positions(group) for group in cycles.values()])
     cov = np.array([_covs(group) for group in cycles.values()])
     try:
-        figures = path_metrics(attained, _commands(first), cov, _common(rows))
+        metrics = path_metrics(attained, _commands(first), cov, _common(rows))
     except InputError as error:
         raise InputError(f"path {name}: {error}") from None
-    return {
-        "count": len(attained),
-        "AT_m": figure(figures.accuracy),
-        "RT_m": figure(figures.repeatability),
-        "off_m": figures.off.tolist(),
-    }
+    return PathResult(len(attained), metrics)
 
 
-def _circle(rows: list[Row], turns: list[Turn]) -> dict[str, Any]:
+def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
     ways = _groups(rows, lambda row: row.approach)
     if set(ways) != {"1", "-1"}:
         raise InputError(
@@ -225,27 +229,12 @@ def _circle(rows: list[Row], turns: list[Turn]) -> dict[str, Any]:
     command = _commands(rows)
     axes = plane_axes(np.linalg.svd(command - command.mean(axis=0), full_matrices=False)[2][2])
     middle = (command.max(axis=0) + command.min(axis=0)) / 2
-    flat = np.array([turn.p - middle for turn in turns]).reshape(-1, 3) @ axes.T
+    flat = np.array([reversal.p - middle for reversal in reversals]).reshape(-1, 3) @ axes.T
     at = (np.degrees(np.arctan2(flat[:, 1], flat[:, 0])) % 360).tolist()
-    asked = [(angle, turn.way) for angle, turn in zip(at, turns, strict=True)]
-    figures = circle_metrics(_places(ways["1"]), _places(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
-    return {
-        "centre_m": figures.centre.tolist(),
-        "radius_m": figures.radius_m,
-        "axes": axes.tolist(),
-        "circularity_m": figure(figures.circularity),
-        "hysteresis_m": figure(figures.hysteresis),
-        "steps_m": figures.steps_m.tolist(),
-        "backlash_m": [figure(f) for f in figures.backlash],
-        "turns": [
-            {"joints": list(turn.joints), "way": turn.way, "angle_deg": angle, "jump_m": figure(jump)}
-            for turn, angle, jump in zip(turns, at, figures.jumps, strict=True)
-        ],
-        "angle_deg": figures.angle_deg.tolist(),
-        "radii_m": figures.radii_m.tolist(),
-    }
-
-
-def figure(figure: Figure) -> dict[str, float | None]:
-    """Return a figure as JSON has it."""
-    return {**asdict(figure), "sigma": figure.sigma}
+    asked = [(angle, reversal.way) for angle, reversal in zip(at, reversals, strict=True)]
+    metrics = circle_metrics(_positions(ways["1"]), _positions(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
+    jumps = [
+        JumpResult(reversal.joints, reversal.way, angle, jump)
+        for reversal, angle, jump in zip(reversals, at, metrics.jumps, strict=True)
+    ]
+    return CircleResult(axes, metrics, jumps)

@@ -30,11 +30,15 @@ from armsight.vision.rig import StereoRig
 
 #: Test -> how many cycles it has unless asked otherwise.
 CYCLES = {"poses": 30, "wide": 1, "line": 10, "circle": 3}
-#: The circle's radius, in sides of the cube (8.2: its diameter is 80 % of it), where it starts, and by how much more than a
-#: whole one it is run: what is judged is neither its start nor its end.
-RADIUS, START_DEG, OVER_DEG = 0.4, 15.0, 60.0
-#: Points of the body are this far from the images' edges, px; places looked at along a path.
-_MARGIN_PX, _LOOKED = 20.0, 200
+#: The circle's radius, in sides of the cube (8.2: its diameter is 80 % of it).
+RADIUS = 0.4
+#: Where on the circle the motion starts, and by how much more than a whole revolution it is run, deg: neither the start nor
+#: the end is evaluated.
+START_DEG, OVER_DEG = 15.0, 60.0
+#: Points of the body stay this far from the images' edges, px.
+_MARGIN_PX = 20.0
+#: Points of a path that are looked at for limits and visibility.
+_LOOKED = 200
 Allowed = Callable[[Array], NDArray[np.bool_]]
 
 
@@ -55,7 +59,7 @@ class PlannedTest(NamedTuple):
 
 
 def plan_test(
-    arm: Arm, name: str, cycles: int | None, centre: Array | None, speed_m_s: float, seen_in: Path | None
+    arm: Arm, name: str, cycles: int | None, centre: Array | None, speed_m_s: float, visible_in: Path | None
 ) -> PlannedTest:
     """Plan a test.
 
@@ -65,12 +69,12 @@ def plan_test(
         cycles: how many times; None for the usual.
         centre: (3,) of the cube, base, m; None to let it be found.
         speed_m_s: along lines and circles.
-        seen_in: an earlier run, whose cameras must see all of it; None to let all be seen.
+        visible_in: an earlier run, whose cameras must see all of it; None to let all be seen.
 
     Raises:
         InputError: no cube is within reach, or the run's files cannot be used.
     """
-    allowed = everywhere if seen_in is None else _seen_by(seen_in)
+    allowed = everywhere if visible_in is None else _seen_by(visible_in)
     paths = {"line": partial(_line, arm), "circle": partial(_circle, arm)}
     done = paths.get(name)
     too_fast: list[CheckPlan] = []  # cubes whose poses would do, but not the path
@@ -98,7 +102,7 @@ def plan_test(
 
 
 def _goes(arm: Arm, path: Callable[[], Trajectory], allowed: Allowed) -> bool:
-    """Say whether the arm can follow a path, clear of its limits and, all along it, where it may be."""
+    """Return whether the arm can follow a path, clear of its limits and, all along it, where it may be."""
     try:
         way = path()
     except InputError:
@@ -109,7 +113,7 @@ def _goes(arm: Arm, path: Callable[[], Trajectory], allowed: Allowed) -> bool:
 
 
 def _seen_by(run: Path) -> Allowed:
-    """Return what says whether both cameras of a run see all of its body at poses (N, 4, 4) of the tool."""
+    """Return a function: whether both cameras of a run see all of its body at poses (N, 4, 4) of the tool."""
     rig, body = StereoRig.load(run / "rig.json"), open_target(str(run / "body.toml")).body.points
     file = run / "handeye.json"
     try:
@@ -156,9 +160,9 @@ def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> Trajectory:
     return circle(arm, _start(arm, plan, start), plan.centre, axis, np.radians(angle), duration_s=duration_s)
 
 
-def _start(arm: Arm, plan: CheckPlan, place: Array) -> Array:
-    """Return joint angles (6,), rad, at a place (3,), base, m, in the configuration of the poses."""
-    found = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], place), near=plan.q[0]).best
+def _start(arm: Arm, plan: CheckPlan, p_base: Array) -> Array:
+    """Return joint angles (6,), rad, at a position (3,), base, m, in the configuration of the poses."""
+    found = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], p_base), near=plan.q[0]).best
     if found is None:
         raise InputError("the circle is out of reach")
     return found
@@ -188,8 +192,8 @@ def _line_text(arm: Arm, plan: CheckPlan, cycles: int, speed_m_s: float) -> str:
     text = _joints("to P2", plan.q[1])
     for cycle in range(1, cycles + 1):
         for way, goal in (("P2 to P4", 3), ("P4 to P2", 1)):
-            place = 1e3 * plan.Ts_base_tool[goal][:3, 3]
-            text += f'\n[[motion]]\nkind = "line"\nname = "{way} cycle {cycle}"\nto_mm = {_numbers(place)}\n'
+            to_mm = 1e3 * plan.Ts_base_tool[goal][:3, 3]
+            text += f'\n[[motion]]\nkind = "line"\nname = "{way} cycle {cycle}"\nto_mm = {_numbers(to_mm)}\n'
             text += f"duration_s = {duration:.4f}\n"
     return text
 

@@ -19,21 +19,21 @@ from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
 
 TESTS = ("pose", "path", "circle")
 _TEXTS = ("test", "pose", "cycle", "approach")
-_PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-_COMMAND = tuple(f"command_{name}" for name in (*_PLACE, *_TURN))
-_SIGMA, _COMMON = (tuple(f"{kind}_{name}" for name in _PLACE) for kind in ("sigma", "sigma_common"))
-NEEDED = ("pose", *_PLACE, *_COMMAND[:3])
-#: Columns of which all or none are there.
-_TOGETHER = (_TURN, _COMMAND[3:], _SIGMA, _COMMON)
-#: An arm that is further off its commands than this is none: units or frames are mixed up.
+_POSITION, _QUATERNION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
+_COMMAND = tuple(f"command_{name}" for name in (*_POSITION, *_QUATERNION))
+_SIGMA, _COMMON = (tuple(f"{kind}_{name}" for name in _POSITION) for kind in ("sigma", "sigma_common"))
+NEEDED = ("pose", *_POSITION, *_COMMAND[:3])
+#: Groups of columns: a row has all of a group or none of it.
+_TOGETHER = (_QUATERNION, _COMMAND[3:], _SIGMA, _COMMON)
+#: Half of the rows further off their commands than this, m, are an error: units or frames are mixed up.
 _FAR_M = 0.1
-#: Commands of one place differ by rounding at most, m (and their turns' matrices).
+#: Commands of one pose differ by rounding at most: by this much, m, and in their rotation matrices.
 SAME_M = 1e-5
 _COLUMNS = (
     *_TEXTS,
     "t_s",
-    *_PLACE,
-    *_TURN,
+    *_POSITION,
+    *_QUATERNION,
     *_COMMAND,
     *_SIGMA,
     *_COMMON,
@@ -46,16 +46,16 @@ class Row(Record):
 
     Attributes:
         test: pose, path or circle.
-        pose: its name; on a path or circle the station.
-        cycle: which time round.
-        approach: where it was come to from; of a path its name; on a circle 1 counter-clockwise, -1 clockwise.
+        pose: its name; on a path the number of the path point, on a circle the angle, deg.
+        cycle: which repetition.
+        approach: where the arm came from; of a path its name; on a circle 1 counter-clockwise, -1 clockwise.
         t_s: when, s; None where that is not known.
         T: (4, 4) attained, base.
         T_command: (4, 4) commanded.
-        cov: (3, 3) covariance of the place by the instrument, base's axes, m^2: what differs from row to row.
+        cov: (3, 3) covariance of the position by the instrument, base's axes, m^2: what differs from row to row.
         cov_common: (3, 3) that of the instrument's constant error.
-        turned: whether the attained turn is known.
-        commanded_rotation: whether the commanded one is.
+        measured_rotation: whether the attained rotation is known.
+        commanded_rotation: whether the commanded rotation is known.
     """
 
     test: str
@@ -67,12 +67,12 @@ class Row(Record):
     T_command: Array
     cov: Array
     cov_common: Array
-    turned: bool = True
+    measured_rotation: bool = True
     commanded_rotation: bool = True
 
 
-class Turn(NamedTuple):
-    """Joints turn back on the circle.
+class Reversal(NamedTuple):
+    """Joints reverse on the circle.
 
     Attributes:
         joints: their numbers, 1 to 6.
@@ -89,21 +89,21 @@ class Attained(NamedTuple):
     """What a test attained.
 
     Attributes:
-        rows: all that is judged.
-        notes: what was left out, in words.
-        turns: where joints turn back on the circle, as far as that is known.
+        rows: all that is evaluated.
+        notes: what was left out, as text.
+        reversals: where joints reverse on the circle, as far as that is known.
     """
 
     rows: list[Row]
     notes: list[str]
-    turns: list[Turn]
+    reversals: list[Reversal]
 
 
 def read_rows(file: Path) -> list[Row]:
     """Read a CSV.
 
     Raises:
-        InputError: unreadable, a column missing, or a cell that is no number; the message names the line.
+        InputError: unreadable, a column missing, or a value that is no number; the message names the line.
     """
     table = read_table(file)
     if not table:
@@ -115,9 +115,9 @@ def read_rows(file: Path) -> list[Row]:
         hint = "; a motion file is for armsight run --motion" if file.suffix == ".toml" else hint
         raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
     rows = []
-    for line, cells in enumerate(table[1:], start=2):
-        if any(cell.strip() for cell in cells):
-            named = dict(zip(header, (cell.strip() for cell in cells), strict=False))
+    for line, entries in enumerate(table[1:], start=2):
+        if any(entry.strip() for entry in entries):
+            named = dict(zip(header, (entry.strip() for entry in entries), strict=False))
             rows.append(_row(f"{file}: line {line}", named))
     if not rows:
         raise InputError(f"{file}: no rows; one line an attained pose is needed")
@@ -138,50 +138,50 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
         seen.add(what)
         apart = row.T_command - sent.setdefault(row.pose, row.T_command) if row.test == "pose" else np.zeros(1)
         if np.abs(apart).max() > SAME_M:
-            raise InputError(f"{file}: pose {row.pose} has several commands; give each place a name of its own")
+            raise InputError(f"{file}: pose {row.pose} has several commands; give each position a name of its own")
     off_m = float(np.median([np.linalg.norm(row.T[:3, 3] - row.T_command[:3, 3]) for row in rows]))
     if off_m > _FAR_M:
         raise InputError(
             f"{file}: half of the rows are more than {1e3 * off_m:.0f} mm from their commands: both must be in m, in one "
-            "frame, and their columns in order"
+            "frame, and each column under its own name"
         )
 
 
-def _row(where: str, cells: dict[str, str]) -> Row:
-    test = cells.get("test", "") or "pose"
+def _row(where: str, entries: dict[str, str]) -> Row:
+    test = entries.get("test", "") or "pose"
     if test not in TESTS:
         raise InputError(f"{where}: test is {test!r}; known are {', '.join(TESTS)}")
     numbers = {}
     for name in _COLUMNS[len(_TEXTS) :]:
-        cell = cells.get(name, "")
-        if not cell:
+        entry = entries.get(name, "")
+        if not entry:
             continue
         try:
-            numbers[name] = float(cell)
+            numbers[name] = float(entry)
         except ValueError:
-            raise InputError(f"{where}: {name} is {cell!r}, must be a number") from None
+            raise InputError(f"{where}: {name} is {entry!r}, must be a number") from None
         if not np.isfinite(numbers[name]):
-            raise InputError(f"{where}: {name} is {cell}, must be a finite number")
-    _require_whole(where, cells, numbers)
+            raise InputError(f"{where}: {name} is {entry}, must be a finite number")
+    _require_whole(where, entries, numbers)
     covs = [np.diag([numbers.get(name, 0.0) ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
     return Row(
         test,
-        cells["pose"],
-        cells.get("cycle", ""),
-        cells.get("approach", ""),
+        entries["pose"],
+        entries.get("cycle", ""),
+        entries.get("approach", ""),
         numbers.get("t_s"),
         _pose(where, numbers, ""),
         _pose(where, numbers, "command_"),
         covs[0],
         covs[1],
-        _TURN[0] in numbers,
+        _QUATERNION[0] in numbers,
         _COMMAND[3] in numbers,
     )
 
 
-def _require_whole(where: str, cells: dict[str, str], numbers: dict[str, float]) -> None:
-    """Raise InputError where a row lacks a cell, or a standard deviation is none."""
-    if not cells.get("pose"):
+def _require_whole(where: str, entries: dict[str, str], numbers: dict[str, float]) -> None:
+    """Raise InputError where a row lacks a value, or a standard deviation is none."""
+    if not entries.get("pose"):
         raise InputError(f"{where}: pose is empty; it needs a name")
     for name in NEEDED[1:]:
         if name not in numbers:
@@ -196,11 +196,11 @@ def _require_whole(where: str, cells: dict[str, str], numbers: dict[str, float])
 
 
 def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
-    """Return a pose (4, 4); without a turn it has that of the base."""
-    q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _TURN])
+    """Return a pose (4, 4); without a rotation it has that of the base."""
+    q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _QUATERNION])
     if not 0.999 < np.linalg.norm(q) < 1.001:
         raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {np.linalg.norm(q):.4g}, not 1")
-    return pose(from_quaternion_wxyz(q / np.linalg.norm(q)), np.array([numbers[prefix + name] for name in _PLACE]))
+    return pose(from_quaternion_wxyz(q / np.linalg.norm(q)), np.array([numbers[prefix + name] for name in _POSITION]))
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -214,13 +214,13 @@ def rows_csv(rows: list[Row]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for row in rows:
-        cells = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
-        for T, known in ((row.T, row.turned), (row.T_command, row.commanded_rotation)):
-            cells += _decimals(T[:3, 3])
-            cells += _decimals(quaternion_wxyz(T[:3, :3])) if known else [""] * len(_TURN)
+        entries = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
+        for T, known in ((row.T, row.measured_rotation), (row.T_command, row.commanded_rotation)):
+            entries += _decimals(T[:3, 3])
+            entries += _decimals(quaternion_wxyz(T[:3, :3])) if known else [""] * len(_QUATERNION)
         for cov in (row.cov, row.cov_common):
-            cells += _decimals(np.sqrt(np.diag(cov)))
-        writer.writerow(cells)
+            entries += _decimals(np.sqrt(np.diag(cov)))
+        writer.writerow(entries)
     return out.getvalue()
 
 
