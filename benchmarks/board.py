@@ -32,12 +32,12 @@ sys.path.insert(0, str(ROOT / "tests" / "firmware" / "core"))
 import firmware_arm  # noqa: E402
 import numpy as np  # noqa: E402
 import test_firmware_pid as pid_tests  # noqa: E402
+from firmware_stack import stack_use  # noqa: E402
 
 from armsight import firmware  # noqa: E402
 from armsight.app.board.scenarios import DRIVEN, Bench  # noqa: E402
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
-from armsight.firmware.stack import stack_use  # noqa: E402
 from armsight.robot.boards.configuration import gains_array, lab_configuration  # noqa: E402
 from armsight.robot.boards.emulated import EmulatedLink  # noqa: E402
 from armsight.robot.boards.opening import configured, open_emulator  # noqa: E402

@@ -34,7 +34,7 @@ import numpy as np
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, Command, Rejection, State
+from armsight.robot.boards.codes import BoardState, Command, Fault, Rejection
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.sim.joints import JointPlant, PotFault
@@ -190,9 +190,9 @@ class Campaign:
         """Bring the arm into motion, out of whatever the last fault left."""
         for _ in range(100):
             state = self.board.status.state
-            if state == State.ENABLED and not self.board.status.faults:
+            if state == BoardState.ENABLED and not self.board.status.faults:
                 break
-            self.board.command(Command.ENABLE if state == State.DISABLED else Command.CLEAR_FAULTS)
+            self.board.command(Command.ENABLE if state == BoardState.DISABLED else Command.CLEAR_FAULTS)
             self.board.receive(0.02)
             self.take_up()
         else:

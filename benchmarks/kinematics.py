@@ -32,7 +32,6 @@ import numba  # noqa: E402
 import numpy as np  # noqa: E402
 import peers  # noqa: E402
 
-from armsight.robot.kinematics import batch as lanes  # noqa: E402
 from armsight.robot.kinematics import chain, inverse  # noqa: E402
 from armsight.robot.kinematics.inverse import MOST, WIDTH  # noqa: E402
 from armsight.robot.models import MODELS  # noqa: E402
@@ -109,7 +108,7 @@ def our_times(arm, q, Ts, each, eachT, rng):
             least(lambda: arm.jacobian(many), 1) / BATCH,
         ),
         "inverse": (
-            least(lambda: inverses(*tables, Ts, near, rows, scratch, lanes.LANES, 5), 1) / 5000,
+            least(lambda: inverses(*tables, Ts, near, rows, scratch, chain.BATCH, 5), 1) / 5000,
             least(lambda: arm.inverse(next(eachT)), 3000),
             least(lambda: arm.inverse_batch(manyTs), 1, 4) / BATCH,
         ),

@@ -8,7 +8,7 @@
 #include "types.h"
 
 typedef struct board_description {
-    const char *name; /* at most 16 characters, told in WELCOME */
+    const char *name; /* at most 16 characters, sent in WELCOME */
     uint32_t baud;    /* bits a second on the wire, 8N1: the telemetry's rate follows from it */
 
     /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts,
@@ -21,7 +21,7 @@ typedef struct board_description {
     /* Tick, once each time it ran to its end. */
     void (*feed_watchdog)(void);
 
-    /* Before the first tick. Tell whether the watchdog restarted the board. */
+    /* Before the first tick. Return whether the watchdog restarted the board. */
     bool (*watchdog_reset)(void);
 
     /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which

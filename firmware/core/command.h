@@ -4,7 +4,7 @@
 
 #include "types.h"
 
-/* Execute this tick's command wholly, or reject it and change nothing; either is written down with its sequence number. */
+/* Execute this tick's command wholly, or reject it and change nothing; either is recorded with its sequence number. */
 void command_take(core_state *core, const core_inputs *inputs);
 
 #endif

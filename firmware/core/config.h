@@ -16,7 +16,7 @@ uint32_t config_crc(const void *bytes, uint32_t length);
 /* Fill in values that keep an unknown arm harmless: weak, slow, and with a fault that rejects enabling. */
 void config_factory(core_config *config);
 
-/* Tell whether every value is in the range types.h names. */
+/* Return whether every value is in the range types.h names. */
 bool config_is_valid(const core_config *config);
 
 /* Make a copy to store: config with its serial number, version and CRC. */

@@ -37,7 +37,7 @@ static void measure(core_state *core, uint32_t i, uint32_t counts)
         safety_raise(core, fault, i);
     }
     if (!known || fault != FAULT_NONE) {
-        pid_reset(&joint->pid, joint->pot.angle_rad); /* a new place is no speed */
+        pid_reset(&joint->pid, joint->pot.angle_rad); /* a new position is no speed */
     } else {
         pid_measure(&joint->pid, &config->gains, joint->pot.angle_rad);
     }

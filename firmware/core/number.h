@@ -9,10 +9,10 @@
 /* The same bits everywhere need float arithmetic that is float arithmetic. */
 _Static_assert(FLT_EVAL_METHOD == 0, "float expressions must be computed in float");
 
-/* Tell whether x is neither NaN nor infinite. */
+/* Return whether x is neither NaN nor infinite. */
 static inline bool number_finite(float x) { return x >= -FLT_MAX && x <= FLT_MAX; }
 
-/* Tell whether x lies in [low, high]; NaN does not. */
+/* Return whether x lies in [low, high]; NaN does not. */
 static inline bool number_within(float x, float low, float high) { return x >= low && x <= high; }
 
 /* Return x held within [low, high]; low <= high. */

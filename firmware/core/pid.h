@@ -19,10 +19,10 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
 /* Move what a change of gains would add to the output into the integral, so that the output does not jump. */
 void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gains *after);
 
-/* Tell whether every gain is finite. */
+/* Return whether every gain is finite. */
 bool pid_gains_finite(const joint_gains *gains);
 
-/* Tell whether every gain is in the range types.h names. */
+/* Return whether every gain is in the range types.h names. */
 bool pid_gains_in_range(const joint_gains *gains);
 
 #endif

@@ -36,7 +36,7 @@ uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uin
             pot->valid = 0u; /* when it comes back, it may be anywhere */
             return suspect;
         }
-        /* A jump that lasts is the new place: the fault is told, and the reading goes on from there. */
+        /* A jump that lasts is the new position: the fault is reported, and the reading goes on from there. */
     }
     pot->valid = 1u;
     pot->bad_ticks = 0u;
@@ -67,7 +67,7 @@ bool pot_is_inverted(pot_state *pot, const pot_config *config, float error_rad, 
     const bool driven_there = duty * error_rad > 0.0f; /* braked otherwise, or left alone */
     const int32_t towards = driven_there ? (error_rad > 0.0f ? 1 : -1) : 0;
     const float along_rad = (float)towards * pot->angle_rad;
-    /* Measured from the farthest place it was driven to, so that noise does not add up. */
+    /* Measured from the farthest position it was driven to, so that noise does not add up. */
     if (towards != pot->towards || along_rad > pot->farthest_rad) {
         pot->towards = towards;
         pot->farthest_rad = along_rad;

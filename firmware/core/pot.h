@@ -1,4 +1,4 @@
-/* One potentiometer: counts to joint angle, and whether the counts can be believed. All functions: tick context. */
+/* One potentiometer: counts to joint angle, and whether the counts are plausible. All functions: tick context. */
 #ifndef ARMSIGHT_POT_H
 #define ARMSIGHT_POT_H
 
@@ -14,16 +14,16 @@ float pot_angle(const pot_config *config, uint32_t counts);
  * believed: the angle stays. Returns the fault once that lasts confirm_ticks (1 or more), FAULT_NONE until then. */
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks);
 
-/* Tell whether the present angle is a reading of this tick. */
+/* Return whether the present angle is a reading of this tick. */
 bool pot_is_read(const pot_state *pot);
 
 /* Begin to watch how the counts follow the reference (rad). */
 void pot_watch(pot_state *pot, float reference_rad);
 
-/* Tell whether the counts have stood still while the reference (rad) travelled frozen_rad. Driven joints only. */
+/* Return whether the counts have stood still while the reference (rad) travelled frozen_rad. Driven joints only. */
 bool pot_is_frozen(pot_state *pot, const pot_config *config, uint32_t counts, float reference_rad);
 
-/* Tell whether the joint has moved away from its command by inverted_rad although it is driven towards it.
+/* Return whether the joint has moved away from its command by inverted_rad although it is driven towards it.
  * error_rad is reference minus angle, duty this tick's. Driven joints only. */
 bool pot_is_inverted(pot_state *pot, const pot_config *config, float error_rad, float duty);
 

@@ -102,13 +102,13 @@ void safety_watch_arm(core_state *core, const core_inputs *inputs)
 /* Return the count of ticks in a row in which something holds. */
 static uint32_t in_a_row(uint32_t ticks, bool holds) { return holds ? number_count(ticks) : 0u; }
 
-/* Return for how many ticks the joint has been driven hard without turning. Travel is looked at, not speed: the noise
+/* Return for how many ticks the joint has been driven hard without rotating. Travel is looked at, not speed: the noise
  * of a potentiometer is a speed, but it leads nowhere. */
 static uint32_t joint_stands(joint_state *joint, const joint_config *config)
 {
     const bool driven = number_size(joint->pid.duty) >= config->stall_duty;
-    const bool turned = number_size(joint->pid.measured_rad - joint->stall_mark_rad) > config->stall_rad;
-    joint->stall_ticks = in_a_row(joint->stall_ticks, driven && !turned);
+    const bool rotated = number_size(joint->pid.measured_rad - joint->stall_mark_rad) > config->stall_rad;
+    joint->stall_ticks = in_a_row(joint->stall_ticks, driven && !rotated);
     if (joint->stall_ticks == 0u) {
         joint->stall_mark_rad = joint->pid.measured_rad;
     }

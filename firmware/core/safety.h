@@ -17,7 +17,7 @@ const char *fault_text(uint32_t code);
 const char *state_text(uint32_t code);
 const char *rejection_text(uint32_t code);
 
-/* Tell whether the drives are on in the present state. */
+/* Return whether the drives are on in the present state. */
 bool safety_drives_on(const core_state *core);
 
 /* Latch a fault of a joint (0 to 5, or NO_JOINT), whose cause stands in this tick, and react to it. */
@@ -26,7 +26,7 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint);
 /* Take the emergency stop: drives off in every state. */
 void safety_stop(core_state *core);
 
-/* Forget all latched faults; the caller has made sure that none of their causes stands. */
+/* Forget all latched faults; the caller has made sure that the cause of none of them stands. */
 void safety_forget(core_state *core);
 
 /* Watch the tick timer, the supply and, while the arm follows the host, the host's silence. */

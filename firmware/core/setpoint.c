@@ -31,14 +31,14 @@ bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32
     const float distance_rad = to_rad - setpoint->position_rad;
     const float least_ticks =
         shortest_s(distance_rad, setpoint->speed_rad_s, to_rad_s, speed_limit_rad_s) * (float)TICKS_PER_S;
-    const bool stretched = least_ticks > (float)ticks;
+    const bool lengthened = least_ticks > (float)ticks;
     setpoint->from_rad = setpoint->position_rad;
     setpoint->from_rad_s = setpoint->speed_rad_s;
     setpoint->to_rad = to_rad;
     setpoint->to_rad_s = to_rad_s;
-    setpoint->ticks = stretched ? (uint32_t)least_ticks + 1u : ticks;
+    setpoint->ticks = lengthened ? (uint32_t)least_ticks + 1u : ticks;
     setpoint->elapsed = 0u;
-    return stretched;
+    return lengthened;
 }
 
 void setpoint_advance(setpoint_state *setpoint)

@@ -2,7 +2,7 @@
  *
  * Angles are radians at the joint, duties are fractions of full drive (-1 to 1), counts are 16-bit fractions of the
  * potentiometer's supply (a 12-bit converter's reading is shifted left by four). Every record is built of fields of
- * two or four bytes without a hole, so that it reads the same on every machine and can be stored and checked as bytes.
+ * two or four bytes without a hole, so that it reads the same everywhere and can be stored and checked as bytes.
  * Integers where a board measures, floats where the law computes: what comes from a board can never be NaN.
  */
 #ifndef ARMSIGHT_TYPES_H
@@ -20,11 +20,11 @@
 #define FAULT_LIST(X)                                                                                 \
     X(POT_OPEN, 1, RELEASE, "potentiometer open: the reading is above its band")                      \
     X(POT_SHORT, 2, RELEASE, "potentiometer short: the reading is below its band")                    \
-    X(POT_FROZEN, 3, RELEASE, "potentiometer frozen: the reading stands still while the arm is told to move") \
+    X(POT_FROZEN, 3, RELEASE, "potentiometer frozen: the reading stands still while the arm is commanded to move") \
     X(POT_JUMP, 4, RELEASE, "potentiometer jump: the reading moved faster than the joint can")        \
     X(POT_INVERTED, 5, RELEASE, "inverted: the joint moves away from its command")                    \
     X(FOLLOWING, 6, RELEASE, "following error: the joint is too far from its reference")              \
-    X(STALL, 7, RELEASE, "stall: the motor is driven hard and the joint does not turn")               \
+    X(STALL, 7, RELEASE, "stall: the motor is driven hard and the joint does not rotate")             \
     X(HOST_SILENT, 8, CHOSEN, "host silent: no motion command within the time set")                   \
     X(SUPPLY_LOW, 9, RELEASE, "supply too low")                                                       \
     X(SUPPLY_HIGH, 10, RELEASE, "supply too high")                                                    \
@@ -133,8 +133,8 @@ typedef struct joint_config {
     float duty_slew_per_s;     /* 0.1 to 1000: largest change of duty */
     float current_cut_per_a_s; /* 0 to 1000: duty taken away per second and ampere beyond the limit */
     float following_rad;       /* 1e-3 to 13: largest distance from the reference */
-    float stall_duty;          /* 0.01 to 1: from here on the motor must turn the joint */
-    float stall_rad;           /* 1e-4 to 1: turning less than this within stall_ticks is standing still */
+    float stall_duty;          /* 0.01 to 1: from here on the motor must rotate the joint */
+    float stall_rad;           /* 1e-4 to 1: rotating less than this within stall_ticks is standing still */
     uint32_t current_limit_ma; /* motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
 } joint_config;
@@ -165,7 +165,7 @@ typedef struct config_copy {
 typedef struct move_command {
     float position_rad[JOINTS]; /* where to be when duration_ticks have passed; clamped to the soft limits */
     float speed_rad_s[JOINTS];  /* how fast to be there; clamped to the speed limits */
-    float gravity_duty[JOINTS]; /* -1 to 1: duty that carries the arm's weight, added from the next tick on */
+    float gravity_duty[JOINTS]; /* -1 to 1: duty that compensates the gravity load, added from the next tick on */
     uint32_t duration_ticks;    /* 1 to 10000: usually the host's own period */
 } move_command;
 
@@ -246,9 +246,9 @@ typedef struct setpoint_state {
 /* What is remembered of one potentiometer. */
 typedef struct pot_state {
     uint32_t valid;        /* not 0 once a reading was within its band */
-    uint32_t bad_ticks;    /* readings not believed in a row */
+    uint32_t bad_ticks;    /* implausible readings in a row */
     uint32_t last_counts;
-    float angle_rad;       /* the last one believed */
+    float angle_rad;       /* the last plausible one */
     float mark_rad;        /* where the reference was when the counts last changed */
     int32_t towards;       /* which way the joint is driven to its command, 0 while it is braked */
     float farthest_rad;    /* how far that way it has been meanwhile */
@@ -261,7 +261,7 @@ typedef struct joint_state {
     pot_state pot;
     float gravity_duty;
     float duty_cap;          /* what the current limit leaves of the duty limit */
-    float low_rad;           /* soft limits, widened to the joint's place while it is brought back in */
+    float low_rad;           /* soft limits, widened to the joint's position while it is brought back in */
     float high_rad;
     uint32_t following_ticks;
     uint32_t stall_ticks;
@@ -272,7 +272,7 @@ typedef struct joint_state {
 
 /* The whole controller. */
 typedef struct core_state {
-    uint32_t guard_head; /* a known word on either side: a stray write that passes through shows */
+    uint32_t guard_head; /* a known word on either side: an erroneous write that passes through shows */
     core_config config;
     joint_state joint[JOINTS];
     uint32_t state;

@@ -21,7 +21,7 @@ void command_acknowledge(wire_state *wire, uint32_t sequence)
     wire->status_due = 1u;
 }
 
-/* Tell whether this number comes after all that came; numbers go round. */
+/* Return whether this number comes after all that came; numbers go round. */
 static bool is_newer(const wire_state *wire, uint32_t sequence)
 {
     const uint32_t ahead = sequence - wire->newest_sequence;
@@ -166,7 +166,7 @@ static void take_gains(wire_state *wire, const mavlink_message_t *message)
     }
 }
 
-/* A stop is taken whatever its number and whoever sent it; what waited before it is no longer wanted. */
+/* A stop is taken whatever its number and whoever sent it; what waited before it is dropped. */
 static void take_stop(wire_state *wire, const mavlink_message_t *message)
 {
     const uint32_t sequence = mavlink_msg_stop_get_sequence(message);

@@ -6,7 +6,7 @@
 
 #define WIRE_SYSTEM 1u    /* the board's MAVLink system and component */
 #define WIRE_COMPONENT 1u
-#define COMMAND_STORE 0x100u /* a CONFIG_STORE in its place among the commands; the core never sees it */
+#define COMMAND_STORE 0x100u /* a CONFIG_STORE in its order among the commands; the core never sees it */
 
 /* Return the tick of the newest report. */
 static inline uint32_t wire_tick(const wire_state *wire) { return wire->report.outputs.tick; }
@@ -14,10 +14,10 @@ static inline uint32_t wire_tick(const wire_state *wire) { return wire->report.o
 /* Execute a message whose checksum is right. */
 void message_take(wire_state *wire, const mavlink_message_t *message);
 
-/* Tell whether a command may be taken, by its number and by who sent it; rejects or drops it otherwise. */
+/* Return whether a command may be taken, by its number and by who sent it; rejects or drops it otherwise. */
 bool command_admit(wire_state *wire, uint32_t sequence);
 
-/* Return the place at the queue's end for a command of this kind; NULL, and rejects it, where there is none. */
+/* Return the slot at the queue's end for a command of this kind; NULL, and rejects it, where there is none. */
 core_command *command_append(wire_state *wire, uint32_t kind, uint32_t sequence);
 
 /* Reject a command before it reaches the core, or say that the wire itself acknowledged it. */

@@ -158,14 +158,14 @@ static void write_angles(wire_state *wire)
     wire->angles_tick = outputs->tick;
 }
 
-/* Tell whether what waits to go out leaves telemetry worth writing. */
+/* Return whether what waits to go out leaves telemetry worth writing. */
 static bool has_room(const wire_state *wire)
 {
     const uint32_t waiting = wire->output.written - wire->output.taken;
     return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
 }
 
-/* Tell whether it is time for a BOARD_STATUS. A host of another version is told why its commands are rejected, and no
+/* Return whether it is time for a BOARD_STATUS. A host of another version learns why its commands are rejected, and no
  * more. */
 static bool status_is_due(const wire_state *wire)
 {

@@ -22,7 +22,7 @@ static void await(wire_input *input)
     input->message.len = 0u;
 }
 
-/* Tell whether the header that was just read belongs to no message of ours. MAVLink's own check would also reject
+/* Return whether the header that was just read belongs to no message of ours. MAVLink's own check would also reject
  * messages whose trailing zeros were left out, and without one a false begin swallows up to 255 bytes of good
  * messages. */
 static bool is_foreign(const wire_input *input)

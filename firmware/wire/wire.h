@@ -142,12 +142,12 @@ void wire_receive(wire_state *wire, const uint8_t *bytes, uint32_t length, uint3
 /* Hand the next command to the tick, and write the telemetry that is due. Main loop, after wire_receive. */
 void wire_poll(wire_state *wire);
 
-/* Return the configuration the board must store now and tell of by wire_stored, NULL without. Main loop, after
+/* Return the configuration the board must store now and report by wire_stored; NULL without. Main loop, after
  * wire_poll. */
 const core_config *wire_to_store(const wire_state *wire);
 void wire_stored(wire_state *wire, bool done);
 
-/* Point *bytes to what waits to go out and return how much of it lies there in one piece; then tell how many went.
+/* Point *bytes to what waits to go out and return how much of it lies there in one piece; wire_sent then takes how many were sent.
  * Main loop. */
 uint32_t wire_output(const wire_state *wire, const uint8_t **bytes);
 void wire_sent(wire_state *wire, uint32_t length);

@@ -2,6 +2,7 @@
 
 import sys
 
+import firmware_stack as stack
 import numpy as np
 import pytest
 from firmware_build import FIRMWARE
@@ -10,7 +11,7 @@ from firmware_pil import Host
 
 from armsight import firmware
 from armsight.errors import DeviceError, InputError
-from armsight.firmware import build, stack
+from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.opening import open_emulator
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.robot.models import MODELS, open_arm
+from armsight.robot.arm_file import open_arm
+from armsight.robot.models import MODELS
 
 ARM = MODELS["ur5"]
 T = ARM.forward(ARM.home)

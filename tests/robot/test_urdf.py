@@ -17,8 +17,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.robot.arm import Arm
 from armsight.robot.models import MODELS
-from armsight.robot.urdf import read_urdf
-from armsight.robot.urdf_table import decompose
+from armsight.robot.urdf import decompose, read_urdf
 from armsight.robot.urdf_write import urdf_text, write_urdf
 
 SIX_R = MODELS["six_r"]

@@ -2,7 +2,7 @@
 #ifndef ARMSIGHT_MEMORY_H
 #define ARMSIGHT_MEMORY_H
 
-/* Copy .data to its place and clear .bss (sections.ld). Once, right after reset; no variable is good before it. */
+/* Copy .data to its address and clear .bss (sections.ld). Once, right after reset; no variable is good before it. */
 void memory_start(void);
 
 #endif

@@ -18,7 +18,7 @@ void pil_start(void);
 /* Run one tick on pil_request_frame and write pil_answer_frame: the three parts below, one after the other. */
 void pil_tick(void);
 
-/* Main loop: take the request and its bytes. Returns whether it is one; pil_answer_frame tells why not otherwise. */
+/* Main loop: take the request and its bytes. Returns whether it is one; otherwise pil_answer_frame says why not. */
 bool pil_begin(void);
 
 /* Tick interrupt. */

@@ -6,7 +6,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Open a file of the machine QEMU runs on, to read or to write; returns its handle, below 0 where it cannot be
+/* Open a file of the computer QEMU runs on, to read or to write; returns its handle, below 0 where it cannot be
  * opened. */
 int32_t semihost_open(const char *path, bool writing);
 

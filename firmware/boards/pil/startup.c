@@ -1,4 +1,4 @@
-/* The emulated board's machine: vectors, SysTick, and frames by semihosting. Under QEMU reset runs it all; under
+/* The emulated board's start-up: vectors, SysTick, and frames by semihosting. Under QEMU reset runs it all; under
  * Unicorn, which has neither SysTick nor semihosting, Python calls pil_boot once and then pil_tick. */
 #include <stddef.h>
 
@@ -21,7 +21,7 @@ extern char stack_top[]; /* of mps2.ld */
 void reset(void);
 void pil_boot(void);
 void tick_interrupt(void);
-void stray_interrupt(void);
+void unexpected_interrupt(void);
 
 static volatile uint32_t due; /* not 0: a request waits for its tick */
 
@@ -33,19 +33,19 @@ void tick_interrupt(void)
     }
 }
 
-void stray_interrupt(void) { semihost_exit(false); }
+void unexpected_interrupt(void) { semihost_exit(false); }
 
 typedef void (*vector)(void);
 
 __attribute__((section(".vectors"), used)) static const vector vectors[16] = {
-    (vector)(uintptr_t)stack_top, reset,           stray_interrupt, stray_interrupt,
-    stray_interrupt,              stray_interrupt, stray_interrupt, NULL,
-    NULL,                         NULL,            NULL,            stray_interrupt,
-    stray_interrupt,              NULL,            stray_interrupt, tick_interrupt,
+    (vector)(uintptr_t)stack_top, reset,           unexpected_interrupt, unexpected_interrupt,
+    unexpected_interrupt,              unexpected_interrupt, unexpected_interrupt, NULL,
+    NULL,                         NULL,            NULL,            unexpected_interrupt,
+    unexpected_interrupt,              NULL,            unexpected_interrupt, tick_interrupt,
 };
 
 /* Wait for the tick's interrupt with all floating-point registers in use; returns whether it left them as they were.
- * It turns round in place of sleeping: an emulated processor that sleeps costs its emulator more than one that
+ * It loops instead of sleeping: an emulated processor that sleeps costs its emulator more than one that
  * counts. */
 static bool wait_for_tick(uint32_t seed)
 {

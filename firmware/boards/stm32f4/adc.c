@@ -57,7 +57,7 @@ void adc_start(void)
     scan_start();
 }
 
-/* Tell whether the ring went on since the last tick: it is half or wholly through every 0.4 ms. */
+/* Return whether the ring went on since the last tick: it is half or wholly through every 0.4 ms. */
 static bool alive(void)
 {
     const uint32_t progress = DMA2->lisr & (DMA_HTIF | DMA_TCIF);
@@ -67,7 +67,7 @@ static bool alive(void)
 
 void adc_read(core_inputs *inputs)
 {
-    const bool believed = alive();
+    const bool running = alive();
     uint32_t sum[CHANNELS] = {0u};
     for (uint32_t scan = 0u; scan < SCANS; scan++) {
         for (uint32_t i = 0u; i < CHANNELS; i++) {
@@ -76,10 +76,10 @@ void adc_read(core_inputs *inputs)
     }
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
         inputs->current_ma[joint] = sum[joint] * CURRENT_FULL_MA >> 16;
-        inputs->counts[joint] = believed ? sum[JOINTS + 1u + joint] : OPEN_COUNTS;
+        inputs->counts[joint] = running ? sum[JOINTS + 1u + joint] : OPEN_COUNTS;
     }
     inputs->supply_mv = (uint32_t)((uint64_t)sum[JOINTS] * SUPPLY_FULL_MV >> 16);
-    if (!believed) {
+    if (!running) {
         adc_start();
     }
 }

@@ -2,7 +2,7 @@
 #include "drivers.h"
 #include "registers.h"
 
-#define HSE_PATIENCE 20000u /* turns of a loop: about 10 ms; a clock that is there is there within microseconds */
+#define HSE_PATIENCE 20000u /* passes of a loop: about 10 ms; a clock that is there is there within microseconds */
 #define PLL_IN_MHZ 2u       /* the manual's advice against jitter; 1 to 2 are allowed */
 #define PLL_N 180u
 #define PLL_FACTORS(in_mhz) ((in_mhz) / PLL_IN_MHZ | FIELD(PLL_N, 6) | FIELD(0, 16) | FIELD(8, 24) | FIELD(2, 28))
@@ -26,7 +26,7 @@ static bool hse_start(void)
 {
     RCC->cr |= RCC_CR_HSEBYP;
     RCC->cr |= RCC_CR_HSEON;
-    for (uint32_t turn = 0u; turn < HSE_PATIENCE; turn++) {
+    for (uint32_t pass = 0u; pass < HSE_PATIENCE; pass++) {
         if ((RCC->cr & RCC_CR_HSERDY) != 0u) {
             return true;
         }

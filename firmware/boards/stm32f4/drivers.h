@@ -36,7 +36,7 @@ void drives_write(const float duty[JOINTS]);
 /* Switch the bridges off and the PWM outputs low. Any context, any state: needs nothing but the registers. */
 void drives_off(void);
 
-/* Tell whether the emergency stop's line is open, or was since the last call. Tick only. */
+/* Return whether the emergency stop's line is open, or was since the last call. Tick only. */
 bool drives_stopped(void);
 
 /* Start the converter; the timers trigger it. Startup, and the tick where it stands still. */
@@ -61,7 +61,7 @@ void watchdog_set_short(void); /* 10 ms (6.8 to 18.8: its oscillator is a rough 
 void watchdog_set_long(void);  /* 2 s (1.4 to 3.8): while starting, and while the flash memory is written */
 void watchdog_feed(void);
 
-/* Tell whether it was the watchdog that reset the processor; forgets it. Startup only. */
+/* Return whether it was the watchdog that reset the processor; forgets it. Startup only. */
 bool watchdog_was_here(void);
 
 /* Read stored copy which (0 or 1) as it is. Any context but the tick. */

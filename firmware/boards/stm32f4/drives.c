@@ -36,7 +36,7 @@ static void timer_start(tim_registers *timer)
     timer->ccer = CHANNELS_ON;
     timer->cr2 = TIM_CR2_TRGO_OC4REF; /* idle outputs are low; TIM8's trigger is the converter's */
     timer->egr = TIM_EGR_UG;
-    timer->bdtr = BRIDGE_OFF; /* locked: no stray write turns the break off again */
+    timer->bdtr = BRIDGE_OFF; /* locked: no erroneous write switches the break off again */
     timer->sr = 0u;
 }
 
@@ -90,7 +90,7 @@ void drives_off(void)
     }
 }
 
-/* Tell whether a timer's break came since the last time, and forget it. */
+/* Return whether a timer's break came since the last time, and forget it. */
 static bool broken(tim_registers *timer)
 {
     const bool was = (timer->sr & TIM_SR_BIF) != 0u;

@@ -47,10 +47,10 @@ static void cache_forget(void)
 
 static bool reads(uint32_t at, const config_copy *copy)
 {
-    const uint32_t *wanted = (const uint32_t *)(const void *)copy;
+    const uint32_t *source = (const uint32_t *)(const void *)copy;
     const word *there = (const word *)(uintptr_t)at;
     for (uint32_t i = 0u; i < sizeof *copy / 4u; i++) {
-        if (there[i] != wanted[i]) {
+        if (there[i] != source[i]) {
             return false;
         }
     }

@@ -14,7 +14,7 @@ void pendsv_interrupt(void);
 /* Begin. Reset. */
 void reset(void);
 
-/* Switch the drives off and wait for the watchdog. Every fault, a failed clock, a supply too low, a stray interrupt. */
+/* Switch the drives off and wait for the watchdog. Every fault, a failed clock, supply too low, unexpected interrupt. */
 void fault(void);
 void fault_stop(void);
 

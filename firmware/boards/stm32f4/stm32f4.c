@@ -2,7 +2,7 @@
  *
  * SysTick counts milliseconds and asks for PendSV, which has the lowest priority and runs the tick: so a tick that
  * takes too long is seen while it runs, and no millisecond goes uncounted. The main loop serves the wire. Floats are
- * used by PendSV and the main loop; the processor keeps a place for its registers on entry and fills it only where
+ * used by PendSV and the main loop; the processor keeps stack space for its registers on entry and fills it only where
  * both do (lazy stacking, its default). */
 #include "drivers.h"
 #include "loop.h"
@@ -13,14 +13,14 @@ static board_loop loop;
 static volatile uint32_t ticks;
 static volatile uint32_t overruns;
 static volatile uint32_t running;
-static uint32_t overruns_told;
+static uint32_t overruns_reported;
 
 static void sense(core_inputs *inputs)
 {
     const uint32_t seen = overruns;
     inputs->tick = ticks;
-    inputs->overrun = seen - overruns_told;
-    overruns_told = seen;
+    inputs->overrun = seen - overruns_reported;
+    overruns_reported = seen;
     inputs->stop_pressed = drives_stopped() ? 1u : 0u;
     adc_read(inputs);
 }

@@ -1,7 +1,10 @@
 """The board's firmware as the package carries it: what was built at install, and where to find it.
 
-``built/`` holds the emulated board's image, the host library and the dialect's Python module.
-:mod:`~armsight.firmware.build` makes them from the C sources, :mod:`~armsight.firmware.elf` reads images.
+In: the C sources in ``firmware/``. Out: ``built/``, which holds the emulated board's image, the host library and the
+dialect's Python module; here are their paths.
+
+- ``build``: makes them from the C sources, at install and by ``armsight board build``;
+- ``elf``: reads images.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ def image() -> Path:
 
 
 def host_library() -> Path:
-    """Return the firmware as a shared library of this machine, ``image``'s twin."""
+    """Return the firmware as a shared library of this computer, ``image``'s twin."""
     return _built(HOST_LIBRARY)
 
 

@@ -3,7 +3,7 @@
     python -m armsight.firmware.build                         what the package carries, into its built/
     python -m armsight.firmware.build --board stm32f4 -o out  one board's image
 
-Compilers are ``zig`` (``ziglang`` from PyPI) and ``gcc`` (``arm-none-eabi-gcc``, and this machine's own for the host
+Compilers are ``zig`` (``ziglang`` from PyPI) and ``gcc`` (``arm-none-eabi-gcc``, and this computer's own for the host
 library).
 Runs at install, beside nothing but pymavlink and a compiler: of armsight it imports what needs no other package.
 """
@@ -45,7 +45,7 @@ class Compiler:
     Attributes:
         name: "zig" or "gcc".
         arm: the command that compiles for a Cortex-M4F.
-        host: the command that compiles for this machine, any processor of its kind.
+        host: the command that compiles for this computer, any processor of its kind.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Compiler:
 
 
 def compilers() -> dict[str, Compiler]:
-    """Return the compilers this machine has, by name, the preferred one first."""
+    """Return the compilers this computer has, by name, the preferred one first."""
     found = {}
     if importlib.util.find_spec("ziglang"):
         zig = (sys.executable, "-m", "ziglang", "cc")
@@ -71,9 +71,9 @@ def open_compiler(name: str | None = None) -> Compiler:
     name = name or os.environ.get(COMPILER_VARIABLE) or next(iter(found), "")
     if name in found:
         return found[name]
-    wanted = f"no firmware compiler {name!r}" if name else "no firmware compiler"
+    missing = f"no firmware compiler {name!r}" if name else "no firmware compiler"
     have = f"found: {', '.join(found)}" if found else "none found"
-    raise InputError(f"{wanted} ({have}); zig needs pip install 'armsight[build]', gcc needs {_ARM_GCC} and gcc")
+    raise InputError(f"{missing} ({have}); zig needs pip install 'armsight[build]', gcc needs {_ARM_GCC} and gcc")
 
 
 def source_folder() -> Path:
@@ -106,7 +106,7 @@ def generate(language: str, target: Path) -> None:
     except (mavparse.MAVParseError, SystemExit) as error:  # it exits where the schema is not met
         raise InputError(f"firmware/wire/armsight.xml: {error}") from error
     if not done:
-        raise InputError(f"firmware/wire/armsight.xml: pymavlink refused it: {said.getvalue().strip()}")
+        raise InputError(f"firmware/wire/armsight.xml: pymavlink rejected it: {said.getvalue().strip()}")
 
 
 @contextlib.contextmanager
@@ -137,7 +137,7 @@ def board_sources(board: str) -> list[str]:
 
 
 def host_sources() -> list[str]:
-    """Return the C files of the host library: the emulated board's, without the machine it is emulated on."""
+    """Return the C files of the host library: the emulated board's, without the start-up of its ARM emulation."""
     return [*_found("core", "wire", "boards", "boards/host"), "boards/pil/pil.c"]
 
 
@@ -161,7 +161,7 @@ def build_board(board: str, target: Path, compiler: Compiler) -> Path:
     with headers() as mavlink:
         compile_c(compiler.arm, target, board_sources(board), *board_flags(board, mavlink), *link)
     if not read_elf(target).hard_float:
-        raise InputError(f"{target}: computes floats in software; {compiler.arm[0]} did not obey its flags")
+        raise InputError(f"{target}: computes floats in software; {compiler.arm[0]} ignored its flags")
     return target
 
 
@@ -173,7 +173,7 @@ def build_host(target: Path, compiler: Compiler) -> Path:
 
 
 def fingerprint() -> str:
-    """Return the SHA-256 of the sources of what the package carries, by which a build that is out of date is told."""
+    """Return the SHA-256 of the sources of what the package carries, by which an outdated build is recognised."""
     root = source_folder()
     digest = hashlib.sha256((root / "cflags.txt").read_bytes())
     for folder in ("core", "wire", "boards", "boards/host", "boards/pil", "boards/cortex_m", "boards/cortex_m/include"):

@@ -22,7 +22,7 @@ _SOFT_FLOAT = re.compile(r"__aeabi_[fd](?!p)")
 
 
 @dataclass(frozen=True)
-class Segment:
+class ElfSegment:
     """A piece of memory the image fills.
 
     Attributes:
@@ -48,11 +48,11 @@ class Elf:
         segments: what is loaded.
         symbols: addresses by name, functions with the Thumb bit.
         sizes: bytes of each symbol, by name.
-        undefined: names it wants from elsewhere; none once it is linked.
+        undefined: names it needs from elsewhere; none once it is linked.
         hard_float: whether floats are passed in floating-point registers and no soft-float helper is in it.
     """
 
-    segments: tuple[Segment, ...]
+    segments: tuple[ElfSegment, ...]
     symbols: dict[str, int]
     sizes: dict[str, int]
     undefined: frozenset[str]
@@ -88,11 +88,11 @@ def read_elf(path: Path) -> Elf:
     return Elf(tuple(segment for segment in segments if segment), symbols, sizes, undefined, hard_float)
 
 
-def _segment(raw: bytes, at: int) -> Segment | None:
+def _segment(raw: bytes, at: int) -> ElfSegment | None:
     kind, offset, address, load_address, stored, size, flags = struct.unpack_from("<7I", raw, at)
     if kind != _LOAD or size == 0:
         return None
-    return Segment(address, load_address, raw[offset : offset + stored], size, bool(flags & _WRITABLE))
+    return ElfSegment(address, load_address, raw[offset : offset + stored], size, bool(flags & _WRITABLE))
 
 
 def _symbols(raw: bytes, headers: list[int]) -> list[tuple[str, int, int, int]]:

@@ -1,1 +1,11 @@
-"""Pose <-> joints: arms from their tables. Never imports vision."""
+"""The robot's side: kinematics, trajectories and controllers. Never imports vision.
+
+In: an arm by name, from a TOML table or from URDF; poses T_base_tool, m; joint angles, rad; a board's port. Out: poses,
+Jacobians, joint angles, trajectories; joint commands to a board and what its joints report.
+
+- ``arm``, ``solutions``, ``reach``: an arm of six revolute joints, its inverse kinematics, its workspace;
+- ``models/``: the arms that come with armsight; ``urdf``, ``urdf_write``: arms from and to URDF;
+- ``kinematics/``: the compiled functions beneath;
+- ``trajectories/``: motions that are checked against every limit before they start;
+- ``boards/``: the controllers that drive the joints, real ones on a serial port and emulated ones.
+"""

@@ -1,17 +1,9 @@
-"""Arm: a table of numbers that knows where its tool is, how it moves, and which joints bring it somewhere.
+"""Arm: a Denavit-Hartenberg table that knows where its tool is, how it moves, and which joints bring it to a pose.
 
-In: joint angles, rad, or a wanted pose. Out: poses ``T_base_tool``, Jacobians, :class:`Solutions`. The work is done by
-the functions in ``kinematics``; here stands what is checked once at the public door. Conventions: docs/arm.md.
-
-The table whose closed form starts the iterative inverse of an arm with axes a little off parallel.
-
-The common normal of two axes that are all but parallel is far away, so that such a row holds a d of many metres, the next
-one takes it back, and what lies between looks like no arm. Here d is carried on to where the normal is near, and the tilt
-left out.
-
-Joint angles and poses as they come in at the public door: made into new arrays, and refused with the reason.
-
-New arrays, so that the kernels see one type only. What costs time, looking at every number, the kernels do.
+In: joint angles, rad, or a requested pose T_base_tool, m. Out: poses ``T_base_tool``, Jacobians, :class:`Solutions`. The
+functions in ``kinematics`` do the work; here is what is checked once at the public door: joint angles and poses are copied
+into new arrays, so that the kernels see one type only, and rejected with the reason. The kernels look at every number.
+Conventions: the documentation's page on the arm.
 """
 
 from __future__ import annotations
@@ -29,7 +21,6 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
-from armsight.robot.kinematics import batch as lanes
 from armsight.robot.kinematics import chain, inverse
 from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
 from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, KEY, MOST, OUTSIDE, POSITION, STATE, WIDTH
@@ -40,86 +31,8 @@ from armsight.robot.solutions import ManySolutions, Nearest, Solutions
 #: Axes further apart than this, rad, are not meant to be parallel.
 TILT_RAD = np.deg2rad(3.0)
 _A, _D, _COS, _SIN, _OFFSET, _DIRECTION = range(6)
-
-
-def untilted(table: Array) -> Array:
-    """Return a packed table (96,) with axes that are all but parallel made parallel, and the rest as near as may be."""
-    out = table.copy()
-    rows = out[:BASE].reshape(6, 6)
-    for row, after in itertools.pairwise(rows):
-        if abs(row[_SIN]) > np.sin(TILT_RAD) or row[_SIN] == 0.0:
-            continue
-        along = -row[_D] / row[_COS]  # on the next axis, as far up as this joint stands
-        turn = np.array([[np.cos(row[_OFFSET]), -np.sin(row[_OFFSET])], [np.sin(row[_OFFSET]), np.cos(row[_OFFSET])]])
-        at = link(*row[:4]) @ [0.0, 0.0, along, 1.0]
-        x, y = turn @ at[:2]
-        facing = row[_OFFSET]  # where the next frame's x points; the tilt turns it by its square
-        row[_A], row[_D] = np.hypot(x, y), 0.0
-        row[_OFFSET] = np.arctan2(y, x)
-        row[_COS], row[_SIN] = np.sign(row[_COS]), 0.0
-        after[_D] -= along
-        after[_OFFSET] += row[_COS] * (facing - row[_OFFSET])
-    return out
-
-
+#: What an error adds where angles are too large for radians.
 DEGREES = "are these degrees? give radians: numpy.deg2rad(...)"
-
-
-def angles_of(q: ArrayLike, *, batch: bool = True, name: str = "q") -> Array:
-    """Return joint angles as a new array, so that kernels see one type only."""
-    try:
-        angles = np.array(q, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers: {error}") from None
-    if angles.shape != (6,) and not (batch and angles.ndim == 2 and angles.shape[1] == 6):
-        raise InputError(f"{name} has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
-    return angles
-
-
-def near_angles(near: ArrayLike) -> Array:
-    """Return the angles to be near to."""
-    angles = angles_of(near, batch=False, name="near")
-    if chain.verdict(angles):
-        raise InputError(str(angle_refusal(angles)).replace("q", "near", 1))
-    return angles
-
-
-def poses_of(T: ArrayLike, dimensions: int) -> Array:
-    """Return poses as a new array, so that kernels see one type only."""
-    try:
-        poses = np.array(T, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"T_base_tool must be numbers: {error}") from None
-    if poses.ndim != dimensions or poses.shape[-2:] != (4, 4):
-        want = "(4, 4)" if dimensions == 2 else "(N, 4, 4)"
-        raise InputError(f"T_base_tool has shape {poses.shape}, must be {want}")
-    return poses
-
-
-def pose_refusal(Ts: Array) -> InputError:
-    """Tell what is wrong with poses that a kernel refused."""
-    if not np.isfinite(Ts).all():
-        return InputError("T_base_tool contains NaN or infinity; every entry must be a finite number")
-    R = Ts[:, :3, :3]
-    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max()
-    if (Ts[:, 3] != (0, 0, 0, 1)).any():
-        return InputError("T_base_tool is no rigid motion: its last row must be 0 0 0 1")
-    if off < 1e-6:
-        return InputError("T_base_tool is no rigid motion: its 3x3 part is a mirror image, its determinant is -1")
-    return InputError(
-        f"T_base_tool is no rigid motion: its columns are off from orthonormal by {off:.2g}; allowed is 1e-6"
-    )
-
-
-def angle_refusal(angles: Array) -> InputError:
-    """Tell what is wrong with joint angles that a kernel refused."""
-    if not np.isfinite(angles).all():
-        return InputError("q contains NaN or infinity; every joint angle must be a finite number")
-    row, joint = divmod(int(np.argmax(np.abs(angles) > chain.MOST_RADIANS)), 6)
-    where = f"joint {joint + 1}" + (f" of row {row}" if angles.ndim == 2 else "")
-    return InputError(f"q: {where} is at {angles.ravel()[6 * row + joint]:g} rad; {DEGREES}")
-
-
 Convention = Literal["standard", "modified"]
 Axes = Literal["base", "tool"]
 _AXES = {"base": False, "tool": True}
@@ -131,9 +44,9 @@ def _six(value: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Arm(Record):
-    """An arm of six turning joints: its Denavit-Hartenberg table, its limits and its names.
+    """An arm of six revolute joints: its Denavit-Hartenberg table, its limits and its names.
 
-    Joint i turns by ``theta_i = direction_i * q_i + offset_i``. The tool is at
+    Joint i rotates by ``theta_i = direction_i * q_i + offset_i``. The tool is at
     ``T_base_tool = T_base_0 @ A_1 @ ... @ A_6 @ T_flange_tool``; the flange is frame 6 of the table.
 
     Attributes:
@@ -148,7 +61,7 @@ class Arm(Record):
         qddd_max: (6,) greatest jerks, rad/s^3.
         offset: (6,) added to the joint angles, rad.
         direction: (6,) +1 or -1, by which the joint angles are multiplied.
-        home: (6,) the pose to start from, rad.
+        home: (6,) the joint angles to start from, rad.
         convention: "standard", Rz(theta) Tz(d) Tx(a) Rx(alpha) a row, or "modified", Rx(alpha) Tx(a) Rz(theta) Tz(d).
         T_base_0: (4, 4) where the table's frame 0 sits in the base.
         T_flange_tool: (4, 4) where the tool sits on the flange.
@@ -181,7 +94,7 @@ class Arm(Record):
         """Check the numbers and pack them for the kernels.
 
         Raises:
-            InputError: a wrong shape, a number that is none, or limits that leave nothing.
+            InputError: a wrong shape, a value that is not finite, or a limit that is not positive.
         """
         for at in fields(self):
             if at.type == "Array" and at.init:
@@ -233,7 +146,7 @@ class Arm(Record):
 
     @cached_property
     def size_m(self) -> float:
-        """The length of all links together, m: what makes turning and moving of the tool comparable."""
+        """The length of all links together, m: it makes rotation and translation of the tool comparable."""
         rows = untilted(self.table)[:BASE].reshape(6, 6)
         return float(np.hypot(rows[:, 0], rows[:, 1]).sum())
 
@@ -253,11 +166,11 @@ class Arm(Record):
         if angles.ndim == 1:
             T = np.empty((4, 4))
             if chain.forward(self.table, angles, T):
-                raise angle_refusal(angles)
+                raise angle_rejection(angles)
             return T
         Ts = np.empty((len(angles), 4, 4))
-        if lanes.forward_batch(self.table, angles, Ts, np.empty(lanes.WORK), lanes.LANES):
-            raise angle_refusal(angles)
+        if chain.forward_batch(self.table, angles, Ts, np.empty(chain.BATCH_WORK), chain.BATCH):
+            raise angle_rejection(angles)
         return Ts
 
     def links(self, q: ArrayLike) -> Array:
@@ -272,7 +185,7 @@ class Arm(Record):
         angles = angles_of(q, batch=False)
         Ts = np.empty((8, 4, 4))
         if chain.links(self.table, angles, Ts):
-            raise angle_refusal(angles)
+            raise angle_rejection(angles)
         Ts[0] = self.T_base_0  # the packed table of a modified convention begins behind its first alpha and a
         return Ts
 
@@ -290,11 +203,11 @@ class Arm(Record):
         if angles.ndim == 1:
             J = np.empty((6, 6))
             if chain.jacobian(self.table, angles, in_tool_axes, J):
-                raise angle_refusal(angles)
+                raise angle_rejection(angles)
             return J
         Js = np.empty((len(angles), 6, 6))
         if chain.jacobian_batch(self.table, angles, in_tool_axes, Js):
-            raise angle_refusal(angles)
+            raise angle_rejection(angles)
         return Js
 
     def jacobian_rate(self, q: ArrayLike, qd: ArrayLike, frame: Axes = "base") -> Array:
@@ -311,7 +224,7 @@ class Arm(Record):
         angles, speeds = angles_of(q, batch=False), checked(qd, (6,), "qd").copy()
         J = np.empty((6, 6))
         if chain.jacobian_rate(self.table, angles, speeds, _in_tool_axes(frame), J):
-            raise angle_refusal(angles)
+            raise angle_rejection(angles)
         return J
 
     def manipulability(self, q: ArrayLike) -> Array:
@@ -328,15 +241,15 @@ class Arm(Record):
     def inverse(self, T_base_tool: ArrayLike, near: ArrayLike | None = None) -> Solutions:
         """Return all joint angles that bring the tool to a pose.
 
-        All of up to eight, exact to rounding, where the table has a closed form (docs/arm.md says which do); else those
-        that damped least squares finds from many starts. Nothing is raised for a pose out of reach or singular: the
-        answer says so.
+        All of up to eight, exact to rounding, where the table has a closed form (``kinematics.structure`` says which do);
+        else those that damped least squares finds from many starts. Nothing is raised for a pose out of reach or
+        singular: the result says so.
 
         Args:
-            T_base_tool: (4, 4) where the tool shall be, m. A rotation off by up to 1e-6 is put right.
-            near: (6,) joint angles, rad: solutions are ordered by their distance from these (the root of the sum of
-                squares), whole turns are taken towards them, and a joint that is not determined is given its value of
-                these. Without: the whole turn nearest 0, and 0.
+            T_base_tool: (4, 4) where the tool shall be, m. A rotation off by up to 1e-6 is made orthonormal.
+            near: (6,) joint angles, rad: solutions are sorted by their distance from these (the root of the sum of
+                squares), the revolution nearest to them is taken, and a joint that is not determined gets its value
+                of these. Without: the revolution nearest 0, and 0.
 
         Raises:
             InputError: not a rigid motion, wrong shape, NaN, or ``near`` in what are no radians.
@@ -345,10 +258,10 @@ class Arm(Record):
         goal = _NO_ANGLES if near is None else near_angles(near)
         rows, scratch = np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
         count, missed, bits = inverse.inverse(
-            self.table, self._closed, self._limits, T, goal, near is not None, rows, scratch, lanes.LANES
+            self.table, self._closed, self._limits, T, goal, near is not None, rows, scratch, chain.BATCH
         )
         if count < 0:
-            raise pose_refusal(T[None])
+            raise pose_rejection(T[None])
         if count and not bits:
             return Solutions(rows[:count])
         lost = count == 0 or bits >= OUTSIDE
@@ -363,14 +276,14 @@ class Arm(Record):
             near: (6,) joint angles, rad: what a joint that is not determined is given, 0 by default; the order stays.
         """
         Ts = poses_of(Ts_base_tool, 3)
-        most = MOST if self._closed[KIND] == NEITHER else lanes.LANES
+        most = MOST if self._closed[KIND] == NEITHER else chain.BATCH
         rows, counts = np.zeros((len(Ts), most, KEY)), np.zeros(len(Ts), np.int64)
         row, scratch = np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
         goal = _NO_ANGLES if near is None else near_angles(near)
         if inverse.inverse_batch(
-            self.table, self._closed, self._limits, Ts, goal, row, scratch, lanes.LANES, rows, counts
+            self.table, self._closed, self._limits, Ts, goal, row, scratch, chain.BATCH, rows, counts
         ):
-            raise pose_refusal(Ts)
+            raise pose_rejection(Ts)
         state = rows[:, :, STATE]
         there = np.arange(most) < counts[:, None]
         return ManySolutions(
@@ -384,7 +297,7 @@ class Arm(Record):
         )
 
     def _reason(self, bits: int, given: bool) -> str:
-        """Say what keeps solutions from being plain."""
+        """Return why solutions are singular or outside the limits, in words."""
         value = "its value in near" if given else "0"
         texts = _SINGULAR[self._closed[KIND] == PARALLEL]
         parts = ["singular: " + text.format(value=value) for bit, text in texts.items() if bits & bit]
@@ -393,15 +306,15 @@ class Arm(Record):
         return "; ".join(parts)
 
     def _nearest(self, T: Array, near: Array) -> Nearest:
-        """Return the pose within the limits that comes closest to one that cannot be had."""
+        """Return the pose within the limits that comes closest to one that cannot be reached."""
         q, rows, scratch = np.empty(6), np.empty((MOST, WIDTH)), np.zeros(inverse.SCRATCH)
-        inverse.nearest(self.table, self._closed, self._limits, T, near, q, rows, scratch, lanes.LANES)
+        inverse.nearest(self.table, self._closed, self._limits, T, near, q, rows, scratch, chain.BATCH)
         T_base_tool = self.forward(q)
-        turned = log_so3(T_base_tool[:3, :3].T @ T[:3, :3])
-        return Nearest(q, T_base_tool, math.dist(T_base_tool[:3, 3], T[:3, 3]), float(np.linalg.norm(turned)))
+        off = log_so3(T_base_tool[:3, :3].T @ T[:3, :3])
+        return Nearest(q, T_base_tool, math.dist(T_base_tool[:3, 3], T[:3, 3]), float(np.linalg.norm(off)))
 
     def within_limits(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Say whether joint angles (6,) or (N, 6), rad, are within the limits; () or (N,)."""
+        """Return whether joint angles (6,) or (N, 6), rad, are within the limits; () or (N,)."""
         angles = angles_of(q)
         return np.asarray(((angles >= self.q_min) & (angles <= self.q_max)).all(axis=-1))
 
@@ -417,12 +330,12 @@ _OUT_OF_REACH = {
 _SINGULAR = {
     False: {
         SHOULDER: "shoulder: the wrist is as near to axis 1 as it can be; joint 1 is {value} if the wrist is on axis 1",
-        ELBOW: "elbow: the arm is stretched or folded, elbow up and down are one",
+        ELBOW: "elbow: the arm is straight or folded, elbow up and down are one",
         WRIST: "wrist: axes 4 and 6 are one, joints 4 and 6 are determined together only; joint 4 is {value}",
     },
     True: {
         SHOULDER: "shoulder: the wrist is as near to axis 1 as it can be; joint 1 is {value} if the wrist is on axis 1",
-        ELBOW: "elbow: the arm is stretched or folded, elbow up and down are one",
+        ELBOW: "elbow: the arm is straight or folded, elbow up and down are one",
         WRIST: "wrist: axis 6 is parallel to axes 2, 3 and 4, which are not determined one by one; joint 6 is {value}, or "
         "as close as the arm's reach lets it",
     },
@@ -430,7 +343,7 @@ _SINGULAR = {
 
 
 def _out_of_reach(missed: int) -> str:
-    """Say why there is no solution."""
+    """Return why there is no solution, in words."""
     parts = [text for bit, text in _OUT_OF_REACH.items() if missed & bit]
     return "unreachable: " + (" and ".join(parts) or "damped least squares found no joint angles")
 
@@ -439,3 +352,83 @@ def _in_tool_axes(frame: str) -> bool:
     if frame not in _AXES:
         raise InputError(f"frame {frame!r} is unknown; known are {', '.join(_AXES)}")
     return _AXES[frame]
+
+
+def angles_of(q: ArrayLike, *, batch: bool = True, name: str = "q") -> Array:
+    """Return joint angles, rad, as a new array (6,) or (N, 6), so that kernels see one type only."""
+    try:
+        angles = np.array(q, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers: {error}") from None
+    if angles.shape != (6,) and not (batch and angles.ndim == 2 and angles.shape[1] == 6):
+        raise InputError(f"{name} has shape {angles.shape}, must be {'(6,) or (N, 6)' if batch else '(6,)'}")
+    return angles
+
+
+def near_angles(near: ArrayLike) -> Array:
+    """Return the joint angles (6,), rad, that solutions shall be near to."""
+    angles = angles_of(near, batch=False, name="near")
+    if chain.validity(angles):
+        raise InputError(str(angle_rejection(angles)).replace("q", "near", 1))
+    return angles
+
+
+def poses_of(T: ArrayLike, dimensions: int) -> Array:
+    """Return poses, (4, 4) or (N, 4, 4), as a new array, so that kernels see one type only."""
+    try:
+        poses = np.array(T, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"T_base_tool must be numbers: {error}") from None
+    if poses.ndim != dimensions or poses.shape[-2:] != (4, 4):
+        want = "(4, 4)" if dimensions == 2 else "(N, 4, 4)"
+        raise InputError(f"T_base_tool has shape {poses.shape}, must be {want}")
+    return poses
+
+
+def pose_rejection(Ts: Array) -> InputError:
+    """Return the error that says what is wrong with poses (N, 4, 4) that a kernel rejected."""
+    if not np.isfinite(Ts).all():
+        return InputError("T_base_tool contains NaN or infinity; every entry must be a finite number")
+    R = Ts[:, :3, :3]
+    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max()
+    if (Ts[:, 3] != (0, 0, 0, 1)).any():
+        return InputError("T_base_tool is no rigid motion: its last row must be 0 0 0 1")
+    if off < 1e-6:
+        return InputError("T_base_tool is no rigid motion: its 3x3 part is a mirror image, its determinant is -1")
+    return InputError(
+        f"T_base_tool is no rigid motion: its columns are off from orthonormal by {off:.2g}; allowed is 1e-6"
+    )
+
+
+def angle_rejection(angles: Array) -> InputError:
+    """Return the error that says what is wrong with joint angles, (6,) or (N, 6), that a kernel rejected."""
+    if not np.isfinite(angles).all():
+        return InputError("q contains NaN or infinity; every joint angle must be a finite number")
+    row, joint = divmod(int(np.argmax(np.abs(angles) > chain.MOST_RADIANS)), 6)
+    where = f"joint {joint + 1}" + (f" of row {row}" if angles.ndim == 2 else "")
+    return InputError(f"q: {where} is at {angles.ravel()[6 * row + joint]:g} rad; {DEGREES}")
+
+
+def untilted(table: Array) -> Array:
+    """Return a packed table (96,) with axes that are nearly parallel made parallel, and the rest as near as may be.
+
+    The common normal of two nearly parallel axes is far away: such a row holds a d of many metres, and the next row takes
+    it back. Here d is moved to where the normal is near, and the tilt is left out. The closed form of the result gives the
+    starts of the iterative inverse.
+    """
+    out = table.copy()
+    rows = out[:BASE].reshape(6, 6)
+    for row, after in itertools.pairwise(rows):
+        if abs(row[_SIN]) > np.sin(TILT_RAD) or row[_SIN] == 0.0:
+            continue
+        along = -row[_D] / row[_COS]  # on the next axis, as far up as this joint stands
+        R = np.array([[np.cos(row[_OFFSET]), -np.sin(row[_OFFSET])], [np.sin(row[_OFFSET]), np.cos(row[_OFFSET])]])
+        at = link(*row[:4]) @ [0.0, 0.0, along, 1.0]
+        x, y = R @ at[:2]
+        facing = row[_OFFSET]  # where the next frame's x points; the tilt rotates it by its square only
+        row[_A], row[_D] = np.hypot(x, y), 0.0
+        row[_OFFSET] = np.arctan2(y, x)
+        row[_COS], row[_SIN] = np.sign(row[_COS]), 0.0
+        after[_D] -= along
+        after[_OFFSET] += row[_COS] * (facing - row[_OFFSET])
+    return out

@@ -1,6 +1,6 @@
-"""What an arm answers when it is asked for the joint angles of a pose.
+"""The result of inverse kinematics: all joint angles of a pose, or the nearest pose.
 
-A pose out of reach, or one where a joint is not determined, is an answer with a reason, not an error.
+A pose out of reach, or one where a joint is not determined, is a result with a reason, not an error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POS
 
 @dataclass(frozen=True)
 class Configuration:
-    """Which of the up to eight ways an arm takes to a pose; docs/arm.md has pictures in words.
+    """Which of the up to eight ways an arm takes to a pose; see the documentation's page on the arm.
 
     Attributes:
         shoulder: "front" where the wrist is ahead of axis 1 along link 1's x axis, "back" where the arm reaches over.
@@ -34,15 +34,15 @@ class Configuration:
 
 @dataclass(frozen=True, eq=False)
 class Nearest(Record):
-    """The pose within the joints' limits that comes closest to one that cannot be had.
+    """The pose within the joints' limits that comes closest to one that cannot be reached.
 
     1 mm of position counts as much as 1 mrad of orientation.
 
     Attributes:
         q: (6,) joint angles, rad.
         T_base_tool: (4, 4) where they bring the tool, m.
-        off_m: how far that is from the wanted position, m.
-        off_rad: how far it is turned from the wanted orientation, rad.
+        off_m: how far that is from the requested position, m.
+        off_rad: how far it is rotated from the requested orientation, rad.
     """
 
     q: Array
@@ -59,8 +59,8 @@ class Solutions:
     is the quick way to make a record.
 
     Attributes:
-        rows: (N, 13) a row for each solution, as ``kinematics.rows`` tells; the properties are its columns.
-        reason: what keeps the answer from being plain: "singular: ...", "outside limits: ...", "unreachable: ..."; None
+        rows: (N, 13) a row for each solution; ``kinematics.inverse`` names the columns, the properties return them.
+        reason: what is special about the result: "singular: ...", "outside limits: ...", "unreachable: ..."; None
             where nothing does.
         find_nearest: how to find ``nearest``; None where a solution is within limits.
     """
@@ -84,17 +84,17 @@ class Solutions:
 
     @property
     def q(self) -> Array:
-        """(N, 6) joint angles, rad; whole turns are taken so that a joint is within its limits where that can be."""
+        """(N, 6) joint angles, rad, moved by whole revolutions into the joint's limits where that can be."""
         return self.rows[:, :POSITION]
 
     @property
     def residual_m(self) -> Array:
-        """(N,) distance of the tool from the wanted position, m."""
+        """(N,) distance of the tool from the requested position, m."""
         return self.rows[:, POSITION]
 
     @property
     def residual_rad(self) -> Array:
-        """(N,) angle between the tool and the wanted orientation, rad."""
+        """(N,) angle between the tool and the requested orientation, rad."""
         return self.rows[:, ANGLE]
 
     @property

@@ -1,8 +1,13 @@
 """Read an arm from URDF, the XML in which ROS describes robots (wiki.ros.org/urdf/XML).
 
-Six revolute joints in a row are read, with fixed ones anywhere; anything else that moves is refused by name. Masses and
-shapes are passed over. The table is found by :mod:`armsight.robot.urdf_table`; what is written, and where that goes beyond
-plain URDF, stands in :mod:`armsight.robot.urdf_write`.
+In: a URDF file with six revolute joints in a row, and fixed ones anywhere; an error names any other joint that moves.
+Masses and shapes are ignored. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where
+that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf_write`.
+
+From a chain of axes to the table: between two axes in space there is always Rz(beta) Tz(d) Tx(a) Rx(alpha) Tz(e) Rz(gamma):
+along the first to the foot of their common normal, over it, and along the second. Rz(gamma) Tz(e) stands at the next
+joint's own axis and goes into its offset and d. What is free (either sense of the normal, its position between parallel
+axes) is chosen so that gamma and e vanish where they can, which gives a table back that was written as URDF.
 """
 
 from __future__ import annotations
@@ -18,17 +23,24 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.table import exact_cos_sin
-from armsight.robot.urdf_table import Link, arm_rows, check_same
 
 #: What an arm is given where its URDF has no accelerations and jerks: full speed in 0.25 s, full acceleration in 0.1 s.
 TO_SPEED_S, TO_ACCELERATION_S = 0.25, 0.1
+#: Two frames differ by rounding below this, m and rad: numbers written with ten digits.
+EXACT = 1e-9
+#: A common normal further away than this many times the chain's length leaves no digits to hold the chain exactly. Nearer
+#: ones do: an identified arm's axes are a little off parallel, and are meant to be.
+FAR = 1e6
+#: Random poses at which the table is compared with the chain.
+PROBES = 16
 _MOVING = ("revolute", "continuous", "prismatic", "floating", "planar")
 
 
 class _Joint(NamedTuple):
-    """A joint element: its name, type, links, where it stands, and itself."""
+    """A joint element: its name, type and links, its pose (4, 4) in the parent link, m, and the element itself."""
 
     name: str
     kind: str
@@ -66,8 +78,8 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
     joints = [_joint(path, element) for element in robot.findall("joint")]
     chain = _chain(path, robot, joints, tool_link)
-    turning = [joint for joint in chain if joint.kind == "revolute"]
-    return _arm(path, robot, chain, turning)
+    revolute = [joint for joint in chain if joint.kind == "revolute"]
+    return _arm(path, robot, chain, revolute)
 
 
 def _joint(path: str | Path, element: ET.Element) -> _Joint:
@@ -144,13 +156,13 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
                 f"{path}: link {joint.child!r} hangs on two joints, {above[joint.child].name!r} and {joint.name!r}"
             )
         above[joint.child] = joint
-    refused = [j for j in joints if j.kind in _MOVING[1:] or j.element.find("mimic") is not None]
-    if refused:
-        told = ", ".join(f"{j.name!r} is {'a mimic' if j.kind == 'revolute' else j.kind}" for j in refused)
-        raise InputError(f"{path}: only arms of six revolute joints are read here; {told}")
-    turning = [joint.name for joint in joints if joint.kind == "revolute"]
-    if len(turning) != 6:
-        raise InputError(f"{path}: {len(turning)} revolute joints ({', '.join(turning)}); an arm here has six")
+    unsupported = [j for j in joints if j.kind in _MOVING[1:] or j.element.find("mimic") is not None]
+    if unsupported:
+        named = ", ".join(f"{j.name!r} is {'a mimic' if j.kind == 'revolute' else j.kind}" for j in unsupported)
+        raise InputError(f"{path}: only arms of six revolute joints are read here; {named}")
+    revolute = [joint.name for joint in joints if joint.kind == "revolute"]
+    if len(revolute) != 6:
+        raise InputError(f"{path}: {len(revolute)} revolute joints ({', '.join(revolute)}); an arm here has six")
     parents = {joint.parent for joint in joints}
     ends = {link: list(_up(path, link, above)) for link in above if link not in parents or link == tool_link}
     whole = {link: chain for link, chain in ends.items() if sum(joint.kind == "revolute" for joint in chain) == 6}
@@ -177,23 +189,23 @@ def _up(path: str | Path, link: str, above: dict[str, _Joint]) -> Iterator[_Join
         link = above[link].parent
 
 
-def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], turning: list[_Joint]) -> Arm:
-    """Put an arm together from its chain."""
-    links = [Link(np.eye(4), np.zeros(3))]
+def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: list[_Joint]) -> Arm:
+    """Return the arm of a chain of joints from the base to the tool."""
+    links = [ChainLink(np.eye(4), np.zeros(3))]
     for joint in chain:
         if joint.kind == "revolute":
             axis = _vector(f"{path}: joint {joint.name!r}", joint.element.find("axis"), "xyz", "1 0 0")
             length = float(np.linalg.norm(axis))
             if length == 0:
                 raise InputError(f"{path}: joint {joint.name!r}: <axis> is zero; it must be a direction")
-            links[-1] = Link(links[-1].T_before @ joint.T_parent_joint, axis / length)
-            links.append(Link(np.eye(4), np.zeros(3)))
+            links[-1] = ChainLink(links[-1].T_before @ joint.T_parent_joint, axis / length)
+            links.append(ChainLink(np.eye(4), np.zeros(3)))
         else:
-            links[-1] = Link(links[-1].T_before @ joint.T_parent_joint, np.zeros(3))
-    first_fixed = chain[chain.index(turning[-1]) + 1].T_parent_joint if chain[-1] is not turning[-1] else np.eye(4)
-    rows = arm_rows(f"{path}", [joint.name for joint in turning], links, first_fixed)
+            links[-1] = ChainLink(links[-1].T_before @ joint.T_parent_joint, np.zeros(3))
+    first_fixed = chain[chain.index(revolute[-1]) + 1].T_parent_joint if chain[-1] is not revolute[-1] else np.eye(4)
+    rows = arm_rows(f"{path}", [joint.name for joint in revolute], links, first_fixed)
     extra = robot.find("armsight")
-    limits = [_limits(f"{path}: joint {joint.name!r}", joint.element) for joint in turning]
+    limits = [_limits(f"{path}: joint {joint.name!r}", joint.element) for joint in revolute]
     q_min, q_max, qd, qdd, qddd = (np.array(column) for column in zip(*limits, strict=True))
     home = np.zeros(6) if extra is None else _home(f"{path}: <armsight>", extra)
     try:
@@ -212,7 +224,7 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], turning: list
             home=home,
             T_base_0=rows.T_base_0,
             T_flange_tool=rows.T_flange_tool,
-            joint_names=tuple(joint.name for joint in turning),
+            joint_names=tuple(joint.name for joint in revolute),
             source=(extra.get("source", "") if extra is not None else "") or f"URDF {Path(path).name}",
         )
     except InputError as error:
@@ -250,3 +262,158 @@ def _limits(where: str, element: ET.Element) -> tuple[float, float, float, float
     speed = found[0]
     acceleration = min((value for value in found[1:3] if value is not None), default=speed / TO_SPEED_S)
     return low, high, speed, acceleration, found[3] or acceleration / TO_ACCELERATION_S
+
+
+class ChainLink(NamedTuple):
+    """A joint of the chain, or its end.
+
+    Attributes:
+        T_before: (4, 4) where the joint stands in the frame that rotates with the joint before.
+        axis: (3,) its unit axis there; zero for the chain's end.
+    """
+
+    T_before: Array
+    axis: Array
+
+
+class TableRows(NamedTuple):
+    """A standard table with what stands before and after it, as in :class:`Arm`."""
+
+    a: Array
+    d: Array
+    alpha: Array
+    offset: Array
+    direction: Array
+    T_base_0: Array
+    T_flange_tool: Array
+
+
+class Decomposition(NamedTuple):
+    """A transform as Rz(beta) Tz(d) Tx(a) Rx(alpha) Tz(e) Rz(gamma), rad and m."""
+
+    beta: float
+    d: float
+    a: float
+    alpha: float
+    e: float
+    gamma: float
+
+
+def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: Array) -> TableRows:
+    """Find the table of a chain.
+
+    Args:
+        where: what to name in an error.
+        names: six names of the joints.
+        links: seven: the joints and the end.
+        first_fixed: (4, 4) the first fixed joint after the last revolute one: the flange, where it can be row 6.
+
+    Raises:
+        InputError: two axes are so nearly parallel that no sensible table holds them.
+    """
+    size_m = float(sum(np.linalg.norm(link.T_before[:3, 3]) for link in links)) + EXACT
+    upright = [_upright(link.axis) for link in links]
+    between = [np.linalg.inv(upright[i][0]) @ links[i + 1].T_before @ upright[i + 1][0] for i in range(5)]
+    steps = []
+    for i, C in enumerate(between):
+        steps.append(decompose(C))
+        if max(abs(steps[-1].d), abs(steps[-1].e)) > FAR * size_m:
+            apart = abs(np.degrees(np.arctan2(np.hypot(C[0, 2], C[1, 2]), abs(C[2, 2]))))
+            raise InputError(
+                f"{where}: the axes of joints {names[i]!r} and {names[i + 1]!r} are {apart:.2g} deg from parallel, "
+                "which no table holds sensibly; were angles rounded? write pi/2 as 1.5707963267948966"
+            )
+    after = np.linalg.inv(upright[5][0])
+    last = decompose(after @ first_fixed)
+    if abs(last.e) > EXACT or abs(last.gamma) > EXACT:
+        last = Decomposition(0, 0, 0, 0, 0, 0)
+    steps.append(last)
+    carried = [0.0, *(step.gamma for step in steps[:5])], [0.0, *(step.e for step in steps[:5])]
+    flange = after @ links[6].T_before
+    return TableRows(
+        np.array([step.a for step in steps]),
+        np.array([step.d for step in steps]) + carried[1],
+        np.array([step.alpha for step in steps]),
+        _wrapped(np.array([step.beta for step in steps]) + carried[0]),
+        np.array([way for _, way in upright[:6]]),
+        links[0].T_before @ upright[0][0],
+        np.linalg.inv(_motion(last)) @ flange,
+    )
+
+
+def check_same(where: str, arm: Arm, links: list[ChainLink]) -> None:
+    """Compare an arm with the chain it was read from.
+
+    Raises:
+        InputError: they differ by more than rounding.
+    """
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(-np.pi, np.pi, (PROBES, 6)):
+        T = np.eye(4)
+        for link, angle in zip(links, [*q, 0.0], strict=True):
+            T = T @ link.T_before @ pose(exp_so3(link.axis * angle), np.zeros(3))
+        off = float(np.abs(arm.forward(q) - T).max())
+        if off > EXACT:
+            raise InputError(
+                f"{where}: no table holds this chain exactly: the nearest is {off:.2g} m or rad off; are angles such "
+                "as pi/2 rounded? write them as 1.5707963267948966"
+            )
+
+
+def decompose(C: Array) -> Decomposition:
+    """Split a transform (4, 4) between two joints whose axes are z."""
+    x, y, z = C[:3, 3]
+    sine = float(np.hypot(C[0, 2], C[1, 2]))
+    if sine < EXACT:
+        return _parallel(C)
+    options = []
+    for sense in (1.0, -1.0):
+        beta = float(np.arctan2(sense * C[0, 2], -sense * C[1, 2]))
+        c, s = np.cos(beta), np.sin(beta)
+        alpha = float(np.arctan2(sense * sine, C[2, 2]))
+        e = float((s * x - c * y) / (sense * sine))
+        gamma = _gamma(C, beta, alpha)
+        options.append(Decomposition(beta, float(z - e * C[2, 2]), float(c * x + s * y), alpha, e, gamma))
+    return min(options, key=lambda step: (abs(step.gamma) > EXACT, abs(step.beta)))
+
+
+def _parallel(C: Array) -> Decomposition:
+    """Split a transform between parallel axes; e is chosen as 0."""
+    x, y, z = C[:3, 3]
+    alpha = 0.0 if C[2, 2] > 0 else np.pi
+    whole = float(np.arctan2(C[1, 0], C[0, 0]))  # what stays when gamma is 0
+    foot = float(np.arctan2(y, x))
+    for beta in (whole, foot, foot - np.copysign(np.pi, foot)):
+        c, s = np.cos(beta), np.sin(beta)
+        if abs(c * y - s * x) < EXACT:
+            break
+    return Decomposition(beta, float(z), float(c * x + s * y), alpha, 0.0, _gamma(C, beta, alpha))
+
+
+def _gamma(C: Array, beta: float, alpha: float) -> float:
+    """Return gamma."""
+    step = _motion(Decomposition(beta, 0, 0, alpha, 0, 0))
+    R = step[:3, :3].T @ C[:3, :3]
+    return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _motion(step: Decomposition) -> Array:
+    """Return Rz(beta) Tz(d) Tx(a) Rx(alpha), without what comes after."""
+    R = exp_so3(np.array([[0, 0, step.beta], [step.alpha, 0, 0]]))
+    return pose(R[0] @ R[1], R[0] @ np.array([step.a, 0, 0]) + np.array([0, 0, step.d]))
+
+
+def _upright(axis: Array) -> tuple[Array, float]:
+    """Return a rotation (4, 4) W and a direction with W z direction = axis; none where the axis is z or -z, or zero."""
+    if not axis.any() or np.hypot(axis[0], axis[1]) < EXACT**1.5:
+        return np.eye(4), -1.0 if axis[2] < 0 else 1.0
+    rotation = np.array([-axis[1], axis[0], 0.0])
+    size = np.linalg.norm(rotation)
+    angle = np.arctan2(size, axis[2])
+    return pose(exp_so3(rotation / size * angle), np.zeros(3)), 1.0
+
+
+def _wrapped(angle: Array) -> Array:
+    """Return angles within (-pi, pi], half a revolution as +pi."""
+    wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+    return np.where(np.abs(wrapped + np.pi) < EXACT, np.pi, wrapped)

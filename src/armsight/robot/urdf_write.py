@@ -1,8 +1,8 @@
 """Write an arm as URDF, so that what is read back is the same arm to the last digit.
 
-A link's frame sits at its joint and turns with it, so that joint i + 1 stands at Rz(offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i)
+A link's frame sits at its joint and rotates with it, so that joint i + 1 stands at Rz(offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i)
 of link i, which is what a URDF origin holds without loss. Accelerations and jerks stand in ``limit`` as URDF 1.2 has them;
-the home pose and the source stand in an element ``armsight`` that other programs pass over. Efforts are not known: 0.
+the home pose and the source stand in an element ``armsight`` that other programs ignore. Efforts are not known: 0.
 """
 
 from __future__ import annotations

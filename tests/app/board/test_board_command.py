@@ -10,7 +10,7 @@ from armsight.app.board import selftest as board_selftest
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.board.scenarios import AT_REST, DRIVEN
 from armsight.firmware import build, host_library
-from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.host import HostEmulator
 from armsight.robot.boards.opening import EMULATORS
 from cli_runs import refused
@@ -39,7 +39,7 @@ class Deaf:
     """A board that does not hear commands once it is driven: its arm goes where it likes."""
 
     def __init__(self, image):
-        self.machine, self.ticks = HostEmulator(host_library()), 0
+        self.machine, self.ticks = HostEmulator.open(host_library()), 0
 
     def tick(self, request):
         self.ticks += 1
@@ -78,7 +78,7 @@ def test_monitor_prints_a_line_at_a_time(armsight):
     said = armsight("board", "monitor", *HOST, "--seconds", "1", "--every", "0.25", "--json")
     assert said.code == 0
     assert len(said.lines) == 4
-    assert all(line["state"] == State.DISABLED.name and line["faults"] == [] for line in said.lines)
+    assert all(line["state"] == BoardState.DISABLED.name and line["faults"] == [] for line in said.lines)
     assert [line["readings"] for line in said.lines[1:]] == [250] * 3
     assert "board pil, firmware" in said.err
     text = armsight("board", "monitor", *HOST, "--seconds", "0.5")

@@ -7,7 +7,7 @@ from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import ConfigSource, Fault, Limited, Command, Rejection, State
+from armsight.robot.boards.codes import BoardState, Command, ConfigSource, Fault, Limited, Rejection
 from armsight.robot.boards.configuration import gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import open_emulator
@@ -32,7 +32,7 @@ def test_a_hello_tells_who_the_board_is():
     board, _, _ = host_board()
     assert (board.welcome.board, board.welcome.ticks_per_s, board.welcome.baud) == ("pil", 1000, 921600)
     assert board.welcome.config_source == ConfigSource.NEWEST
-    assert board.status.state == State.DISABLED
+    assert board.status.state == BoardState.DISABLED
     assert not board.status.drives_on
     assert board.status.faults == ()
 
@@ -89,7 +89,7 @@ def test_motion_is_followed_and_every_reading_arrives_in_order():
     assert abs(states.t_s[-1] - link.t_s) < 0.005
     # The potentiometer's noise has a sigma of 4 counts of 11343 per rad: 6 sigma are 2.1 mrad.
     assert np.abs(states.q[-1] - plant.q).max() < 6 * 4 / 11343
-    assert board.status.state == State.ENABLED
+    assert board.status.state == BoardState.ENABLED
 
 
 def test_readings_that_come_while_waiting_are_not_lost():
@@ -181,7 +181,7 @@ def test_an_emergency_stop_survives_a_disturbed_copy_of_itself():
     link._faults = Spoils()
     board.stop()
     board.receive(0.02)
-    assert board.status.state == State.STOPPED
+    assert board.status.state == BoardState.STOPPED
     assert board.status.crc_errors == 1
     with pytest.raises(DeviceError, match="not in this state"):
         board.enable()
@@ -324,7 +324,7 @@ def test_a_message_whose_code_nobody_knows_counts_as_broken():
     link.waiting = speaker.status(5, state=77) + speaker.angles(6)
     assert len(board.receive().t_s) == 1
     assert board.broken_messages == before + 1
-    assert board.status.state == State.DISABLED
+    assert board.status.state == BoardState.DISABLED
 
 
 def test_a_board_is_closed_with_its_block():

@@ -63,7 +63,7 @@ def listed(which, text=TYPES):
     ("which", "ours", "texts"),
     [
         ("FAULT", codes.Fault, codes.FAULT_TEXTS),
-        ("STATE", codes.State, codes.STATE_TEXTS),
+        ("STATE", codes.BoardState, codes.STATE_TEXTS),
         ("REFUSAL", codes.Rejection, codes.REJECTION_TEXTS),
     ],
 )

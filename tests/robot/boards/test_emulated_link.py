@@ -6,7 +6,7 @@ from board_rigs import hold, host_board
 
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC
 from armsight.robot.boards.opening import EMULATORS, configured, open_board, open_emulator
@@ -96,7 +96,7 @@ def test_a_whole_board_runs_in_a_world_that_owns_the_time():
     link = EmulatedLink(open_emulator("host"), JointPlant(), advance=lambda dt_s: link.step(round(dt_s * 1000)))
     board = configured(link)
     board.enable()
-    assert board.status.state == State.ENABLED
+    assert board.status.state == BoardState.ENABLED
 
 
 @pytest.mark.parametrize("changed", [{"magic": 0}, {"version": 2}, {"tick": 9}])
@@ -136,7 +136,7 @@ def test_lost_time_is_told_by_its_own_fault():
         spoil(link)
         board.receive(0.03)
         assert [each.fault for each in board.status.faults] == [fault]
-        assert board.status.state == State.HOLDING
+        assert board.status.state == BoardState.HOLDING
 
 
 def test_missed_time_moves_the_arm_on():
@@ -163,7 +163,7 @@ def test_a_power_cut_switches_the_drives_off():
 
 def test_boards_are_opened_by_name():
     board = open_board("emulated:host", JointPlant())
-    assert board.status.state == State.DISABLED
+    assert board.status.state == BoardState.DISABLED
     board.close()
     with pytest.raises(InputError, match="no board 'emulated:avr'; there are emulated:unicorn, emulated:qemu"):
         open_board("emulated:avr", JointPlant())

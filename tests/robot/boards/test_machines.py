@@ -38,7 +38,7 @@ def library(tmp_path_factory):
 @pytest.fixture(scope="module")
 def expected(library):
     """What each scenario does on the host build."""
-    return {name: run_scenario(scenario, HostEmulator(library)) for name, scenario in DRIVEN.items()}
+    return {name: run_scenario(scenario, HostEmulator.open(library)) for name, scenario in DRIVEN.items()}
 
 
 @pytest.mark.parametrize("scenario", DRIVEN)
@@ -80,7 +80,7 @@ def test_one_bit_of_a_potentiometer_is_another_trace():
 
 
 def test_two_host_boards_do_not_share_anything(library):
-    first, second = (EmulatedLink(HostEmulator(library), JointPlant(seed=seed)) for seed in (1, 2))
+    first, second = (EmulatedLink(HostEmulator.open(library), JointPlant(seed=seed)) for seed in (1, 2))
     first.step(5)
     second.step(1)
     assert first.answer["tick"] == 5
@@ -90,7 +90,7 @@ def test_two_host_boards_do_not_share_anything(library):
 def test_a_missing_qemu_is_told(monkeypatch, images):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match="qemu-system-arm is not installed: apt install qemu-system-arm, or use"):
-        QemuEmulator(next(iter(images.values())))
+        QemuEmulator.open(next(iter(images.values())))
 
 
 def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
@@ -98,7 +98,7 @@ def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     broken = tmp_path / "none.elf"
     broken.write_bytes(b"\x7fELF nothing more")
-    machine = QemuEmulator(broken)
+    machine = QemuEmulator.open(broken)
     with pytest.raises(DeviceError, match="the emulated board broke down: qemu-system-arm ended"):
         list(map(machine.tick, [bytes(REQUEST.itemsize)] * 3))
     machine.close()
@@ -106,14 +106,14 @@ def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
 
 
 def test_a_request_that_is_none_runs_no_tick(images):
-    machine = UnicornEmulator(images[next(iter(images))])
+    machine = UnicornEmulator.open(images[next(iter(images))])
     answer = machine.tick(bytes(REQUEST.itemsize))
     assert len(answer) == ANSWER.itemsize
     assert answer[:4] == b"ASNO"
 
 
 def test_an_image_that_breaks_down_is_told(images):
-    machine = UnicornEmulator(images[next(iter(images))])
+    machine = UnicornEmulator.open(images[next(iter(images))])
     machine._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
     with pytest.raises(DeviceError, match="the emulated board broke down"):
         machine.tick(bytes(REQUEST.itemsize))

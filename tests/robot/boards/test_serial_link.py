@@ -15,7 +15,7 @@ from board_rigs import PtyBoard, hold, keep_on
 
 from armsight.app.board.selftest import selftest
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.opening import open_board
 from armsight.robot.boards.serial import SerialLink, list_ports
 from armsight.sim.joints import PotFault
@@ -44,14 +44,14 @@ def cable():
 def test_a_wrong_port_is_told(monkeypatch, port, said):
     monkeypatch.setattr("armsight.robot.boards.serial.list_ports", list)
     with pytest.raises(DeviceError) as told:
-        SerialLink(port)
+        SerialLink.open(port)
     assert said in str(told.value)
 
 
 def test_ports_that_are_there_are_named(monkeypatch):
     monkeypatch.setattr("armsight.robot.boards.serial.list_ports", lambda: ["/dev/ttyACM1", "/dev/ttyUSB0"])
     with pytest.raises(DeviceError, match="no such port; there is /dev/ttyACM1, /dev/ttyUSB0"):
-        SerialLink("/dev/ttyACM0")
+        SerialLink.open("/dev/ttyACM0")
     assert all(isinstance(port, str) for port in list_ports())
 
 
@@ -69,20 +69,20 @@ def test_a_port_that_is_refused_is_told(monkeypatch, code, said):
 
     monkeypatch.setattr(serial, "Serial", refuse)
     with pytest.raises(DeviceError, match=f"/dev/ttyACM0: {said}"):
-        SerialLink("/dev/ttyACM0")
+        SerialLink.open("/dev/ttyACM0")
 
 
 def test_a_missing_pyserial_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(InputError, match=r"pip install 'armsight.board.'"):
-        SerialLink("/dev/ttyACM0")
+        SerialLink.open("/dev/ttyACM0")
 
 
 def test_a_port_belongs_to_one_program():
     master, slave = pty.openpty()
-    link = SerialLink(os.ttyname(slave))
+    link = SerialLink.open(os.ttyname(slave))
     with pytest.raises(DeviceError, match="in use by another program"):
-        SerialLink(os.ttyname(slave))
+        SerialLink.open(os.ttyname(slave))
     os.write(master, b"abc")
     assert link.read(0.01) == b"abc"
     link.write(b"xyz")
@@ -138,7 +138,7 @@ def test_a_cable_pulled_in_motion_is_told_and_the_arm_stops_by_itself(cable):
     assert (cable.plant.q > moved).all()
     cable.link.step(500)
     outputs = cable.link.answer["outputs"]
-    assert outputs["state"] == State.HOLDING
+    assert outputs["state"] == BoardState.HOLDING
     assert outputs["first_fault"] == Fault.HOST_SILENT
     assert np.abs(cable.plant.qd).max() < 0.01
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armsight.geometry.rotation import log_so3
-from armsight.robot.kinematics.trig import angle_of, sincos
+from armsight.robot.kinematics.chain import angle_of, sincos
 from asserts import numeric_jacobian
 from strategies import vectors
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.robot.trajectories import Tabled, line, point_to_point
 from armsight.robot.trajectories.tabled import STEP_S
 

@@ -16,7 +16,7 @@ from armsight.firmware.elf import read_elf
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.link import Emulator
-from armsight.robot.boards.opening import SERIAL, configured, emulated_machine, open_emulator
+from armsight.robot.boards.opening import SERIAL, configured, emulator_name, open_emulator
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant
 
@@ -115,7 +115,7 @@ def selftest(board: str, *, drives: bool = False, baud: int = BAUD, told: Callab
     """
     if board.startswith(SERIAL):
         return _of_real(board, drives, baud, told)
-    machine = emulated_machine(board)
+    machine = emulator_name(board)
     scenarios = {}
     for name, scenario in DRIVEN.items():
         told(name)
@@ -135,7 +135,7 @@ def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -
     for name, scenario in chosen.items():
         told(name)
         problems: list[str] = []
-        link = SerialLink(port, baud)
+        link = SerialLink.open(port, baud)
         bench = Bench(link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, name=port)
         home_rad = bench.home_rad
         try:
@@ -152,7 +152,7 @@ def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -
 
 def _ticks_per_s(port: str, baud: int) -> float:
     """Return how many ticks a real board makes in a second of this computer's clock."""
-    with Board.connect(SerialLink(port, baud), name=port) as board:
+    with Board.connect(SerialLink.open(port, baud), name=port) as board:
         board.receive(0.1)
         start, from_s = time.perf_counter(), board.joints.t_s
         board.receive(_SPEED_S)

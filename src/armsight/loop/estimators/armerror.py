@@ -26,8 +26,7 @@ import numba
 import numpy as np
 
 from armsight.data import Array
-from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame
-from armsight.robot.kinematics.trig import sincos
+from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, sincos
 
 #: Harmonics of a potentiometer's linearity: an eccentric wiper has one turn's, its bow another.
 HARMONICS = 3

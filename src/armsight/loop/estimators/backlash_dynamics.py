@@ -21,8 +21,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame
-from armsight.robot.kinematics.trig import sincos
+from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
 
 GRAVITY_M_S2 = 9.81
 #: Friction of a link's bearing, of the greatest torque that its weight and acceleration need: rolling bearings' order.

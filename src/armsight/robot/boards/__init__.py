@@ -1,1 +1,11 @@
-"""Boards: joint commands go out, what the joints do comes back."""
+"""Boards: joint commands go out, what the joints do comes back.
+
+In: a board's name (``emulated:unicorn``, ``emulated:qemu``, ``emulated:host``, ``serial:PORT``) and :class:`JointCommand`.
+Out: :class:`JointStates` and what the board says of itself.
+
+- ``opening``: opens a board by its name; ``board``: the host's end, :class:`~armsight.robot.boards.board.Board`;
+- ``wire``: messages over a link; ``codes``, ``configuration``, ``reports``: what their numbers mean;
+- ``link``: the contracts of a link, of an emulator and of the plant at an emulated board's motors;
+- ``serial``: the link to a real board; ``emulated``: the link to an emulated one, ``frames`` its memory layout;
+- ``unicorn``, ``qemu``, ``host``: the emulators that run the firmware.
+"""

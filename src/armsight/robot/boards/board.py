@@ -3,8 +3,8 @@
 In: :class:`~armsight.data.JointCommand`. Out: :class:`~armsight.data.JointStates` and what the board says of itself. The
 messages are ``firmware/wire/armsight.xml``'s. Commands are numbered; the board names the last one it acknowledged and the
 last one it rejected, so that the host learns what became of each. Time passes only in :meth:`Board.connect`,
-:meth:`Board.receive` and the methods that wait. :class:`Session` has the hello, the clock and the newest of every report; an error of the link says
-what the arm does without a host.
+:meth:`Board.receive` and the methods that wait. :class:`Session` has the hello, the clock and the newest of every report;
+an error of the link says what the arm does without a host.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class Session:
         raise DeviceError(f"{self.name}: board {self.welcome.board} answers the hello, but sends no telemetry")
 
     def _ask_reaction(self) -> str:
-        """Return the words on what the arm does by itself without a host, from the end of the configuration."""
+        """Return in words what the arm does by itself without a host, from the end of the configuration."""
         ticks, reaction = struct.unpack("<II", self.config_part(CONFIG.itemsize - 8))
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
@@ -258,7 +258,7 @@ class Board:
         return self._session.wire.broken + self._session.wire.lost
 
     def send(self, command: JointCommand) -> int:
-        """Send a motion command and return its number; whether it was acknowledged, :attr:`status` tells.
+        """Send a motion command and return its number; :attr:`status` says whether it was acknowledged.
 
         Raises:
             InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks.
@@ -333,7 +333,7 @@ class Board:
         """Let ``wait_s`` pass and return all readings of the potentiometers since the last call.
 
         Raises:
-            DeviceError: the board is gone or started anew; the message tells what its arm does.
+            DeviceError: the board is gone or has restarted; the message says what its arm does.
         """
         self._session.pump(wait_s)
         taken = self._session.take_angles()
@@ -393,5 +393,5 @@ def _six(name: str, values: Array) -> list[float]:
 
 
 def _older(sequence: int, other: int) -> bool:
-    """Tell whether a number is older than another; they wrap."""
+    """Return whether a number is older than another; they wrap."""
     return (sequence - other) % _WRAP >= _WRAP // 2

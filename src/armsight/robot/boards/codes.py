@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from enum import IntEnum, IntFlag
 
 
-class State(IntEnum):
+class BoardState(IntEnum):
     """What the board does with its drives."""
 
     DISABLED = 0
@@ -67,7 +67,7 @@ class Limited(IntFlag):
 
 
 class Command(IntEnum):
-    """What a board can be told beside motion; the numbers are the wire's."""
+    """The commands of a board beside motion; the numbers are the wire's."""
 
     ENABLE = 2
     ENABLE_INWARD = 3
@@ -91,22 +91,22 @@ class ConfigSource(IntEnum):
     FACTORY = 2
 
 
-STATE_TEXTS: Mapping[State, str] = {
-    State.DISABLED: "disabled: drives off",
-    State.ENABLED: "enabled: follows the host",
-    State.STOPPING: "stopping: a fault slows the arm down to rest",
-    State.HOLDING: "holding: a fault stands, the arm is held at rest",
-    State.FAULTED: "faulted: a fault stands, drives off",
-    State.STOPPED: "emergency stop: drives off until it is cleared",
+STATE_TEXTS: Mapping[BoardState, str] = {
+    BoardState.DISABLED: "disabled: drives off",
+    BoardState.ENABLED: "enabled: follows the host",
+    BoardState.STOPPING: "stopping: a fault slows the arm down to rest",
+    BoardState.HOLDING: "holding: a fault stands, the arm is held at rest",
+    BoardState.FAULTED: "faulted: a fault stands, drives off",
+    BoardState.STOPPED: "emergency stop: drives off until it is cleared",
 }
 FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.POT_OPEN: "potentiometer open: the reading is above its band",
     Fault.POT_SHORT: "potentiometer short: the reading is below its band",
-    Fault.POT_FROZEN: "potentiometer frozen: the reading stands still while the arm is told to move",
+    Fault.POT_FROZEN: "potentiometer frozen: the reading stands still while the arm is commanded to move",
     Fault.POT_JUMP: "potentiometer jump: the reading moved faster than the joint can",
     Fault.POT_INVERTED: "inverted: the joint moves away from its command",
     Fault.FOLLOWING: "following error: the joint is too far from its reference",
-    Fault.STALL: "stall: the motor is driven hard and the joint does not turn",
+    Fault.STALL: "stall: the motor is driven hard and the joint does not rotate",
     Fault.HOST_SILENT: "host silent: no motion command within the time set",
     Fault.SUPPLY_LOW: "supply too low",
     Fault.SUPPLY_HIGH: "supply too high",
@@ -132,5 +132,5 @@ REJECTION_TEXTS: Mapping[Rejection, str] = {
 
 
 def faults_in(bits: int) -> tuple[Fault, ...]:
-    """Return the faults of a set of bits, by code; bits no fault belongs to are passed over."""
+    """Return the faults of a set of bits, by code; bits that belong to no fault are ignored."""
     return tuple(fault for fault in Fault if bits >> fault & 1)

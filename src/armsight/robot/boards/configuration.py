@@ -175,7 +175,7 @@ def check_gains(gains: Array) -> Array:
 
 
 def check_configuration(config: Configuration) -> None:
-    """Say what is wrong with a configuration, where the board would refuse it whole.
+    """Check a configuration that the board would reject as a whole, and say what is wrong with it.
 
     Raises:
         InputError: it is of another layout, or a value is outside its range.

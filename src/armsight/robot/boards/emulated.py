@@ -1,7 +1,7 @@
-"""The link to an emulated board: one frame a millisecond carries what the board senses, drives, hears and says.
+"""The link to an emulated board: one frame a millisecond carries the board's readings, duties and bytes in and out.
 
-In: bytes of the host. Out: bytes of the board. Every tick the plant is sensed, the firmware runs once on a machine, and
-the plant moves on with the duties it gave. Bytes to the board ride in at the modelled baud rate (8N1: ten bits each),
+In: bytes of the host. Out: bytes of the board. Every tick the plant is sensed, the firmware runs once on an emulator, and
+the plant moves on with the duties it gave. Bytes to the board arrive at the modelled baud rate (8N1: ten bits each),
 those from it leave at the rate the firmware keeps to by itself. Time passes by ``read`` and ``step`` alone.
 """
 
@@ -52,18 +52,18 @@ class EmulatedLink:
     """A board in lock-step, behind the contract of :class:`~armsight.robot.boards.link.Link`.
 
     Args:
-        machine: runs the firmware; closed with the link.
+        emulator: runs the firmware; closed with the link.
         plant: the arm at the board's motors.
         baud: bits a second towards the board, as its own wire has: it gives a message up that comes much slower.
         faults: what goes wrong on the wire.
-        advance: lets a number of seconds pass in place of this link, whose ``step`` it must call once a millisecond:
-            for a world that owns the time.
+        advance: lets a number of seconds pass instead of this link, whose ``step`` it must call once a millisecond:
+            for a simulation that owns the time.
         watch: called with every answer frame (``pil_answer`` as bytes), for traces.
     """
 
     def __init__(
         self,
-        machine: Emulator,
+        emulator: Emulator,
         plant: Plant,
         baud: int = 921600,
         faults: Faults | None = None,
@@ -73,7 +73,7 @@ class EmulatedLink:
     ) -> None:
         if baud <= 0:
             raise InputError(f"the baud rate is {baud}; it must be positive")
-        self._machine, self._plant, self._faults = machine, plant, faults
+        self._emulator, self._plant, self._faults = emulator, plant, faults
         self._advance, self._watch = advance, watch
         self._bytes_per_tick = baud / _BITS_PER_BYTE * TICK_S
         self._credit = 0.0
@@ -138,7 +138,7 @@ class EmulatedLink:
         """End the emulation."""
         if not self._closed:
             self._closed = True
-            self._machine.close()
+            self._emulator.close()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -176,7 +176,7 @@ class EmulatedLink:
 
     def _tick(self) -> None:
         self._ticks += 1
-        reply = self._machine.tick(self._request())
+        reply = self._emulator.tick(self._request())
         fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0, 0, 0, 0, 0)
         magic, version, tick, drives_on, length = fields
         if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % _WRAP:

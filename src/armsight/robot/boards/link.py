@@ -1,6 +1,7 @@
 """The contract of a link: bytes to a board and back. To add one: one file with a class that fulfils :class:`Link`.
 
-The contracts on the far side of an emulated board: the machine that runs the firmware, and the arm it drives.
+The contracts on the far side of an emulated board: the :class:`Emulator` that runs the firmware, and the :class:`Plant`,
+the arm that the board drives.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Open a board by its name: ``emulated:unicorn``, ``emulated:qemu``, ``emulated:host`` or ``serial:PORT``.
 
-The machines that run the emulated board's firmware, by name.
+Here is the registry of the emulators that run the firmware.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from armsight.robot.boards.qemu import QemuEmulator
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.robot.boards.unicorn import UnicornEmulator
 
-#: Name -> what makes the machine of a file, and the file the package carries for it.
+#: Name -> what opens the emulator of a file, and the file the package carries for it.
 EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] = {
-    "unicorn": (UnicornEmulator, firmware.image),
-    "qemu": (QemuEmulator, firmware.image),
-    "host": (HostEmulator, firmware.host_library),
+    "unicorn": (UnicornEmulator.open, firmware.image),
+    "qemu": (QemuEmulator.open, firmware.image),
+    "host": (HostEmulator.open, firmware.host_library),
 }
 
 
 def open_emulator(name: str, image: Path | None = None) -> Emulator:
-    """Start a machine on a fresh board: nothing is stored on it.
+    """Start an emulator with a fresh board: nothing is stored on it.
 
     Args:
         name: one of :data:`EMULATORS`.
         image: another image (for host: library) than the package's.
 
     Raises:
-        InputError: there is no such machine, or what it needs is not installed.
+        InputError: there is no such emulator, or what it needs is not installed.
         DeviceError: the firmware was not built.
     """
     if name not in EMULATORS:
-        raise InputError(f"no machine {name!r}; there are {', '.join(EMULATORS)}")
+        raise InputError(f"no emulator {name!r}; there are {', '.join(EMULATORS)}")
     make, built = EMULATORS[name]
     return make(image or built())
 
@@ -64,24 +64,24 @@ def open_board(
     """
     if name.startswith(SERIAL):
         port = name.removeprefix(SERIAL)
-        return Board.connect(SerialLink(port, baud), name=port)
-    machine = emulated_machine(name)
+        return Board.connect(SerialLink.open(port, baud), name=port)
+    emulator = emulator_name(name)
     if plant is None:
         raise InputError(f"{name} needs a plant: the arm at its motors, such as armsight.sim.joints.JointPlant()")
-    return configured(EmulatedLink(open_emulator(machine), plant), config)
+    return configured(EmulatedLink(open_emulator(emulator), plant), config)
 
 
-def emulated_machine(name: str) -> str:
-    """Return the machine of an emulated board's name.
+def emulator_name(name: str) -> str:
+    """Return the emulator of an emulated board's name.
 
     Raises:
         InputError: there is no such board; the message names those there are.
     """
-    machine = name.removeprefix(EMULATED)
-    if not name.startswith(EMULATED) or machine not in EMULATORS:
-        known = ", ".join(f"{EMULATED}{machine}" for machine in EMULATORS)
+    emulator = name.removeprefix(EMULATED)
+    if not name.startswith(EMULATED) or emulator not in EMULATORS:
+        known = ", ".join(f"{EMULATED}{each}" for each in EMULATORS)
         raise InputError(f"no board {name!r}; there are {known} and {SERIAL}PORT, such as serial:/dev/ttyACM0")
-    return machine
+    return emulator
 
 
 def configured(link: EmulatedLink, config: Configuration | None = None) -> Board:

@@ -1,6 +1,6 @@
-"""The firmware's ARM image under QEMU: a whole Cortex-M4F machine, mps2-an386, with its interrupts and SysTick.
+"""The firmware's ARM image under QEMU: a whole Cortex-M4F board, mps2-an386, with its interrupts and SysTick.
 
-Frames go through the emulation's standard input and output by semihosting. The machine's time is counted in
+Frames go through the emulation's standard input and output by semihosting. The emulated time is counted in
 instructions, 128 ns each: it runs as fast as it can and always the same, and does not wait long for its timer.
 """
 
@@ -10,13 +10,13 @@ import contextlib
 import shutil
 import subprocess
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.frames import ANSWER
 
 PROGRAM = "qemu-system-arm"
-_MACHINE = (
+_OPTIONS = (
     *("-M", "mps2-an386", "-icount", "shift=7,align=off,sleep=off", "-display", "none"),
     *("-monitor", "none", "-serial", "none", "-parallel", "none", "-semihosting-config", "enable=on,target=native"),
 )
@@ -24,28 +24,35 @@ _END_S = 5.0
 
 
 class QemuEmulator:
-    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Emulator`.
+    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Emulator`; :meth:`open` starts it.
 
     Args:
-        image: ELF file of the board ``pil``.
-
-    Raises:
-        InputError: QEMU is not installed.
+        process: QEMU, with pipes to its standard input, output and error.
     """
 
-    def __init__(self, image: Path) -> None:
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+        self._in, self._out, self._said = _pipes(process)
+
+    @classmethod
+    def open(cls, image: Path) -> Self:
+        """Start QEMU on an ELF file of the board ``pil``.
+
+        Raises:
+            InputError: QEMU is not installed.
+        """
         program = shutil.which(PROGRAM)
         if program is None:
             raise InputError(f"{PROGRAM} is not installed: apt install qemu-system-arm, or use emulated:unicorn")
-        self._process = subprocess.Popen(
-            [program, *_MACHINE, "-kernel", str(image)],
+        process = subprocess.Popen(
+            [program, *_OPTIONS, "-kernel", str(image)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             bufsize=0,
             start_new_session=True,  # an interrupt from the keyboard is for us: the arm is to be stopped through the board
         )
-        self._in, self._out, self._said = _pipes(self._process)
+        return cls(process)
 
     def tick(self, request: bytes) -> bytes:
         """Run one tick on a request frame and return the answer frame."""
@@ -58,7 +65,7 @@ class QemuEmulator:
         except (BrokenPipeError, ValueError):
             answer = b""
         if not answer:
-            raise DeviceError(f"the emulated board broke down: {PROGRAM} ended{self._last_words()}")
+            raise DeviceError(f"the emulated board broke down: {PROGRAM} ended{self._stderr_text()}")
         return answer
 
     def close(self) -> None:
@@ -73,7 +80,7 @@ class QemuEmulator:
         self._out.close()
         self._said.close()
 
-    def _last_words(self) -> str:
+    def _stderr_text(self) -> str:
         self._process.wait(_END_S)
         said = self._said.read().decode(errors="replace").strip()
         return f": {said}" if said else ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.robot.boards.codes import FAULT_TEXTS, ConfigSource, Fault, Limited, Rejection, State, faults_in
+from armsight.robot.boards.codes import FAULT_TEXTS, BoardState, ConfigSource, Fault, Limited, Rejection, faults_in
 from armsight.robot.boards.wire import Message
 
 _NO_JOINT = 255
@@ -60,7 +60,7 @@ class BoardStatus:
         first_fault: the one that came first since the last clear; None without.
         acknowledged_sequence: number of the last command acknowledged.
         acknowledged_count: how many were.
-        rejected_sequence: number of the last command refused.
+        rejected_sequence: number of the last command rejected.
         rejected_count: how many were.
         rejection: why that one was.
         supply_v: motor supply, V.
@@ -73,7 +73,7 @@ class BoardStatus:
     """
 
     t_s: float
-    state: State
+    state: BoardState
     faults: tuple[JointFault, ...]
     first_fault: JointFault | None
     acknowledged_sequence: int
@@ -92,7 +92,7 @@ class BoardStatus:
     @property
     def drives_on(self) -> bool:
         """Whether the motors are driven."""
-        return self.state in (State.ENABLED, State.STOPPING, State.HOLDING)
+        return self.state in (BoardState.ENABLED, BoardState.STOPPING, BoardState.HOLDING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def status_of(message: Message, t_s: float) -> BoardStatus:
         )
     return BoardStatus(
         t_s=t_s,
-        state=State(message.state),
+        state=BoardState(message.state),
         faults=_faults(message.faults, message.joint_faults),
         first_fault=first,
         acknowledged_sequence=message.acknowledged_sequence,
@@ -169,8 +169,8 @@ def joints_of(message: Message, t_s: float) -> JointReport:
 def _faults(bits: int, joint_bits: list[int]) -> tuple[JointFault, ...]:
     """Return the latched faults, those of the joints first."""
     of_joints = [JointFault(fault, j) for j, own in enumerate(joint_bits) for fault in faults_in(own)]
-    told = {each.fault for each in of_joints}
-    return tuple(of_joints + [JointFault(fault) for fault in faults_in(bits) if fault not in told])
+    of_named_joints = {each.fault for each in of_joints}
+    return tuple(of_joints + [JointFault(fault) for fault in faults_in(bits) if fault not in of_named_joints])
 
 
 def _text(field: object) -> str:

@@ -1,13 +1,13 @@
 """The link to a real board: a serial port, most often USB (``/dev/ttyACM0``, ``/dev/ttyUSB0``).
 
-What goes wrong with a port is told in one line: which port, what is wrong with it, what to do.
+An error of a port is one line: which port, what is wrong with it, what to do.
 """
 
 from __future__ import annotations
 
 import errno
 import time
-from typing import Any
+from typing import Any, Self
 
 from armsight.errors import DeviceError, InputError
 
@@ -18,29 +18,39 @@ _NAP_S = 0.002
 
 
 class SerialLink:
-    """A serial port behind the contract of :class:`~armsight.robot.boards.link.Link`.
+    """A serial port behind the contract of :class:`~armsight.robot.boards.link.Link`; :meth:`open` opens it.
 
     Args:
-        port: the device; nobody else may have it open.
-        baud: bits a second; a board on native USB does not care.
-
-    Raises:
-        DeviceError: it cannot be opened, and why.
-        InputError: pyserial is not installed.
+        port: the device's name, for errors.
+        opened: pyserial's open port.
+        error: pyserial's class of errors.
     """
 
-    def __init__(self, port: str, baud: int = BAUD) -> None:
+    def __init__(self, port: str, opened: Any, error: type[Exception]) -> None:  # noqa: ANN401 - pyserial has no types
+        self._port, self._serial, self._error = port, opened, error
+
+    @classmethod
+    def open(cls, port: str, baud: int = BAUD) -> Self:
+        """Open a serial port.
+
+        Args:
+            port: the device; nobody else may have it open.
+            baud: bits a second; a board on native USB does not care.
+
+        Raises:
+            DeviceError: it cannot be opened, and why.
+            InputError: pyserial is not installed.
+        """
         try:
             import serial
         except ImportError:
             raise InputError("serial boards need pyserial: pip install 'armsight[board]'") from None
-        self._port = port
-        self._error: type[Exception] = serial.SerialException
         try:
-            self._serial: Any = serial.Serial(port, baud, timeout=0, write_timeout=_WRITE_S, exclusive=True)
+            opened = serial.Serial(port, baud, timeout=0, write_timeout=_WRITE_S, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise DeviceError(_why_not_opened(port, baud, error)) from None
-        self._serial.reset_input_buffer()
+        opened.reset_input_buffer()
+        return cls(port, opened, serial.SerialException)
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
@@ -74,7 +84,7 @@ class SerialLink:
 
 
 def list_ports() -> list[str]:
-    """Return the serial ports of this machine that something is plugged into."""
+    """Return the serial ports of this computer that something is plugged into."""
     from serial.tools import list_ports as tools
 
     return sorted(

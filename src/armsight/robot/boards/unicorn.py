@@ -8,12 +8,12 @@ from __future__ import annotations
 import importlib
 import mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from armsight.errors import DeviceError, InputError
-from armsight.firmware.elf import read_elf
+from armsight.firmware.elf import Elf, read_elf
 
 _FLASH, _FLASH_BYTES = 0, 0x40000
 _RAM, _RAM_BYTES = 0x20000000, 0x10000
@@ -31,22 +31,21 @@ class UnicornEmulator:
     """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.link.Emulator`.
 
     Args:
-        image: ELF file of the board ``pil``.
+        elf: the image of the board ``pil``; :meth:`open` reads it from a file.
 
     Attributes:
         uc: the emulated processor, for those who count its instructions.
 
     Raises:
-        InputError: unicorn is not installed, or the file is no image.
+        InputError: unicorn is not installed.
     """
 
-    def __init__(self, image: Path) -> None:
+    def __init__(self, elf: Elf) -> None:
         try:
             unicorn: Any = importlib.import_module("unicorn")  # it comes without types
             arm_const: Any = importlib.import_module("unicorn.arm_const")
         except ImportError:
             raise InputError("emulated:unicorn needs unicorn: pip install 'armsight[board]'") from None
-        elf = read_elf(image)
         self._error: type[Exception] = unicorn.UcError
         self._stack, self._callee = arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_R4
         self._symbols, self._sizes = elf.symbols, elf.sizes
@@ -63,10 +62,19 @@ class UnicornEmulator:
             self.uc.mem_write(segment.load_address, segment.data)
         self.uc.mem_write(_CALL, _CALLER)
         self.uc.reg_write(arm_const.UC_ARM_REG_FPEXC, _FPU_ON)
-        self._request = self._place("pil_request_frame")
-        self._answer = self._place("pil_answer_frame")
+        self._request = self._address("pil_request_frame")
+        self._answer = self._address("pil_answer_frame")
         self._called, self._tick = 0, self._symbols["pil_tick"] | _THUMB
         self._call(self._symbols["pil_boot"] | _THUMB)
+
+    @classmethod
+    def open(cls, image: Path) -> Self:
+        """Read an ELF file of the board ``pil`` and boot it.
+
+        Raises:
+            InputError: unicorn is not installed, or the file is no image.
+        """
+        return cls(read_elf(image))
 
     def tick(self, request: bytes) -> bytes:
         """Run one tick on a request frame and return the answer frame."""
@@ -78,8 +86,8 @@ class UnicornEmulator:
         """End the emulation."""
         self.uc = None
 
-    def _place(self, name: str) -> slice:
-        """Return where a variable lies in the RAM."""
+    def _address(self, name: str) -> slice:
+        """Return the bytes of the RAM that a variable takes."""
         start = self._symbols[name] - _RAM
         return slice(start, start + self._sizes[name])
 

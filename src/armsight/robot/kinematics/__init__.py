@@ -1,6 +1,11 @@
-"""Kinematics as plain functions of (table, q), compiled by numba: no checks and no allocation; the checks are Arm's.
+"""Kinematics as plain functions of (table, q), compiled by numba: no checks and no allocation; :class:`Arm` checks.
 
-``table`` is the packed form of an arm that :func:`armsight.robot.kinematics.table.packed` makes.
+In: the packed table of an arm and joint angles, rad, or a pose T_base_tool, m. Out: poses, Jacobians, joint angles.
+
+- ``table``: the packed form of a Denavit-Hartenberg table, which all kernels read;
+- ``chain``: forward kinematics, Jacobian and its rate, one configuration or a batch of eight;
+- ``structure``: which closed-form inverse a table has; ``closed``: that inverse;
+- ``inverse``: all joint angles of a pose, checked, polished and sorted; the nearest pose where there are none.
 
 numba's cache on disk looks at the age of a function's own file only: after a change to a file here, remove the cached
 code of the files that call into it (``find src -name "*.nb[ci]" -delete``).

@@ -1,11 +1,17 @@
-"""From a wanted pose to checked, polished and ordered joint angles; and to the nearest pose where there are none.
+"""Inverse kinematics: from a requested pose to checked, polished and sorted joint angles, or to the nearest pose.
 
-Where the arm has a closed form, its solutions are measured against the true table and polished if rounding, or a table
-that has the structure only nearly, left them off. Where it has none, damped least squares starts from many places.
+In: the packed table (96,), the table of its closed form, limits and T_base_tool. Out: rows of joint angles with what is
+left of the error, their configuration and their state. In this order:
 
-A wanted pose as it comes in: whether it is a rigid motion, and its rotation put right to the last place.
-
-Rows of the inverse's answer: what their columns are, limits, whole turns, doubles and order.
+1. The requested pose: whether it is a rigid motion; its rotation is made orthonormal to the last digit.
+2. Damped least squares: from a start to the joint angles whose pose comes closest. The error is [position, m; rotation
+   vector, rad], so that 1 mm counts as much as 1 mrad. Levenberg and Marquardt's method (Nocedal and Wright, "Numerical
+   Optimization", 2006, chapter 10) with the joints held within bounds: a joint that stands at a bound and is pulled beyond
+   it is left out of the step.
+3. The rows: their columns, joint limits, whole revolutions, doubles and order.
+4. The solutions. Where the arm has a closed form, its solutions are measured against the true table and polished if
+   rounding, or a table that has the structure only nearly, left an error. Where it has none, damped least squares starts
+   from many configurations.
 """
 
 from __future__ import annotations
@@ -16,51 +22,189 @@ import numba
 import numpy as np
 
 from armsight.data import Array, Ids
-from armsight.robot.kinematics.batch import errors, frames, thetas
-from armsight.robot.kinematics.chain import Frame, after, before, tool_frame
+from armsight.robot.kinematics.chain import (
+    Frame,
+    after,
+    angle_of_each,
+    before,
+    errors,
+    frames,
+    jacobian_base,
+    sincos_each,
+    thetas,
+    tool_frame,
+)
 from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
-from armsight.robot.kinematics.descent import WORK, descend, pose_error
 from armsight.robot.kinematics.table import KIND, UNBASE, UNTOOL
-from armsight.robot.kinematics.trig import angle_of_each, sincos_each
 
-#: Verdicts on a pose, beside 0.
+#: The validity of a pose, beside 0.
 NOT_FINITE, NOT_RIGID = -1, -2
-#: A rotation may be off by this much and is then put right.
+#: A rotation may be this far from orthonormal and is then corrected.
 _NEARLY_RIGID = 1e-6
+#: Rows of the workspace (20, 6): Jacobian, normal matrix, then error, gradient, step and trial.
+WORK = 20
+#: An error of this squared length is as good as none.
+_NONE = 1e-30
+#: A step that takes off less than this share of the error ends the descent; so does this much damping.
+_SLOW, _STIFF = 1e-9, 1e6
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @_kernel
 def rigid(T: Array) -> tuple[int, Frame]:
-    """Return the verdict on a transform (4, 4), and its frame with the rotation put right."""
+    """Return the validity of a transform (4, 4), and its frame with the rotation made orthonormal."""
     total = 0.0
     for i in range(4):
         for j in range(4):
             total += T[i, j] * 0.0
     xx, xy, xz, yx, yy, yz = T[0, 0], T[1, 0], T[2, 0], T[0, 1], T[1, 1], T[2, 1]
     zx, zy, zz, px, py, pz = T[0, 2], T[1, 2], T[2, 2], T[0, 3], T[1, 3], T[2, 3]
-    verdict = 0
+    validity = 0
     if total != 0.0:
-        verdict = NOT_FINITE
+        validity = NOT_FINITE
     else:
         handed = (xy * yz - xz * yy) * zx + (xz * yx - xx * yz) * zy + (xx * yy - xy * yx) * zz
         if handed < 0.0 or T[3, 0] != 0.0 or T[3, 1] != 0.0 or T[3, 2] != 0.0 or T[3, 3] != 1.0:
-            verdict = NOT_RIGID
+            validity = NOT_RIGID
     for _ in range(2):
         a, b = (0.5 * (xx * xx + xy * xy + xz * xz - 1.0), 0.5 * (yx * yx + yy * yy + yz * yz - 1.0))
         c, d = (0.5 * (zx * zx + zy * zy + zz * zz - 1.0), 0.5 * (xx * yx + xy * yy + xz * yz))
         e, f = 0.5 * (xx * zx + xy * zy + xz * zz), 0.5 * (yx * zx + yy * zy + yz * zz)
         off = max(max(abs(a), abs(b), abs(c)), max(abs(d), abs(e), abs(f)))
-        if off > _NEARLY_RIGID and verdict == 0:
-            verdict = NOT_RIGID
-        if off < 1e-15 or verdict != 0:
+        if off > _NEARLY_RIGID and validity == 0:
+            validity = NOT_RIGID
+        if off < 1e-15 or validity != 0:
             break
         # R (3 I - R^T R) / 2 has the same rotation and the square of the error (Bjorck and Bowie, 1971).
         xx, yx, zx = (xx - a * xx - d * yx - e * zx, yx - d * xx - b * yx - f * zx, zx - e * xx - f * yx - c * zx)
         xy, yy, zy = (xy - a * xy - d * yy - e * zy, yy - d * xy - b * yy - f * zy, zy - e * xy - f * yy - c * zy)
         xz, yz, zz = (xz - a * xz - d * yz - e * zz, yz - d * xz - b * yz - f * zz, zz - e * xz - f * yz - c * zz)
-    return verdict, (xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz)
+    return validity, (xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz)
+
+
+@_kernel
+def pose_error(F: Frame, G: Frame, error: Array) -> float:
+    """Write what moves F onto G, [translation; rotation vector] in base axes; return its squared length."""
+    x = 0.5 * (F[1] * G[2] - F[2] * G[1] + F[4] * G[5] - F[5] * G[4] + F[7] * G[8] - F[8] * G[7])
+    y = 0.5 * (F[2] * G[0] - F[0] * G[2] + F[5] * G[3] - F[3] * G[5] + F[8] * G[6] - F[6] * G[8])
+    z = 0.5 * (F[0] * G[1] - F[1] * G[0] + F[3] * G[4] - F[4] * G[3] + F[6] * G[7] - F[7] * G[6])
+    s = math.sqrt(x * x + y * y + z * z)
+    c = 0.5 * (F[0] * G[0] + F[1] * G[1] + F[2] * G[2] + F[3] * G[3] + F[4] * G[4] + F[5] * G[5])
+    c += 0.5 * (F[6] * G[6] + F[7] * G[7] + F[8] * G[8] - 1.0)
+    angle = math.atan2(s, c)
+    scale = 1.0
+    if s > 1e-9:
+        scale = angle / s
+    elif c < 0.0:  # half a revolution exactly: any axis of it will do to start with
+        x, scale = np.pi, 1.0
+    error[0], error[1], error[2] = G[9] - F[9], G[10] - F[10], G[11] - F[11]
+    error[3], error[4], error[5] = scale * x, scale * y, scale * z
+    total = 0.0
+    for i in range(6):
+        total += error[i] * error[i]
+    return total
+
+
+@_kernel
+def _solve(A: Array, g: Array, damping: float, step: Array) -> bool:
+    """Solve (A + damping I) step = g by Cholesky; False where that cannot be done.
+
+    A's upper half and g are read; the factor goes below A's diagonal, its own diagonal into ``step`` until the end.
+    """
+    for i in range(6):
+        for j in range(i + 1):
+            total = A[j, i]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            if j < i:
+                A[i, j] = total / step[j]
+            elif total + damping > 0.0:
+                step[i] = math.sqrt(total + damping)
+            else:
+                return False
+    for i in range(6):
+        total = g[i]
+        for k in range(i):
+            total -= A[i, k] * g[k]
+        g[i] = total / step[i]
+    for i in range(5, -1, -1):
+        total = g[i]
+        for k in range(i + 1, 6):
+            total -= A[k, i] * g[k]
+        g[i] = total / step[i]
+    for i in range(6):
+        step[i] = g[i]
+    return True
+
+
+@_kernel
+def _normal(J: Array, e: Array, q: Array, low: Array, high: Array, A: Array, g: Array) -> None:
+    """Write the upper half of J^T J (6, 6), and J^T e (6,); a joint at a bound and pulled beyond it is left out."""
+    for i in range(6):
+        total = 0.0
+        for k in range(6):
+            total += J[k, i] * e[k]
+        g[i] = total
+    for i in range(6):
+        if (q[i] <= low[i] and g[i] < 0.0) or (q[i] >= high[i] and g[i] > 0.0):
+            g[i] = 0.0
+            for k in range(6):
+                J[k, i] = 0.0
+    for i in range(6):
+        for j in range(i, 6):
+            total = 0.0
+            for k in range(6):
+                total += J[k, i] * J[k, j]
+            A[i, j] = total
+
+
+@_kernel
+def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int, work: Array) -> float:
+    """Move joint angles (6,) in-place towards a requested frame, within bounds.
+
+    Args:
+        table: (96,) packed table.
+        G: the requested frame of the tool.
+        q: (6,) where to start, within the bounds; where it ends.
+        low: (6,) lower bounds, rad.
+        high: (6,) upper bounds, rad.
+        most: how many steps at most.
+        work: (20, 6) workspace.
+
+    Returns:
+        the squared length of the error that is left.
+    """
+    J, A, e, g, step, trial = work[0:6], work[6:12], work[12], work[13], work[14], work[15]
+    cost = np.inf
+    damping, better = 0.0, True
+    for _ in range(most):
+        if better:
+            cost = pose_error(jacobian_base(table, q, J), G, e)
+            if cost < _NONE:
+                break
+            damping = 0.1 * damping if damping > 0.0 else 1e-6 * min(1.0, cost)
+        _normal(J, e, q, low, high, A, g)
+        size = 0.0
+        after = np.inf
+        if _solve(A, g, damping + 1e-18, step):
+            for i in range(6):
+                size = max(size, abs(step[i]))
+            for i in range(6):
+                trial[i] = min(high[i], max(low[i], q[i] + step[i] / max(1.0, size)))
+            after = pose_error(tool_frame(table, trial), G, g)
+        better = after < cost
+        if better:
+            q[:] = trial
+            slow = cost - after < _SLOW * cost
+            cost = after
+            if slow:
+                break
+        else:
+            damping = max(10.0 * damping, 1e-12)
+            if damping > _STIFF:
+                break
+    return cost
 
 
 #: Most solutions that are looked for: eight where there is a closed form; a general arm has up to sixteen.
@@ -73,7 +217,7 @@ OUTSIDE = 8
 
 #: Two solutions that differ less than this in every joint, rad, are one.
 _SAME_RAD = 1e-7
-_TURN = 2.0 * np.pi
+_REVOLUTION = 2.0 * np.pi
 #: Added to the key of a row outside the limits: more than any distance.
 _LAST = 1e9
 
@@ -81,25 +225,25 @@ _LAST = 1e9
 @_kernel
 def wrap(q: float) -> float:
     """Bring an angle into (-pi, pi]."""
-    turns: float = np.ceil((q - np.pi) / _TURN)
-    return q - _TURN * turns
+    revolutions: float = np.ceil((q - np.pi) / _REVOLUTION)
+    return q - _REVOLUTION * revolutions
 
 
 @_kernel
-def placed(q: float, low: float, high: float, goal: float) -> tuple[float, bool]:
-    """Return the angle, whole turns apart, that lies within the limits and nearest a goal; and whether there is one."""
-    least, most = (np.ceil((low - q) / _TURN - 1e-13), np.floor((high - q) / _TURN + 1e-13))
-    wanted = np.floor((goal - q) / _TURN + 0.5)
+def unwrapped(q: float, low: float, high: float, goal: float) -> tuple[float, bool]:
+    """Return the angle, whole revolutions from q, within the limits and nearest a goal; and whether there is one."""
+    least, most = (np.ceil((low - q) / _REVOLUTION - 1e-13), np.floor((high - q) / _REVOLUTION + 1e-13))
+    nearest_goal = np.floor((goal - q) / _REVOLUTION + 0.5)
     inside = least <= most
-    held = min(most, max(least, wanted))
-    turned = q + _TURN * (held if inside else wanted)
+    held = min(most, max(least, nearest_goal))
+    angle = q + _REVOLUTION * (held if inside else nearest_goal)
     # A joint that rounding put over its limit is put on it.
-    return (min(high, max(low, turned)) if inside else turned), inside
+    return (min(high, max(low, angle)) if inside else angle), inside
 
 
 @_kernel
 def known(rows: Array, count: int) -> bool:
-    """Say whether row ``count`` stands among the rows before it."""
+    """Return whether row ``count`` stands among the rows before it."""
     for k in range(count):
         same = True
         for i in range(6):
@@ -113,11 +257,11 @@ def known(rows: Array, count: int) -> bool:
 
 
 @_kernel
-def place(limits: Array, near: Array, ordered: bool, row: Array) -> None:
-    """Turn a row's joints within the limits, and write its state and key."""
+def bring_within(limits: Array, near: Array, ordered: bool, row: Array) -> None:
+    """Move a row's joints by whole revolutions into the limits, and write its state and key."""
     outside, distance = False, 0.0
     for i in range(6):
-        row[i], inside = placed(row[i], limits[0, i], limits[1, i], near[i])
+        row[i], inside = unwrapped(row[i], limits[0, i], limits[1, i], near[i])
         outside = outside or not inside
         distance += (row[i] - near[i]) ** 2
     if outside:
@@ -127,7 +271,7 @@ def place(limits: Array, near: Array, ordered: bool, row: Array) -> None:
 
 @_kernel
 def sort(rows: Array, count: int) -> None:
-    """Order rows by their keys; equal ones keep their order."""
+    """Sort rows by their keys; equal ones keep their order."""
     for k in range(1, count):
         j = k
         while j > 0 and rows[j - 1, KEY] > rows[j, KEY]:
@@ -136,13 +280,13 @@ def sort(rows: Array, count: int) -> None:
             j -= 1
 
 
-#: Size of a call's workspace: the lanes' sines, cosines, angles, thetas, frames, tags, errors; and that of the descent.
+#: Size of a call's workspace: the batch's sines, cosines, angles, thetas, frames, tags, errors; and that of the descent.
 SCRATCH = 4 * 48 + 96 + 32 + 16 + 6 * WORK
-_LANES = SCRATCH - 6 * WORK
+_BATCH = SCRATCH - 6 * WORK
 #: A solution is polished where its pose is off by more than this, m or rad, and dropped where the polish leaves more.
 _POLISHED, _WRONG = 1e-12, 3e-10
-#: How many places damped least squares starts from for an arm without structure, and for the nearest pose beside the
-#: closed form's; how many steps it takes at most, in a polish and from afar.
+#: How many configurations damped least squares starts from: for an arm without structure, and for the nearest pose beside
+#: the closed form's; how many steps it takes at most, in a polish and from afar.
 _STARTS, _NEAREST_STARTS, _STEPS, _LONG_STEPS = 64, 8, 20, 200
 #: Bounds of a joint that has none, rad.
 _FAR = 1e9
@@ -150,7 +294,7 @@ _FAR = 1e9
 
 @_kernel
 def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool:
-    """Move a row onto the pose, measure what is left, and say whether it brings the tool there."""
+    """Move a row onto the pose, measure what is left, and return whether it brings the tool there."""
     q, e = work[16], work[12]
     for i in range(6):
         q[i], work[17, i], work[18, i] = row[i], -_FAR, _FAR
@@ -165,7 +309,7 @@ def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool
 
 @_kernel
 def _start(n: int, near: Array, q: Array) -> None:
-    """Write the n-th place to start from: ``near``, then points spread evenly over all turns."""
+    """Write the n-th configuration to start from: ``near``, then points spread evenly over a revolution of every joint."""
     # The fractional parts of n times powers of the root of x^7 = x + 1 spread best (Roberts, 2018).
     for i in range(6):
         spread = (0.5 + n * 1.1127756842787055 ** -(i + 1.0)) % 1.0
@@ -187,9 +331,9 @@ def _from_everywhere(table: Array, F: Frame, near: Array, most: int, rows: Array
 
 
 @_kernel
-def _to_rows(lanes: Array, found: int, rows: Array) -> None:
-    """Copy angles, errors and tags of the lanes into rows."""
-    q, tags, off = lanes[96:144], lanes[288:320], lanes[320:336]
+def _to_rows(batch: Array, found: int, rows: Array) -> None:
+    """Copy angles, errors and tags of the batch into rows."""
+    q, tags, off = batch[96:144], batch[288:320], batch[320:336]
     for k in range(found):
         for i in range(6):
             rows[k, i] = q[8 * i + k]
@@ -199,14 +343,14 @@ def _to_rows(lanes: Array, found: int, rows: Array) -> None:
 
 
 @_kernel
-def _lane_angles(closed: Array, limits: Array, near: Array, lanes: Array, n: int) -> None:
-    """Turn the lanes' points into joint angles within the limits where that can be."""
-    y, x, q, theta = lanes[:48], lanes[48:96], lanes[96:144], lanes[144:192]
+def _batch_angles(closed: Array, limits: Array, near: Array, batch: Array, n: int) -> None:
+    """Convert the batch's points (cosine, sine) into joint angles, within the limits where that can be."""
+    y, x, q, theta = batch[:48], batch[48:96], batch[96:144], batch[144:192]
     angle_of_each(y, x, theta, 6 * n)
     for i in range(6):
         way, offset, low, high, goal = (closed[6 * i + 5], closed[6 * i + 4], limits[0, i], limits[1, i], near[i])
         for k in range(n):
-            q[8 * i + k], _ = placed(way * (theta[8 * i + k] - offset), low, high, goal)
+            q[8 * i + k], _ = unwrapped(way * (theta[8 * i + k] - offset), low, high, goal)
 
 
 @_kernel
@@ -219,7 +363,7 @@ def _from_closed_form(
     clamp: bool,
     rows: Array,
     already: int,
-    lanes: Array,
+    batch: Array,
     work: Array,
     n: int,
 ) -> tuple[int, int]:
@@ -227,15 +371,15 @@ def _from_closed_form(
 
     Clamped, it is where the steps of the closed form come closest, which a longer descent makes solutions of or not.
     """
-    y, x, q, theta = lanes[:48], lanes[48:96], lanes[96:144], lanes[144:192]
+    y, x, q, theta = batch[:48], batch[48:96], batch[96:144], batch[144:192]
     M = after(closed, UNTOOL, before(closed, UNBASE, F))
-    found, missed = closed_form(closed, M, near, clamp, y, x, lanes[288:320])
-    _lane_angles(closed, limits, near, lanes, n)
+    found, missed = closed_form(closed, M, near, clamp, y, x, batch[288:320])
+    _batch_angles(closed, limits, near, batch, n)
     thetas(table, q, theta, n)
     sincos_each(theta, y, x, 6 * n)
-    frames(table, y, x, lanes[192:288], n)
-    errors(lanes[192:288], F, lanes[320:328], lanes[328:336], n)
-    _to_rows(lanes, found, rows[already:])
+    frames(table, y, x, batch[192:288], n)
+    errors(batch[192:288], F, batch[320:328], batch[328:336], n)
+    _to_rows(batch, found, rows[already:])
     count, moved = already, already > 0
     for k in range(already, min(already + found, MOST)):
         if k != count:
@@ -268,20 +412,20 @@ def inverse(
         closed: (96,) the table that the closed form works on, KIND 0 where there is none.
         limits: (2, 6) lower and upper limits of the joints, rad.
         T: (4, 4) T_base_tool, m.
-        near: (6,) joint angles, rad: what an undetermined joint is given, and which of several whole turns is taken.
-        ordered: whether the rows are ordered by their distance from ``near``; those outside the limits come last anyway.
+        near: (6,) joint angles, rad: what an undetermined joint is given, and which of several revolutions is taken.
+        ordered: whether the rows are sorted by their distance from ``near``; those outside the limits come last anyway.
         rows: (16, 13) is written: joint angles, errors, configuration, state and key.
         scratch: (SCRATCH,) workspace of finite numbers.
-        n: 8, the lanes' number.
+        n: 8, the size of the batch.
 
     Returns:
-        how many rows were written, or a verdict on T; bits of what kept solutions out of reach; and those of all rows'
+        how many rows were written, or the validity of T; bits of what kept solutions out of reach; and those of all rows'
         states together, OUTSIDE only where every row is.
     """
-    verdict, F = rigid(T)
-    if verdict != 0:
-        return verdict, 0, 0
-    lanes, work = scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
+    validity, F = rigid(T)
+    if validity != 0:
+        return validity, 0, 0
+    batch, work = scratch[:_BATCH], scratch[_BATCH:].reshape((WORK, 6))
     count = missed = 0
     irregular = closed[KIND] == 0.0
     exact = table[KIND] != 0.0
@@ -289,7 +433,7 @@ def inverse(
     for again in range(0 if irregular else 2):
         clamp = again == 1 or not exact
         if again == 0 or missed & DOUBT:
-            count, out = _from_closed_form(table, closed, limits, F, near, clamp, rows, count, lanes, work, n)
+            count, out = _from_closed_form(table, closed, limits, F, near, clamp, rows, count, batch, work, n)
             missed |= out
     if count == 0 and (not exact or missed & DOUBT):
         most = 1 if exact else MOST if irregular else n
@@ -298,7 +442,7 @@ def inverse(
     bits = 0
     for k in range(count):
         bits |= int(rows[k, STATE])
-        place(limits, near, ordered, rows[k])
+        bring_within(limits, near, ordered, rows[k])
     sort(rows, count)
     if count > 0 and rows[0, STATE] >= OUTSIDE:
         bits |= OUTSIDE
@@ -318,7 +462,7 @@ def inverse_batch(
     rows: Array,
     counts: Ids,
 ) -> int:
-    """Write all joint angles for poses (N, 4, 4) into rows (N, most, 12) and counts (N,); return the worst verdict."""
+    """Write all joint angles for poses (N, 4, 4) into rows (N, most, 12) and counts (N,); return the worst validity."""
     worst = 0
     for k in range(Ts.shape[0]):
         count, _, _ = inverse(table, closed, limits, Ts[k], near, False, row, scratch, n)
@@ -336,12 +480,12 @@ def nearest(
 ) -> None:
     """Write the joint angles (6,) within the limits whose pose comes closest to T, as far as descent finds them."""
     _, F = rigid(T)
-    count, lanes, work = 0, scratch[:_LANES], scratch[_LANES:].reshape((WORK, 6))
+    count, batch, work = 0, scratch[:_BATCH], scratch[_BATCH:].reshape((WORK, 6))
     if closed[KIND] != 0.0:
         M = after(closed, UNTOOL, before(closed, UNBASE, F))
-        count, _ = closed_form(closed, M, near, True, lanes[:48], lanes[48:96], lanes[288:320])
-        _lane_angles(closed, limits, near, lanes, n)
-        _to_rows(lanes, count, rows)
+        count, _ = closed_form(closed, M, near, True, batch[:48], batch[48:96], batch[288:320])
+        _batch_angles(closed, limits, near, batch, n)
+        _to_rows(batch, count, rows)
     best, trial = np.inf, work[16]
     for k in range(count + _NEAREST_STARTS):
         if k < count:
@@ -349,8 +493,8 @@ def nearest(
         else:
             _start(k - count, near, trial)
         for i in range(6):
-            turned, _ = placed(trial[i], limits[0, i], limits[1, i], near[i])
-            trial[i] = min(limits[1, i], max(limits[0, i], turned))
+            angle, _ = unwrapped(trial[i], limits[0, i], limits[1, i], near[i])
+            trial[i] = min(limits[1, i], max(limits[0, i], angle))
         cost = descend(table, F, trial, limits[0], limits[1], _LONG_STEPS, work)
         if k == 0 or cost < best:  # the first anyway: a pose may be so far off that every cost is infinite
             best = cost

@@ -1,8 +1,9 @@
 """Which closed-form inverse an arm has, read off its table.
 
-Two structures are known, both with axis 1 square to axes 2 and 3, which are parallel, and two right angles at the wrist:
+Two structures are known, both with axis 1 perpendicular to axes 2 and 3, which are parallel, and two right angles at the
+wrist:
 
-- PARALLEL: axes 2, 3 and 4 are parallel, and axes 5 and 6 meet (the chapter's arm, Universal Robots);
+- PARALLEL: axes 2, 3 and 4 are parallel, and axes 5 and 6 meet (``six_r``, Universal Robots);
 - SPHERICAL: axes 4, 5 and 6 meet in one point (PUMA 560, IRB 120, most industrial arms).
 
 A table that has neither exactly but is close to one, such as an identified table, still gets the solutions of the close
@@ -46,7 +47,7 @@ def recognised(table: Array) -> tuple[Array, bool]:
 
 
 def _squared(table: Array, near_rad: float) -> Array:
-    """Round twists close to right angles, and turn joints about so that no twist of links 2 and 3 is 180 degrees.
+    """Round twists close to right angles, and reverse joints so that no twist of links 2 and 3 is 180 degrees.
 
     ``Rx(pi) Rz(theta) Tz(d) Tx(a) Rx(alpha) = Rz(-theta) Tz(-d) Tx(a) Rx(alpha + pi)`` carries it one link further.
     """
@@ -64,7 +65,7 @@ def _squared(table: Array, near_rad: float) -> Array:
 
 
 def _fits(rows: Array, kind: int, near_m: float) -> bool:
-    """Say whether squared rows have a structure, lengths within ``near_m``."""
+    """Return whether squared rows have a structure, lengths within ``near_m``."""
     right = np.abs(rows[:, _SIN]) == 1.0
     along = rows[:, _COS] == 1.0
     if not (right[0] and along[1] and right[3] and right[4] and abs(rows[1, _A]) > _SHORTEST_M):

@@ -11,7 +11,7 @@ A packed table (96,) holds, in this order:
 - 36 (BASE), 48 (TOOL): T_base_0 and T_6_tool, twelve numbers each, row by row;
 - 60 (MODIFIED): 1 for the modified convention, where a link's frame sits on its own joint's axis; 0 for the standard one;
 - 61 (KIND) to 63: the structure the closed-form inverse works on, and its forearm (see ``structure``);
-- 64 (UNBASE), 76 (UNTOOL): the inverses of T_base_0, and of everything that comes after joint 6's turn;
+- 64 (UNBASE), 76 (UNTOOL): the inverses of T_base_0, and of everything that comes after joint 6's rotation;
 - 88 on: the forearm's angle (see ``structure``); the rest is free.
 """
 

@@ -2,20 +2,8 @@
 
 from __future__ import annotations
 
-from armsight.errors import InputError
 from armsight.robot.arm import Arm
 from armsight.robot.models import irb120, puma560, six_r, ur5, ur10
 
 #: Name -> arm.
 MODELS: dict[str, Arm] = {module.ARM.name: module.ARM for module in (six_r, puma560, ur5, ur10, irb120)}
-
-
-def open_arm(name: str) -> Arm:
-    """Return the arm of that name.
-
-    Raises:
-        InputError: unknown.
-    """
-    if name not in MODELS:
-        raise InputError(f"arm {name!r} is unknown; known are {', '.join(MODELS)}")
-    return MODELS[name]

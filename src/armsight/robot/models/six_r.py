@@ -1,6 +1,6 @@
-"""The chapter's 6R arm (table 18.1; "Application of Stereo Vision and ARM Processor for Motion Control").
+"""The 6R arm of "Application of Stereo Vision and ARM Processor for Motion Control", table 18.1.
 
-Table and home pose are the chapter's. It gives no limits: those here are chosen, as what a table-top arm of this size with
+Table and home pose are that text's. It gives no limits: those here are chosen, as what a table-top arm of this size with
 geared DC motors plausibly has, and are to be replaced by those of the arm at hand.
 """
 
@@ -19,5 +19,5 @@ ARM = Arm(
     qd_max=np.deg2rad([90.0, 90.0, 120.0, 150.0, 150.0, 180.0]),  # chosen
     qdd_max=np.deg2rad([360.0, 360.0, 480.0, 600.0, 600.0, 720.0]),  # chosen: full speed in 0.25 s
     qddd_max=np.deg2rad([3600.0, 3600.0, 4800.0, 6000.0, 6000.0, 7200.0]),  # chosen: full acceleration in 0.1 s
-    source="table 18.1 of the chapter; limits are chosen, the chapter gives none",
+    source="Application of Stereo Vision and ARM Processor for Motion Control, table 18.1; limits are chosen",
 )

@@ -1,4 +1,14 @@
-"""Motions: joint angles over time, known and checked against every limit before the first step (trajectory.py)."""
+"""Motions: joint angles over time, known and checked against every limit before the first step.
+
+In: an arm, joint angles to start from, rad, and a goal, path or way-points. Out: a :class:`Trajectory`; or
+:class:`MotionRejected`, which says where and why it cannot be made.
+
+- ``trajectory``: the contract; ``limits``: the check against the arm's limits; ``profile``: jerk-limited profiles;
+- ``point_to_point``: in joints; ``tabled``: another trajectory as a table, quick to look up;
+- ``path``, ``line``, ``circle``, ``waypoints``: paths of the tool in space;
+- ``cartesian``: travels such a path exactly, by ``lookahead`` (the joints along it) and ``law`` (how fast);
+- ``resolved_rate``: travels it through the Jacobian, past singularities too.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz."""
+"""Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz.
+
+In: an arm, a path and a start state. Out: a :class:`PathMotion`, checked; or :class:`MotionRejected`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.chain import fit_chain
-from armsight.robot.trajectories.law import CLOSE, Law, fit_law, moving_laws, time_of
+from armsight.robot.trajectories.law import CLOSE, Law, fit_chain, fit_law, moving_laws, time_of
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.lookahead import Obstacle, Walk, derivatives, refined, walk
 from armsight.robot.trajectories.path import Path
@@ -32,7 +34,7 @@ class PathMotion:
         arm: the arm that travels it.
         path: the path.
         law: share of the way over time.
-        guide: the joints along the path, by which the right solution is told.
+        guide: the joints along the path, near which the inverse kinematics takes its solution.
     """
 
     arm: Arm
@@ -49,9 +51,9 @@ class PathMotion:
         """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
         times = clamped(t_s, self.duration_s)
         share, speed, acceleration = (part[:, :1] for part in self.law.at(times.ravel()))
-        places = self.path.at(share[:, 0])
-        q = refined(self.arm, places.T_base_tool, self.guide.near(share[:, 0]))
-        q1, q2 = derivatives(self.arm, q, places)
+        points = self.path.at(share[:, 0])
+        q = refined(self.arm, points.T_base_tool, self.guide.near(share[:, 0]))
+        q1, q2 = derivatives(self.arm, q, points)
         joints = (q, q1 * speed, q1 * acceleration + q2 * speed**2)
         return Joints(*(part.reshape(*times.shape, 6) for part in joints))
 
@@ -85,7 +87,7 @@ def follow(
     start = start_state(arm, q_start, qd_start, qdd_start)
     guide, obstacle = walk(arm, path, start.q, np.zeros((0, 2)) if cruises is None else cruises)
     if obstacle is not None and obstacle.share == 0:
-        raise _refused(path, obstacle, 0.0)
+        raise _rejection(path, obstacle, 0.0)
     share = _share_state(start, guide, arm)
     if start.qd.any() or start.qdd.any():
         return _from_moving(arm, path, guide, obstacle, share, duration_s, cruises)
@@ -94,11 +96,11 @@ def follow(
         clear = Walk(*(part[: obstacle.clear] for part in guide))
         law = fit_law(arm, clear) if cruises is None else fit_chain(arm, clear, share, cruises)
         scale = 1.0 if duration_s is None else duration_s / law.duration_s
-        raise _refused(path, obstacle, scale * time_of(law, obstacle.share))
+        raise _rejection(path, obstacle, scale * time_of(law, obstacle.share))
     law = fit_law(arm, guide) if cruises is None else fit_chain(arm, guide, share, cruises)
     motion = PathMotion(arm, path, law, guide)
     while (most := _check_whole(motion)).ratio > 1 + ROUNDING:
-        motion = replace(motion, law=motion.law.slower(most.stretch * (1 + CLOSE / 10)))
+        motion = replace(motion, law=motion.law.slower(most.time_scale * (1 + CLOSE / 10)))
     return motion if duration_s is None else _lasting(motion, duration_s)
 
 
@@ -116,13 +118,13 @@ def _from_moving(
         raise InputError("duration_s cannot be asked for on way-points from a moving start")
     if obstacle is not None:
         # How it would be travelled from here cannot be said where its end cannot be reached: at the pace of the start.
-        raise _refused(path, obstacle, obstacle.share / float(start.qd[0]) if start.qd[0] > 0 else 0.0)
+        raise _rejection(path, obstacle, obstacle.share / float(start.qd[0]) if start.qd[0] > 0 else 0.0)
     laws: list[Law] = [fit_chain(arm, guide, start, cruises)] if cruises is not None else []
     for law in laws or moving_laws(arm, guide, start, duration_s):
         motion = PathMotion(arm, path, law, guide)
         if (most := _check_whole(motion)).ratio <= 1 + ROUNDING:
             return motion
-    raise _refused(path, Obstacle(float(motion.law.at(most.t_s).q[0]), most.what), most.t_s)
+    raise _rejection(path, Obstacle(float(motion.law.at(most.t_s).q[0]), most.what), most.t_s)
 
 
 def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
@@ -142,8 +144,8 @@ def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
     return motion
 
 
-def _refused(path: Path, obstacle: Obstacle, t_s: float) -> MotionRejected:
-    """Return the refusal of a motion at an obstacle."""
+def _rejection(path: Path, obstacle: Obstacle, t_s: float) -> MotionRejected:
+    """Return the rejection of a motion at an obstacle, at a time, s."""
     p_base = path.at(np.array([obstacle.share])).T_base_tool[0, :3, 3]
     return MotionRejected(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
 
@@ -153,11 +155,11 @@ def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
     along, bend = guide.q1[0], guide.q2[0]
     speed = float(along @ start.qd / (along @ along))
     acceleration = float(along @ (start.qdd - bend * speed**2) / (along @ along))
-    for name, value, wanted, limit in (
+    for name, value, needed, limit in (
         ("qd_start", start.qd, along * speed, arm.qd_max),
         ("qdd_start", start.qdd, along * acceleration + bend * speed**2, arm.qdd_max),
     ):
-        if (np.abs(value - wanted) > ALONG * limit).any():
+        if (np.abs(value - needed) > ALONG * limit).any():
             raise InputError(f"{name} does not carry the tool along the path: give speeds that do, or start from rest")
     if speed < 0:
         raise InputError("qd_start carries the tool backwards on the path")
@@ -170,7 +172,9 @@ def _check_whole(motion: PathMotion) -> Worst:
     Raises:
         MotionRejected: its joints leave their limits or jump from one configuration to another.
     """
-    return max((_check_piece(motion, t_s) for t_s in pieces(check_times(motion.duration_s))), key=lambda w: w.stretch)
+    return max(
+        (_check_piece(motion, t_s) for t_s in pieces(check_times(motion.duration_s))), key=lambda w: w.time_scale
+    )
 
 
 def _check_piece(motion: PathMotion, t_s: Array) -> Worst:
@@ -184,5 +188,5 @@ def _check_piece(motion: PathMotion, t_s: Array) -> Worst:
         row = int(np.argmax(bad))
         reason = outside(arm, joints.q[row]) or "the arm would have to change its configuration"
         at_s = float(t_s[row])
-        raise _refused(motion.path, Obstacle(float(motion.law.at(at_s).q[0]), reason), at_s)
+        raise _rejection(motion.path, Obstacle(float(motion.law.at(at_s).q[0]), reason), at_s)
     return worst(arm, t_s, joints)

@@ -1,4 +1,4 @@
-"""Circles and arcs of the tool in space, its orientation turning evenly about one axis."""
+"""Circles and arcs of the tool in space, its orientation rotating evenly about one axis."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ TOO_SMALL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ArcPath(Record):
-    """A turn of the tool's position about an axis in space, with an even turn of its orientation.
+    """A rotation of the tool's position about an axis in space, with an even rotation of its orientation.
 
     Attributes:
         T_base_start: (4, 4) where it starts.
         center_base: (3,) a point of the axis, m.
         sweep: (3,) the axis times the angle travelled, rad, base axes.
-        rotation_base: (3,) how far the tool turns, rad, base axes.
+        rotation_base: (3,) how far the tool rotates, rad, base axes.
     """
 
     T_base_start: Array
@@ -71,7 +71,7 @@ def circle(
         axis_base: (3,) direction of the axis, any length, base frame; the tool moves about it by the right hand.
         angle_rad: how far round, rad; a full circle by default, negative for the other way.
         rotation_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
-            axis times ``angle_rad`` turns the tool with the circle.
+            axis times ``angle_rad`` rotates the tool with the circle.
         qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the circle. None for rest.
         qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
@@ -103,7 +103,7 @@ def arc(
     qdd_start: ArrayLike | None = None,
     duration_s: float | None = None,
 ) -> PathMotion:
-    """Plan the arc of the tool from where it is through a point to a pose, the orientation turning evenly (slerp).
+    """Plan the arc of the tool from where it is through a point to a pose, the orientation rotating evenly (slerp).
 
     Args:
         arm: the arm.

@@ -24,13 +24,13 @@ class Worst(NamedTuple):
 
     Attributes:
         ratio: the value over its limit; at most 1 within it.
-        stretch: how many times longer the motion would have to take to be at that limit.
+        time_scale: how many times longer the motion would have to take to be just at that limit.
         what: the limited quantity in words, with its values.
         t_s: when, s.
     """
 
     ratio: float
-    stretch: float
+    time_scale: float
     what: str
     t_s: float
 
@@ -70,7 +70,7 @@ def inside(arm: Arm, q: ArrayLike, name: str) -> Array:
         InputError: wrong shape, NaN or outside.
     """
     angles = checked(q, (6,), name)
-    arm.forward(angles)  # refuses degrees with a hint
+    arm.forward(angles)  # rejects degrees with a hint
     if (reason := outside(arm, angles)) is not None:
         raise InputError(f"{name}: {reason}")
     return angles
@@ -94,10 +94,10 @@ def worst(arm: Arm, t_s: Array, joints: Joints) -> Worst:
         ratio, most = float(ratios[row, i]), float(np.degrees(limit[i]))
         what = f"joint {i + 1} would need a {name} of {ratio * most:.4g} {unit}, its limit is {most:.4g}"
         found.append(Worst(ratio, ratio ** (1 / order), what, float(t_s[row])))
-    return max(found, key=lambda w: w.stretch)
+    return max(found, key=lambda w: w.time_scale)
 
 
-def stretches(arm: Arm, t_s: Array, joints: Joints) -> Array:
+def time_scales(arm: Arm, t_s: Array, joints: Joints) -> Array:
     """Return how many times longer the motion would have to take for each of its samples (N,) to be at a limit."""
     ratios = [ratios.max(axis=1) ** (1 / order) for order, (_, _, ratios, _) in enumerate(_ratios(arm, t_s, joints), 1)]
     return np.asarray(np.max(ratios, axis=0))
@@ -117,7 +117,7 @@ def _ratios(arm: Arm, t_s: Array, joints: Joints) -> list[tuple[str, str, Array,
 
 
 def check_limits(arm: Arm, trajectory: Trajectory) -> None:
-    """Hold a motion in joints against every limit of the arm at 1 kHz.
+    """Check a motion in joints against every limit of the arm at 1 kHz.
 
     Raises:
         MotionRejected: at the first instant outside the joint limits, or where another limit is passed.
@@ -127,13 +127,13 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
         over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING
         if over.any():
             row = int(np.argmax(over))
-            raise _refused(arm, trajectory, str(outside(arm, joints.q[row])), float(t_s[row]))
+            raise _rejection(arm, trajectory, str(outside(arm, joints.q[row])), float(t_s[row]))
         most = worst(arm, t_s, joints)
         if most.ratio > 1 + ROUNDING:
-            raise _refused(arm, trajectory, most.what, most.t_s)
+            raise _rejection(arm, trajectory, most.what, most.t_s)
 
 
-def _refused(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRejected:
-    """Return the refusal of a motion in joints at a time."""
+def _rejection(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRejected:
+    """Return the rejection of a motion in joints at a time, s."""
     share = t_s / trajectory.duration_s if trajectory.duration_s > 0 else 0.0
     return MotionRejected(reason, share=share, t_s=t_s, p_base=arm.forward(trajectory.at(t_s).q)[:3, 3])

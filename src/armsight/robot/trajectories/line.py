@@ -1,4 +1,4 @@
-"""A straight line of the tool in space, its orientation turning evenly about one axis (slerp)."""
+"""A straight line of the tool in space, its orientation rotating evenly about one axis (slerp)."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LinePath(Record):
-    """A straight line with an even turn.
+    """A straight line with an even rotation.
 
     Attributes:
         T_base_start: (4, 4) where it starts.
         step: (3,) how far it goes, m, base axes.
-        turn: (3,) how far it turns, rad, axes of the tool.
+        rotation: (3,) how far it rotates, rad, axes of the tool.
     """
 
     T_base_start: Array
     step: Array
-    turn: Array
+    rotation: Array
 
     @staticmethod
     def between(T_base_start: Array, T_base_goal: Array) -> LinePath:
@@ -39,17 +39,17 @@ class LinePath(Record):
         Raises:
             InputError: they are the same.
         """
-        step, turn, length = way(T_base_start, T_base_goal)
+        step, rotation, length = way(T_base_start, T_base_goal)
         if length == 0:
             raise InputError("T_base_goal is where the tool already is: there is nothing to travel")
-        return LinePath(T_base_start, step, turn)
+        return LinePath(T_base_start, step, rotation)
 
     def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""
         T = np.tile(self.T_base_start, (len(share), 1, 1))
         T[:, :3, 3] += share[:, None] * self.step
-        T[:, :3, :3] = self.T_base_start[:3, :3] @ exp_so3(share[:, None] * self.turn)
-        twist = np.tile(np.concatenate([self.step, self.T_base_start[:3, :3] @ self.turn]), (len(share), 1))
+        T[:, :3, :3] = self.T_base_start[:3, :3] @ exp_so3(share[:, None] * self.rotation)
+        twist = np.tile(np.concatenate([self.step, self.T_base_start[:3, :3] @ self.rotation]), (len(share), 1))
         return PathPoints(T, twist, np.zeros_like(twist))
 
 

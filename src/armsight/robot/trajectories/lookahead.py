@@ -13,25 +13,25 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.trajectories.limits import outside
-from armsight.robot.trajectories.path import TURN_M, Path, PathPoints
+from armsight.robot.trajectories.path import ROTATION_M, Path, PathPoints
 
 if TYPE_CHECKING:
     from armsight.robot.arm import Arm
 
 #: The smallest singular value of the Jacobian, its linear rows divided by the arm's size, below which a pose counts as
-#: singular: joints would turn 200 times as fast as the tool. A wrist is there within about 0.4 degrees.
+#: singular: joints would rotate 200 times as fast as the tool. A wrist is there within about 0.4 degrees.
 SINGULAR = 5e-3
 #: The same where a motion begins to be slow because of it.
 SLOW = 10 * SINGULAR
-#: The walk's steps, m, with turns counted as in :data:`TURN_M`, and the bounds of how many there are.
+#: The walk's steps, m, with rotations counted as in :data:`ROTATION_M`, and the bounds of how many there are.
 STEP_M, STEPS = 1e-3, (100, 5000)
-#: How far a joint may turn from one place of the walk to the next, rad; by more only beside a singularity.
+#: How far a joint may rotate from one point of the walk to the next, rad; by more only beside a singularity.
 FAR_RAD = 0.2
 #: In how many steps a bend is walked at least.
 BEND_STEPS = 50
 #: Halvings of a step that find where a reason begins: to 1e-12 of the way.
 HALVINGS = 30
-#: Newton steps from a place of the walk to one beside it, and what they may leave, m and rad.
+#: Newton steps from a point of the walk to one beside it, and what they may leave, m and rad.
 NEWTON, REFINED = 3, 1e-10
 
 
@@ -61,7 +61,7 @@ class Obstacle(NamedTuple):
     Attributes:
         share: where on the way.
         reason: what it is.
-        clear: how many places of the walk are not yet slowed down by a singularity before it, at least 1.
+        clear: how many points of the walk are not yet slowed down by a singularity before it, at least 1.
     """
 
     share: float
@@ -94,7 +94,7 @@ def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
 
 
 def behind(T_goal: Array, T: Array) -> Array:
-    """Return how far poses (..., 4, 4) are behind others, (..., 6): [m; rad], base axes, for small turns."""
+    """Return how far poses (..., 4, 4) are behind others, (..., 6): [m; rad], base axes, for small rotations."""
     M = T_goal[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
     off = np.empty((*T.shape[:-2], 6))
     off[..., :3] = T_goal[..., :3, 3] - T[..., :3, 3]
@@ -104,17 +104,17 @@ def behind(T_goal: Array, T: Array) -> Array:
     return off
 
 
-def derivatives(arm: Arm, q: Array, places: PathPoints) -> tuple[Array, Array]:
+def derivatives(arm: Arm, q: Array, points: PathPoints) -> tuple[Array, Array]:
     """Return q', q'' (N, 6) by the share of the way at joint angles (N, 6)."""
     J = arm.jacobian(q)
-    q1 = np.asarray(np.linalg.solve(J, places.twist[..., None])[..., 0], np.float64)
-    turning = np.array([arm.jacobian_rate(a, b) @ b for a, b in zip(q, q1, strict=True)])
-    return q1, np.asarray(np.linalg.solve(J, (places.bend - turning)[..., None])[..., 0], np.float64)
+    q1 = np.asarray(np.linalg.solve(J, points.twist[..., None])[..., 0], np.float64)
+    rate = np.array([arm.jacobian_rate(a, b) @ b for a, b in zip(q, q1, strict=True)])
+    return q1, np.asarray(np.linalg.solve(J, (points.bend - rate)[..., None])[..., 0], np.float64)
 
 
 def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
     """Return the smallest singular value (N,) and the sign of the determinant (N,) at joint angles (N, 6)."""
-    # What the tool's point and its turning have in common: the arm's size.
+    # The linear rows are divided by the arm's size, m, so that they compare with the angular ones.
     J: Array = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1, 1, 1])[:, None]
     return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), np.asarray(np.sign(np.linalg.det(J)))
 
@@ -132,26 +132,26 @@ def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obst
         The walk up to the first obstacle, and that; None where there is none.
     """
     share = _steps(path, bends)
-    places = path.at(share)
-    q, reason = _chain(arm, places, q_start)
+    points = path.at(share)
+    q, reason = _chain(arm, points, q_start)
     smallest, sign = singular_values(arm, q)
     bad = (smallest < SINGULAR) | (sign != sign[0]) | np.array([outside(arm, row) is not None for row in q])
     bad[1:] |= (np.abs(np.diff(q, axis=0)) > FAR_RAD).any(axis=1)
     good = int(np.argmax(bad)) if bad.any() else len(q)
     obstacle = None
     if good < len(share):
-        # An arm that stretches out becomes singular just before it cannot reach: then the reach is what is in the way.
-        stretched = reason is not None and bool((smallest[good:] < 4 * SINGULAR).all())
-        last = max((len(q) if stretched else good) - 1, 0)
+        # An arm that extends fully becomes singular just before it cannot reach: then the reach is what is in the way.
+        extended = reason is not None and bool((smallest[good:] < 4 * SINGULAR).all())
+        last = max((len(q) if extended else good) - 1, 0)
         low, high = share[last], share[min(last + 1, len(share) - 1)]
-        obstacle = _obstacle(arm, path, (low, high), q[last], None if stretched else sign[0])
+        obstacle = _obstacle(arm, path, (low, high), q[last], None if extended else sign[0])
         if good == 0:
             obstacle = Obstacle(0.0, _problem(arm, q[0], sign[0]) or obstacle.reason)
         slow = smallest[:good] < SLOW
         obstacle = obstacle._replace(clear=max(1, int(np.argmax(slow)) if slow.any() else good))
     if good == 0:
         return Walk(share[:0], q[:0], q[:0], q[:0]), obstacle
-    kept = PathPoints(*(part[:good] for part in places))
+    kept = PathPoints(*(part[:good] for part in points))
     q1, q2 = derivatives(arm, q[:good], kept)
     return Walk(share[:good], q[:good], q1, q2), obstacle
 
@@ -159,17 +159,19 @@ def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obst
 def _steps(path: Path, bends: Array) -> Array:
     """Return (K,) shares in steps of about :data:`STEP_M`, each bend in :data:`BEND_STEPS` at least."""
     coarse = path.at(np.linspace(0, 1, 65)).twist
-    length = np.maximum(np.linalg.norm(coarse[:, :3], axis=1), TURN_M * np.linalg.norm(coarse[:, 3:], axis=1)).mean()
+    length = np.maximum(
+        np.linalg.norm(coarse[:, :3], axis=1), ROTATION_M * np.linalg.norm(coarse[:, 3:], axis=1)
+    ).mean()
     even = np.linspace(0, 1, int(np.clip(length / STEP_M, *STEPS)) + 1)
     return np.unique(
         np.concatenate([even, *(np.linspace(begin, end, BEND_STEPS + 1) for begin, end in bends.tolist())])
     )
 
 
-def _chain(arm: Arm, places: PathPoints, q_start: Array) -> tuple[Array, str | None]:
-    """Return joint angles (K, 6) from place to place, and why they end where the reach does; they end at a limit too."""
+def _chain(arm: Arm, points: PathPoints, q_start: Array) -> tuple[Array, str | None]:
+    """Return joint angles (K, 6) from point to point, and why they end where the reach does; they end at a limit too."""
     chain = [q_start]
-    for T in places.T_base_tool[1:]:
+    for T in points.T_base_tool[1:]:
         q = _solve(arm, T, chain[-1])
         if isinstance(q, str):
             return np.array(chain), q
@@ -199,13 +201,13 @@ def _problem(arm: Arm, q: Array, sign: float) -> str | None:
     idle = np.abs(np.linalg.svd(arm.jacobian(q))[2][-1])
     joints = [str(i + 1) for i in np.nonzero(idle > 0.1 * idle.max())[0]]
     named = " and ".join([", ".join(joints[:-1]), joints[-1]] if len(joints) > 1 else joints)
-    return f"a singularity: joints {named} can turn with hardly any motion of the tool"
+    return f"a singularity: joints {named} can rotate with hardly any motion of the tool"
 
 
 def _obstacle(arm: Arm, path: Path, between: tuple[float, float], q_good: Array, sign: float | None) -> Obstacle:
     """Find where between two shares, of which the first is good, a reason begins; without a sign only the reach is one."""
     low, high = between
-    reason = f"close to a singularity: a joint would turn by {np.degrees(FAR_RAD):.0f} deg within a step of the path"
+    reason = f"close to a singularity: a joint would rotate by {np.degrees(FAR_RAD):.0f} deg within a step of the path"
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         q = _solve(arm, path.at(np.array([middle])).T_base_tool[0], q_good)

@@ -1,4 +1,4 @@
-"""Paths of the tool in space: where it is and how it turns as the share of the way goes from 0 to 1, without time.
+"""Paths of the tool in space: position and orientation as the share of the way goes from 0 to 1, without time.
 
 Every path here is twice continuously differentiable, so that a jerk-limited share of the way gives joint accelerations
 without steps.
@@ -15,9 +15,9 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 
-#: A turn of one radian counts as this length, m, where a way is measured that turns as well as travels: about what a
-#: tool's tip sweeps.
-TURN_M = 0.25
+#: A rotation of one radian counts as this length, m, where the length of a way with rotation and translation is measured:
+#: about what a tool's tip sweeps.
+ROTATION_M = 0.25
 #: How far from orthonormal a pose handed in may be.
 POSE_TOLERANCE = 1e-6
 
@@ -63,8 +63,8 @@ def checked_pose(T: object, name: str) -> Array:
 def way(T_a: Array, T_b: Array) -> tuple[Array, Array, float]:
     """Return what lies between two poses: (3,) m in base axes, (3,) rad in the tool's, and the length of both, m.
 
-    The turn is the shorter one; of two half turns either.
+    The rotation is the shorter one; of two half revolutions either.
     """
     step = T_b[:3, 3] - T_a[:3, 3]
-    turn = log_so3(np.ascontiguousarray(T_a[:3, :3].T @ T_b[:3, :3]))
-    return step, turn, float(max(np.linalg.norm(step), TURN_M * np.linalg.norm(turn)))
+    rotation = log_so3(np.ascontiguousarray(T_a[:3, :3].T @ T_b[:3, :3]))
+    return step, rotation, float(max(np.linalg.norm(step), ROTATION_M * np.linalg.norm(rotation)))

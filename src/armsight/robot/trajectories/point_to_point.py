@@ -36,7 +36,7 @@ def point_to_point(
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
-        MotionRejected: a moving start carries a joint through its limit before it can turn round.
+        MotionRejected: a moving start carries a joint through its limit before it can reverse.
         InputError: a state outside the limits, or a duration that cannot be met.
     """
     start = start_state(arm, q_start, qd_start, qdd_start)

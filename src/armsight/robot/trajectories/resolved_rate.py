@@ -1,10 +1,9 @@
-"""Resolved-rate tracking: the tool's wanted velocity turned into joint speeds through the Jacobian, step by step.
+"""Resolved-rate tracking: the tool's reference velocity becomes joint speeds through the Jacobian, step by step.
 
 qd = J# (V_ref + K e), e being how far the tool is behind its reference (Whitney, "Resolved motion rate control of
-manipulators and human prostheses", 1969), the chapter's trajectory tracking. J# is the inverse, damped where the smallest
-singular value is small (Nakamura and Hanafusa, 1986; here with a damping that sets in smoothly): the tool then leaves the
-path a little instead of the joints turning without bound, so this tracker passes singularities at which exact motions are
-refused.
+manipulators and human prostheses", 1969). J# is the inverse, damped where the smallest singular value is small (Nakamura
+and Hanafusa, 1986; here with a damping that sets in smoothly): the tool then leaves the path a little, and the joint speeds
+stay bounded, so this tracker passes singularities at which exact motions are rejected.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class TrackedMotion:
     Attributes:
         duration_s: how long the motion takes, the settling at its end included, s.
         deviation_m: the furthest the tool is from its reference at any step, m.
-        deviation_rad: the furthest it is turned from it, rad.
+        deviation_rad: the furthest its orientation is from the reference's, rad.
         least_singular: the smallest singular value met; damping sets in below :data:`SOFT`.
         least_singular_t_s: when, s.
         spline: the joints over time.
@@ -125,10 +124,10 @@ def resolved_rate(
             f"{np.degrees(gap_rad):.3f} deg away"
         )
     share = _share_state(arm, start, path)
-    wanted_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
+    reference_s = duration_s if duration_s is not None else _first_guess_s(arm, start.q, path)
     tried: list[tuple[float, float]] = []
     while True:
-        law = _law(share, wanted_s, duration_s)
+        law = _law(share, reference_s, duration_s)
         run = _track(arm, start.q, path, law)
         motion = _motion(run, start.qd)
         # At the spline's own instants, 1 kHz or a little more: between them the jerk is constant.
@@ -137,9 +136,9 @@ def resolved_rate(
             _check(arm, path, law, run, tolerance_m)
             return motion
         if duration_s is not None or len(tried) == ROUNDS:
-            raise _refused(path, law, most.what, most.t_s)
-        tried.append((wanted_s, most.ratio))
-        wanted_s *= _slower(tried, most)
+            raise _rejection(path, law, most.what, most.t_s)
+        tried.append((reference_s, most.ratio))
+        reference_s *= _slower(tried, most)
 
 
 def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
@@ -148,7 +147,7 @@ def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
     Away from singularities all goes with a power of the duration. Close to them the damping keeps its own time, and the
     power is taken from the last two tries.
     """
-    factor = most.stretch
+    factor = most.time_scale
     if len(tried) > 1:
         (s_a, ratio_a), (s_b, ratio_b) = tried[-2:]
         power = np.log(ratio_a / ratio_b) / np.log(s_b / s_a)
@@ -156,14 +155,14 @@ def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
     return float(min(factor, 4.0)) * 1.01
 
 
-def _law(start: Joints, wanted_s: float, duration_s: float | None) -> Profile:
-    """Return the share of the way over time: in ``wanted_s``, or from a moving start in about that.
+def _law(start: Joints, reference_s: float, duration_s: float | None) -> Profile:
+    """Return the share of the way over time: in ``reference_s``, or from a moving start in about that.
 
     Raises:
         InputError: a moving start cannot stop at the end of the path so gently.
     """
-    speed, acceleration, jerk = (np.array([limit / wanted_s**order]) for order, limit in enumerate(SHAPE, start=1))
-    exact_s = duration_s if start.qd.any() else wanted_s
+    speed, acceleration, jerk = (np.array([limit / reference_s**order]) for order, limit in enumerate(SHAPE, start=1))
+    exact_s = duration_s if start.qd.any() else reference_s
     law = plan_profile(start, np.ones(1), speed, acceleration, jerk, exact_s)
     low, high = law.extrema(0)
     if low < -ROUNDING or high > 1 + ROUNDING:
@@ -215,24 +214,24 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
     most = steps + int(SETTLE_S * CHECK_RATE_HZ)
     dt = law.duration_s / steps
     moved = law.at(np.arange(2 * most + 1) * dt / 2)
-    places = path.at(moved.q[:, 0])
-    V_ref, scale = places.twist * moved.qd, _scale(arm)
+    points = path.at(moved.q[:, 0])
+    V_ref, scale = points.twist * moved.qd, _scale(arm)
     rows: list[tuple[Array, Array, float]] = []
     q = q_start
     for k in range(most):
-        qd, off, least = _step(arm, q, places, V_ref, 2 * k, scale)
+        qd, off, least = _step(arm, q, points, V_ref, 2 * k, scale)
         rows.append((q, off, least))
         if k >= steps and (np.abs(qd) < SETTLED * arm.qd_max).all():
             break
-        q = q + dt * _step(arm, q + dt / 2 * qd, places, V_ref, 2 * k + 1, scale)[0]
+        q = q + dt * _step(arm, q + dt / 2 * qd, points, V_ref, 2 * k + 1, scale)[0]
     qs, offs, leasts = (np.array(part) for part in zip(*rows, strict=True))
     off_m, off_rad = (np.asarray(np.linalg.norm(part, axis=1)) for part in (offs[:, :3], offs[:, 3:]))
     return _Run(np.linspace(0, (len(qs) - 1) * dt, len(qs)), qs, off_m, off_rad, leasts)
 
 
-def _step(arm: Arm, q: Array, places: PathPoints, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
-    """Return the joint speeds (6,) wanted now, how far the tool is behind (6,), and the smallest singular value."""
-    off = behind(places.T_base_tool[row], arm.forward(q))
+def _step(arm: Arm, q: Array, points: PathPoints, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
+    """Return the joint speeds (6,) commanded now, how far the tool is behind (6,), and the smallest singular value."""
+    off = behind(points.T_base_tool[row], arm.forward(q))
     qd, least = _speeds(arm.jacobian(q), V_ref[row] + GAIN * off, scale)
     return qd, off, least
 
@@ -252,22 +251,22 @@ def _motion(run: _Run, qd_start: Array) -> TrackedMotion:
 
 
 def _check(arm: Arm, path: Path, law: Profile, run: _Run, tolerance_m: float) -> None:
-    """Refuse a run that leaves the joint limits or the path."""
+    """Reject a run that leaves the joint limits or the path."""
     beyond = np.maximum(arm.q_min - run.q, run.q - arm.q_max).max(axis=1) > ROUNDING
     if beyond.any():
         row = int(np.argmax(beyond))
-        raise _refused(path, law, str(outside(arm, run.q[row])), float(run.t_s[row]))
+        raise _rejection(path, law, str(outside(arm, run.q[row])), float(run.t_s[row]))
     off = run.off_m > tolerance_m
     if off.any():
         reason = (
             f"near a singularity the tool would leave the path, by {1e3 * run.off_m.max():.3f} mm in the end where "
             f"{1e3 * tolerance_m:.3f} mm are allowed"
         )
-        raise _refused(path, law, reason, float(run.t_s[int(np.argmax(off))]))
+        raise _rejection(path, law, reason, float(run.t_s[int(np.argmax(off))]))
 
 
-def _refused(path: Path, law: Profile, reason: str, t_s: float) -> MotionRejected:
-    """Return the refusal of a tracked motion at a time."""
+def _rejection(path: Path, law: Profile, reason: str, t_s: float) -> MotionRejected:
+    """Return the rejection of a tracked motion at a time, s."""
     share = float(law.at(t_s).q[0])
     p_base = path.at(np.array([share])).T_base_tool[0, :3, 3]
     return MotionRejected(reason, share=share, t_s=t_s, p_base=p_base)

@@ -1,9 +1,9 @@
 """The contract of a trajectory: joint angles over time, known and checked before the first step is taken.
 
-A member of this family is a function ``(arm, q_start, ...) -> Trajectory``. It looks at the whole motion first, at 1 kHz,
-and raises :class:`MotionRejected` with the place and the time where an arm's limit would be passed, so that what it returns
-can be run as it is. To write a new one: return a frozen object with ``duration_s`` and ``at``, hand it to
-:func:`armsight.robot.trajectories.limits.check_limits`, and add it to the registry in ``__init__``.
+A member of this family is a function ``(arm, q_start, ...) -> Trajectory``. It checks the whole motion first, at 1 kHz,
+and raises :class:`MotionRejected` with the position and the time where a limit of the arm would be passed, so that the
+trajectory that it returns can be run as it is. To write a new one: return a frozen object with ``duration_s`` and ``at``,
+hand it to :func:`armsight.robot.trajectories.limits.check_limits`, and add it to the registry in ``__init__``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Near a corner the motion before it fades out while the one after it fades in: with the way s measured from the corner and
 a blend that reaches r to both sides, position = corner + a f(s) + b g(s) and orientation = corner exp(alpha f) exp(beta g),
-a, alpha and b, beta being what the lines before and after travel and turn in a unit of way. g' rises from 0 to 1 as the
+a, alpha and b, beta being what the lines before and after travel and rotate in a unit of way. g' rises from 0 to 1 as the
 cubic step 3x^2 - 2x^3 and f' = 1 - g', so that speed and acceleration join the lines without a step. The tool passes a
 corner at 3/16 r |b - a|: 0.27 r at a right angle.
 """
@@ -32,7 +32,7 @@ class BlendedPath(Record):
 
     Attributes:
         Ts_base_corner: (C, 4, 4) poses of the corners, without start and goal.
-        rates: (C + 1, 6) what each line travels and turns in a unit of its way: [m/m base axes; rad/m tool's axes].
+        rates: (C + 1, 6) what each line travels and rotates in a unit of its way: [m/m base axes; rad/m tool's axes].
         corners_m: (C,) where the corners lie on the way, m.
         blends_m: (C,) how far each blend reaches to both sides, m.
         length_m: the whole way.
@@ -56,7 +56,7 @@ class BlendedPath(Record):
         T[:, :3, 3] += before[:, :3] * f + after[:, :3] * g
         faded = exp_so3(after[:, 3:] * g)
         T[:, :3, :3] = corner[:, :3, :3] @ exp_so3(before[:, 3:] * f) @ faded
-        # The turn before, seen in the axes that the turn after has already turned.
+        # The rotation before, seen in the axes that the rotation after has already rotated.
         alpha = (np.swapaxes(faded, -1, -2) @ before[:, 3:, None])[..., 0]
         omega = alpha * f1 + after[:, 3:] * g1
         omega1 = alpha * f2 + after[:, 3:] * g2 - (skew(after[:, 3:] * g1) @ alpha[..., None])[..., 0] * f1
@@ -91,7 +91,7 @@ def waypoints(
         q_start: (6,) angles to start from, rad; their configuration is kept.
         Ts_base_way: (M, 4, 4) poses of the tool, M >= 2; all but the last are passed at a distance (see the module).
         blend_m: how far before a way-point its blend begins, m; shortened to half the lines beside it. On lines that
-            mostly turn, a radian counts as 0.25 m.
+            mostly rotate, a radian counts as 0.25 m.
         qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the first line. None for rest.
         qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
@@ -133,7 +133,7 @@ def blended(Ts_base_tool: Array, blend_m: float) -> BlendedPath:
     lengths = np.array([length for _, _, length in ways])
     return BlendedPath(
         Ts_base_tool[1:-1],
-        np.array([np.concatenate([step, turn]) / length for step, turn, length in ways]),
+        np.array([np.concatenate([step, rotation]) / length for step, rotation, length in ways]),
         np.cumsum(lengths)[:-1],
         np.minimum(blend_m, np.minimum(lengths[:-1], lengths[1:]) / 2),
         float(lengths.sum()),

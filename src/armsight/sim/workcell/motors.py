@@ -23,7 +23,7 @@ from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, store
-from armsight.robot.kinematics.trig import sincos
+from armsight.robot.kinematics.chain import sincos
 
 GRAVITY_M_S2 = 9.81
 #: Radii of the links, share of the arm's whole length; of a joint's housing, share of its link's; density, kg/m^3.

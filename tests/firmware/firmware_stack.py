@@ -1,7 +1,7 @@
-"""How much stack the firmware needs: what gcc says of each function, added up along the deepest chain of calls.
+"""How much stack the firmware needs: what gcc reports for each function, summed along the deepest chain of calls.
 
 gcc's ``-fcallgraph-info=su`` gives each function's frame and whom it calls once everything is inlined. A call through a
-pointer may reach any function of the board's struct literal. Recursion would have no bound and is refused.
+pointer may reach any function of the board's struct literal. Recursion would have no bound and is rejected.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class StackUse:
 
     @property
     def total_bytes(self) -> int:
-        """The tick at the main loop's deepest place."""
+        """The tick at the main loop's deepest point."""
         return self.main.stack_bytes + INTERRUPT_BYTES + self.tick.stack_bytes
 
 
