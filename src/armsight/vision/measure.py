@@ -1,4 +1,4 @@
-"""One shot to where the body is: detect, match, triangulate, locate.
+"""Measure a body's pose from one shot: detect, match, triangulate, locate.
 
 from armsight import StereoRig, measure, open_source, open_target
 rig, target = StereoRig.load("rig.json"), open_target("chessboard:9x6:25mm")
@@ -16,13 +16,12 @@ from armsight.vision.discs.locate import locate_composite
 from armsight.vision.image import grey
 from armsight.vision.locate import locate
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import Composite
 from armsight.vision.match import gate, join, match
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 
-#: Fewest common points on which exchanged cameras can be told from bad detections.
-_TELLING_POINTS = 4
+#: Fewest common points with which exchanged cameras are distinguishable from bad detections.
+_POINTS_MIN = 4
 
 
 def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed:
@@ -30,7 +29,7 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
 
     Args:
         rig: the calibrated pair.
-        target: what to look for.
+        target: the body to find.
         shot: two simultaneous images.
 
     Returns:
@@ -43,18 +42,18 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
         if (problem := size_problem(camera.image_size_px, image, side)) is not None:
             return Missed(problem)
     left, right = (grey(image) for image in images)
-    found, flips = (target.detect(left), target.detect(right)), getattr(target, "flips", ())
-    if isinstance(target, Composite) and target.discs is not None:
+    found = target.detect(left), target.detect(right)
+    if target.discs is not None:
         discs = target.discs.find(left), target.discs.find(right)
-        return locate_composite(rig, target.body, target.discs, found, discs, flips=flips)
+        return locate_composite(rig, target.body, target.discs, found, discs, symmetries=target.symmetries)
     problems = [f"{side}: {d.problem}" for side, d in zip(SIDES, found, strict=True) if d.problem is not None]
     if problems:
         return Missed("; ".join(problems))
-    return measure_detections(rig, target.body, *found, flips=flips)
+    return measure_detections(rig, target.body, *found, symmetries=target.symmetries)
 
 
 def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:
-    """Say that an image is not of the size a camera was calibrated at, or None."""
+    """Return a message where an image does not have the size that a camera was calibrated at, or None."""
     got = (image.shape[1], image.shape[0])
     if got == tuple(size_px):
         return None
@@ -65,10 +64,10 @@ def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | Non
 
 
 def measure_detections(
-    rig: StereoRig, body: Body, left: Detections, right: Detections, *, flips: tuple[np.ndarray, ...] = ()
+    rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[np.ndarray, ...] = ()
 ) -> PoseEstimate | Missed:
     """Measure a body from what each camera detected; ``flips`` as in :func:`~armsight.vision.match.match`."""
-    seen = match(rig, body, left, right, flips=flips)
+    seen = match(rig, body, left, right, symmetries=symmetries)
     result = locate(rig, body, triangulate(rig, body, seen))
     if isinstance(result, Missed) and _exchanged(rig, body, left, right):
         return Missed(f"left and right are exchanged: the images fit the rig the other way round ({result.reason})")
@@ -78,19 +77,19 @@ def measure_detections(
 def _exchanged(rig: StereoRig, body: Body, left: Detections, right: Detections) -> bool:
     """Whether the detections fit the rig only with the cameras exchanged."""
     common = join(left, right)
-    if common.paired.sum() < _TELLING_POINTS:
+    if common.paired.sum() < _POINTS_MIN:
         return False
-    swapped = triangulate(rig, body, gate(rig, body, join(right, left)))
-    return len(swapped.ids) > 0.8 * int(common.paired.sum())
+    exchanged = triangulate(rig, body, gate(rig, body, join(right, left)))
+    return len(exchanged.ids) > 0.8 * int(common.paired.sum())
 
 
 def measure_seen(rig: StereoRig, body: Body, shot: SeenShot) -> PoseEstimate | Missed:
-    """Measure a body from detections of a file; where a name stands twice, the body with most detections is taken."""
+    """Measure a body from detections of a file; where a name occurs twice, use the body with most detections."""
     seen = plain(shot)
     if seen is None:
         bodies = instances(body.points, rig.cameras, rig.T_left_right, shot, candidates(body.points, rig.cameras, shot))
         if not bodies:
-            return Missed("markers stand twice in one image, and no pose of the body agrees with them")
+            return Missed("markers occur twice in one image, and no pose of the body agrees with them")
         seen = bodies[0][1]
     return _located(rig, body, seen)
 

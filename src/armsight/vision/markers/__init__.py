@@ -1,1 +1,12 @@
-"""Marker families: a grey image goes in, the places of a body's points come out. The contract is in ``marker.py``."""
+"""Marker families: a grey image goes in, the detected points of a body come out, raw pixels with their covariance.
+
+The contract is :class:`~armsight.vision.markers.marker.Target` in ``marker.py``; ``targets.py`` opens a target by its
+spec or its file.
+
+- Calibration boards: ``board.py`` (contract and registry), ``spec.py`` (parser), ``chessboard.py``, ``charuco.py``,
+  ``circles.py``, ``aprilgrid.py``, and ``grid.py`` for what regular grids share.
+- Bodies: ``body_file.py`` (file formats and checks), ``body_layout.py`` (markers by kind), ``tag.py``,
+  ``board_marker.py``, ``disc/`` (plain discs).
+- Sub-pixel fits: ``corner.py`` with its kernels in ``crossing.py``; ``square.py`` for tags found by ``aruco.py``;
+  ``normal.py`` for the edge profile and the normal equations that they share.
+"""

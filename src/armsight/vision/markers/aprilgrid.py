@@ -2,8 +2,8 @@
 
 As Kalibr prints and counts them: family 36h11 with a dark border of two cells, tags numbered row by row from the lower
 left, a small dark square where four tags meet. Points are all tags' corners, row by row from the lower left; x runs
-along the columns to the right, y up, z out of the board. Every tag says who it is, so no order is ambiguous and part of
-the board will do.
+along the columns to the right, y up, z out of the board. Every tag carries its number, so no order is ambiguous and a
+part of the board is enough.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.aruco import cells, family_size, find_squares
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
-from armsight.vision.markers.square import SquareFit, place_square
+from armsight.vision.markers.square import SquareFit, fit_square
 
 FAMILY = "tag36h11"
 #: Widths of the dark border, cells, in the order they are tried: Kalibr's own, then that of single AprilTags.
@@ -26,7 +27,7 @@ BORDERS = (2, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class AprilGrid(Record):
+class AprilGrid(Record, Target):
     """A grid of AprilTags.
 
     Attributes:
@@ -42,7 +43,6 @@ class AprilGrid(Record):
     spacing: float
 
     form = "aprilgrid:COLUMNSxROWS:TAG:SPACING (tags; gap as a share of the tag), such as aprilgrid:6x6:88mm:0.3"
-    flips: tuple[Ids, ...] = ()
 
     @staticmethod
     def from_fields(fields: Fields) -> AprilGrid:
@@ -73,34 +73,34 @@ class AprilGrid(Record):
             if found:
                 break
         identities = [identity for identity, _ in found]
-        placed: dict[int, SquareFit] = {}
+        fitted: dict[int, SquareFit] = {}
         for identity, corners in found:
             if identities.count(identity) == 1:
-                self._place(image, identity, corners, border, placed)
-        for identity, corners in self._overlooked(placed, image.shape):
-            self._place(image, identity, corners, border, placed)
-        if not placed:
+                self._fit(image, identity, corners, border, fitted)
+        for identity, corners in self._missed(fitted, image.shape):
+            self._fit(image, identity, corners, border, fitted)
+        if not fitted:
             return Detections.none(f"no tag of {self.body.name} found")
-        ids = np.concatenate([self._corner_ids(identity) for identity in placed])
+        ids = np.concatenate([self._corner_ids(identity) for identity in fitted])
         order = np.argsort(ids)
-        uv, cov = (np.concatenate([getattr(fit, key) for fit in placed.values()])[order] for key in ("uv", "cov_uv"))
+        uv, cov = (np.concatenate([getattr(fit, key) for fit in fitted.values()])[order] for key in ("uv", "cov_uv"))
         return Detections(ids[order], uv, cov)
 
-    def _place(
-        self, image: NDArray[np.uint8], identity: int, corners: Array, border: int, placed: dict[int, SquareFit]
+    def _fit(
+        self, image: NDArray[np.uint8], identity: int, corners: Array, border: int, fitted: dict[int, SquareFit]
     ) -> None:
-        """Fit one tag and add it to those placed if it is good."""
-        fit = place_square(image, corners, cells(FAMILY, identity, border), diagonal=-1)
+        """Fit one tag and add it to ``fitted`` if the fit is good."""
+        fit = fit_square(image, corners, cells(FAMILY, identity, border), diagonal=-1)
         if fit.problem is None:
-            placed[identity] = fit
+            fitted[identity] = fit
 
-    def _overlooked(self, placed: dict[int, SquareFit], shape: tuple[int, ...]) -> list[tuple[int, Array]]:
-        """Say where tags must be that were not found, if they are in the image: dark squares that touch hide outlines."""
-        missing = [identity for identity in range(self.columns * self.rows) if identity not in placed]
-        if not placed or not missing:
+    def _missed(self, fitted: dict[int, SquareFit], shape: tuple[int, ...]) -> list[tuple[int, Array]]:
+        """Predict the corners of tags in the image that were not found: touching dark squares hide outlines."""
+        missing = [identity for identity in range(self.columns * self.rows) if identity not in fitted]
+        if not fitted or not missing:
             return []
-        seen = np.concatenate([self.body.points[self._corner_ids(identity), :2] for identity in placed])
-        H, _ = cv2.findHomography(seen, np.concatenate([fit.uv for fit in placed.values()]))
+        seen = np.concatenate([self.body.points[self._corner_ids(identity), :2] for identity in fitted])
+        H, _ = cv2.findHomography(seen, np.concatenate([fit.uv for fit in fitted.values()]))
         if H is None:
             return []
         out = []

@@ -1,8 +1,8 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
-AprilTag families carry their own names (``tag36h11``) and then read upright as the AprilTag project draws them; OpenCV's
-names (``DICT_APRILTAG_36h11``, ``DICT_4X4_50``) read upright as OpenCV draws them. The same AprilTag is upside down in
-the two, which is why the name says whose upright is meant.
+AprilTag families carry their own names (``tag36h11``) and are then upright as the AprilTag project prints them; markers
+of OpenCV's names (``DICT_APRILTAG_36h11``, ``DICT_4X4_50``) are upright as OpenCV prints them. The two conventions
+print the same AprilTag upside down to each other, so the name of the family states which one is used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIDE_MIN_PX = 10.0
 
 
 def family_name(text: str) -> str:
-    """Return the family a user means: any case, with or without OpenCV's ``DICT_``.
+    """Return the family that a text names: any case, with or without OpenCV's ``DICT_``.
 
     Raises:
         InputError: unknown; the message lists the known ones.
@@ -68,7 +68,8 @@ def _detector(family: str, perimeter_share: float, border: int) -> cv2.aruco.Aru
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = perimeter_share
     parameters.perspectiveRemovePixelPerCell = 8  # small markers are read from more samples a cell than by default
-    # A marker on a card of its own has the card's outline close around it; OpenCV would keep only the larger of the two.
+    # A marker on a card of its own has the card's outline close around it; OpenCV would keep only the larger of the
+    # two.
     parameters.minMarkerDistanceRate = 0.01
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     parameters.markerBorderBits = border
@@ -110,7 +111,7 @@ def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
 
 
 def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list[tuple[int, Array]]:
-    """Find the markers of a family, upright as its name has it.
+    """Find the markers of a family, upright by the convention of the family's name.
 
     Args:
         image: (H, W) grey image.
@@ -121,10 +122,10 @@ def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list
         Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
         left of the upright marker.
     """
-    turn = 2 if family in APRILTAGS else 0
+    rot90 = 2 if family in APRILTAGS else 0
     corners, identities = detect_markers(image, family, border)
     return [
-        (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -turn, axis=0))
+        (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -rot90, axis=0))
         for identity, found in zip(identities[:, 0], corners, strict=True)
     ]
 

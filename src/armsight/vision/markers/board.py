@@ -1,6 +1,6 @@
 """Calibration boards by their spec, such as ``chessboard:9x6:25mm``.
 
-To add a kind of board: one file with a class that fulfils :class:`Board`, and one line in BOARDS.
+To add a kind of board: write one file with a class that fulfils :class:`CalibrationBoard`, and add one line to BOARDS.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from armsight.data import Ids
 from armsight.errors import InputError
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.charuco import Charuco
@@ -18,21 +17,15 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
 
-class Board(Target, Protocol):
-    """A flat target whose points lie in z = 0, the first at the origin, x along the columns."""
+class CalibrationBoard(Target, Protocol):
+    """A flat target whose points lie in z = 0, the first at the origin, x along the columns; m, board frame.
 
-    @property
-    def flips(self) -> tuple[Ids, ...]:
-        """Permutations (M,) under which the board looks the same, without identity: point i may as well be perm[i].
-
-        ``perm[ids]`` renames detections; empty for a board that shows which way up it is. One image cannot tell; left
-        and right of a pair together can.
-        """
-        ...
+    ``symmetries`` is empty for a board that shows which way up it is.
+    """
 
 
 #: Kind -> (form, maker).
-BOARDS: dict[str, tuple[str, Callable[[Fields], Board]]] = {
+BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {
     "chessboard": (Chessboard.form, Chessboard.from_fields),
     "charuco": (Charuco.form, Charuco.from_fields),
     "circles": (CircleGrid.form, CircleGrid.from_fields),
@@ -41,7 +34,7 @@ BOARDS: dict[str, tuple[str, Callable[[Fields], Board]]] = {
 }
 
 
-def open_board(spec: str) -> Board:
+def open_board(spec: str) -> CalibrationBoard:
     """Make the board that a spec names.
 
     Args:

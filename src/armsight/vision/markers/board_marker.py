@@ -1,8 +1,8 @@
 """Boards as markers of a body: ``board = { spec = "chessboard:9x6:25mm" }``.
 
-A marker's place is the board's first point, and its frame is turned as every marker's: x along the columns, y down, z into
-the face. (Kalibr's boards have y up and z out of themselves: they are turned over.) Points are named after the marker and
-their name on the board: ``B.0``, ``B.1``, ...
+A marker's position is that of the board's first point, and its frame is oriented as every marker's: x along the
+columns, y down, z into the face. (Kalibr's boards have y up and z out of the face: they are rotated by 180 degrees
+about x.) Points are named after the marker and their name on the board: ``B.0``, ``B.1``, ...
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
 from armsight.vision.markers.aprilgrid import FAMILY, AprilGrid
 from armsight.vision.markers.aruco import APRILTAGS, family_name
-from armsight.vision.markers.board import Board, open_board
+from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import Marker
 from armsight.vision.markers.charuco import Charuco
+from armsight.vision.markers.marker import Target
 
-#: From a frame whose y runs up and whose z points out of the face to the marker's.
-_TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
+#: T_marker_board of a board whose y axis runs up and whose z axis points out of the face.
+_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +39,13 @@ class MountedBoard(Record):
     """
 
     name: str
-    board: Board
+    board: CalibrationBoard
     T_body_board: Array
     normal: Array
 
 
 @dataclass(frozen=True, eq=False)
-class BoardTarget(Record):
+class BoardTarget(Record, Target):
     """A body found by its boards.
 
     Attributes:
@@ -60,17 +61,17 @@ class BoardTarget(Record):
         """Build the target from a body file's markers of kind ``board``.
 
         Raises:
-            InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is turned, or two
-                boards of one body that may be taken for one another.
+            InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is rotated, or
+                two boards of one body that may be taken for one another.
         """
         boards: list[MountedBoard] = []
         for marker in markers:
             marker.check_keys("board", required=("spec",))
             board = open_board(marker.converted("spec", _checked))
-            if board.flips:
+            if board.symmetries:
                 raise marker.error(
-                    f"{board.body.name} looks the same when it is turned, so its corners cannot be named on a body: take "
-                    "a chessboard whose columns + rows is odd, such as 9x6, a charuco board or an aprilgrid"
+                    f"{board.body.name} looks the same when it is rotated, so its corners cannot be identified on a body: "
+                    "use a chessboard whose columns + rows is odd, such as 9x6, a charuco board or an aprilgrid"
                 )
             for other in boards:
                 if _alike(board, other.board):
@@ -80,27 +81,27 @@ class BoardTarget(Record):
                     )
             T = marker.pose()
             boards.append(
-                MountedBoard(marker.name, board, T @ _TURNED_OVER if isinstance(board, AprilGrid) else T, -T[:3, 2])
+                MountedBoard(marker.name, board, T @ _ABOUT_X if isinstance(board, AprilGrid) else T, -T[:3, 2])
             )
         return BoardTarget(name, tuple(boards))
 
     @cached_property
     def body(self) -> Body:
         """The points of all boards, board by board."""
-        names = tuple(f"{placed.name}.{name}" for placed in self.boards for name in placed.board.body.point_names)
-        points = [transform(placed.T_body_board, placed.board.body.points) for placed in self.boards]
+        names = tuple(f"{mounted.name}.{name}" for mounted in self.boards for name in mounted.board.body.point_names)
+        points = [transform(mounted.T_body_board, mounted.board.body.points) for mounted in self.boards]
         return Body(self.name, names, np.concatenate(points))
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the boards in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
         first, found, problems = 0, [], []
-        for placed in self.boards:
-            seen = placed.board.detect(image)
+        for mounted in self.boards:
+            seen = mounted.board.detect(image)
             if seen.problem is None:
                 found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv))
             else:
-                problems.append(f"{placed.name}: {seen.problem}")
-            first += len(placed.board.body.point_names)
+                problems.append(f"{mounted.name}: {seen.problem}")
+            first += len(mounted.board.body.point_names)
         if not found:
             return Detections.none("; ".join(problems))
         ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
@@ -114,11 +115,11 @@ def _checked(spec: str) -> str:
 
 
 def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
-    """Refuse a tag that is on a board of the same body too: it would be seen twice, and neither could be told.
+    """Reject a tag that is also on a board of the same body: it would be detected twice, and the two are ambiguous.
 
     Args:
-        tags: entries of kind ``tag``, already found good.
-        boards: entries of kind ``board``, already found good.
+        tags: entries of kind ``tag``, already checked.
+        boards: entries of kind ``board``, already checked.
 
     Raises:
         InputError: such a tag; the message names it and the board.
@@ -129,12 +130,12 @@ def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
             if _dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] < count:
                 raise tag.error(
                     f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids 0 to "
-                    f"{count - 1}: take another id or family"
+                    f"{count - 1}: use another id or family"
                 )
 
 
-def _codes(board: Board) -> tuple[str, int]:
-    """Return the dictionary of a board's tags and how many it has, counted from 0; of none where it has no tags."""
+def _codes(board: CalibrationBoard) -> tuple[str, int]:
+    """Return the dictionary of a board's tags and their number; an empty name and 0 where it has no tags."""
     if isinstance(board, AprilGrid):
         return _dictionary(FAMILY), board.columns * board.rows
     if isinstance(board, Charuco):
@@ -143,11 +144,11 @@ def _codes(board: Board) -> tuple[str, int]:
 
 
 def _dictionary(family: str) -> str:
-    """Return the one name of families that hold the same tags."""
+    """Return the one name of all families that hold the same tags."""
     return APRILTAGS.get(family, family)
 
 
-def _alike(one: Board, other: Board) -> bool:
+def _alike(one: CalibrationBoard, other: CalibrationBoard) -> bool:
     """Whether the finder of one board may find the other: tags of one dictionary, or two of a kind without tags."""
     families = _codes(one)[0], _codes(other)[0]
     return families[0] == families[1] if any(families) else type(one) is type(other)

@@ -1,4 +1,4 @@
-"""What a body file says about looks: discs, tags and boards, and which way each point's face looks."""
+"""The markers of a body by kind: a body file goes in; discs, tags, boards and the normal at each point come out."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 from armsight.data import Array, Body, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
-from armsight.vision.markers.body_check import check_points
-from armsight.vision.markers.body_file import read_body_file
+from armsight.vision.markers.body_file import check_points, read_body_file
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.tag import TagTarget
 
@@ -44,12 +43,12 @@ class Layout(Record):
 
     @cached_property
     def normals(self) -> Array:
-        """(M, 3) unit vectors out of the face of each point; NaN where the file does not say."""
+        """(M, 3) unit vectors out of the face of each point; NaN where the file does not give it."""
         rows = [] if self.discs is None else [self.discs.normals]
         rows += [] if self.tags is None else [np.tile(-tag.T_body_tag[:3, 2], (4, 1)) for tag in self.tags.tags]
         if self.boards is not None:
-            for placed in self.boards.boards:
-                rows.append(np.tile(placed.normal, (len(placed.board.body.points), 1)))
+            for mounted in self.boards.boards:
+                rows.append(np.tile(mounted.normal, (len(mounted.board.body.points), 1)))
         return np.concatenate(rows)
 
     @property
@@ -59,7 +58,7 @@ class Layout(Record):
 
     @property
     def coded(self) -> bool:
-        """Whether a tag or a board says which body this is, and how it is turned."""
+        """Whether a tag or a board identifies the body and its orientation."""
         return self.tags is not None or self.boards is not None
 
 
@@ -67,10 +66,10 @@ def read_layout(path: str | Path) -> Layout:
     """Read a body file.
 
     Raises:
-        InputError: missing, malformed, no TOML body, or a body that is refused everywhere (``body_check``).
+        InputError: missing, malformed, no TOML body, or a body that no command accepts (``check_points``).
     """
     if Path(path).suffix.lower() != ".toml":
-        raise InputError(f"{path}: expected a TOML body file, which says how its markers look (docs/targets.md)")
+        raise InputError(f"{path}: expected a TOML body file, which describes its markers (docs/howto/targets.md)")
     name, markers = read_body_file(path, KINDS)
     of = {kind: [marker for marker in markers if marker.kind == kind] for kind in KINDS}
     layout = Layout(

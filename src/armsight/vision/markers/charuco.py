@@ -2,7 +2,7 @@
 
 As OpenCV prints them, in both layouts it has had. Points are the inner corners of the chessboard, row by row from the
 upper left; x runs along the columns, y down, z into the board. OpenCV finds them through the markers, so no order is
-ambiguous and part of the board will do; :mod:`~armsight.vision.markers.corner` places them.
+ambiguous and a part of the board is enough; :mod:`~armsight.vision.markers.corner` fits them to a fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.data import Array, Body, Detections, Record
 from armsight.errors import InputError
 from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size
 from armsight.vision.markers.chessboard import fit_grid, misfits
 from armsight.vision.markers.grid import completed, grid_points
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
 
 @dataclass(frozen=True, eq=False)
-class Charuco(Record):
+class Charuco(Record, Target):
     """A chessboard with markers in its bright squares.
 
     Attributes:
@@ -42,7 +43,6 @@ class Charuco(Record):
     family: str
 
     form = "charuco:COLUMNSxROWS:SQUARE:MARKER:FAMILY (squares), such as charuco:8x11:15mm:11mm:DICT_5X5_100"
-    flips: tuple[Ids, ...] = ()
 
     @staticmethod
     def from_fields(fields: Fields) -> Charuco:

@@ -1,10 +1,11 @@
 """Chessboards: ``chessboard:9x6:25mm``, inner corners columns x rows and the side of a square.
 
-OpenCV finds the grid, :mod:`~armsight.vision.markers.corner` places its corners. Their order is made canonical in each
-image by itself: right-handed as seen from the front (x along the columns, y along the rows, so z points into the
-board), and starting at the corner whose first square, the one between corners (0, 0) and (1, 1), is dark. Colours
-decide this unless columns + rows is even; what they leave open is in :attr:`Chessboard.flips`, the corner that lies
-most to the upper left in the image comes first, and whoever sees both images settles it.
+OpenCV finds the grid, :mod:`~armsight.vision.markers.corner` fits its corners to a fraction of a pixel. Their order is
+made canonical in each image by itself: right-handed as seen from the front (x along the columns, y along the rows, so z
+points into the board), and starting at the corner whose first square, the one between corners (0, 0) and (1, 1), is
+dark. The colours determine this unless columns + rows is even. The ambiguities that they leave are in
+:attr:`Chessboard.symmetries`; then the corner most to the upper left in the image comes first, and
+:func:`~armsight.vision.match.match` resolves the ambiguity with both images.
 """
 
 from __future__ import annotations
@@ -17,27 +18,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
-from armsight.vision.markers.corner import VERDICTS, CornerFits, crossed, refine_corners
+from armsight.vision.markers.corner import OUTCOMES, CornerFits, crossing_signs, refine_corners
 from armsight.vision.markers.grid import grid_points, local_squares, rotations
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
-#: Above this many pixels a side the grid is looked for in a smaller copy first; corners are placed in the full image.
+#: Above this many pixels a side the grid is looked for in a smaller copy first; corners are fitted in the full image.
 SEARCH_SIDE_PX = 1600
 #: OpenCV's finders raise errors on images smaller than their filters.
 IMAGE_SIDE_MIN_PX = 32
-#: Fewer corners than this share of the board are not taken for the board.
+#: Fewer corners than this share of the board do not count as the board.
 KEPT_SHARE = 0.5
-#: A board is larger than it was said to be if this share of a further row is made of corners too.
+#: A board is larger than its spec if at least this share of a further row consists of corners too.
 MORE_SHARE = 0.7
-#: A residual this many times the median residual of the board's corners, both relative to the contrast, is not of a
-#: clean corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
+#: A residual this many times the median residual of the board's corners, both relative to the contrast, marks a
+#: disturbed corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
 MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
 #: The four outermost lines of a grid (rows, columns), each with the one next to it.
 _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
 
 
 @dataclass(frozen=True, eq=False)
-class Chessboard(Record):
+class Chessboard(Record, Target):
     """A chessboard; its points are the inner corners, row by row.
 
     Attributes:
@@ -66,18 +68,18 @@ class Chessboard(Record):
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     @cached_property
-    def _turns(self) -> tuple[tuple[int, Ids], ...]:
-        """The quarter turns that lay the board on itself, colours aside."""
+    def _rotations(self) -> tuple[tuple[int, Ids], ...]:
+        """The rotations that map the board onto itself, colours ignored: multiple of 90 degrees, and permutation."""
         return rotations(self.body.points)
 
     @cached_property
-    def flips(self) -> tuple[Ids, ...]:
+    def symmetries(self) -> tuple[Ids, ...]:
         """Permutations (M,) under which the board looks the same, without identity: corner i may as well be perm[i]."""
-        return tuple(perm for turns, perm in self._turns if not self._colours_tell(turns))
+        return tuple(perm for rot90, perm in self._rotations if not self._exchanges_colours(rot90))
 
-    def _colours_tell(self, turns: int) -> bool:
-        """Whether a rotation by so many quarter turns exchanges dark and bright."""
-        return (self.columns + self.rows if turns == 2 else self.columns) % 2 == 1
+    def _exchanges_colours(self, rot90: int) -> bool:
+        """Whether a rotation by so many times 90 degrees exchanges dark and bright."""
+        return (self.columns + self.rows if rot90 == 2 else self.columns) % 2 == 1
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
@@ -90,9 +92,9 @@ class Chessboard(Record):
         kept = fits.kept & ~misfits(fits) & (colours == first)
         if kept.sum() < max(4, KEPT_SHARE * kept.size):
             return Detections.none(_why_not(fits, int(kept.sum())))
-        if goes_on(image, fits, kept, first * self._parity, (self.rows, self.columns)):
+        if extends_beyond(image, fits, kept, first * self._parity, (self.rows, self.columns)):
             return Detections.none(
-                f"the chessboard goes on beyond {self.columns}x{self.rows} inner corners: count those where two dark "
+                f"the chessboard extends beyond {self.columns}x{self.rows} inner corners: count those where two dark "
                 "squares touch, columns x rows"
             )
         order = self._canonical_order(fits, first < 0)
@@ -106,10 +108,10 @@ class Chessboard(Record):
         return np.where((x + y) % 2 == 0, 1.0, -1.0).ravel()
 
     def _canonical_order(self, fits: CornerFits, first_is_dark: bool) -> Ids:
-        """Return (M,) the permutation that brings fits into the board's order."""
+        """Return (M,) the permutation that sorts the fits into the board's order."""
         here = np.arange(self.columns * self.rows)
-        orders = [here, *(perm for _, perm in self._turns)]
-        dark = [first_is_dark, *(first_is_dark != self._colours_tell(n) for n, _ in self._turns)]
+        orders = [here, *(perm for _, perm in self._rotations)]
+        dark = [first_is_dark, *(first_is_dark != self._exchanges_colours(n) for n, _ in self._rotations)]
         if any(dark):
             orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
         if len(orders) == 1:
@@ -125,7 +127,8 @@ class Chessboard(Record):
 def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Find the inner corners of a chessboard roughly, (rows, columns, 2), px, right-handed; None where there is none.
 
-    The quadrangle finder takes low contrast and small squares, the saddle-point finder glints, blur and uneven light.
+    The quadrangle finder copes with low contrast and small squares, the saddle-point finder with glints, blur and
+    uneven light.
     """
     if min(image.shape) < IMAGE_SIDE_MIN_PX:
         return None
@@ -146,33 +149,33 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
 
 
 def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> CornerFits:
-    """Fit the corners of a grid, each window shaped by its neighbours: roughly first, then by what that found.
+    """Fit the corners of a grid, each window shaped by its neighbours: a rough fit first, then one that starts from it.
 
     Args:
         image: (H, W) grey image.
-        rough: (rows, columns, 2) rough places, px; NaN where there is none.
-        arm: as :func:`~armsight.vision.markers.corner.refine_corners` takes it.
+        rough: (rows, columns, 2) rough pixel positions; NaN where there is none.
+        arm: as in :func:`~armsight.vision.markers.corner.refine_corners`.
 
     Returns:
-        The fits row by row; one without a rough place is not kept.
+        The fits row by row; one without a rough position is not kept.
     """
-    places = rough.reshape(-1, 2)
-    first = refine_corners(image, places, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
-    uv = np.where(first.kept[:, None], first.uv, places)
+    rough_uv = rough.reshape(-1, 2)
+    first = refine_corners(image, rough_uv, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
+    uv = np.where(first.kept[:, None], first.uv, rough_uv)
     squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv.reshape(rough.shape)))
     return refine_corners(image, uv, squares, bows, arm=arm, like=first)
 
 
-def goes_on(
+def extends_beyond(
     image: NDArray[np.uint8], fits: CornerFits, kept: NDArray[np.bool_], colours: Array, shape: tuple[int, int]
 ) -> bool:
-    """Tell whether another row or column of corners stands where a board should end: it is larger than it was said to be.
+    """Return whether a further row or column of corners follows where the board should end: the board exceeds its spec.
 
     Args:
         image: (H, W) grey image.
         fits: of the board's corners, row by row.
-        kept: (M,) which of them are good.
-        colours: (M,) +1 and -1 by turns: the signs of the corners' contrast.
+        kept: (M,) whether each of them is good.
+        colours: (M,) +1 and -1 alternately: the signs of the corners' contrast.
         shape: (rows, columns).
     """
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
@@ -181,7 +184,7 @@ def goes_on(
     for end, inner in _ENDS:
         beyond, sides, colour = 2 * uv[end] - uv[inner], squares[end], -signs[end]
         least = max(3.0, MORE_SHARE * np.count_nonzero(np.isfinite(beyond[:, 0])))
-        if np.count_nonzero(crossed(image, beyond, sides) == colour) < least:
+        if np.count_nonzero(crossing_signs(image, beyond, sides) == colour) < least:
             continue
         more = refine_corners(image, beyond, sides, rough=True)
         if np.count_nonzero(more.kept & (np.sign(more.contrast) == colour)) >= least:
@@ -190,7 +193,7 @@ def goes_on(
 
 
 def misfits(fits: CornerFits) -> NDArray[np.bool_]:
-    """(N,) whether a corner's residual, relative to its contrast, is far off the others'."""
+    """(N,) whether a corner's residual, relative to its contrast, is far above the others'."""
     relative = fits.residual / np.maximum(np.abs(fits.contrast), 1e-9)
     good = np.sort(relative[fits.kept])
     usual = float(good[len(good) // 2]) if len(good) else 0.0
@@ -198,8 +201,8 @@ def misfits(fits: CornerFits) -> NDArray[np.bool_]:
 
 
 def _why_not(fits: CornerFits, kept: int) -> str:
-    """Say why a grid that was found is not used."""
-    counts = np.bincount(fits.verdict, minlength=len(VERDICTS))
+    """Return the reason why a grid that was found is not used."""
+    counts = np.bincount(fits.outcome, minlength=len(OUTCOMES))
     worst = int(counts[1:].argmax()) + 1
-    reason = f", mostly: {VERDICTS[worst]}" if counts[worst] else ""
+    reason = f", mostly: {OUTCOMES[worst]}" if counts[worst] else ""
     return f"a chessboard was found but only {kept} of {len(fits.uv)} corners fit{reason}"

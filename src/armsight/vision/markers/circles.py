@@ -1,12 +1,12 @@
 """Grids of dark discs on white: ``circles:7x6:20mm`` and, staggered, ``acircles:4x11:20mm``; discs columns x rows, pitch.
 
 As OpenCV's ``findCirclesGrid`` takes them, which finds the discs; the points are the discs' middles, row by row, z = 0.
-In the staggered grid rows lie a pitch apart, discs of a row two pitches, and every other row is moved on by one pitch.
+In the staggered grid rows are one pitch apart, discs of a row two pitches, and every other row is shifted by one pitch.
 
-PathPoints are the centroids of darkness, with the covariance of the image's noise. Mind the perspective: the centroid of a
-tilted disc's image is not the image of its middle. A disc of radius r at distance z, tilted by t, is off by about
-``f r^2 sin(t) cos(t) / z^2`` pixels, some hundredths on a board of many small discs and more on large ones; nothing here
-corrects it. Chessboards have no such error.
+The pixel positions are the centroids of darkness, with the covariance of the image's noise. The centroid of a tilted
+disc's image is not the image of its middle (perspective bias): for a disc of radius r at distance z, tilted by t, it is
+off by about ``f r^2 sin(t) cos(t) / z^2`` pixels, some hundredths on a board of many small discs and more on large
+ones. The bias is not corrected here. Chessboards have no such bias.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.grid import grid_points, local_squares, rotations
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
 #: The window reaches this many radii out; white is read between its two ends.
@@ -28,14 +29,14 @@ _CONTRAST_MIN = 8.0  # grey levels
 
 
 @dataclass(frozen=True, eq=False)
-class CircleGrid(Record):
+class CircleGrid(Record, Target):
     """A grid of discs.
 
     Attributes:
         columns: discs in a row.
         rows: rows.
         pitch_m: distance of the grid's lines, m.
-        staggered: whether every other row is moved on by a pitch.
+        staggered: whether every other row is shifted by a pitch.
     """
 
     columns: int
@@ -69,7 +70,7 @@ class CircleGrid(Record):
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     @cached_property
-    def flips(self) -> tuple[Ids, ...]:
+    def symmetries(self) -> tuple[Ids, ...]:
         """Permutations (M,) under which the board looks the same, without identity: disc i may as well be perm[i]."""
         return tuple(perm for _, perm in rotations(self.body.points))
 
@@ -87,13 +88,13 @@ class CircleGrid(Record):
             uv = _upright(uv)
         squares, _ = local_squares(uv)
         nearest = np.linalg.norm(squares, axis=-1).min(axis=-1).ravel()  # of the next disc, in the row or the next row
-        places = [centroid(image, start, gap) for start, gap in zip(uv.reshape(-1, 2), nearest, strict=True)]
-        kept = np.array([place is not None for place in places])
+        centroids = [centroid(image, start, gap) for start, gap in zip(uv.reshape(-1, 2), nearest, strict=True)]
+        kept = np.array([found_centroid is not None for found_centroid in centroids])
         if kept.sum() < 4:
             return Detections.none(
                 f"{self.body.name} was found but its discs are too faint or too near the image border"
             )
-        good = [place for place in places if place is not None]
+        good = [found_centroid for found_centroid in centroids if found_centroid is not None]
         return Detections(np.flatnonzero(kept), np.array([p for p, _ in good]), np.array([c for _, c in good]))
 
 
@@ -106,7 +107,7 @@ def _upright(uv: Array) -> Array:
 
 
 def centroid(image: NDArray[np.uint8], start: Array, pitch_px: float) -> tuple[Array, Array] | None:
-    """Place one dark disc on white.
+    """Measure the centroid of one dark disc on white.
 
     Args:
         image: (H, W) grey image.
@@ -114,7 +115,8 @@ def centroid(image: NDArray[np.uint8], start: Array, pitch_px: float) -> tuple[A
         pitch_px: distance of the next disc's middle, px.
 
     Returns:
-        (2,) the centroid of darkness and (2, 2) its covariance, px^2; None where the disc is faint or cut by the border.
+        (2,) the centroid of darkness and (2, 2) its covariance, px^2; None where the disc is faint or cut by the
+        border.
     """
     c, radius = start, 0.3 * pitch_px
     for _ in range(3):

@@ -1,7 +1,7 @@
 """Sub-pixel X corners (chessboards, charuco) by a model fit, each with the covariance its own residuals support.
 
-A grey image, rough corners and the shape of the squares around them go in; places and covariances come out. Around a
-corner the image is modelled as the product of two edges under an illumination that varies linearly,
+A grey image, rough corners and the shape of the squares around them go in; pixel positions and covariances come out.
+Around a corner the image is modelled as the product of two edges under an illumination that varies linearly,
 
     I(x) = (1 + k . d) (a + b M),   M = E1(u1) E2(u2) + C(u1, u2),   d = x - c,   u_i = n_i . (d - h_i t_i^2).
 
@@ -14,7 +14,8 @@ finds c, the edges' angles, s, a, b and k; the covariance of c is that of the li
 residuals at the edges show. An X corner has a point symmetry that gamma, bleeding print, blur and sharpening keep, so
 none of them moves it.
 
-The window about an X corner: which pixels a fit sees, and the moments of those that lie on plain squares.
+First the window about a corner: which pixels a fit uses, and the moments of those on plain squares. Then the fit of
+every corner of an image; its kernels are in ``crossing.py``.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ from armsight.vision.markers.crossing import (
     fit_crossing,
     rough_noise,
 )
-from armsight.vision.markers.normal import LANES
+from armsight.vision.markers.normal import SIMD_WIDTH
 
-#: How far the window reaches along each square's side, as a share of the side, and at most in px. The next corners
-#: stay out of it with their blur.
+#: How far the window extends along each square's side, as a share of the side, and at most in px. The next corners stay
+#: outside with their blur.
 WINDOW_SHARE, WINDOW_MAX_PX = 0.42, 12.0
 #: Where squares carry a print, this much more room is left beside it, px, for its blur.
 ARM_GAP_PX = 1.5
@@ -67,17 +68,17 @@ def gather(
 
     Args:
         image: (H, W) grey image.
-        c: (2,) the corner; places are counted from the whole pixel next to it.
+        c: (2,) the corner; pixel positions are relative to the nearest whole pixel.
         square: (2, 2) the sides of the square at it, px.
         bow: (2, 2) how the edges bow, 1/px.
-        arm: as ``refine_corners`` takes it.
-        most: how far the window reaches along the sides at most, px.
-        near: (2,) how far from each edge a pixel is near it, px.
+        arm: as in ``refine_corners``.
+        most: how far the window extends along the sides at most, px.
+        near: (2,) distance from each edge below which a pixel counts as near it, px.
         w: (WORK,) receives x, y and grey of the pixels near the edges.
         flat: (2, MOMENTS) receives the moments of those of plain squares.
 
     Returns:
-        How many pixels are near.
+        The number of pixels near the edges.
     """
     height, width = image.shape
     s1, s2 = np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1])
@@ -108,7 +109,7 @@ def gather(
             u, v = u0 + ux * x, v0 + vx * x
             grey: Any = np.int64(row[x0 + x])
             if abs(v) < near_v or abs(u) < near_u:
-                if n < ROOM - LANES and (abs(u) <= arm1 or abs(v) <= arm2):
+                if n < ROOM - SIMD_WIDTH and (abs(u) <= arm1 or abs(v) <= arm2):
                     w[n], w[Y + n], w[GREY + n] = x, y, grey
                     n += 1
             elif abs(u) <= arm1 or abs(v) <= arm2:
@@ -140,7 +141,7 @@ def _add_row(m: Array, y: int, n: int, x: int, xx: int, i: int, ix: int, ii: int
 
 @numba.njit(cache=True, error_model="numpy")
 def thin(n: int, w: Work, flat: Array) -> int:
-    """Leave a share of the pixels; return how many."""
+    """Keep a share of the pixels; return their number."""
     step = max(1, n // PIXELS_FIRST)
     few = (n + step - 1) // step
     for i in range(few):
@@ -151,45 +152,45 @@ def thin(n: int, w: Work, flat: Array) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def fill_up(n: int, w: Work) -> None:
-    """Repeat the last pixel to the end of a vector."""
-    for i in range(n, n + LANES):
+    """Repeat the last pixel to the end of a SIMD vector."""
+    for i in range(n, n + SIMD_WIDTH):
         w[i], w[Y + i], w[GREY + i] = w[n - 1], w[Y + n - 1], w[GREY + n - 1]
 
 
 @numba.njit(cache=True, error_model="numpy")
 def reach_px(square: Array) -> float:
-    """Return how far the window reaches along the shorter side of a square, px."""
+    """Return how far the window extends along the shorter side of a square, px."""
     shorter = min(np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1]))
     return float(min(WINDOW_SHARE * shorter, WINDOW_MAX_PX))
 
 
-#: How far the window of a first fit reaches at most, px.
+#: How far the window of a first fit extends at most, px.
 WINDOW_ROUGH_PX = 8.0
-#: The blur that the first fit of an image starts with, and that no window is drawn for less than.
+#: The blur that the first fit of an image starts with, and the least for which a window is sized.
 START_BLUR_PX = 1.0
-#: Pixels further from an edge than so many sigmas of its blur, and these px, are of plain squares. The error left is
-#: 5e-4 of the contrast at the most; a rough place asks for more room.
+#: Pixels further from an edge than so many sigmas of its blur, plus these px, are on plain squares. The remaining error
+#: is 5e-4 of the contrast at the most; a rough position needs more room.
 NEAR_SIGMAS, NEAR_PX, NEAR_ROUGH_PX = 3.5, 0.25, 0.75
 #: A fit ends with the step that lowers the sum of squares by less than this share of one pixel's noise, a first one by
 #: less than this; or that moves the edges and their blur by less than this share of the blur.
 STOP, STOP_ROUGH = 0.05, 20.0
 SLIGHT, SLIGHT_ROUGH = 0.1, 0.3
-#: Fewer pixels near the edges than this tell no corner.
+#: Fewer pixels near the edges than this do not determine a corner.
 _FEWEST = 16
-#: A window whose opposite quadrants differ by less, grey levels, shows nothing.
+#: A window whose opposite quadrants differ by less, grey levels, shows no corner.
 PLAIN = 1.0
-#: A start further off than this leaves the window off centre; it is drawn again about the corner.
+#: A start further off than this leaves the window off centre; the window is gathered again about the corner.
 RECENTRE_PX = 0.5
-#: A fit that ends further from its start has found something else: share of the shorter side, and px.
+#: A fit that ends further from its start is not of this corner: share of the shorter side, and px.
 MOVED_SHARE, MOVED_MAX_PX = 0.25, 3.0
 #: Fewest grey levels between a corner's dark and bright squares.
 CONTRAST_MIN = 8.0
 #: Largest residual as a share of the contrast (half the step). Camera noise of 10 grey levels on a contrast of 50
-#: gives 0.4; half a window of wrong colour gives 0.9.
+#: gives 0.4; half a window of the wrong colour gives 0.9.
 MISFIT_MAX = 0.45
 
-#: Why a corner was not kept; the index is the code in :attr:`CornerFits.verdict`.
-VERDICTS = (
+#: Why a corner was not kept; the index is the code in :attr:`CornerFits.outcome`.
+OUTCOMES = (
     "kept",
     "too near the image border",
     "no convergence",
@@ -202,41 +203,42 @@ _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 
 @dataclass(frozen=True, eq=False)
 class CornerFits(Record):
-    """What became of each corner.
+    """The fit of each corner.
 
     Attributes:
-        models: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k (2).
+        models: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k
+            (2).
         cov_uv: (N, 2, 2) covariance from each fit's own residuals, px^2.
         residual: (N,) standard deviation of the residuals at the edges, grey levels.
-        verdict: (N,) index into VERDICTS; 0 is kept.
+        outcome: (N,) index into OUTCOMES; 0 is kept.
     """
 
     models: Array
     cov_uv: Array
     residual: Array
-    verdict: Ids
+    outcome: Ids
 
     @property
     def uv(self) -> Array:
-        """(N, 2) refined places, raw pixels; meaningless where the verdict is not 0."""
+        """(N, 2) refined corners, raw pixels; meaningless where the outcome is not 0."""
         return self.models[:, :2]
 
     @property
     def contrast(self) -> Array:
         """(N,) signed half step between the squares, grey levels.
 
-        The sign tells the colours: positive where the square between the first and the second side is bright.
+        The sign gives the colours: positive where the square between the first and the second side is bright.
         """
         return self.models[:, 7]
 
     @property
     def kept(self) -> NDArray[np.bool_]:
         """(N,) whether a corner's fit is good."""
-        return np.asarray(self.verdict == _KEPT)
+        return np.asarray(self.outcome == _KEPT)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _place(
+def _fit_one(
     image: NDArray[np.uint8],
     start: Array,
     square: Array,
@@ -249,16 +251,16 @@ def _place(
     q: Array,
     L: Array,
 ) -> int:
-    """Fit one corner, from q where that is known, else with a blur to begin with; q, w and L are left at the solution.
+    """Fit one corner, from q where that is known, else from a given blur; q, w and L are left at the solution.
 
-    Return how many pixels near the edges were fitted, or minus a verdict.
+    Return the number of pixels near the edges that were fitted, or minus the outcome.
     """
     if not np.isfinite(start[0] + start[1] + square.sum()):
         return -_BORDER
     sides, centre, near, flat = np.empty((2, 2)), np.empty(2), np.empty(2), np.empty((2, MOMENTS))
     for j in range(2):
         sides[j] = square[j] / np.hypot(square[j, 0], square[j, 1])
-    if not known:  # a share of the pixels finds the corner faster, and all of them place it
+    if not known:  # a share of the pixels finds the corner faster; all of them refine it
         near[:] = NEAR_SIGMAS * np.sqrt(START_BLUR_PX**2 + 1.0 / 12.0) + NEAR_ROUGH_PX
         n = gather(image, start, square, bow, arm, WINDOW_ROUGH_PX, near, w, flat)
         if n < _FEWEST or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
@@ -302,57 +304,57 @@ def _refine(
     models: Array,
     cov: Array,
     residual: Array,
-    verdict: Ids,
+    outcome: Ids,
 ) -> None:
     """Fit every corner; models (N, PARAMETERS) holds the starts of those that are known, and receives the solutions."""
     w, L, blur = np.zeros(WORK, np.float32), np.zeros((PARAMETERS, PARAMETERS)), START_BLUR_PX
     for i in range(uv0.shape[0]):
         q = models[i]
-        n = _place(image, uv0[i], squares[i], bows[i], arm, rough, known[i], blur, w, q, L)
+        n = _fit_one(image, uv0[i], squares[i], bows[i], arm, rough, known[i], blur, w, q, L)
         if n < 0:
-            verdict[i] = -n
+            outcome[i] = -n
             continue
         residual[i] = np.sqrt(rough_noise(n, w) if rough else edge_noise(n, w, L, cov[i]))
         reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
-            verdict[i] = _MOVED
+            outcome[i] = _MOVED
         elif not abs(q[7]) >= 0.5 * CONTRAST_MIN:
-            verdict[i] = _FAINT
+            outcome[i] = _FAINT
         elif residual[i] > MISFIT_MAX * abs(q[7]) or np.sqrt(max(q[4], q[5])) > reach:
-            verdict[i] = _MISFIT
+            outcome[i] = _MISFIT
         else:
-            verdict[i] = _KEPT
+            outcome[i] = _KEPT
             blur = np.sqrt(0.5 * (q[4] + q[5]))  # the next one's is about the same
 
 
 def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image as all kernels get it: contiguous and read-only, so that they are compiled once."""
+    """Return an image in the form that all kernels expect: contiguous and read-only, so that they are compiled once."""
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False
     return pixels
 
 
-def crossed(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
-    """Tell where squares of two colours may cross, at a glance.
+def crossing_signs(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
+    """Find where squares of two colours may meet crosswise, by a quick test.
 
     Args:
         image: (H, W) grey image.
-        uv: (N, 2) places, raw pixels, right to a quarter of a square.
-        squares: (N, 2, 2) the two sides of the square at each place, px.
+        uv: (N, 2) raw pixels, right to a quarter of a square.
+        squares: (N, 2, 2) the two sides of the square at each position, px.
 
     Returns:
         (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
         both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
     """
     out = np.zeros(len(uv))
-    _glance(_pixels(image), uv, squares, out)
+    _quick_signs(_pixels(image), uv, squares, out)
     return out
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _glance(image: NDArray[np.uint8], uv: Array, squares: Array, out: Array) -> None:
-    """Fill what :func:`crossed` returns, out (N,) being zero."""
+def _quick_signs(image: NDArray[np.uint8], uv: Array, squares: Array, out: Array) -> None:
+    """Fill what :func:`crossing_signs` returns, out (N,) being zero."""
     means = np.empty((2, 2))
     for n in range(len(uv)):
         inside = np.isfinite(uv[n].sum() + squares[n].sum())
@@ -388,13 +390,13 @@ def refine_corners(
         squares: (N, 2, 2) the two sides of the square at each corner, px: along the columns, along the rows.
         bows: (N, 2, 2) how each of the two edges bows, 1/px: a point t px along it lies ``t^2 * bow`` off its tangent;
             straight by default.
-        arm: how far from the edges the squares are plain, as a share of a side; what lies further from both edges is
-            not looked at. The squares of a charuco board are plain only along their sides.
+        arm: how far from the edges the squares are plain, as a share of a side; pixels further from both edges are
+            ignored. The squares of a charuco board are plain only along their sides.
         rough: fit a share of the pixels only, in half the time; good to some hundredths of a pixel, without covariance.
-        like: earlier fits of the same corners at uv; those it kept are where the fits start, in half the time.
+        like: earlier fits of the same corners at uv; the fits start from those it kept, in half the time.
 
     Returns:
-        The fits, in the order given.
+        The fits, in the order of uv.
     """
     n = len(uv)
     uv, squares = np.ascontiguousarray(uv, dtype=np.float64), np.ascontiguousarray(squares, dtype=np.float64)
@@ -404,6 +406,6 @@ def refine_corners(
         models[:, :2] = uv
     else:
         known, models = like.kept, np.array(like.models)
-    cov, residual, verdict = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
-    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, residual, verdict)
-    return CornerFits(models, cov, residual, verdict)
+    cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
+    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, residual, outcome)
+    return CornerFits(models, cov, residual, outcome)

@@ -1,10 +1,9 @@
-"""The compiled image model of two crossing edges and its fit; what it means is told in ``corner.py``.
+"""The compiled image model of two crossing edges and its fit; the model is defined in ``corner.py``.
 
 Pixels near an edge are evaluated one by one, in single precision and without branches so that they fill the processor's
-vectors: grey levels have eight bits, single precision has 24. Pixels further off lie on a plain square, M is 1 or -1
-there, and what they say about the light is in their moments: they cost nothing however many they are.
-
-What the fit of a corner leaves: the noise at its edges, and the covariance of its place.
+vectors (SIMD): grey levels have eight bits, single precision has 24. Pixels further off lie on a plain square, M is 1
+or -1 there, and all their information about the light is in their moments: they cost nothing however many they are.
+Last come the noise at the edges, from the residuals, and the covariance of the corner's position.
 """
 
 from __future__ import annotations
@@ -14,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.normal import LANES, decay_single, edge_single, factor, products, solve
+from armsight.vision.markers.normal import SIMD_WIDTH, decay_single, edge_single, factor, products, solve
 
 Work = NDArray[np.float32]
 
 PARAMETERS = 10  # c (2), edge angles (2), squared blurs (2), a, b, k (2)
-#: Length of a row of the work space: the most pixels a window has near its edges, and some to fill the last vector.
+#: Length of a row of the work space: the most pixels a window has near its edges, and some to fill the last SIMD
+#: vector.
 ROOM = 1424
 #: Rows of the work space: x, y, grey, the derivatives by the parameters, the residual, one to fill the last tile.
 Y, GREY, JACOBIAN, RESIDUAL = ROOM, 2 * ROOM, 3 * ROOM, (3 + PARAMETERS) * ROOM
@@ -29,11 +29,11 @@ MOMENTS = 10
 _STEPS = 25
 _LAMBDA = 1e-3
 _BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
-#: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It decides
-#: only what the pixels leave open: the blur of an edge that falls between two pixels.
+#: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It acts
+#: only on what the pixels do not determine: the blur of an edge that falls between two pixels.
 _BLUR2_PRIOR = (0.25, 0.25)
 
-#: How far from the corner a turn of an edge moves it, px.
+#: Lever arm by which the rotation of an edge is converted to a shift, px.
 _ARM_PX = 10.0
 
 _f = np.float32
@@ -106,7 +106,7 @@ def rows(w: Work) -> Work:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _add_plain(flat: Array, x0: float, y0: float, q: Array, H: Array) -> None:
-    """Add to H what the plain squares say: there the image is linear in x and y, and moments are all it takes."""
+    """Add the plain squares to H: there the image is linear in x and y, so moments are sufficient."""
     cx, cy, kx, ky, B = q[0] - x0, q[1] - y0, q[8], q[9], np.zeros((PARAMETERS, 3))
     light = 1.0 - kx * cx - ky * cy  # where x and y are zero
     for k in range(2):
@@ -136,7 +136,7 @@ def _assemble(
     n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, H: Array
 ) -> float:
     """Fill the normal equations at q: H (12, 12), lower half, row 10 the gradient; return the cost."""
-    full = (n + LANES - 1) // LANES * LANES
+    full = (n + SIMD_WIDTH - 1) // SIMD_WIDTH * SIMD_WIDTH
     evaluate(full, w, x0, y0, q, sides, bow)
     for i in range(PARAMETERS + 1):
         for m in range(JACOBIAN + i * ROOM + n, JACOBIAN + i * ROOM + full):
@@ -162,9 +162,9 @@ def first_guess(
     """Set the parameters from the squares' shape and the mean grey of opposite quadrants."""
     q[:] = 0.0
     q[0], q[1], q[4], q[5] = c[0], c[1], blur * blur, blur * blur
-    turn = 1.0 if square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0] > 0 else -1.0
-    q[2] = np.arctan2(turn * square[0, 0], -turn * square[0, 1])  # the normal of side 0 points to side 1
-    q[3] = np.arctan2(-turn * square[1, 0], turn * square[1, 1])  # and the other way round
+    hand = 1.0 if square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0] > 0 else -1.0
+    q[2] = np.arctan2(hand * square[0, 0], -hand * square[0, 1])  # the normal of side 0 points to side 1
+    q[3] = np.arctan2(-hand * square[1, 0], hand * square[1, 1])  # and the other way round
     n1x, n1y, n2x, n2y = np.cos(q[2]), np.sin(q[2]), np.cos(q[3]), np.sin(q[3])
     cx, cy = c[0] - x0, c[1] - y0
     count, total, signed = flat[0, 0] + flat[1, 0] + n, flat[0, 6] + flat[1, 6], flat[0, 6] - flat[1, 6]
@@ -177,7 +177,7 @@ def first_guess(
 
 @numba.njit(cache=True, error_model="numpy")
 def _slight(x: Array, q: Array, share: float) -> bool:
-    """Whether a step x from q moves and blurs the edges by so little that residuals follow it linearly."""
+    """Whether a step x from q moves and blurs the edges so little that the residuals change linearly."""
     blur2 = min(q[4], q[5]) + 1.0 / 12.0
     moved = abs(x[0]) + abs(x[1]) + _ARM_PX * max(abs(x[2]), abs(x[3]))
     return bool(moved < share * np.sqrt(blur2) and max(abs(x[4]), abs(x[5])) < share * blur2)
@@ -185,7 +185,7 @@ def _slight(x: Array, q: Array, share: float) -> bool:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def _carry(n: int, w: Work, x: Array) -> None:
-    """Take the residuals along a step x, linearly."""
+    """Update the residuals for a step x, linearly."""
     left = w[RESIDUAL : RESIDUAL + n]
     for i in range(PARAMETERS):
         share, o = _f(x[i]), JACOBIAN + i * ROOM
@@ -202,18 +202,18 @@ def fit_crossing(
     """Minimise from q by Levenberg-Marquardt; the work space and L are left at the solution. False if it does not settle.
 
     Args:
-        n: how many pixels there are near the edges.
+        n: number of pixels near the edges.
         w: (WORK,) work space; x, y from x0, y0 and grey of those pixels in its first rows.
         flat: (2, MOMENTS) moments of the pixels of plain squares, those where M is 1 and where it is -1.
-        x0: where x is counted from, px.
-        y0: where y is counted from, px.
+        x0: origin of x, px.
+        y0: origin of y, px.
         q: (PARAMETERS,) start, and solution.
         sides: (2, 2) unit vectors along the edges.
-        bow: (2, 2) how each edge bows, 1/px.
-        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information, as ``normal.factor`` fills it.
+        bow: (2, 2) the bow of each edge, 1/px.
+        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information, from ``normal.factor``.
         stop: a step is the last when it lowers the cost by less than this share of one pixel's noise,
-        slight: or when it moves the edges and their blur by less than this share of the blur: the next would be that share
-            of it.
+        slight: or when it moves the edges and their blur by less than this share of the blur: the next would be that
+            share of it.
     """
     H, T = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.empty((PARAMETERS + 2, PARAMETERS + 2))
     x, trial = np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -252,7 +252,7 @@ def fit_crossing(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def rough_noise(n: int, w: Work) -> float:
-    """Return the variance of what a fit leaves of the n pixels near the edges."""
+    """Return the variance of the residuals of the n pixels near the edges."""
     r, power = w[RESIDUAL : RESIDUAL + n], np.float32(0.0)
     for m in range(n):
         power += r[m] * r[m]
@@ -261,10 +261,10 @@ def rough_noise(n: int, w: Work) -> float:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
-    """Return the variance of the noise and fill cov (2, 2), the covariance of the place; derivatives are used up.
+    """Return the variance of the noise and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 
-    The noise is that of the pixels that tell the place, as in ``normal.edge_noise``. Leverage is the squared length of
-    L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
+    The noise is that of the pixels that determine the corner, as in ``normal.edge_noise``. Leverage is the squared
+    length of L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
     """
     H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
     for j in range(PARAMETERS):
@@ -274,13 +274,13 @@ def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
             for m in range(j, i):
                 s -= L[i, m] * inverse[m, j]
             inverse[i, j] = s * L[i, i]
-    n = (n + LANES - 1) // LANES * LANES  # derivatives and residuals are zero to the end of a vector
+    n = (n + SIMD_WIDTH - 1) // SIMD_WIDTH * SIMD_WIDTH  # derivatives and residuals are zero to the end of a vector
     jx, jy, root = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[:n]
     weight = np.float32(0.0)
     for m in range(n):
         v = jx[m] * jx[m] + jy[m] * jy[m]
         weight += v
-        root[m] = np.sqrt(v)  # where the columns were: the pixels have done their work
+        root[m] = np.sqrt(v)  # overwrites the columns, which are no longer needed
     for i in range(PARAMETERS + 1):
         o = JACOBIAN + i * ROOM
         row = w[o : o + n]

@@ -1,4 +1,4 @@
-"""Grids of points on a plane: where they sit, which rotations leave them in place, and the local shape of their image."""
+"""Grids of points on a plane: their positions, their rotational symmetries, and the local shape of their image."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ def grid_points(columns: int, rows: int, pitch_m: float) -> Array:
 
 
 def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
-    """Find the quarter turns in the plane that lay a set of points (M, 3) on itself.
+    """Find the rotations by 90, 180 and 270 degrees in the plane that map a set of points (M, 3) onto itself.
 
     Returns:
-        Pairs of how many quarter turns (1, 2, 3) and the permutation (M,): point i comes to lie where point perm[i] was.
+        Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
+        was.
     """
     p = points[:, :2] - 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
     tree = KDTree(p)
     tolerance = 0.1 * float(np.asarray(tree.query(p, k=2)[0])[:, 1].min())
-    found, turned = [], p
-    for turns in (1, 2, 3):
-        turned = turned @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-        distance, nearest = tree.query(turned)
+    found, rotated = [], p
+    for rot90 in (1, 2, 3):
+        rotated = rotated @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+        distance, nearest = tree.query(rotated)
         if np.max(distance) < tolerance:
-            found.append((turns, np.asarray(nearest, dtype=np.int64)))
+            found.append((rot90, np.asarray(nearest, dtype=np.int64)))
     return tuple(found)
 
 
 def local_squares(uv: Array) -> tuple[Array, Array]:
-    """Read the shape of the squares around each point of a seen grid from its neighbours.
+    """Estimate the shape of the squares around each point of a detected grid from its neighbours.
 
     Args:
-        uv: (rows, columns, 2) places, px; NaN where a point is not known.
+        uv: (rows, columns, 2) pixel positions; NaN where a point is not known.
 
     Returns:
         (rows, columns, 2, 2) the vectors to the next column and to the next row, as long as the shorter of the two
@@ -55,7 +56,7 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
 
 @numba.njit(cache=True, error_model="numpy")
 def _read_squares(uv: Array, squares: Array, bows: Array) -> bool:
-    """Fill what :func:`local_squares` returns; tell whether a known point has a side without a neighbour, NaN."""
+    """Fill what :func:`local_squares` returns; return whether a known point has a side without a neighbour, NaN."""
     rows, columns = uv.shape[:2]
     missing = False
     bow = np.empty((2, rows, columns, 2))
@@ -133,12 +134,12 @@ def _homography(uv: Array) -> Array | None:
 
 def _homography_squares(uv: Array, where: NDArray[np.bool_]) -> Array:
     """Return (n, 2, 2) the square's sides at the points ``where`` by the homography that fits all known points."""
-    wanted = np.argwhere(where)
+    requested = np.argwhere(where)
     H = _homography(uv)
     if H is None:
-        return np.full((len(wanted), 2, 2), np.nan)
-    p = np.column_stack([wanted[:, 1], wanted[:, 0], np.ones(len(wanted))]) @ H.T
-    out = np.empty((len(wanted), 2, 2))
+        return np.full((len(requested), 2, 2), np.nan)
+    p = np.column_stack([requested[:, 1], requested[:, 0], np.ones(len(requested))]) @ H.T
+    out = np.empty((len(requested), 2, 2))
     for side in range(2):
         out[:, side] = (H[:2, side] - (p[:, :2] / p[:, 2:]) * H[2, side]) / p[:, 2:]
     return out

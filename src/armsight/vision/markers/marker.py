@@ -1,4 +1,4 @@
-"""The contract of a marker family: an image goes in, the places of a body's points come out.
+"""The contract of a marker family: an image goes in, the pixel positions of a body's points come out.
 
 To add a family: write one file with a class that fulfils :class:`Target`, and add one line to the registry in
 ``targets.py``. The laws in tests/vision/markers are parametrised over that registry, so the new member inherits them.
@@ -8,25 +8,43 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from armsight.data import Body, Detections, Image
+from armsight.data import Body, Detections, Ids, Image
+from armsight.vision.markers.disc.target import DiscTarget
 
 
 class Target(Protocol):
-    """A rigid body that can be found in an image."""
+    """A rigid body that can be found in an image.
+
+    Derive from this class to inherit the two defaults: no symmetries, no discs.
+    """
 
     @property
     def body(self) -> Body:
-        """The points that can be found and where they sit on the body, m."""
+        """The points that can be found and their positions, m, body frame."""
         ...
 
+    @property
+    def symmetries(self) -> tuple[Ids, ...]:
+        """Permutations (M,) of the points under which the body looks the same, without identity: i may be perm[i].
+
+        ``perm[ids]`` renames detections. One image cannot resolve the ambiguity; the left and the right image of a pair
+        together can.
+        """
+        return ()
+
+    @property
+    def discs(self) -> DiscTarget | None:
+        """Its plain discs, which carry no code and whose points come last in ``body``; None where it has none."""
+        return None
+
     def detect(self, image: Image) -> Detections:
-        """Find the body in one grey image.
+        """Find the coded points of the body in one grey image; discs are identified by both cameras together.
 
         Args:
             image: (H, W) uint8.
 
         Returns:
             The points found: rows of ``body.points``, raw pixels ((0, 0) is the centre of the top-left pixel), and the
-            covariance the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
+            covariance that the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
         """
         ...

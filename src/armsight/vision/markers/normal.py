@@ -1,10 +1,11 @@
-"""Normal equations of small least-squares fits, compiled: assemble, factor, solve, invert.
+"""Compiled parts of the model fits of corners, tags and discs: the profile of an edge, and small normal equations.
 
-The profile of a straight step from dark to bright as a blurred lens and square pixels show it.
+The profile is that of a straight step from dark to bright, seen through a blurred lens and square pixels. Gaussian blur
+and the pixel's width are both integrated exactly: across an edge a pixel is a box as wide as the longer of its two
+shadows, and the shorter one adds to the blur. There are two versions: from tables, and in single precision without
+tables or branches, so that a loop over pixels fills the processor's vectors (SIMD).
 
-Compiled pieces for the model fits of corners and tags. Gaussian blur and the pixel's width are both integrated exactly:
-across an edge a pixel is a box as wide as the longer of its two shadows, and the shorter one joins the blur. Twice:
-from tables, and in single precision without tables or branches, so that a loop over pixels fills the processor's vectors.
+The normal equations of a least-squares fit are assembled, Cholesky-factored, solved and inverted.
 """
 
 from __future__ import annotations
@@ -89,15 +90,15 @@ def edge_single(
 
 Floats = NDArray[np.float32]
 
-#: Pixels are worked on by so many at once: what is summed by :func:`products` is filled up to a multiple of it with zeros.
-LANES = 32
+#: Pixels are processed in blocks of this many: the input of :func:`products` is padded to a multiple of it with zeros.
+SIMD_WIDTH = 32
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def products(n: int, rows: Floats, sums: Array) -> None:
     """Fill the lower half of sums (12, 12) with the products of each two of the rows (12, N), summed over n pixels.
 
-    Two rows by four at a time: eight sums under way keep the processor busy, one alone waits for itself.
+    Two rows by four at a time: eight independent sums keep the processor busy; a single one stalls on its own result.
     """
     for i in range(0, 12, 2):
         a0, a1 = rows[i, :n], rows[i + 1, :n]
@@ -137,7 +138,7 @@ def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
 def factor(A: Array, damping: float, L: Array) -> bool:
     """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite.
 
-    Divisions are dear: L's diagonal is filled with its own inverse.
+    Divisions are slow, so L's diagonal receives its own inverse.
     """
     for i in range(len(L)):
         for j in range(i):
@@ -156,7 +157,7 @@ def factor(A: Array, damping: float, L: Array) -> bool:
 
 @numba.njit(cache=True, error_model="numpy")
 def solve(L: Array, g: Array, x: Array) -> None:
-    """Solve L L^T x = g with the factor that :func:`factor` fills."""
+    """Solve L L^T x = g with the factor from :func:`factor`."""
     for i in range(len(L)):
         s = g[i]
         for m in range(i):
@@ -171,7 +172,7 @@ def solve(L: Array, g: Array, x: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def invert(L: Array, inverse: Array) -> None:
-    """Fill the inverse of L L^T, L as :func:`factor` fills it."""
+    """Fill the inverse of L L^T, L from :func:`factor`."""
     unit, x = np.zeros(len(L)), np.empty(len(L))
     for i in range(len(L)):
         unit[:] = 0.0
@@ -182,11 +183,11 @@ def invert(L: Array, inverse: Array) -> None:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def edge_noise(n: int, J: Array, r: Array, inverse: Array, first: int, second: int) -> float:
-    """Estimate the variance of the noise from residuals r (n,) where it matters to two parameters, those of place.
+    """Estimate the variance of the noise from the residuals r (n,) of the pixels that determine two parameters (position).
 
-    The mean squared residual, each divided by what the fit leaves of it (1 - leverage) and weighted by how much its
-    pixel says about the two parameters: flat areas, saturated ones above all, must not speak for the edges. No image is
-    known better than its quantisation.
+    The mean squared residual, each divided by 1 - leverage and weighted by its pixel's information about the two
+    parameters: flat areas, saturated ones above all, must not count for the edges. No image is known better than its
+    quantisation.
     """
     leverage = np.zeros(n)
     for i in range(len(J)):

@@ -1,4 +1,4 @@
-"""Reading board specs such as ``chessboard:9x6:25mm``: counts and lengths with units, and what to say when they are not."""
+"""Parse board specs such as ``chessboard:9x6:25mm``: counts, lengths with units, messages for malformed ones."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Fields:
 
     Attributes:
         spec: the whole spec, for messages.
-        form: the form it must have, up to the first space, then words for messages.
-        values: what stands between the colons after the kind.
+        form: the form it must have, up to the first space, then an explanation for messages.
+        values: the texts between the colons after the kind.
     """
 
     spec: str

@@ -2,7 +2,7 @@
 
 A marker's own frame has its origin in the middle, x to the right and y down as one looks at it upright, and z into it.
 Its corners are named ``NAME.0`` to ``NAME.3``: upper left, upper right, lower right, lower left. OpenCV finds the
-markers, :mod:`~armsight.vision.markers.square` places them.
+markers, :mod:`~armsight.vision.markers.square` fits their corners to a fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
 from armsight.vision.markers.aruco import cells, family_name, family_size, find_squares
 from armsight.vision.markers.body_file import Marker
-from armsight.vision.markers.square import place_square
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.square import fit_square
 
 #: A marker's corners in its own frame, in halves of its side.
 CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -45,7 +46,7 @@ class Tag(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class TagTarget(Record):
+class TagTarget(Record, Target):
     """A body found by its square markers.
 
     Attributes:
@@ -85,7 +86,7 @@ class TagTarget(Record):
         return Body(self.name, names, np.concatenate(points))
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
-        """Find the body in one grey image; a marker that is seen twice is left out, for one of the two is not ours."""
+        """Find the body in one grey image; a marker that is detected twice is left out: one of them is foreign."""
         ids, uv, cov, problems = [], [], [], []
         for family in sorted({tag.family for tag in self.tags}):
             found = find_squares(image, family)
@@ -97,7 +98,7 @@ class TagTarget(Record):
                 if seen[tag.identity] > 1:
                     problems.append(f"{tag.name} is seen {seen[tag.identity]} times")
                     continue
-                fit = place_square(image, corners[tag.identity], cells(family, tag.identity))
+                fit = fit_square(image, corners[tag.identity], cells(family, tag.identity))
                 if fit.problem is not None:
                     problems.append(f"{tag.name}: {fit.problem}")
                     continue

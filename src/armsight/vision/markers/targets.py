@@ -1,4 +1,4 @@
-"""What a user names, a board's spec or a body's file, becomes a Target to detect or a Body to measure against."""
+"""Open targets: a board's spec or a body file goes in, a Target to detect or a Body to measure against comes out."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board import BOARDS, open_board
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
-from armsight.vision.markers.body_check import check_points
-from armsight.vision.markers.body_file import Marker, load_body_csv, read_body_file
+from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
 
-#: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name. Discs carry
-#: no code, so one image does not name them: they are a kind of their own, :data:`DISC`.
+#: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name. Discs
+#: carry no code, so one image cannot identify them: they are a kind of their own, :data:`DISC`.
 MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
     "tag": TagTarget.from_markers,
     "board": BoardTarget.from_markers,
@@ -33,7 +32,7 @@ DISC = "disc"
 
 
 @dataclass(frozen=True, eq=False)
-class Composite(Record):
+class Composite(Record, Target):
     """A body that carries markers of several kinds; its points are those of its parts, one part after the other.
 
     Attributes:
@@ -54,7 +53,7 @@ class Composite(Record):
         return Body(self.name, names, np.concatenate([body.points for body in bodies]))
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
-        """Find every coded part in one grey image; discs are named by both cameras together."""
+        """Find every coded part in one grey image; discs are identified by both cameras together."""
         first, found, problems = 0, [], []
         for part in self.parts:
             seen = part.detect(image)
@@ -65,7 +64,7 @@ class Composite(Record):
             first += len(part.body.point_names)
         if not found:
             return Detections.none(
-                "; ".join(problems) or "plain discs carry no names: one image cannot tell them apart"
+                "; ".join(problems) or "plain discs carry no codes: one image alone cannot identify them"
             )
         ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
         return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
@@ -94,13 +93,13 @@ def open_target(spec: str) -> Target:
         spec: a board such as ``chessboard:9x6:25mm``, or a TOML body file.
 
     Raises:
-        InputError: neither, malformed, or a CSV body, which has points but no looks.
+        InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
     """
     kind = _kind(spec)
     if kind == ".csv":
         raise InputError(
-            f"{spec}: a CSV body has points but does not say how they look, so it cannot be found in images; give "
-            "--detections with it, or describe its markers in a TOML body file (docs/targets.md)"
+            f"{spec}: a CSV body has points but no description of its markers, so it cannot be found in images; give "
+            "--detections with it, or describe its markers in a TOML body file (docs/howto/targets.md)"
         )
     return load_body_toml(spec) if kind == ".toml" else open_board(spec)
 
@@ -122,5 +121,5 @@ def _kind(spec: str) -> str:
     if suffix in (".toml", ".csv"):
         return suffix
     raise InputError(
-        f"{spec!r} is no target: expected a board ({', '.join(BOARDS)}), a .toml body file or a .csv of points"
+        f"{spec!r} is not a target: expected a board ({', '.join(BOARDS)}), a .toml body file or a .csv of points"
     )

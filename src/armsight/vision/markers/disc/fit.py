@@ -1,28 +1,24 @@
-"""The centre of one disc to the limit that the image's noise sets, and what is no disc.
-
-Gauss-Newton on :mod:`~armsight.vision.markers.disc.fit`: a first step on a third of the rows, then on all until the
-centre rests. Where the surround is not plain its own variance lowers the weight of what shows it; where the disc has a
-gradient (a score test), the kind of gradient that fits best is taken. What is left tells discs from what looks like one.
-
-What the pixels of a disc should be, and how they change with its parameters.
+"""The centre of one disc to the limit that the image's noise sets, and the reasons why something is not a disc.
 
 A disc's image is modelled as
 
     I(x) = B + C Phi(d(x) / s) + g (x - c) k(x)
 
 with d the distance inside the rim of the ellipse (x - c)^T M (x - c) = 1 (to first order, Sampson 1982), Phi the normal
-distribution that lens and pixel blur the edge with, B the surround's level, C the contrast and g a gradient. Ten unknowns:
-c, M, s, C, B, g. A surround that is uneven itself leaves the disc flat (k = 1 - Phi), uneven light slopes disc and
-surround in proportion to their levels, stray light both alike (k = 1).
+distribution that models the blur of the edge by lens and pixel, B the surround's level, C the contrast and g a
+gradient. There are ten unknowns: c, M, s, C, B, g. A surround that is uneven itself leaves the disc flat (k = 1 - Phi),
+uneven light slopes disc and surround in proportion to their levels, veiling glare slopes both alike (k = 1).
 
-Loops run over one array of float32 for each quantity, so that the compiler makes vectors of them.
+The method is Gauss-Newton: a first step on a third of the rows, then all rows until the centre converges. Where the
+surround is textured, its own variance reduces the weight of its pixels; where the disc has a gradient (a score test),
+the kinds of gradient are averaged by their likelihood. The residuals of the fit reject look-alikes: those of the rim,
+those of the inside, and gradients that the model lacks.
 
-Which pixels tell about a disc.
+The file follows the fit: the work space, the model and its derivatives, the normal equations, the choice of pixels
+(those near the rim determine the position; of the rows that cross flat areas, which determine only levels and gradient,
+one in three to eighteen is used in full), the measures of the residuals, and last :func:`fit` itself.
 
-Pixels near the rim tell where it is; of the rows that show flat ones, which tell only levels and gradient, one in three to
-eighteen is taken whole.
-
-What a disc's fit leaves tells discs from what looks like one: its rim, its inside, gradients it did not know of.
+Loops run over one array of float32 for each quantity, so that the compiler can vectorise them (SIMD).
 """
 
 from __future__ import annotations
@@ -34,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.normal import LANES, products
+from armsight.vision.markers.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
 MOST_PIXELS = 3072
@@ -43,8 +39,8 @@ UNKNOWNS = 10
 #: Floats in a cache line.
 _LINE = 16
 
-#: What a gradient may be one of.
-LIGHT, SURROUND, STRAY = 0, 1, 2
+#: Kinds of gradient; GLARE is light that is added to disc and surround alike.
+LIGHT, SURROUND, GLARE = 0, 1, 2
 
 F = np.float32
 _E0, _E1, _E2, _E3, _E4, _E5 = (F(x) for x in (1.0, -1 / 16, 1 / 512, -1 / 24576, 1 / 1572864, -1 / 125829120))
@@ -56,16 +52,16 @@ _ZERO, _HALF, _ONE, _FIVE = F(0.0), F(0.5), F(1.0), F(5.0)
 Floats = NDArray[np.float32]
 
 
-class Work(NamedTuple):
-    """The arrays that a fit works in; one set for each thread.
+class FitBuffers(NamedTuple):
+    """The buffers of a fit; one set for each thread.
 
     Attributes:
         px: (MOST_PIXELS,) columns of the pixels, relative to the nearest pixel of the centre.
         py: (MOST_PIXELS,) their rows.
         level: (MOST_PIXELS,) their grey.
-        J: (12, MOST_PIXELS + LANES) whitened derivatives, residuals, an empty row.
-        residual: (MOST_PIXELS + LANES,) the row of J that holds the residuals, whitened.
-        left: (MOST_PIXELS,) what the last step leaves of the residuals.
+        J: (12, MOST_PIXELS + SIMD_WIDTH) whitened derivatives, residuals, an empty row.
+        residual: (MOST_PIXELS + SIMD_WIDTH,) the row of J that holds the residuals, whitened.
+        left: (MOST_PIXELS,) the residuals after the last step.
         inside: (MOST_PIXELS,) share of disc.
         H: (10, 10) normal matrix.
         g: (10,) right side.
@@ -75,8 +71,8 @@ class Work(NamedTuple):
         at: (10,) parameters, the centre relative to the pixels' origin.
         shapes: (4, 5) ellipses.
         sectors: (2, 16) of the rim.
-        trial: (10,) parameters tried.
-        start: (10,) parameters begun with.
+        trial: (10,) trial parameters.
+        start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
     """
@@ -103,18 +99,18 @@ class Work(NamedTuple):
 
 
 def _aligned(rows: int, columns: int) -> Floats:
-    """Return zeros (rows, columns) that begin with a cache line: vectors across two lines take half as long again."""
+    """Return zeros (rows, columns) aligned to a cache line: SIMD vectors across two lines take half as long again."""
     room = np.zeros(rows * columns + _LINE, np.float32)
     first = -room.ctypes.data // 4 % _LINE
     return room[first : first + rows * columns].reshape(rows, columns)
 
 
-def workspace() -> Work:
-    """Return room for fits."""
+def workspace() -> FitBuffers:
+    """Return the buffers for fits."""
     n = UNKNOWNS
     px, py, level, left, inside = _aligned(5, MOST_PIXELS)
-    J = _aligned(n + 2, MOST_PIXELS + LANES)
-    return Work(
+    J = _aligned(n + 2, MOST_PIXELS + SIMD_WIDTH)
+    return FitBuffers(
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
         np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
@@ -122,14 +118,14 @@ def workspace() -> Work:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def linearise(n: int, slope: int, texture: float, work: Work) -> float:
+def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     """Fill whitened residual, J and share of disc of the first n pixels at ``work.at``.
 
     Args:
-        n: how many.
-        slope: what the gradient is one of: LIGHT, SURROUND, STRAY.
+        n: number of pixels.
+        slope: kind of gradient: LIGHT, SURROUND, GLARE.
         texture: variance of the surround over the noise's.
-        work: the pixels, and room.
+        work: the pixels, and buffers.
 
     Returns:
         The sum of the squared residuals.
@@ -141,7 +137,7 @@ def linearise(n: int, slope: int, texture: float, work: Work) -> float:
     v_texture = F(texture)
     most = max(abs(base), abs(base + contrast), _ONE)
     k_out = base / most if slope == LIGHT else _ONE
-    k_in = (base + contrast) / most if slope == LIGHT else (_ONE if slope == STRAY else _ZERO)
+    k_in = (base + contrast) / most if slope == LIGHT else (_ONE if slope == GLARE else _ZERO)
     for i in range(n):
         u, v = px[i] - cx, py[i] - cy
         mu, mv = m11 * u + m12 * v, m12 * u + m22 * v
@@ -184,10 +180,10 @@ def linearise(n: int, slope: int, texture: float, work: Work) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def normal_equations(n: int, work: Work) -> None:
+def normal_equations(n: int, work: FitBuffers) -> None:
     """Fill H = J J^T (10, 10), its lower half, and g = J residual (10,), of the first n pixels."""
     J, H, g, sums = work.J, work.H, work.g, work.sums
-    full = (n + LANES - 1) // LANES * LANES
+    full = (n + SIMD_WIDTH - 1) // SIMD_WIDTH * SIMD_WIDTH
     for a in range(UNKNOWNS + 1):
         J[a, n:full] = _ZERO
     products(full, J, sums)
@@ -201,7 +197,7 @@ def normal_equations(n: int, work: Work) -> None:
 def factor(H: Array, L: Array, scale: Array) -> bool:
     """Factor H as D L L^T D; False where it is not positive definite.
 
-    Divisions are dear: ``scale`` (n,) is filled with the inverse of D's diagonal, and L's diagonal with its own inverse.
+    Divisions are slow: ``scale`` (n,) receives the inverse of D's diagonal, and L's diagonal its own inverse.
     """
     n = len(H)
     for a in range(n):
@@ -241,13 +237,14 @@ def solve(L: Array, scale: Array, g: Array, x: Array) -> None:
         x[a] *= scale[a]
 
 
-#: How far from the rim pixels tell about it, in blurs; a ring beyond, px, tells the surround.
+#: Distance from the rim, in blurs, within which pixels depend on it; width, px, of a ring beyond that shows the
+#: surround.
 _NEAR, _RING_PX = 3.4, 4.0
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _chord(v: float, s: Array) -> tuple[float, float]:
-    """Return middle and half length of the chord at height v of an ellipse that :func:`_grown` filled; half < 0: none."""
+    """Return middle and half length of the chord at height v of an ellipse of :func:`_enlarged`; half < 0: none."""
     rest = s[2] - v * v
     if rest <= 0.0:
         return 0.0, -1.0
@@ -255,8 +252,8 @@ def _chord(v: float, s: Array) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _grown(shape: Array, by: float, out: Array) -> None:
-    """Fill the ellipse whose half axes are longer by ``by``, not below zero: S11, S12, S22, its chords' lean and length."""
+def _enlarged(shape: Array, by: float, out: Array) -> None:
+    """Fill the ellipse with half axes longer by ``by``, not below zero: S11, S12, S22, slope and length of its chords."""
     mean, half = (shape[0] + shape[2]) / 2, (shape[0] - shape[2]) / 2
     root = np.sqrt(half * half + shape[1] * shape[1])
     major, minor = np.sqrt(mean + root), np.sqrt(max(mean - root, 1e-6))
@@ -267,7 +264,7 @@ def _grown(shape: Array, by: float, out: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
-def _take(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: int, n: int, work: Work) -> int:
+def _append(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: int, n: int, work: FitBuffers) -> int:
     """Append the pixels first <= x < end of a row; return the new count."""
     count = max(min(end - first, MOST_PIXELS - n), 0)
     px, py, level, line = work.px[n : n + count], work.py[n : n + count], work.level[n : n + count], image[y, first:end]
@@ -280,17 +277,17 @@ def _take(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: i
 
 
 @numba.njit(cache=True, error_model="numpy")
-def gather(image: NDArray[np.uint8], theta: Array, work: Work) -> tuple[int, int]:
-    """Collect the pixels that tell about a disc: px, py relative to the nearest pixel of the centre, and their grey.
+def gather(image: NDArray[np.uint8], theta: Array, work: FitBuffers) -> tuple[int, int]:
+    """Collect the pixels that depend on a disc: px, py relative to the nearest pixel of the centre, and their grey.
 
     Args:
         image: (H, W) grey.
         theta: (10,) parameters of the disc as far as they are known.
-        work: room; px, py and level are filled.
+        work: buffers; px, py and level are filled.
 
     Returns:
-        How many, -1 where the disc and its rim are not all inside the image; and how many of them, the first, are every
-        third row, enough for a first step.
+        Their number, -1 where the disc and its rim are not completely inside the image; and how many of them, the
+        first, are of every third row, enough for a first step.
     """
     height, width = image.shape
     x0, y0 = int(np.rint(theta[0])), int(np.rint(theta[1]))
@@ -302,9 +299,9 @@ def gather(image: NDArray[np.uint8], theta: Array, work: Work) -> tuple[int, int
     if x0 < half_w or y0 < half_h or x0 + half_w > width - 1 or y0 + half_h > height - 1:
         return -1, -1
     near = _NEAR * theta[5] + 0.5
-    _grown(s, near, outer)
-    _grown(s, near + _RING_PX, ring)
-    _grown(s, -near, hole)
+    _enlarged(s, near, outer)
+    _enlarged(s, near + _RING_PX, ring)
+    _enlarged(s, -near, hole)
     size = np.sqrt(np.sqrt(s[0] * s[2] - s[1] * s[1]))
     # Of every third row, one in so many is taken with its flat pixels.
     flat = 1 if size < 7.0 else (2 if size < 12.0 else 3 if size < 18.0 else 6)
@@ -312,9 +309,9 @@ def gather(image: NDArray[np.uint8], theta: Array, work: Work) -> tuple[int, int
     reach = int(np.sqrt(ring[2]))
     top, bottom = max(0, y0 - reach), min(height - 1, y0 + reach)
     n = 0
-    for turn in range(3):
-        for y in range(top + turn * stride, bottom + 1, 3 * stride):
-            whole = turn == 0 and ((y - top) // stride) % flat == 0
+    for third in range(3):
+        for y in range(top + third * stride, bottom + 1, 3 * stride):
+            whole = third == 0 and ((y - top) // stride) % flat == 0
             v = y - theta[1]
             middle, half = _chord(v, ring if whole else outer)
             if half < 0.0:
@@ -322,21 +319,21 @@ def gather(image: NDArray[np.uint8], theta: Array, work: Work) -> tuple[int, int
             first, end = max(0, int(theta[0] + middle - half) + 1), min(width, int(theta[0] + middle + half) + 1)
             middle, half = _chord(v, hole)
             if whole or half < 2.0:
-                n = _take(image, y, first, end, x0, y0, n, work)
+                n = _append(image, y, first, end, x0, y0, n, work)
             else:
-                n = _take(image, y, first, int(theta[0] + middle - half) + 1, x0, y0, n, work)
-                n = _take(image, y, int(theta[0] + middle + half), end, x0, y0, n, work)
-        if turn == 0:
+                n = _append(image, y, first, int(theta[0] + middle - half) + 1, x0, y0, n, work)
+                n = _append(image, y, int(theta[0] + middle + half), end, x0, y0, n, work)
+        if third == 0:
             sample = n
     return n, sample
 
 
-#: Parts that the rim is judged in.
+#: Sectors in which the rim is evaluated.
 SECTORS = 16
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def spread(n: int, work: Work, flat: Array) -> None:
+def spread(n: int, work: FitBuffers, flat: Array) -> None:
     """Fill the mean squares of the residuals inside and outside, away from the rim, and their counts (4,)."""
     residual, inside = work.residual, work.inside
     square_in, square_out, count_in, count_out = F(0.0), F(0.0), F(0.0), F(0.0)
@@ -353,7 +350,7 @@ def spread(n: int, work: Work, flat: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def clipped(n: int, work: Work) -> int:
+def clipped(n: int, work: FitBuffers) -> int:
     """Count the pixels that are black or white to the last level."""
     level, count = work.level, np.int32(0)
     for i in range(n):
@@ -362,7 +359,7 @@ def clipped(n: int, work: Work) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _stepped(n: int, work: Work) -> None:
+def _stepped(n: int, work: FitBuffers) -> None:
     """Fill ``work.left``, the residuals after the last step; ``work.residual`` is before it."""
     residual, J, left = work.residual, work.J, work.left
     x0, x1, x2, x3, x4, x5, x6, x7, x8, x9 = work.x.astype(np.float32)
@@ -373,8 +370,8 @@ def _stepped(n: int, work: Work) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) -> None:
-    """Fill, for each sixteenth of the rim, how far it lies outside the ellipse, px, and the weight of that (2, 16)."""
+def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: Array) -> None:
+    """Fill, for each sixteenth of the rim, its distance outside the ellipse, px, and the weight of that (2, 16)."""
     px, py, J, inside = work.px, work.py, work.J, work.inside
     sectors[:, :] = 0.0
     cx, cy = F(theta[0] - x0), F(theta[1] - y0)
@@ -393,11 +390,11 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: Work, sectors: Array) 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def texture_factor(n: int, blur: float, texture: float, work: Work) -> float:
-    """Return how many times larger the centre's variance is because neighbouring pixels of a texture are alike.
+def texture_factor(n: int, blur: float, texture: float, work: FitBuffers) -> float:
+    """Return the factor by which the centre's variance grows because neighbouring pixels of a texture are correlated.
 
-    The correlation of neighbours, k, gives (1 + k) / (1 - k) pixels that vary as one along the rim, and at most the width
-    of the edge across it; it counts by the share that the texture has in what tells the centre.
+    The correlation of neighbours, k, gives (1 + k) / (1 - k) pixels that vary as one along the rim, and at most the
+    width of the edge across it; it counts by the texture's share in the information about the centre.
     """
     px, py, J, residual, inside = work.px, work.py, work.J, work.residual, work.inside
     square, product = 0.0, 0.0
@@ -407,18 +404,18 @@ def texture_factor(n: int, blur: float, texture: float, work: Work) -> float:
             square += residual[i] * residual[i]
             if i + 1 < n and py[i + 1] == py[i] and px[i + 1] == px[i] + F(1.0):
                 product += residual[i] * residual[i + 1]
-        tells = J[0, i] * J[0, i] + J[1, i] * J[1, i]
+        information = J[0, i] * J[0, i] + J[1, i] * J[1, i]
         rest = 1.0 - inside[i]
-        by_texture += tells * texture * rest * rest / (1.0 + texture * rest * rest)
-        by_all += tells
+        by_texture += information * texture * rest * rest / (1.0 + texture * rest * rest)
+        by_all += information
     k = min(max(product / max(square, 1e-12), 0.0), 0.95)
     along = (1.0 + k) / (1.0 - k)
     return 1.0 + (along * min(along, 1.0 + 2.0 * blur) - 1.0) * by_texture / by_all
 
 
 @numba.njit(cache=True, error_model="numpy")
-def of_centre(work: Work, cov: Array) -> None:
-    """Fill the (2, 2) block of H^-1 that is the centre's."""
+def of_centre(work: FitBuffers, cov: Array) -> None:
+    """Fill the centre's (2, 2) block of H^-1."""
     g, L, scale, x = work.g, work.L, work.scale, work.x
     for a in range(2):
         g[:] = 0.0
@@ -428,12 +425,12 @@ def of_centre(work: Work, cov: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _inside_products(n: int, cx: np.float32, cy: np.float32, work: Work, out: Array) -> None:
-    """Fill the products of the columns of a gradient of the disc's own, u and v times its share.
+def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, out: Array) -> None:
+    """Fill the products of the columns of a gradient inside the disc, u and v times its share.
 
     Args:
         n: pixels.
-        cx: the centre, as the pixels have it.
+        cx: the centre, in the pixels' coordinates.
         cy: see cx.
         work: the pixels, linearised.
         out: (2, 13) filled: with each column of J, with the residual, with u and with v.
@@ -460,13 +457,13 @@ def _inside_products(n: int, cx: np.float32, cy: np.float32, work: Work, out: Ar
 
 
 @numba.njit(cache=True, error_model="numpy")
-def slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> float:
-    """Return what chi-square would gain from a gradient of the disc's own, in units of the noise's variance."""
+def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -> float:
+    """Return by how much a gradient inside the disc would lower chi-square, in units of the noise's variance."""
     g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
     s0, s1 = out[0, 10], out[1, 10]
     k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
-    # The residual is the one before the last step x = H^-1 g; then the columns as far as J does not explain them.
+    # The residual is the one before the last step x = H^-1 g; then the part of the columns that J does not explain.
     for a in range(UNKNOWNS):
         s0 -= out[0, a] * x[a]
         s1 -= out[1, a] * x[a]
@@ -486,26 +483,26 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, work: Work) -> floa
 
 
 @numba.njit(cache=True, error_model="numpy")
-def slope_outside(theta: Array, work: Work) -> float:
-    """Return what chi-square would lose without the surround's gradient, in units of the noise's variance."""
+def slope_outside(theta: Array, work: FitBuffers) -> float:
+    """Return by how much chi-square would rise without the surround's gradient, in units of the noise's variance."""
     L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
-    # Of the last two unknowns the factor's last corner is that of their information, the others' share taken out.
+    # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
     return float((a / L[8, 8] + b * L[9, 8]) ** 2 + (b / L[9, 9]) ** 2)
 
 
 _STEPS = 8
-#: A step of the centre after which the next one does not count: the next is a tenth of it at the most, px; and in
-#: standard deviations of the centre.
+#: A step of the centre after which the next one is negligible (a tenth of it at the most): px, and standard deviations
+#: of the centre.
 _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
 _BLUR_LEAST_PX = 0.2
-#: A step of the centre after which the residuals away from the rim tell the surround's variance, px.
+#: A step of the centre after which the residuals away from the rim give the surround's variance, px.
 _WEIGH_PX = 0.3
 #: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
 _SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
-#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, STRAY).
+#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
-#: Why a place is no disc: code -> words. 0 is a disc.
+#: Why a candidate is not a disc: code -> text. 0 is a disc.
 REASONS = {
     1: "cut by the image's border",
     2: "no ellipse fits its rim",
@@ -514,32 +511,34 @@ REASONS = {
     5: "its rim is not that of an ellipse",
     6: "too faint against the noise",
     7: "smaller than 4 px across",
-    8: "its inside is not even: smeared by motion, or no disc",
+    8: "its inside is not uniform: motion blur, or not a disc",
     9: "open on one side",
-    10: "what surrounds it is not even: text, a ring, a square of a board",
-    11: "found already",
+    10: "its surround is not uniform: text, a ring, a square of a board",
+    11: "a duplicate of another disc",
 }
 FOUND_TWICE = 11
-#: Reasons of places that have a closed rim, those that look most like a disc first.
+#: Reasons of candidates that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
 _LEAST_RATIO = 0.22
-#: How far the sixteenths of the rim may lie off the ellipse beyond what noise does, RMS: px, share of the size, and share
-#: of the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
+#: How far the sixteenths of the rim may deviate from the ellipse beyond noise, RMS: px, share of the size, and share of
+#: the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
 _RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
-#: Standard deviations of that beyond which it is no chance.
+#: Standard deviations of that beyond which it is significant.
 _RIM_CHANCE = 4.0
-#: What the residuals may be beyond the image's noise, as a share of the contrast.
+#: Largest residuals beyond the image's noise, as a share of the contrast.
 _MOST_RESIDUAL = 0.1
-#: A centre that its uneven surround leaves less certain than this is not given, px.
+#: A centre that a textured surround makes less certain than this is rejected, px.
 _MOST_SIGMA_PX = 0.08
-#: How uneven the inside may be beyond the image's noise, as a share of the contrast.
+#: Largest variation of the inside beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step(n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: Work) -> tuple[float, float]:
+def _step(
+    n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: FitBuffers
+) -> tuple[float, float]:
     """Make one Gauss-Newton step on the first n pixels.
 
     Returns:
@@ -572,11 +571,11 @@ def _step(n: int, theta: Array, x0: float, y0: float, slope: int, texture: float
 
 @numba.njit(cache=True, error_model="numpy")
 def _minimise(
-    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: Work
+    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: FitBuffers
 ) -> tuple[float, float]:
-    """Step until the centre rests; return the sum of squared residuals, -1 where there is no minimum, and the texture.
+    """Step until the centre converges; return the sum of squared residuals, -1 without a minimum, and the texture.
 
-    ``weigh``: where the surround varies more than the disc, weigh it less.
+    ``weigh``: where the surround varies more than the disc, reduce its weight.
     """
     flat, H = work.sectors[0], work.H
     texture, weighed = 0.0, not weigh
@@ -599,19 +598,19 @@ def _minimise(
 
 @numba.njit(cache=True, error_model="numpy")
 def _average(
-    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: Work
+    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: FitBuffers
 ) -> None:
-    """Replace centre and covariance by the mean over the kinds of gradient, each by how likely it is (model averaging).
+    """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood (model averaging).
 
-    What SURROUND gives, sum of squares and all, is what comes in. A kind that cannot be told from another pulls the centre
-    by up to its own standard deviation: the spread between the kinds is part of the covariance.
+    The result of SURROUND, its sum of squares included, is the input. A kind that is not distinguishable from another
+    moves the centre by up to its own standard deviation: the spread between the kinds is part of the covariance.
     """
     trial, start = work.trial, work.start
     start[:] = theta
     results, block, least = np.zeros((3, 7)), np.empty((2, 2)), square
     results[SURROUND, 0], results[SURROUND, 1], results[SURROUND, 2] = square, theta[0], theta[1]
     results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
-    for kind in (LIGHT, STRAY):
+    for kind in (LIGHT, GLARE):
         trial[:] = start
         square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
         results[kind, 0] = np.inf
@@ -641,19 +640,19 @@ def _average(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: Work) -> int:
+def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
     """Fit one disc.
 
     Args:
         image: (H, W) grey.
-        noise_sigma: the image's noise as far as it is known beforehand, grey levels; judges what is no disc.
+        noise_sigma: the image's noise as far as it is known beforehand, grey levels; used to reject what is not a disc.
         theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
             result.
         cov: (2, 2) covariance of the centre, px^2; filled.
         work: what :func:`workspace` returns.
 
     Returns:
-        0, or why it is no disc (REASONS).
+        0, or the reason why it is not a disc (REASONS).
     """
     sectors = work.sectors
     n, sample = gather(image, theta, work)
@@ -667,7 +666,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
     if square < 0.0:
         return 2
-    # Clipped pixels have no noise and say nothing of it.
+    # Clipped pixels have no noise and do not count for it.
     variance = square / max(n - clipped(n, work) - UNKNOWNS, UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
     half = (theta[2] + theta[4]) / 2
@@ -710,7 +709,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if uneven:
         _average(n, theta, x0, y0, noise_sigma, square, cov, work)
     if off > _RIM_CHANCE * np.sqrt(chance):
-        # A rim that is off beyond chance, a little of it covered perhaps, may have taken the centre along as far.
+        # A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as
+        # much.
         cov[0, 0] += off / count
         cov[1, 1] += off / count
     return 0
@@ -720,7 +720,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
 def shape_of(theta: Array, shape: Array) -> None:
     """Fill S11, S12, S22 of a fitted ellipse, px^2.
 
-    Blur moves the half-way level of a curved edge inwards by blur^2 / (2 radius); that is put right here.
+    Blur moves the half-way level of a curved edge inwards by blur^2 / (2 radius); that is corrected here.
     """
     det = theta[2] * theta[4] - theta[3] * theta[3]
     wider = (1.0 + 0.5 * theta[5] * theta[5] * np.sqrt(det)) ** 2 / det

@@ -1,12 +1,9 @@
-"""Where in an image discs may be: every third row in steps of eight pixels, then a look around each find.
+"""Where in an image discs may be: every third row in steps of eight pixels, then an outline around each candidate.
 
-A disc is brighter (or darker) than what lies eight pixels to its left. Eight pixels are compared at a time, in
-one 64-bit word; the least contrast that counts follows from the image's own noise. The look around gives an ellipse to
-start the fit from, or the reason why there is none (:mod:`~armsight.vision.markers.disc.search`).
-
-A start for the fit of a disc: the chord through a pixel on it, the chord across that, and sixteen rays outwards.
-
-Where they end gives an ellipse, or the reason why there is none.
+A disc is brighter (or darker) than the pixel eight to its left. Eight pixels are compared at a time, in one 64-bit
+word; the least contrast that counts follows from the image's own noise. Around each candidate :func:`outline` measures
+a chord through the pixel, the chord across it, and sixteen rays outwards; their ends give an ellipse to start the fit
+from (:mod:`~armsight.vision.markers.disc.fit`), or the reason why there is none.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.vision.markers.disc.fit import FOUND_TWICE, Work, factor, fit, shape_of, solve
+from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, factor, fit, shape_of, solve
 
 #: Longest half chord, px: half of the largest disc, blur and all.
 _REACH = 44
@@ -46,7 +43,7 @@ def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int) -
 
 @numba.njit(cache=True, error_model="numpy")
 def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room) -> int:
-    """Look around a pixel on a disc and make a start for the fit of it.
+    """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
 
     Args:
         image: (H, W) grey.
@@ -58,7 +55,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         room: what :func:`workspace` returns.
 
     Returns:
-        0, or why there is no disc (disc_fit.REASONS).
+        0, or the reason why there is no disc (``fit.REASONS``).
     """
     height, width = image.shape
     half = 0
@@ -81,7 +78,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     start = int(0.6 * min(min(left, right), min(up, down)))
     for k in range(_RAYS):
         c, s = _COS[k], _SIN[k]
-        before = np.float64(image[y, x])  # nearer pixels than the first step are on the disc
+        before = np.float64(image[y, x])  # pixels nearer than the first step are on the disc
         radius = -1.0
         for step in range(start + 1, _REACH):
             u, v = x + step * c, y + step * s
@@ -101,7 +98,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         u, v = radius * c, radius * s
         within += radius * radius
         a[0], a[1], a[2], a[3], a[4] = u * u, 2 * u * v, v * v, u, v
-        # Each ray is weighed so that the algebraic distance becomes one along the ray.
+        # Each ray is weighted so that the algebraic distance becomes the one along the ray.
         w = 1.0 / (radius * radius)
         for m in range(5):
             g[m] += w * a[m]
@@ -137,33 +134,33 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
 
 
 def workspace() -> Room:
-    """Return the arrays that :func:`outline` works in."""
+    """Return the buffers of :func:`outline`."""
     return np.empty((5, 5)), np.empty(5), np.empty(5), np.empty((5, 5)), np.empty(5), np.empty(5)
 
 
-#: Rows between those looked at; the smallest disc, 5 px across, shows on one at least.
+#: Step between the rows that are searched; the smallest disc, 5 px across, crosses one at least.
 _ROW_STEP = 3
-#: Rows of the image of which those looked at are looked at together first.
+#: Rows of the image whose searched rows are tested together first.
 _TOGETHER = 8 * _ROW_STEP
 #: Least contrast, grey levels, and in standard deviations of the noise of a difference.
 LEAST_CONTRAST = 10.0
 _CONTRAST_SIGMAS = 5.0
-#: A find so near to the rim of a known disc is that disc, px.
+#: A candidate this near to the rim of a known disc is that disc, px.
 _RIM_PX = 3.0
 _HIGH = np.uint64(0x8080808080808080)
 _SIX = np.uint64(0x3F3F3F3F3F3F3F3F)
-_LANES = np.uint64(0x0101010101010101)
+_EVERY_BYTE = np.uint64(0x0101010101010101)
 _TWO, _MARK = np.uint64(2), np.uint64(0x80)
 _EMPTY = np.uint64(0)
 
-Words = NDArray[np.uint64]
+Words64 = NDArray[np.uint64]
 
 
 @numba.njit(cache=True, error_model="numpy")
 def noise_of(image: Grey) -> float:
     """Estimate the standard deviation of an image's noise, grey levels: the median difference of neighbours.
 
-    A tenth of a level at the least; pixels without light or with too much say nothing.
+    A tenth of a level at the least; pixels that are black or saturated are ignored.
     """
     height, width = image.shape
     counts = np.zeros(256, np.int64)
@@ -193,19 +190,19 @@ def noise_of(image: Grey) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _marks(a: np.uint64, b: np.uint64, t: np.uint64) -> np.uint64:
-    """Mark, with the high bit of its byte, each pixel of b that is brighter than its fellow of a by t times four levels."""
+    """Mark, with the high bit of its byte, each pixel of b that is brighter than that of a by t times four levels."""
     return ((((b >> _TWO) & _SIX) | _HIGH) - ((a >> _TWO) & _SIX) - t) & _HIGH
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
-def _apart(row: Words, i: int, t: np.uint64) -> np.uint64:
+def _apart(row: Words64, i: int, t: np.uint64) -> np.uint64:
     """Mark the pixels of word i of a row that differ from those eight further on."""
     return _marks(row[i], row[i + 1], t) | _marks(row[i + 1], row[i], t)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def differs(row: Words, t: np.uint64) -> bool:
-    """Tell whether any two pixels of a row (W / 8,), eight apart, differ by t units of four levels."""
+def differs(row: Words64, t: np.uint64) -> bool:
+    """Return whether any two pixels of a row (W / 8,), eight apart, differ by t units of four levels."""
     every = _EMPTY
     for i in range(len(row) - 1):
         every |= _apart(row, i, t)
@@ -213,11 +210,11 @@ def differs(row: Words, t: np.uint64) -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def any_differs(words: Words, y: int, t: np.uint64) -> bool:
-    """Tell whether any two pixels of the eight rows from y that are looked at differ as :func:`differs` has it.
+def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
+    """Return whether any two pixels of the eight searched rows from y differ as in :func:`differs`.
 
-    An image that nobody has looked at is far away in memory, and one row at a time waits for each of its lines. Eight at
-    a time wait for eight at once: half the time.
+    An image that was not read before is not in the cache: one row at a time waits for each of its cache lines, eight at
+    a time wait for eight at once. This halves the time.
     """
     every = _EMPTY
     a, b, c, d = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
@@ -231,7 +228,7 @@ def any_differs(words: Words, y: int, t: np.uint64) -> bool:
 
 @numba.njit(cache=True, error_model="numpy")
 def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
-    """Whether a place was looked at already, or lies on a disc that was found."""
+    """Whether a pixel was examined already, or lies on a disc that was found."""
     n = cells[y >> 3, x >> 3]
     if n < 0:
         return False
@@ -244,7 +241,7 @@ def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArr
 
 @numba.njit(cache=True, error_model="numpy")
 def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
-    """Let the cells that a disc covers, and a little more, know it."""
+    """Enter a disc into the cells that it covers, with a margin."""
     height, width = cells.shape
     det = starts[n, 2] * starts[n, 4] - starts[n, 3] ** 2
     half_w, half_h = np.sqrt(starts[n, 4] / det) + _RIM_PX, np.sqrt(starts[n, 2] / det) + _RIM_PX
@@ -257,29 +254,29 @@ def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def search(
-    image: Grey, words: Words, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
 ) -> int:  # fmt: skip
     """Look for discs in a whole image.
 
     Args:
         image: (H, W) grey, W a multiple of eight.
-        words: (H, W / 8) the same memory.
+        words: (H, W / 8) the same memory as 64-bit words.
         noise: standard deviation of the image's noise, grey levels.
         bright: whether bright discs are looked for.
         dark: whether dark ones are.
-        starts: (N, 10) filled with starts for the fit; where there is no disc, with the place that was looked at.
-        codes: (N,) filled with 0 or why there is no disc.
+        starts: (N, 10) filled with starts for the fit; where there is no disc, with the pixel that was examined.
+        codes: (N,) filled with 0 or the reason why there is no disc.
         signs: (N,) filled with 1 for bright discs, -1 for dark ones.
-        room: what ``disc_outline.workspace`` returns.
+        room: what :func:`workspace` returns.
 
     Returns:
-        How many were looked at, at most N.
+        The number of candidates examined, at most N.
     """
     height, width = image.shape
     contrast = max(LEAST_CONTRAST, _CONTRAST_SIGMAS * 1.4142 * noise)
     least = min(int(np.ceil(contrast / 4.0)), 60)
-    t = np.uint64(least) * _LANES
+    t = np.uint64(least) * _EVERY_BYTE
     cells = np.empty((2, height // 8 + 1, width // 8 + 1), np.int16)
     n, plain, begun = 0, False, False
     for y in range(1, height - 1, _ROW_STEP):
@@ -297,16 +294,16 @@ def search(
                 left = _marks(row[i], row[i + 1], t) if sign > 0 else _marks(row[i + 1], row[i], t)
                 mine = cells[(1 - sign) // 2]
                 while left != _EMPTY:
-                    # A run of marked pixels is one find: where the two differ most.
-                    lane, best, x = 0, -1, 0
-                    while (left >> np.uint64(8 * lane)) & _MARK == _EMPTY:
-                        lane += 1
-                    while lane < 8 and (left >> np.uint64(8 * lane)) & _MARK != _EMPTY:
-                        left &= ~(_MARK << np.uint64(8 * lane))
-                        gap = sign * (int(image[y, 8 * i + lane + 8]) - int(image[y, 8 * i + lane]))
+                    # A run of marked pixels is one candidate: where the two differ most.
+                    byte, best, x = 0, -1, 0
+                    while (left >> np.uint64(8 * byte)) & _MARK == _EMPTY:
+                        byte += 1
+                    while byte < 8 and (left >> np.uint64(8 * byte)) & _MARK != _EMPTY:
+                        left &= ~(_MARK << np.uint64(8 * byte))
+                        gap = sign * (int(image[y, 8 * i + byte + 8]) - int(image[y, 8 * i + byte]))
                         if gap > best:
-                            best, x = gap, 8 * i + lane + 8
-                        lane += 1
+                            best, x = gap, 8 * i + byte + 8
+                        byte += 1
                     if _known(x, y, starts, codes, mine):
                         continue
                     if n == len(starts):
@@ -323,9 +320,9 @@ def search(
 
 @numba.njit(cache=True, error_model="numpy")
 def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
-    """Whether disc n is one of those before it; if not, let its cell of 8 px know it.
+    """Whether disc n repeats one of those before it; if not, enter it into its cell of 8 px.
 
-    Two discs in one cell do not look for each other's copies: they are smaller than 5 px then.
+    Two discs in one cell are not checked for repeats: they are smaller than 5 px then.
     """
     x, y = int(starts[n, 0]) >> 3, int(starts[n, 1]) >> 3
     for j in range(max(y - 1, 0), min(y + 2, cells.shape[0])):
@@ -341,26 +338,26 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
 
 @numba.njit(cache=True, error_model="numpy")
 def find(
-    image: Grey, words: Words, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64], signs: NDArray[np.int64],
-    cov: Array, shape: Array, room: Room, work: Work,
+    image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    signs: NDArray[np.int64], cov: Array, shape: Array, room: Room, work: FitBuffers,
 ) -> tuple[int, int]:  # fmt: skip
-    """Search an image and fit what was found.
+    """Search an image and fit every candidate.
 
     Args:
         image: as in :func:`search`, and words, bright, dark, starts, codes, signs and room.
         words: see there.
         bright: see there.
         dark: see there.
-        starts: see there; in the end the discs come first, fitted, then what is none.
+        starts: see there; in the end the discs come first, fitted, then the rejected candidates.
         codes: see there; in the same order.
         signs: see there; in the same order.
         cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
         shape: (N, 3) filled with the discs' ellipses, px^2.
         room: see there.
-        work: room for fits.
+        work: buffers for fits.
 
     Returns:
-        How many discs, and how many places in all.
+        The number of discs, and the number of candidates in all.
     """
     noise = noise_of(image)
     n = search(image, words, noise, bright, dark, starts, codes, signs, room)
