@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 SECOND, THIRD = np.eye(6)[1], np.eye(6)[2]
 
@@ -22,7 +22,7 @@ def arm_toml(path, arm):
 
 
 def poses_csv(path, n=40, seed=0, gaps=()):
-    """Joint angles of the chapter's arm with a longer link and a turned zero, and where a tracker saw a point."""
+    """Joint angles of the six_r arm with a longer link and an offset zero, and where a tracker saw a point."""
     rng = np.random.default_rng(seed)
     nominal = open_arm("six_r")
     true = replace(nominal, a=nominal.a + 2e-3 * SECOND, offset=nominal.offset + 0.01 * THIRD)

@@ -14,9 +14,8 @@ from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.model_file import open_model, read_model
 from armsight.loop.identify.read import read_poses
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm, read_arm_toml
 from cli_runs import Said, refused, run
 
 
@@ -30,40 +29,40 @@ def said(capsys, *arguments):
 def test_from_files_to_files(tmp_path, capsys):
     data, out = poses_csv(tmp_path / "poses.csv", gaps=(3,)), tmp_path / "corrected"
     other = poses_csv(tmp_path / "other.csv", seed=1)
-    arguments = ["--model", arm_toml(tmp_path / "arm.toml", open_arm("six_r")), "--data", data]
+    arguments = ["--arm", arm_toml(tmp_path / "arm.toml", open_arm("six_r")), "--data", data]
     answer = said(capsys, *arguments, "--validate", other, "-o", out, "--json")
     assert answer.code == 0
     assert "line 5 (p1_x_mm)" in answer.err
-    (facts,) = answer.lines
-    assert facts["identified"]["mean_m"] < 1e-4 < 8e-4 < facts["nominal"]["mean_m"]
+    (found,) = answer.lines
+    assert found["identified"]["mean_m"] < 1e-4 < 8e-4 < found["nominal"]["mean_m"]
     for key in ("mean_m", "rms_m", "max_m"):
-        assert 0 < facts["identified"][key] < facts["nominal"][key]
-    told = {p["name"]: p for p in facts["parameters"]}
-    assert set(told["a2"]) >= {"name", "nominal", "value", "sigma", "frozen"}
-    assert told["a2"]["frozen"] is None
-    assert told["a2"]["value"] == pytest.approx(0.2535, abs=4 * told["a2"]["sigma"])
-    assert "no pose can tell" in told["d1"]["frozen"]
+        assert 0 < found["identified"][key] < found["nominal"][key]
+    parameters = {p["name"]: p for p in found["parameters"]}
+    assert set(parameters["a2"]) >= {"name", "nominal", "value", "sigma", "frozen"}
+    assert parameters["a2"]["frozen"] is None
+    assert parameters["a2"]["value"] == pytest.approx(0.2535, abs=4 * parameters["a2"]["sigma"])
+    assert "no pose can distinguish" in parameters["d1"]["frozen"]
     corrected = tomllib.loads((out / "corrected.toml").read_text())
-    assert corrected["joint"][1]["a_m"] == told["a2"]["value"]
+    assert corrected["joint"][1]["a_m"] == parameters["a2"]["value"]
     zeros = tomllib.loads((out / "zeros.toml").read_text())
-    assert zeros["joint"][2]["zero_rad"] == pytest.approx(told["offset3"]["value"], abs=1e-12)
+    assert zeros["joint"][2]["zero_rad"] == pytest.approx(parameters["offset3"]["value"], abs=1e-12)
     assert len(ET.parse(out / "corrected.urdf").getroot().findall("joint")) == 8
-    assert json.loads((out / "identify.json").read_text())["parameters"] == facts["parameters"]
+    assert json.loads((out / "identify.json").read_text())["parameters"] == found["parameters"]
     page = (out / "report.html").read_text()
     assert page.count("<img") == 5
     assert "://" not in page.split("</style>")[1]
-    arm, urdf = open_model(str(out / "corrected.toml")), open_model(str(out / "corrected.urdf"))
+    arm, urdf = open_arm(str(out / "corrected.toml")), open_arm(str(out / "corrected.urdf"))
     np.testing.assert_allclose(arm.forward(np.ones(6)), urdf.forward(np.ones(6)), atol=1e-9)
 
 
 def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
-    answer = said(capsys, "--model", "six_r", "--data", poses_csv(tmp_path / "p.csv"))
+    answer = said(capsys, "--arm", "six_r", "--data", poses_csv(tmp_path / "p.csv"))
     assert answer.code == 0
     assert answer.out.splitlines()[0].startswith("held-out error ")
-    assert "in five turns" in answer.out.splitlines()[0]
+    assert "in five rounds" in answer.out.splitlines()[0]
     assert "not fitted, or not alone" not in answer.out
     assert "-v" in answer.out
-    assert "not fitted, or not alone" in said(capsys, "--model", "six_r", "--data", tmp_path / "p.csv", "-v").out
+    assert "not fitted, or not alone" in said(capsys, "--arm", "six_r", "--data", tmp_path / "p.csv", "-v").out
 
 
 def test_a_written_urdf_is_the_identified_arm():
@@ -83,34 +82,34 @@ def test_a_written_urdf_is_the_identified_arm():
 
 def walk(robot, q):
     """Follow a URDF's joints from the base to the tool: the oracle."""
-    T, turns = np.eye(4), iter(q)
+    T, angles = np.eye(4), iter(q)
     for joint in robot.findall("joint"):
         origin = joint.find("origin")
         xyz, rpy = (np.array([float(v) for v in origin.get(key).split()]) for key in ("xyz", "rpy"))
         T = T @ pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
         if joint.get("type") == "revolute":
             axis = np.array([float(v) for v in joint.find("axis").get("xyz").split()])
-            T = T @ pose(Rotation.from_rotvec(axis * next(turns)).as_matrix(), np.zeros(3))
+            T = T @ pose(Rotation.from_rotvec(axis * next(angles)).as_matrix(), np.zeros(3))
     return T
 
 
 def test_plan(tmp_path, capsys):
-    answer = said(capsys, "plan", "--model", "six_r", "-n", "5", "-o", tmp_path / "plan.csv", "--json")
+    answer = said(capsys, "plan", "--arm", "six_r", "-n", "5", "-o", tmp_path / "plan.csv", "--json")
     assert answer.code == 0
-    (facts,) = answer.lines
-    assert len(facts["q_rad"]) == 5
-    assert (np.diff(facts["sigma_m"]) < 0).all()
+    (found,) = answer.lines
+    assert len(found["q_rad"]) == 5
+    assert (np.diff(found["sigma_m"]) < 0).all()
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
-    refused(said(capsys, "plan", "--model", "six_r", "--rig", tmp_path / "rig.json"), "--data")
-    refused(said(capsys, "plan", "--model", "six_r", "-o", tmp_path / "plan.toml"), "plan.toml", ".csv")
-    told = said(capsys, "plan", "--model", "six_r", "-n", "5", "-o", tmp_path / "plan.csv").out
-    for q in np.degrees(facts["q_rad"]):
-        assert all(f"{v:.2f}" in told for v in q)
-    assert told.endswith(f"written: {tmp_path / 'plan.csv'}\n")
+    refused(said(capsys, "plan", "--arm", "six_r", "--rig", tmp_path / "rig.json"), "--data")
+    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.toml"), "plan.toml", ".csv")
+    printed = said(capsys, "plan", "--arm", "six_r", "-n", "5", "-o", tmp_path / "plan.csv").out
+    for q in np.degrees(found["q_rad"]):
+        assert all(f"{v:.2f}" in printed for v in q)
+    assert printed.endswith(f"written: {tmp_path / 'plan.csv'}\n")
 
 
 @pytest.mark.parametrize(
-    ("header", "rows", "words"),
+    ("header", "rows", "parts"),
     [
         ("q1_rad,q2_rad", ["1,2"], ["line 1", "q3_rad"]),
         ("a,b", ["1,2"], ["line 1", "q1_rad", "q1_deg"]),
@@ -118,41 +117,41 @@ def test_plan(tmp_path, capsys):
         (",".join([*(f"q{i}_rad" for i in range(1, 7)), "p1_x_mm", "p1_y_mm"]), ["0,0,0,0,0,0,1,2"], ["p1_z_mm"]),
     ],
 )
-def test_columns_that_are_missing_are_named(tmp_path, capsys, header, rows, words):
+def test_columns_that_are_missing_are_named(tmp_path, capsys, header, rows, parts):
     path = tmp_path / "bad.csv"
     path.write_text("\n".join([header, *rows]) + "\n")
-    refused(said(capsys, "--model", "six_r", "--data", path), "bad.csv", *words)
+    refused(said(capsys, "--arm", "six_r", "--data", path), "bad.csv", *parts)
 
 
-def test_a_cell_that_is_no_number_is_named(tmp_path, capsys):
+def test_an_entry_that_is_no_number_is_named(tmp_path, capsys):
     path = poses_csv(tmp_path / "p.csv")
     lines = path.read_text().splitlines()
     lines[4] = "x" + lines[4]
     path.write_text("\n".join(lines))
-    refused(said(capsys, "--model", "six_r", "--data", path), "line 5", "q1_rad")
+    refused(said(capsys, "--arm", "six_r", "--data", path), "line 5", "q1_rad")
 
 
-def test_degrees_under_the_name_of_radians_are_told(tmp_path, capsys):
+def test_degrees_under_the_name_of_radians_are_reported(tmp_path, capsys):
     path = poses_csv(tmp_path / "p.csv")
     rows = [line.split(",") for line in path.read_text().splitlines()]
     for row in rows[1:]:
-        row[:6] = [str(np.degrees(float(cell))) for cell in row[:6]]
+        row[:6] = [str(np.degrees(float(entry))) for entry in row[:6]]
     path.write_text("\n".join(",".join(row) for row in rows))
-    refused(said(capsys, "--model", "six_r", "--data", path), "degrees", "q1_deg")
+    refused(said(capsys, "--arm", "six_r", "--data", path), "degrees", "q1_deg")
 
 
 def test_mistakes_at_the_command_line(tmp_path, capsys):
     data = poses_csv(tmp_path / "p.csv")
-    refused(said(capsys, "--data", data), "--model")
-    refused(said(capsys, "--model", "six_rr", "--data", data), "six_rr", "six_r, puma560")
-    refused(said(capsys, "--model", "six_r", "--data", tmp_path / "none.csv"), "none.csv", "no such file")
-    refused(said(capsys, "--model", "six_r", "--data", data, "--prior", "a2"), "NAME=SIGMA")
-    refused(said(capsys, "--model", "six_r", "--data", data, "--prior", "b2=1"), "b2")
-    refused(said(capsys, "--model", "six_r", "--data", poses_csv(tmp_path / "few.csv", n=4)), "4 poses", "6")
+    refused(said(capsys, "--data", data), "--arm")
+    refused(said(capsys, "--arm", "six_rr", "--data", data), "six_rr", "six_r, puma560")
+    refused(said(capsys, "--arm", "six_r", "--data", tmp_path / "none.csv"), "none.csv", "no such file")
+    refused(said(capsys, "--arm", "six_r", "--data", data, "--prior", "a2"), "NAME=SIGMA")
+    refused(said(capsys, "--arm", "six_r", "--data", data, "--prior", "b2=1"), "b2")
+    refused(said(capsys, "--arm", "six_r", "--data", poses_csv(tmp_path / "few.csv", n=4)), "4 poses", "6")
 
 
 def test_fewer_numbers_than_parameters_are_said_and_still_fitted(tmp_path, capsys):
-    answer = said(capsys, "--model", "six_r", "--data", poses_csv(tmp_path / "p.csv", n=12), "--json")
+    answer = said(capsys, "--arm", "six_r", "--data", poses_csv(tmp_path / "p.csv", n=12), "--json")
     assert answer.code == 0
     assert "12 poses are 36 numbers for" in answer.err
 
@@ -163,46 +162,46 @@ def test_mistakes_in_the_data_are_named_and_do_not_spoil_the_held_out_line(tmp_p
     for line in (8, 26, 27):
         rows[line - 1][6] = str(float(rows[line - 1][6]) + 10)
     path.write_text("\n".join(",".join(row) for row in rows))
-    answer = said(capsys, "--model", "six_r", "--data", path, "--json")
-    (facts,) = answer.lines
-    assert facts["left_out_lines"] == [8, 26, 27]
-    assert "3 taken for mistakes apart" in facts["validation"]
-    assert facts["identified"]["max_m"] < 1e-3  # one mistake that stayed in would be 10 mm
-    told = {p["name"]: p for p in facts["parameters"]}
-    assert told["a2"]["value"] == pytest.approx(0.2535, abs=3 * told["a2"]["sigma"])
+    answer = said(capsys, "--arm", "six_r", "--data", path, "--json")
+    (found,) = answer.lines
+    assert found["left_out_lines"] == [8, 26, 27]
+    assert "3 taken for mistakes apart" in found["validation"]
+    assert found["identified"]["max_m"] < 1e-3  # one mistake that stayed in would be 10 mm
+    parameters = {p["name"]: p for p in found["parameters"]}
+    assert parameters["a2"]["value"] == pytest.approx(0.2535, abs=3 * parameters["a2"]["sigma"])
 
 
-def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_told_why(tmp_path, capsys):
+def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path, capsys):
     data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
     rows = [line.split(",") for line in other.read_text().splitlines()]
     for row in rows[1:]:
         row[1] = str(-float(row[1]))
     other.write_text("\n".join(",".join(row) for row in rows))
-    words = ("to validate with", "the sign is turned of joint 2")
-    refused(said(capsys, "--model", "six_r", "--data", data, "--validate", other), *words)
+    parts = ("to validate with", "the sign is turned of joint 2")
+    refused(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
 
 
 def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
     few, there = poses_csv(tmp_path / "few.csv", n=4), tmp_path / "there"
-    refused(said(capsys, "--model", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")
+    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")
     assert not (tmp_path / "new").exists()
     there.mkdir()
-    refused(said(capsys, "--model", "six_r", "--data", few, "-o", there), "4 poses")
+    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", there), "4 poses")
     assert there.is_dir()
-    refused(said(capsys, "--model", "six_r", "--data", few, "-o", few), "cannot be made")
+    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", few), "cannot be made")
     empty = tmp_path / "empty"
     empty.mkdir()
     # A name too long, and a file in the way, come up only after the folder before them is made.
     for out in (tmp_path / "new" / "deep" / ("x" * 300), tmp_path / "new" / ".." / "few.csv" / "deep"):
-        refused(said(capsys, "--model", "six_r", "--data", few, "-o", out), "cannot be made")
+        refused(said(capsys, "--arm", "six_r", "--data", few, "-o", out), "cannot be made")
         assert not (tmp_path / "new").exists()
-    refused(said(capsys, "--model", "six_r", "--data", few, "-o", tmp_path / "new" / ".." / "empty"), "4 poses")
+    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / ".." / "empty"), "4 poses")
     assert not (tmp_path / "new").exists()
     assert empty.is_dir()
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "parts"),
     [
         (lambda text: text.replace("convention", "convetion"), ["convention"]),
         (lambda text: text.replace("a_mm", "a_inch", 1), ["joint 1", "a_inch", "a_mm"]),
@@ -211,16 +210,16 @@ def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
         (lambda text: text + "x = [", ["not TOML"]),
     ],
 )
-def test_what_is_wrong_in_a_model_file_is_told(tmp_path, capsys, change, words):
+def test_what_is_wrong_in_an_arm_file_is_reported(tmp_path, capsys, change, parts):
     path = arm_toml(tmp_path / "arm.toml", open_arm("six_r"))
     path.write_text(change(path.read_text()))
     data = poses_csv(tmp_path / "p.csv")
-    refused(said(capsys, "--model", path, "--data", data), "arm.toml", *words)
+    refused(said(capsys, "--arm", path, "--data", data), "arm.toml", *parts)
 
 
-def test_a_model_file_is_the_arm(tmp_path):
+def test_an_arm_file_is_the_arm(tmp_path):
     arm = open_arm("puma560")
-    read = read_model(arm_toml(tmp_path / "arm.toml", arm))
+    read = read_arm_toml(arm_toml(tmp_path / "arm.toml", arm))
     q = np.linspace(-1, 1, 6)
     np.testing.assert_allclose(read.forward(q), arm.forward(q), atol=1e-12)
 
@@ -233,8 +232,8 @@ def test_full_poses_with_covariance_are_read(tmp_path):
     path = tmp_path / "p.csv"
     names = [*(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", *upper, "approach1"]
     names += [f"approach{i}" for i in range(2, 7)]
-    cells = [90, 0, 0, 0, 0, 0, 1, 2, 3, qw, qx, qy, qz, *(C[int(n[4]), int(n[5])] for n in upper), 1, -1, 0, 1, 1, 1]
-    path.write_text(",".join(names) + "\n" + ",".join(map(repr, map(float, cells))) + "\n")
+    entries = [90, 0, 0, 0, 0, 0, 1, 2, 3, qw, qx, qy, qz, *(C[int(n[4]), int(n[5])] for n in upper), 1, -1, 0, 1, 1, 1]
+    path.write_text(",".join(names) + "\n" + ",".join(map(repr, map(float, entries))) + "\n")
     measured = read_poses(path).measured
     assert measured.q[0, 0] == pytest.approx(np.pi / 2)
     np.testing.assert_allclose(measured.R_rig_body[0], R.as_matrix(), atol=1e-12)

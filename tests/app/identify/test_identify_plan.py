@@ -10,7 +10,7 @@ from armsight.app.identify.plan import plan_from
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.identify.measured import Measured
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from cli_runs import Said, refused, run
@@ -64,7 +64,7 @@ def test_a_rig_nearer_than_the_arms_reach_sees_every_planned_pose(away_m, points
     assert seen_by(rig, T_rig, plan.q)[1].all()
 
 
-def test_poses_that_turn_the_body_further_away_than_it_was_seen_are_not_planned():
+def test_poses_that_rotate_the_body_further_away_than_it_was_seen_are_not_planned():
     rig, T_rig = rig_in_front(), T_base_rig(1.6)
     done = done_before(rig, T_rig, 600)
     toward = np.einsum("nji,nj->ni", done.R_rig_body, -done.p_rig[:, 0])
@@ -79,7 +79,7 @@ def test_poses_that_turn_the_body_further_away_than_it_was_seen_are_not_planned(
     assert (ray[:, 2] / np.linalg.norm(ray, axis=1) > np.cos(np.radians(40 + 40 + 10))).all()
 
 
-def test_a_rig_that_sees_no_pose_of_the_arm_is_told():
+def test_a_rig_that_sees_no_pose_of_the_arm_is_reported():
     rig = rig_in_front()
     T_away = T_base_rig(1.1) @ pose(np.diag([-1.0, 1, -1]), np.zeros(3))
     rng = np.random.default_rng(5)
@@ -91,18 +91,18 @@ def test_a_rig_that_sees_no_pose_of_the_arm_is_told():
 
 def said(capsys, *arguments):
     capsys.readouterr()
-    code = run("identify", "plan", "--model", "six_r", *arguments)
+    code = run("identify", "plan", "--arm", "six_r", *arguments)
     out = capsys.readouterr()
     return Said(code, out.out, out.err)
 
 
-def test_poses_that_cannot_place_the_arm_are_refused_as_identify_refuses_them(tmp_path, capsys):
+def test_poses_that_cannot_locate_the_arm_are_rejected_as_identify_rejects_them(tmp_path, capsys):
     refused(said(capsys, "--data", poses_csv(tmp_path / "few.csv", n=5)), "5 poses are fewer than 6")
     path = poses_csv(tmp_path / "alike.csv")
     with path.open() as file:
         head, first, *rest = list(csv.reader(file))
     path.write_text("\n".join(",".join(row) for row in [head, first, *(first[:6] + row[6:] for row in rest)]))
     refused(said(capsys, "--data", path), "the poses are too alike")
-    swapped = [head, *(row[1::-1] + row[2:] for row in [first, *rest])]
-    path.write_text("\n".join(",".join(row) for row in swapped))
+    exchanged = [head, *(row[1::-1] + row[2:] for row in [first, *rest])]
+    path.write_text("\n".join(",".join(row) for row in exchanged))
     refused(said(capsys, "--data", path), "order is q2, q1")

@@ -54,7 +54,7 @@ def command() -> None:
 def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> None:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
-    DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/check.md). Metrics stand without the
+    DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/howto/iso9283.md). Metrics stand without the
     instrument's own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
     """
     if output is not None and output.is_dir():

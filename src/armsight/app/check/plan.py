@@ -97,7 +97,7 @@ def plan_test(
     with tempfile.TemporaryDirectory() as folder:  # it is planned as it will be; after two cycles all come again
         write_text(Path(folder) / "motion.toml", motions(min(times, 2)))
         read_motions(arm, Path(folder) / "motion.toml")
-    head = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/run.md.\n"
+    head = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/howto/motions.md.\n"
     return PlannedTest(name, times, plan, head + motions(times))
 
 

@@ -1,4 +1,4 @@
-"""The metrics of a test, as records, and the JSON document made of them (docs/check.md has its keys)."""
+"""The metrics of a test, as records, and the JSON document made of them (docs/howto/iso9283.md has its keys)."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _kinds(file: Path) -> dict[str, str]:
         entries: Any = tomllib.loads(read_text(file)).get("motion", [])
         return {str(e.get("name", f"{e['kind']} {n}")): str(e["kind"]) for n, e in enumerate(entries, start=1)}
     except (tomllib.TOMLDecodeError, AttributeError, KeyError, TypeError):
-        raise InputError(f"{file}: not a motion file (docs/run.md)") from None
+        raise InputError(f"{file}: not a motion file (docs/howto/motions.md)") from None
 
 
 def plain(name: str) -> str:

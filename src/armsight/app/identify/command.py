@@ -1,4 +1,4 @@
-"""``armsight identify``: what an arm really is, from joint angles and where its tool was seen."""
+"""``armsight identify``: kinematic identification of an arm from joint angles and measured tool poses."""
 
 from __future__ import annotations
 
@@ -6,68 +6,74 @@ import json
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import click
 
-from armsight.app.identify import run as identify_words
-from armsight.app.identify.plan import plan_csv, plan_from, plan_text
+from armsight.app.identify.plan import plan_csv, plan_from, plan_json, plan_text
 from armsight.app.identify.report import write_identify_report
-from armsight.app.identify.run import results_in, run_identify, summary, write_results
+from armsight.app.identify.run import headline, identify_json, results_in, run_identify, text, write_results
 from armsight.app.progress import steps
 from armsight.app.report.plotting import require_matplotlib
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
-from armsight.loop.identify.model_file import open_model
-from armsight.loop.identify.read import TURNS, read_poses
+from armsight.loop.identify.read import ROTATIONS, read_poses
+from armsight.robot.arm_file import open_arm
 from armsight.vision.rig import StereoRig
 
 
 @click.group(invoke_without_command=True)
-@click.option("--model", metavar="MODEL", help="The nominal arm: a name (armsight arm list), a .toml or a .urdf file.")
 @click.option(
-    "--data", metavar="POSES.csv", type=click.Path(path_type=Path), help="Joint angles, and where the tool was seen."
+    "--arm", "arm_name", metavar="ARM", help="The nominal arm: a name (armsight arm list), a .toml or a .urdf file."
 )
 @click.option(
-    "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to hold it against."
+    "--data", metavar="POSES.csv", type=click.Path(path_type=Path), help="Joint angles, and measured poses of the tool."
 )
-@click.option("--turns", type=click.Choice(TURNS), help="How rx_deg, ry_deg, rz_deg are meant; else they are not used.")
+@click.option(
+    "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to validate with."
+)
+@click.option(
+    "--rotation", type=click.Choice(ROTATIONS), help="What rx_deg, ry_deg, rz_deg mean; without it they are not used."
+)
 @click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
 )
 @click.option(
-    "-o", "--out", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the corrected arm and the report."
+    "-o",
+    "--output",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder for the corrected arm and the report.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Say also why what was not fitted was not.")
+@click.option("-v", "--verbose", is_flag=True, help="Print also why the other parameters were not fitted.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
 def command(
     ctx: click.Context,
-    model: str | None,
+    arm_name: str | None,
     data: Path | None,
     other: Path | None,
-    turns: str | None,
+    rotation: str | None,
     priors: tuple[str, ...],
-    out: Path | None,
+    output: Path | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Find what an arm really is: its table, joint zeros, sensors' errors, backlash and sag, each with sigma.
+    """Identify an arm: its kinematic table, joint zeros, sensor errors, backlash and compliance, each with sigma.
 
-    Formats, and what each result means: docs/identify.md.
+    Formats, and what each result means: docs/howto/identify.md.
     """
     if ctx.invoked_subcommand is not None:
         return
-    if model is None or data is None:
-        raise InputError("give --model and --data: armsight identify --model ur10 --data poses.csv -o corrected/")
-    arm = open_model(model)
-    if out is not None:
+    if arm_name is None or data is None:
+        raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
+    arm = open_arm(arm_name)
+    if output is not None:
         require_matplotlib()
     started = time.perf_counter()
-    with nullcontext() if out is None else results_in(out, (data, other, Path(model))), steps() as progress:
+    with nullcontext() if output is None else results_in(output, (data, other, Path(arm_name))), steps() as progress:
         progress("reading")
-        read = read_poses(data, turns=turns)
-        held = None if other is None else read_poses(other, turns=turns)
+        read = read_poses(data, rotation=rotation)
+        held = None if other is None else read_poses(other, rotation=rotation)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         run = run_identify(
             arm,
@@ -78,70 +84,71 @@ def command(
             notes=notes,
             progress=progress,
         )
-        if out is not None:
+        if output is not None:
             progress("writing")
-            write_results(run, out)
-            write_identify_report(run, out)
+            write_results(run, output)
+            write_identify_report(run, output)
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
-        facts: dict[str, Any] = {**summary(run), "out": None if out is None else str(out)}
-        click.echo(json.dumps({**facts, "wall_s": time.perf_counter() - started}))
+        ended = {"output": None if output is None else str(output), "wall_s": time.perf_counter() - started}
+        click.echo(json.dumps({**identify_json(run), **ended}))
         return
-    click.echo(identify_words.headline(run))
-    click.echo(identify_words.text(run, everything=verbose))
-    if out is not None:
+    click.echo(headline(run))
+    click.echo(text(run, everything=verbose))
+    if output is not None:
         click.echo(
-            f"\nwritten: {out}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"
+            f"\nwritten: {output}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"
         )
 
 
 @command.command()
-@click.option("--model", required=True, metavar="MODEL", help="The nominal arm: a name, a .toml or a .urdf file.")
+@click.option(
+    "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
+)
 @click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="What was measured already.")
 @click.option(
     "--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that shall see the poses."
 )
 @click.option("-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="How many poses.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the candidates.")
-@click.option("-o", "--out", metavar="PLAN.csv", type=click.Path(path_type=Path), help="Write the poses here.")
+@click.option("-o", "--output", metavar="PLAN.csv", type=click.Path(path_type=Path), help="Write the poses here.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def plan(
-    model: str, data: Path | None, rig: Path | None, count: int, seed: int, out: Path | None, as_json: bool
+    arm_name: str, data: Path | None, rig: Path | None, count: int, seed: int, output: Path | None, as_json: bool
 ) -> None:
-    """Choose the poses that tell most about an arm, and say how many more buy how much.
+    """Choose the most informative poses for an identification, and predict the error after each.
 
-    With --data the poses measured already count, and place the arm; with --rig and --data only what both cameras see is
-    chosen, weighted by how well they see it. Check the poses against your cell before you move to them.
+    With --data the poses measured already count, and locate the arm; with --rig and --data only what both cameras see is
+    chosen, weighted by how well they see it. Check the poses against your workcell before you move to them.
     """
     if rig is not None and data is None:
         raise InputError("--rig needs --data: without any pose measured, where the arm is to the cameras is not known")
-    if out is not None:
-        if out.suffix != ".csv":
-            raise InputError(f"{out}: poses are written as .csv; name it so")
-        check_writable(out, apart_from=(data, rig))
+    if output is not None:
+        if output.suffix != ".csv":
+            raise InputError(f"{output}: poses are written as .csv; name it so")
+        check_writable(output, apart_from=(data, rig))
     with steps() as progress:
         progress("choosing poses")
         done = None if data is None else read_poses(data).measured
-        chosen, _ = plan_from(open_model(model), done, None if rig is None else StereoRig.load(rig), count, seed)
-    if out is not None:
-        write_text(out, plan_csv(chosen))
+        chosen, _ = plan_from(open_arm(arm_name), done, None if rig is None else StereoRig.load(rig), count, seed)
+    if output is not None:
+        write_text(output, plan_csv(chosen))
     if as_json:
-        facts = {"q_rad": chosen.q.tolist(), "approach": chosen.approach.tolist(), "sigma_m": chosen.sigma_m.tolist()}
-        click.echo(json.dumps({**facts, "random_sigma_m": chosen.random_sigma_m.tolist()}))
+        click.echo(json.dumps(plan_json(chosen)))
     else:
         click.echo(plan_text(chosen))
-        if out is not None:
-            click.echo(f"\nwritten: {out}")
+        if output is not None:
+            click.echo(f"\nwritten: {output}")
 
 
 def _priors(texts: tuple[str, ...]) -> dict[str, float]:
     """Read NAME=SIGMA."""
     out = {}
-    for text in texts:
-        name, _, sigma = text.partition("=")
+    for given in texts:
+        name, _, sigma = given.partition("=")
         try:
             out[name] = float(sigma)
         except ValueError:
-            raise InputError(f"--prior {text!r} must be NAME=SIGMA, such as a2=0.001 or alpha=0") from None
+            raise InputError(f"--prior {given!r} must be NAME=SIGMA, such as a2=0.001 or alpha=0") from None
     return out

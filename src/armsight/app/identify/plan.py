@@ -1,4 +1,7 @@
-"""Where to look next, from files: what was measured already, and what the cameras can see and how well."""
+"""The next poses of an identification: from what was measured already, and what the cameras can see and how well.
+
+In: the nominal arm, poses measured already and a stereo rig, both optional. Out: the chosen poses, as JSON, CSV and text.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,18 @@ from armsight.loop.identify.plan import Plan, plan_poses
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
-#: What is assumed of an instrument of which nothing is known: sigma of a place, m, and of a turn, rad.
+#: Assumed of an instrument of which nothing is known: sigma of a position, m, and of a rotation, rad.
 NOISE = (1e-4, 5e-4)
-#: A body's spread about its middle, m, and the sigma of a marker, px: they make a pose's covariance of a rig's geometry.
-SPREAD_M, SIGMA_PX = 0.04, 0.1
+#: RMS distance of a body's markers from their middle, m: larger makes its predicted rotation more certain.
+SPREAD_M = 0.04
+#: Sigma of a marker in an image, px: with the rig's geometry it gives the predicted covariance of a pose.
+SIGMA_PX = 0.1
 #: Markers of a body.
 MARKERS = 6
 #: A pose is seen where its body is this far from the images' edges, px.
 MARGIN_PX = 60.0
-#: Markers are on one side of a body: it is taken to be seen as far turned away as it was seen already, and this much more.
+#: Markers are on one side of a body: it is taken to be visible up to the rotation at which it was seen already, and this
+#: much more, rad.
 MORE_RAD = np.radians(10.0)
 
 
@@ -35,14 +41,14 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
 
     Args:
         arm: the nominal arm.
-        done: what was measured already, which places base and tool; None: all that can be reached counts as seen.
+        done: what was measured already, which locates base and tool; None: all that can be reached counts as seen.
         rig: the stereo rig; None: all that can be reached counts as seen, equally well.
         n: how many.
         seed: of the candidates.
 
     Raises:
         InputError: ``done`` is too few poses, or not of this arm; or fewer than ``n`` poses can be reached and seen.
-        CalibrationError: the poses of ``done`` are so alike that they do not tell where the arm is.
+        CalibrationError: the poses of ``done`` are so alike that they do not determine where the arm is.
     """
     if done is None:
         T = arm.forward(arm.home[None])
@@ -54,13 +60,13 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
         return plan_poses(model, x, prior, NOISE, n, done=done, seed=seed), model
     seen = rig
 
-    limits = None if done.R_rig_body is None else _turned_away(seen, _stacked(done))
+    limits = None if done.R_rig_body is None else _rotation_limits(seen, _stacked(done))
 
     def visible(Ts: Array) -> NDArray[np.bool_]:
         out = _visible(seen, Ts)
         if limits is not None:
             axes, most = limits
-            out &= (_turned(seen, Ts, axes) <= most + MORE_RAD).all(axis=1)
+            out &= (_rotated(seen, Ts, axes) <= most + MORE_RAD).all(axis=1)
         return out
 
     def cov(Ts: Array) -> Array:
@@ -70,7 +76,7 @@ def plan_from(arm: Arm, done: Measured | None, rig: StereoRig | None, n: int, se
 
 
 def _visible(rig: StereoRig, Ts: Array) -> NDArray[np.bool_]:
-    """Say whether both cameras see a body's middle, away from their edges and in front."""
+    """Return (N,) whether both cameras see a body's middle, away from their edges and in front."""
     good = np.ones(len(Ts), bool)
     for camera, p in zip(rig.cameras, _in_cameras(rig, Ts[:, :3, 3]), strict=True):
         uv = camera.project(p)
@@ -96,15 +102,15 @@ def _to_cameras(rig: StereoRig, Ts: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
 
 
-def _turned_away(rig: StereoRig, Ts: Array) -> tuple[Array, Array]:
-    """Return the side (2, 3) from which each camera saw the body on the whole, and how far it was turned from it, rad."""
+def _rotation_limits(rig: StereoRig, Ts: Array) -> tuple[Array, Array]:
+    """Return the side (2, 3) from which each camera saw the body on the whole, and the largest rotation from it, rad."""
     axes = _to_cameras(rig, Ts).mean(axis=0)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return axes, np.asarray(_turned(rig, Ts, axes).max(axis=0))
+    return axes, np.asarray(_rotated(rig, Ts, axes).max(axis=0))
 
 
-def _turned(rig: StereoRig, Ts: Array, axes: Array) -> Array:
-    """Return how far bodies are turned (N, 2) from the sides ``axes``, rad."""
+def _rotated(rig: StereoRig, Ts: Array, axes: Array) -> Array:
+    """Return the rotations (N, 2) of bodies from the sides ``axes`` (2, 3), rad."""
     return np.asarray(np.arccos(np.clip(np.einsum("nci,ci->nc", _to_cameras(rig, Ts), axes), -1, 1)))
 
 
@@ -113,14 +119,14 @@ def _in_cameras(rig: StereoRig, p_rig: Array) -> tuple[Array, Array]:
 
 
 def _covariance(rig: StereoRig, Ts: Array, points: int | None) -> Array:
-    """Return the covariance of bodies: of their middle from all markers, of their turn from the markers' spread.
+    """Return the covariance of bodies: of their middle from all markers, of their rotation from the markers' spread.
 
     With so many ``points`` of the tool instead of its full pose: theirs, each from its share of the markers.
     """
     H = np.zeros((len(Ts), 3, 3))
     R_right_left = inverse(rig.T_left_right)[:3, :3]
-    turns = (np.eye(3), R_right_left)
-    for camera, p, R in zip(rig.cameras, _in_cameras(rig, Ts[:, :3, 3]), turns, strict=True):
+    rotations = (np.eye(3), R_right_left)
+    for camera, p, R in zip(rig.cameras, _in_cameras(rig, Ts[:, :3, 3]), rotations, strict=True):
         J = camera.project_jacobians(p)[1] @ R
         H += J.swapaxes(1, 2) @ J / SIGMA_PX**2
     C = np.linalg.inv(H) / MARKERS
@@ -129,25 +135,25 @@ def _covariance(rig: StereoRig, Ts: Array, points: int | None) -> Array:
     back = Ts[:, :3, :3].swapaxes(1, 2)
     out = np.zeros((len(Ts), 6, 6))
     out[:, :3, :3] = back @ C @ Ts[:, :3, :3]
-    # A turn about one axis is told by what moves along the two others, so their mean stands for it.
+    # A rotation about one axis shows as displacement along the two others, so their mean stands for it.
     out[:, 3:, 3:] = np.eye(3) * (np.einsum("nii->n", C) / 3 / SPREAD_M**2)[:, None, None]
     return out
 
 
 def plan_text(plan: Plan) -> str:
-    """Return what a person reads: what so many poses buy."""
+    """Return the plan as text: the predicted error after so many poses, then the poses, deg."""
     n = len(plan.q)
     lines = ["predicted error of the tool over the workspace, RMS:"]
     for k in sorted({0, n // 4, n // 2, 3 * n // 4, n}):
         random = plan.random_for(k)
-        told = (
+        compared = (
             f"as good as {random} at random"
             if random
             else f"more than {len(plan.random_sigma_m) - 1} at random would do"
         )
-        lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({told})" if k else ""))
+        lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({compared})" if k else ""))
     lines.append(
-        "joints, deg; come to each from the side given (+: its angle grew), over the last half degree in a second or two:"
+        "joints, deg; approach each from the side given (+: its angle increases), over the last half degree in 1 to 2 s:"
     )
     for k, (q, side) in enumerate(zip(plan.q, plan.approach, strict=True), 1):
         lines.append(
@@ -157,8 +163,18 @@ def plan_text(plan: Plan) -> str:
     return "\n".join(lines)
 
 
+def plan_json(plan: Plan) -> dict[str, list[float]]:
+    """Return the plan as JSON has it, SI units."""
+    return {
+        "q_rad": plan.q.tolist(),
+        "approach": plan.approach.tolist(),
+        "sigma_m": plan.sigma_m.tolist(),
+        "random_sigma_m": plan.random_sigma_m.tolist(),
+    }
+
+
 def plan_csv(plan: Plan) -> str:
-    """Return the poses as CSV: joint angles, and from which side to come to each."""
+    """Return the poses as CSV: joint angles, and the direction of approach of each."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([*(f"q{i}_rad" for i in range(1, 7)), *(f"approach{i}" for i in range(1, 7)), "sigma_after_mm"])

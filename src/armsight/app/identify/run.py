@@ -1,6 +1,7 @@
-"""One identification from files to files: read, identify, hold against poses left out, and write what comes of it.
+"""One identification: identify, validate on poses that were not fitted to, write the files, print the result.
 
-What ``armsight identify`` prints: the held-out line first, then what was found, in mm and degrees.
+In: the nominal arm and measured poses. Out: an :class:`Identification`; the corrected arm as TOML and URDF, zeros,
+parameters and JSON; text in mm and degrees, the held-out errors first.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, write_text
-from armsight.loop.identify.backlash import JointBacklash, plays
+from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.diagnose import BAD_M, BAD_RAD, check_plausible, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
@@ -29,15 +30,17 @@ from armsight.loop.identify.toml_write import table_text, zeros_text
 from armsight.loop.identify.validate import LEAST, Errors, Validation, validate
 from armsight.robot.arm import Arm
 
-#: Parts for the held-out error where nothing is given to validate with; with more poses than this one part is enough.
-FOLDS, MANY = 5, 500
+#: Parts of the poses that are left out, one after the other, where nothing is given to validate with.
+FOLDS = 5
+#: With more poses than this, one part is enough.
+MANY = 500
 #: What is written beside the report.
 FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json")
 
 
 @dataclass(frozen=True, eq=False)
-class Run(Record):
-    """What an identification came to.
+class Identification(Record):
+    """The result of an identification.
 
     Attributes:
         arm: the nominal arm.
@@ -45,7 +48,7 @@ class Run(Record):
         found: the identified arm.
         held_out: nominal and identified arm on poses that were not fitted to.
         held_out_poses: (H, 6) joint angles of those, rad.
-        how: in words, which poses those are.
+        how: which poses those are, as text.
         lines: (N,) lines of the file that the poses come from.
         notes: what a person should know.
     """
@@ -69,17 +72,17 @@ def run_identify(
     priors: Mapping[str, float] | None = None,
     notes: tuple[str, ...] = (),
     progress: Callable[[str], None] = lambda line: None,
-) -> Run:
-    """Identify an arm and hold it against poses left out.
+) -> Identification:
+    """Identify an arm and validate it on poses left out.
 
     Args:
         arm: the nominal arm.
-        measured: joint angles, and where the tool was seen.
+        measured: joint angles, and measured poses of the tool.
         lines: (N,) lines of the file that they come from.
-        other: poses to validate with; None: parts of ``measured`` are left out in turn.
+        other: poses to validate with; None: parts of ``measured`` are left out, one after the other.
         priors: as in :func:`identify`.
         notes: of the reading.
-        progress: is told what is being done.
+        progress: called with each step as text.
 
     Raises:
         InputError: either file's poses cannot be of this arm, or are too few.
@@ -89,21 +92,21 @@ def run_identify(
     if other is not None:
         held_out = _validated(found, arm, other)
         how = f"{len(other)} poses of another file" + (
-            ", base and tool placed anew" if held_out.placement_refitted else ""
+            ", base and tool fitted anew" if held_out.placement_refitted else ""
         )
         poses = other.q
     else:
         held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
         how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
-    return Run(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
+    return Identification(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
 
 
 def _validated(found: Identified, arm: Arm, other: Measured) -> Validation:
-    """Hold the arm against another file's poses; where they fit far too badly, say what would make them fit."""
+    """Validate the arm on another file's poses; where they fit far too badly, raise what would make them fit."""
     held_out = validate(found, other)
     off = held_out.identified
-    turned = bool(off.angle_rad.size) and float(np.median(off.angle_rad)) > BAD_RAD
-    if len(other) >= LEAST and (turned or float(np.median(off.position_m)) > BAD_M):
+    rotated = bool(off.angle_rad.size) and float(np.median(off.angle_rad)) > BAD_RAD
+    if len(other) >= LEAST and (rotated or float(np.median(off.position_m)) > BAD_M):
         try:
             check_plausible(without_tool(arm), other)
         except InputError as error:
@@ -114,23 +117,23 @@ def _validated(found: Identified, arm: Arm, other: Measured) -> Validation:
 def _left_out(
     arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
 ) -> tuple[Validation, Array, str]:
-    """Identify without a part, and measure on it; with few poses in turn for every part."""
-    order = np.random.default_rng(0).permutation(len(measured))
-    parts = np.array_split(order, min(FOLDS, len(order)))
+    """Identify without a part of the poses, and validate on it; with few poses once for every part."""
+    shuffled = np.random.default_rng(0).permutation(len(measured))
+    parts = np.array_split(shuffled, min(FOLDS, len(shuffled)))
     tried = parts if len(measured) <= MANY else parts[:1]
     done, rows = [], []
     for i, part in enumerate(tried):
         progress(f"error on poses left out, part {i + 1} of {len(tried)}")
         try:
             done.append(
-                validate(identify(arm, measured.rows(np.setdiff1d(order, part)), priors=priors), measured.rows(part))
+                validate(identify(arm, measured.rows(np.setdiff1d(shuffled, part)), priors=priors), measured.rows(part))
             )
         except (InputError, CalibrationError) as error:
             raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
         rows.append(part)
     over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
     joined = Validation(_joined([v.nominal for v in done]), _joined([v.identified for v in done]), False, over)
-    how = f"{sum(map(len, rows))} poses left out" + (" in five turns" if len(tried) > 1 else " of the fit")
+    how = f"{sum(map(len, rows))} poses left out" + (" in five rounds" if len(tried) > 1 else " of the fit")
     return joined, measured.q[np.concatenate(rows)], how
 
 
@@ -139,40 +142,64 @@ def _joined(errors: list[Errors]) -> Errors:
 
 
 def _notes(found: Identified, measured: Measured, lines: Array) -> tuple[str, ...]:
-    """Say what a person should know about the data."""
+    """Return what a person should know about the data."""
     notes = []
     if len(found.left_out):
-        told = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
-        notes.append(f"{len(found.left_out)} poses taken for mistakes and left out: line {told}")
+        shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
+        notes.append(f"{len(found.left_out)} poses taken for mistakes and left out: line {shown}")
     numbers = len(measured) * measured.size
     free = int(found.solution.free.sum())
     if numbers < 3 * len(found.model.nominal()):
         notes.append(
             f"{len(measured)} poses are {numbers} numbers for {len(found.model.nominal())} parameters: only {free} that "
-            "the poses can tell, and that pay, were fitted; `armsight identify plan` says where to look next"
+            "the poses determine, and that lower the held-out error, were fitted; `armsight identify plan` chooses more"
         )
     return tuple(notes)
 
 
-def summary(run: Run) -> dict[str, Any]:
-    """Return the JSON object of a run, SI units."""
+class ParameterRow(NamedTuple):
+    """One parameter of the model, as parameters.csv and the JSON object have it: the fields are their columns and keys.
+
+    Attributes:
+        name: of the parameter.
+        unit: m, rad, rad/m or 1.
+        nominal: value of the nominal arm; None of base and tool.
+        value: identified; the nominal one where it was not fitted.
+        sigma: standard deviation; None where it was not fitted.
+        frozen: why it was not fitted, or not alone; None where it was.
+    """
+
+    name: str
+    unit: str
+    nominal: float | None
+    value: float
+    sigma: float | None
+    frozen: str | None
+
+
+def parameter_rows(run: Identification) -> list[ParameterRow]:
+    """Return all parameters of the model, SI units."""
     found, sigma = run.found, np.sqrt(np.diag(run.found.cov))
     nominal = found.model.nominal()
-    parameters = []
-    for k, p in enumerate(found.model.parameters):
-        free = bool(found.solution.free[k])
-        parameters.append(
-            {
-                "name": p.name,
-                "unit": p.unit,
-                "nominal": None if p.kind in ("base", "tool") else float(nominal[k]),
-                "value": float(found.solution.x[k]),
-                "sigma": float(sigma[k]) if free else None,
-                "frozen": found.reasons.get(p.name),
-            }
+    return [
+        ParameterRow(
+            p.name,
+            p.unit,
+            None if p.kind in ("base", "tool") else float(nominal[k]),
+            float(found.solution.x[k]),
+            float(sigma[k]) if found.solution.free[k] else None,
+            found.reasons.get(p.name),
         )
+        for k, p in enumerate(found.model.parameters)
+    ]
+
+
+def identify_json(run: Identification) -> dict[str, Any]:
+    """Return an identification as JSON has it, SI units."""
+    found = run.found
     return {
-        "model": run.arm.name,
+        "version": 2,
+        "arm": run.arm.name,
         "poses": len(run.measured),
         "left_out_lines": [int(run.lines[k]) for k in found.left_out],
         "validation": run.how,
@@ -182,9 +209,11 @@ def summary(run: Run) -> dict[str, Any]:
         "residual_over_predicted": run.held_out.residual_over_predicted,
         "noise_m": found.solution.noise[0],
         "noise_rad": found.solution.noise[1] if found.model.full else None,
-        "parameters": parameters,
+        "parameters": [row._asdict() for row in parameter_rows(run)],
         "correlated": [{"a": a, "b": b, "correlation": c} for a, b, c in found.correlated()],
-        "growth": [{"cause": s.cause, "parameters": list(s.names), "held_out_rms": s.rms} for s in found.steps],
+        "forward_selection": [
+            {"source": s.source, "parameters": list(s.names), "held_out_rms": s.rms} for s in found.steps
+        ],
         "notes": list(run.notes),
     }
 
@@ -220,40 +249,37 @@ def _make(out: Path, made: list[Path]) -> None:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from None
 
 
-def write_results(run: Run, out: Path) -> None:
+def write_results(run: Identification, out: Path) -> None:
     """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
     corrected = Corrected.of(run.found)
     write_text(out / "corrected.toml", table_text(run.found))
     write_text(out / "corrected.urdf", corrected.urdf())
     write_text(out / "zeros.toml", zeros_text(run.found))
     write_text(out / "parameters.csv", _parameters(run))
-    write_text(out / "identify.json", json.dumps(summary(run), indent=1) + "\n")
+    write_text(out / "identify.json", json.dumps(identify_json(run), indent=1) + "\n")
 
 
-def _parameters(run: Run) -> str:
+def _parameters(run: Identification) -> str:
     """Return the parameters as CSV, SI units."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("name", "unit", "nominal", "value", "sigma", "frozen"))
-    for p in summary(run)["parameters"]:
-        writer.writerow(
-            ["" if p[key] is None else p[key] for key in ("name", "unit", "nominal", "value", "sigma", "frozen")]
-        )
+    writer.writerow(ParameterRow._fields)
+    writer.writerows(["" if value is None else value for value in row] for row in parameter_rows(run))
     return out.getvalue()
 
 
-def headline(run: Run) -> str:
-    """Return the held-out line: before and after."""
+def headline(run: Identification) -> str:
+    """Return the held-out errors, of the nominal and of the identified arm, in one line."""
     before, after = run.held_out.nominal.summary(), run.held_out.identified.summary()
-    told = f"held-out error {1e3 * before['mean_m']:.3f} -> {1e3 * after['mean_m']:.3f} mm mean"
-    told += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
+    line = f"held-out error {1e3 * before['mean_m']:.3f} -> {1e3 * after['mean_m']:.3f} mm mean"
+    line += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
     if "mean_rad" in after:
-        told += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
-    return f"{told} ({run.how})"
+        line += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
+    return f"{line} ({run.how})"
 
 
 def value_text(p: Parameter, value: float) -> str:
-    """Return a value in a person's unit."""
+    """Return a value in mm, deg, deg/m or %."""
     if p.unit == "m":
         return f"{1e3 * value:.3f} mm"
     if p.unit == "rad":
@@ -263,7 +289,7 @@ def value_text(p: Parameter, value: float) -> str:
     return f"{100 * value:.4f} %"
 
 
-def text(run: Run, *, everything: bool = False) -> str:
+def text(run: Identification, *, everything: bool = False) -> str:
     """Return what is printed after the headline; with ``everything`` also why the rest was not fitted."""
     found = run.found
     noise = f"noise {1e3 * found.solution.noise[0]:.3f} mm"
@@ -273,10 +299,10 @@ def text(run: Run, *, everything: bool = False) -> str:
         f"{len(run.measured)} poses, {int(found.solution.free.sum())} parameters fitted, {noise}; held-out residual over "
         f"its predicted sigma {run.held_out.residual_over_predicted:.2f}",
         "",
-        "what each cause moves the tool by, RMS, beyond what those before it take up:",
+        "displacement of the tool by each error source, RMS, beyond what the sources before it explain:",
     ]
     parts = contributions(found, run.measured).items()
-    lines += [f"  {cause:<28} {1e3 * size:8.3f} mm" for cause, size in parts]
+    lines += [f"  {source:<28} {1e3 * size:8.3f} mm" for source, size in parts]
     lines += ["", f"  {'parameter':<12} {'nominal':>16} {'identified':>16} {'sigma':>14}"]
     nominal = found.model.nominal()
     for k, p in enumerate(found.model.parameters):
@@ -286,8 +312,8 @@ def text(run: Run, *, everything: bool = False) -> str:
             tied = "  with others (-v)" if p.name in found.reasons and not everything else ""
             lines.append(f"  {p.name:<12} {row[0]:>16} {row[1]:>16} {row[2]:>14}{tied}")
     lines += [] if everything else _ripples(run)
-    lines += ["", "play of each joint, stop to stop:"]
-    lines += [f"  joint {p.joint + 1}  {_play_text(p)}" for p in plays(found, run.measured)]
+    lines += ["", "backlash of each joint, stop to stop:"]
+    lines += [f"  joint {p.joint + 1}  {_backlash_text(p)}" for p in joint_backlashes(found, run.measured)]
     left = sum(
         not free and p.kind not in ("base", "tool")
         for p, free in zip(found.model.parameters, found.solution.free, strict=True)
@@ -295,12 +321,12 @@ def text(run: Run, *, everything: bool = False) -> str:
     lines += _not_fitted(run) if everything else ["", f"{left} more parameters were not fitted; -v says why"]
     pairs = found.correlated()
     if pairs:
-        lines += ["", "correlations over 0.9 (more varied poses tell them apart):"]
+        lines += ["", "correlations over 0.9 (more varied poses distinguish them):"]
         lines += [f"  {a} and {b}: {c:+.3f}" for a, b, c in pairs]
     return "\n".join(lines)
 
 
-def _ripples(run: Run) -> list[str]:
+def _ripples(run: Identification) -> list[str]:
     """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
     found, lines = run.found, []
     for i in range(6):
@@ -309,25 +335,25 @@ def _ripples(run: Run) -> list[str]:
         if rows:
             size = np.degrees(np.sqrt(np.sum(found.solution.x[rows] ** 2) / 2))
             lines.append(
-                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a turn (-v lists them)"
+                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a revolution (-v lists them)"
             )
     return lines
 
 
-def _play_text(play: JointBacklash) -> str:
-    """Return a joint's play, and what showed it."""
-    if not np.isfinite(play.value_rad):
-        return play.how
-    return f"{np.degrees(play.value_rad):.3f} +- {np.degrees(play.sigma_rad):.3f} deg, by {play.how}"
+def _backlash_text(backlash: JointBacklash) -> str:
+    """Return a joint's backlash, and what showed it."""
+    if not np.isfinite(backlash.value_rad):
+        return backlash.how
+    return f"{np.degrees(backlash.value_rad):.3f} +- {np.degrees(backlash.sigma_rad):.3f} deg, by {backlash.how}"
 
 
-def _not_fitted(run: Run) -> list[str]:
+def _not_fitted(run: Identification) -> list[str]:
     """Return the reasons of what was not fitted, equal ones together."""
     by_reason: dict[str, list[str]] = {}
     for p in run.found.model.parameters:
         reason = run.found.reasons.get(p.name)
         if reason is not None and p.kind not in ("base", "tool"):
-            short = reason.split(":")[0] if reason.startswith("does not pay") else reason
+            short = reason.split(":")[0] if reason.startswith("not selected") else reason
             by_reason.setdefault(short, []).append(p.name)
     if not by_reason:
         return []
