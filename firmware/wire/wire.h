@@ -147,8 +147,8 @@ void wire_poll(wire_state *wire);
 const core_config *wire_to_store(const wire_state *wire);
 void wire_stored(wire_state *wire, bool done);
 
-/* Point *bytes to what waits to go out and return how much of it lies there in one piece; wire_sent then takes how many were sent.
- * Main loop. */
+/* Point *bytes to what waits to go out and return how much of it lies there in one piece; wire_sent then takes
+ * how many were sent. Main loop. */
 uint32_t wire_output(const wire_state *wire, const uint8_t **bytes);
 void wire_sent(wire_state *wire, uint32_t length);
 

@@ -1,6 +1,6 @@
-"""A bench to record on: a rig of two cameras, poses of a board for its calibration, a path of a target to measure.
+"""A test rig to record with: two cameras, poses of a chessboard for their calibration, a path of a target to measure.
 
-Poses are drawn from a seed and kept when the whole pattern is in view of both cameras at a readable slant.
+Poses are sampled from a seed and kept when the whole pattern is in view of both cameras at a readable slant.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def example_rig(
     convergence_deg: float = 8.0,
     model: str = "brown5",
 ) -> StereoRig:
-    """Return two slightly different cameras side by side that look at the same place.
+    """Return two slightly different cameras side by side that look at the same point.
 
     Args:
         image_size_px: (width, height) of both.
         focal_px: about both focal lengths.
         baseline_m: distance between the cameras.
-        convergence_deg: by how much the right camera is turned towards the left one's axis.
+        convergence_deg: by how much the right camera is rotated towards the left one's axis.
         model: distortion model: none, brown4, brown5 or fisheye.
     """
     coefficients = {
@@ -56,7 +56,7 @@ def example_rig(
         "fisheye": (0.02, -0.008, 0.003, -0.001),
     }
     if model not in coefficients:
-        raise InputError(f"a bench's cameras are {', '.join(coefficients)}, not {model!r}")
+        raise InputError(f"the example rig's camera models are {', '.join(coefficients)}, not {model!r}")
     width, height = image_size_px
     fx, fy, cx, cy = focal_px, 1.001 * focal_px, (width - 1) / 2, (height - 1) / 2
     distortion = np.array(coefficients[model])
@@ -71,7 +71,7 @@ def example_rig(
 
 
 def in_view(rig: StereoRig, T_left_pattern: Array, pattern: Pattern) -> bool:
-    """Tell whether both cameras see all of a pattern, at a readable slant."""
+    """Return whether both cameras see all of a pattern, at a readable slant."""
     p_pattern = np.column_stack([outline(pattern), np.zeros(4 * OUTLINE)])
     T_right_left = inverse(rig.T_left_right)
     for camera, T in ((rig.left, T_left_pattern), (rig.right, T_right_left @ T_left_pattern)):
@@ -79,7 +79,7 @@ def in_view(rig: StereoRig, T_left_pattern: Array, pattern: Pattern) -> bool:
         uv = camera.project(p)
         away = p / np.linalg.norm(p, axis=1, keepdims=True)
         high = np.array(camera.image_size_px) - 1 - _MARGIN_PX
-        # Where a distortion polynomial folds back, a point far outside is projected inside: its ray tells.
+        # Where a distortion polynomial folds back, a point far outside is projected inside: its ray shows that.
         seen = (uv >= _MARGIN_PX).all() and (uv <= high).all() and np.abs(camera.unproject(uv) - away).max() < 1e-6
         if not seen or (away @ T[:3, 2]).min() < np.cos(_SLANT_MAX):
             return False
@@ -101,10 +101,10 @@ def board_poses(
     fill: tuple[float, float] = (0.45, 1.1),
     tilt_deg: float = 45.0,
 ) -> Array:
-    """Draw poses of a board that calibrate a rig well: all over both images, near and far, tilted all ways.
+    """Sample poses of a chessboard that calibrate a rig well: all over both images, near and far, tilted all ways.
 
     Args:
-        rng: source of the draws.
+        rng: source of the samples.
         rig: the cameras.
         pattern: the board.
         count: how many poses.
@@ -125,7 +125,7 @@ def board_poses(
     poses = []
     for n in range(count):
         for attempt in range(_TRIES):
-            # The image is cut into 4 x 3 places that take turns; where one cannot be had, the next best is nearer in.
+            # The image is divided into 4 x 3 cells, used in turn; where no pose is in view, the next one is nearer in.
             cell = np.array([cells[n] % 4, cells[n] // 4 % 3])
             uv = (cell + rng.uniform(0, 1, 2)) / (4, 3) * (width, height)
             distance = float(rig.left.intrinsics[0] * diagonal / (rng.uniform(*fill) * height))
@@ -211,7 +211,7 @@ def demo_recording(
     shots: int = 40,
     rate_hz: float = 15.0,
 ) -> tuple[Truth, Truth]:
-    """Record a bench: a board for calibration and an end-effector on its way.
+    """Record with the test rig: a chessboard for calibration, and an end-effector on its way.
 
     Args:
         folder: where to: ``board`` and ``arm`` below it, and ``plate.toml``, the end-effector's body file.

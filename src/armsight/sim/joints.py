@@ -4,7 +4,7 @@ In: duties. Out: counts, currents and the supply, as the board's converters read
 out, its time constant being far below a millisecond) drives the joint with the torque ``K (u V - K w) / R``; against it
 stand viscous and dry friction and, at the end stops, the stop itself. K is the motor's constant times the gear's ratio,
 V s/rad and N m/A at once. Each millisecond is four backward Euler steps, with dry friction solved in the step itself, so
-that a joint at rest rests. Nothing but + - * / is used, so that every machine computes the same motion.
+that a joint at rest rests. Nothing but + - * / is used, so that every computer computes the same motion.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _JUMP_COUNTS = 4000
 
 @numba.njit(cache=True)
 def _move(q: Array, qd: Array, duty: Array, drives_on: bool, supply_v: float, blocked: NDArray[np.bool_]) -> None:
-    """Move the joints on by one tick, in place: q, qd (6,) rad, rad/s."""
+    """Move the joints by one tick, in-place: q, qd (6,) rad, rad/s."""
     h = _TICK_S / _SUBSTEPS
     conductance = CONSTANT_V_S / RESISTANCE_OHM if drives_on else 0.0
     inertia = INERTIA_KG_M2 + h * (VISCOUS_N_M_S + conductance * CONSTANT_V_S)
@@ -122,7 +122,7 @@ class JointPlant:
         self._counts, self._current_ma = np.zeros(JOINTS, np.uint32), np.zeros(JOINTS, np.uint32)
 
     def break_pot(self, joint: int, fault: PotFault) -> None:
-        """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` mends it."""
+        """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` repairs it."""
         self._fault[joint], self._kept[joint] = fault, self._counts[joint]
 
     def sense(self) -> Sensed:

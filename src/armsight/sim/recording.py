@@ -2,7 +2,7 @@
 
 A folder holds left000.png, right000.png and so on, ``shots.csv`` as ``armsight record`` writes it, ``truth_rig.json`` (a
 rig file) and ``truth.json``: where the target was in every shot. So ``armsight calibrate`` and ``measure`` run on it as
-on a recording of real cameras, and what they say can be held against the truth. Everything comes from one seed.
+on a recording of real cameras, and their results can be compared with the truth. Everything comes from one seed.
 """
 
 from __future__ import annotations

@@ -162,7 +162,7 @@ def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
 
 
 def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
-    with Workcell(arm="worn", cameras="640x360@12", machine="host") as workcell:
+    with Workcell.open(arm="worn", cameras="640x360@12", emulator="host") as workcell:
         workcell.truth.rig.save(tmp_path / "rig.json")
         (tmp_path / "body.toml").write_text(workcell.body_text)
         near = workcell.truth.T_base_rig @ pose(np.eye(3), np.array([0, 0, 0.6]))  # so near that not all fits in

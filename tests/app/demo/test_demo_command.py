@@ -101,7 +101,7 @@ def test_the_folder_holds_what_its_page_says(short):
     for name in ("truth", "vision", "potentiometers", "fused", "live", "wanted", "joints"):
         assert (folder / f"{name}.csv").stat().st_size > 1000
         assert (folder / f"{name}.parquet").stat().st_size > 1000
-    for name in ("joints", "path", "errors", "loop", "latency", "pose", "cell"):
+    for name in ("joints", "path", "errors", "loop", "latency", "pose", "workcell"):
         assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     page = (folder / "report.html").read_text()
     # It needs no network. A picture's base64 may hold the letters, but no colon.
@@ -134,7 +134,7 @@ def broken(tmp_path, monkeypatch, mend):
 
 
 def test_a_body_out_of_view_at_the_start(tmp_path, monkeypatch):
-    said = broken(tmp_path, monkeypatch, lambda cell: cell.cover(0.0, 100.0))
+    said = broken(tmp_path, monkeypatch, lambda workcell: workcell.cover(0.0, 100.0))
     assert "is not seen where the arm stands" in said
     assert "bring it into the view" in said
 
@@ -143,7 +143,7 @@ def test_a_camera_that_is_gone(tmp_path, monkeypatch):
     for stale in ("report.html", "truth.csv", "errors.png", "summary.json"):  # of an earlier run
         (tmp_path / stale).write_text("{}")
     (tmp_path / "mine.txt").write_text("mine")
-    said = broken(tmp_path, monkeypatch, lambda cell: cell.source.unplug(3.0, "left camera: unplugged"))
+    said = broken(tmp_path, monkeypatch, lambda workcell: workcell.source.unplug(3.0, "left camera: unplugged"))
     assert said.startswith("left camera: unplugged")
     left = {path.name for path in tmp_path.iterdir()}
     assert not left & {"report.html", "truth.csv", "errors.png"}
@@ -151,15 +151,15 @@ def test_a_camera_that_is_gone(tmp_path, monkeypatch):
 
 
 def test_a_board_that_faults(tmp_path, monkeypatch):
-    def fails(cell):
-        step = cell.plant.step
+    def fails(workcell):
+        step = workcell.plant.step
 
         def stepped(duty, drives_on):
-            if cell.t_s > 2.0:
-                cell.plant.supply_mv = 3000
+            if workcell.t_s > 2.0:
+                workcell.plant.supply_mv = 3000
             step(duty, drives_on)
 
-        monkeypatch.setattr(cell.plant, "step", stepped)
+        monkeypatch.setattr(workcell.plant, "step", stepped)
 
     said = broken(tmp_path, monkeypatch, fails)
     assert "the board went over to FAULTED" in said

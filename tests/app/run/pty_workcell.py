@@ -30,10 +30,10 @@ class PtyCell:
     """A workcell on the other side of a cable."""
 
     def __init__(self, **options):
-        self.cell = Workcell(machine="host", **options)
-        config = self.cell.board.configuration()
+        self.workcell = Workcell.open(emulator="host", **options)
+        config = self.workcell.board.configuration()
         config["silence_ticks"] = SILENT_TICKS
-        configured(self.cell.link, config)
+        configured(self.workcell.link, config)
         self.lock = threading.Lock()
         self.master, self.slave = pty.openpty()
         tty.setraw(self.slave)
@@ -45,13 +45,13 @@ class PtyCell:
 
     def now(self):
         """Return the host's clock."""
-        return self.host_s(self.cell.t_s)
+        return self.host_s(self.workcell.t_s)
 
     def host_s(self, board_s):
         return OFFSET_S + (1 + DRIFT) * board_s
 
     def _run(self):
-        link = self.cell.link
+        link = self.workcell.link
         while not self._stop.wait(0.0005):
             ready, _, _ = select.select([self.master], [], [], 0)
             try:
@@ -75,7 +75,7 @@ class PtyCell:
     def close(self):
         if not self._stop.is_set():
             self.pull()
-        self.cell.close()
+        self.workcell.close()
 
 
 class HostStamped:
@@ -88,7 +88,7 @@ class HostStamped:
     def read(self):
         while not self.closed:
             with self._far.lock:
-                shot = self._far.cell.source.poll()
+                shot = self._far.workcell.source.poll()
             if shot is not None:
                 return replace(shot, t_s=self._far.host_s(shot.t_s) + JITTER_S * self._rng.standard_normal())
             time.sleep(0.001)

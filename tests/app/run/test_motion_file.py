@@ -5,7 +5,7 @@ import pytest
 
 from armsight.app.run.motion_file import DEFAULT_MOTION, read_motions
 from armsight.errors import InputError
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 ARM = open_arm("six_r")
 

@@ -25,9 +25,9 @@ rest_s = 0.5
 def files(tmp_path_factory, host_firmware):
     """Files of the workcell that ``sim:`` opens, small cameras."""
     folder = tmp_path_factory.mktemp("files")
-    with Workcell(arm="worn", cameras="640x360@12", machine="host") as cell:
-        cell.truth.rig.save(folder / "rig.json")
-        (folder / "body.toml").write_text(cell.body_text)
+    with Workcell.open(arm="worn", cameras="640x360@12", emulator="host") as workcell:
+        workcell.truth.rig.save(folder / "rig.json")
+        (folder / "body.toml").write_text(workcell.body_text)
     (folder / "motion.toml").write_text(MOTION)
     return folder
 

@@ -19,7 +19,7 @@ from armsight.app.run import command
 from armsight.app.run.loop import Loop
 from armsight.app.run.setup import HostClock
 from armsight.geometry.pose import inverse
-from armsight.robot.boards.codes import Fault, State
+from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.opening import open_board
 from cli_runs import refused
 
@@ -48,8 +48,8 @@ rest_s = 0.6
 def far(tmp_path, monkeypatch):
     """A cell at the end of a cable, its files, and the command line made to find it."""
     there = PtyCell(arm="used", cameras=CAMERAS, seed=4)
-    there.cell.truth.rig.save(tmp_path / "rig.json")
-    (tmp_path / "body.toml").write_text(there.cell.body_text)
+    there.workcell.truth.rig.save(tmp_path / "rig.json")
+    (tmp_path / "body.toml").write_text(there.workcell.body_text)
     (tmp_path / "motion.toml").write_text(MOTION)
     monkeypatch.setattr(command, "open_source", lambda spec: HostStamped(there))
     monkeypatch.setattr(command, "HostClock", lambda: HostClock(there.now))
@@ -81,15 +81,15 @@ def arguments(far, tmp_path, *more):
 
 def state(far):
     with far.lock:
-        outputs = far.cell.link.answer["outputs"]
-        return State(int(outputs["state"])), int(outputs["first_fault"])
+        outputs = far.workcell.link.answer["outputs"]
+        return BoardState(int(outputs["state"])), int(outputs["first_fault"])
 
 
 def silent(far):
     """Wait until the board has noticed that nobody is there any more."""
-    begin_s = far.cell.t_s
-    while state(far)[0] is not State.HOLDING:
-        assert far.cell.t_s < begin_s + 2.0, state(far)
+    begin_s = far.workcell.t_s
+    while state(far)[0] is not BoardState.HOLDING:
+        assert far.workcell.t_s < begin_s + 2.0, state(far)
         threading.Event().wait(0.01)
 
 
@@ -110,7 +110,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     times = np.array([t_s for t_s, _ in loop.log.commands])
     assert np.diff(times).max() < 1e-3 * SILENT_TICKS
     silent(far)
-    assert state(far) == (State.HOLDING, Fault.HOST_SILENT)
+    assert state(far) == (BoardState.HOLDING, Fault.HOST_SILENT)
     for name in ("vision", "potentiometers", "fused", "live", "wanted", "joints"):
         assert (tmp_path / "run" / f"{name}.csv").stat().st_size > 1000
     assert (tmp_path / "run" / "report.html").exists()
@@ -123,7 +123,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
 
 def _agrees_with_the_truth(far, loop, tmp_path):
     """Vision, brought onto the board's clock, must see the tool where it was, in motion as well as at rest."""
-    truth = far.cell.truth
+    truth = far.workcell.truth
     mounting = loop.mounting
     T = mounting.T_base_rig @ inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
     p_true = (T @ inverse(mounting.T_tool_body))[:, :3, 3]
@@ -188,7 +188,7 @@ def test_an_interrupt_stops_the_arm_and_saves_and_a_held_arm_is_taken_over(armsi
     assert len(rows) > 500
     silent(far)
     with far.lock:
-        path = far.cell.plant.path[-50:, 6:]
+        path = far.workcell.plant.path[-50:, 6:]
     assert np.ptp(path, axis=0).max() < 1e-3  # held, and at rest
 
 
@@ -203,7 +203,7 @@ def test_a_cable_that_is_pulled(armsight, far, tmp_path, monkeypatch):
 
 def test_a_camera_that_breaks_in_a_way_nobody_thought_of(armsight, far, tmp_path, monkeypatch):
     def breaks():
-        far.cell.source.poll = lambda: 1 / 0
+        far.workcell.source.poll = lambda: 1 / 0
 
     meanwhile(monkeypatch, "hand-eye: pose 2", breaks)
     said = armsight(*arguments(far, tmp_path))
@@ -218,4 +218,4 @@ def test_a_fault_that_an_earlier_run_left_is_told_before_anything_moves(armsight
         earlier.receive(0.1)
     said = armsight(*arguments(far, tmp_path))
     refused(said, "the board is not ready: emergency stop", "switch the board off and on again")
-    assert state(far)[0] is State.STOPPED
+    assert state(far)[0] is BoardState.STOPPED

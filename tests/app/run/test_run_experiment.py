@@ -5,16 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.run.experiment import enable, warm_up, require_start
+from armsight.app.run.experiment import enable, require_start, warm_up
 from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
+from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, Reaction, State
+from armsight.robot.boards.codes import BoardState, Fault, Reaction
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
-from armsight.robot.models import open_arm
 from armsight.sim.joints import JointPlant, PotFault
 
 ARM = open_arm("six_r")
@@ -55,12 +55,12 @@ def left_silent(board, link):
 def test_an_arm_that_is_held_is_taken_over_without_letting_go_of_it(made):
     board, link, plant = made()
     again = left_silent(board, link)
-    assert again.status.state is State.HOLDING
+    assert again.status.state is BoardState.HOLDING
     drives = []
     link._watch = lambda _: drives.append(bool(link.answer["outputs"]["drives_on"]))
     q = plant.q.copy()
     enable(again)
-    assert again.status.state is State.ENABLED
+    assert again.status.state is BoardState.ENABLED
     assert again.status.faults == ()
     assert all(drives)
     assert np.abs(plant.q - q).max() < 1e-3
@@ -69,19 +69,19 @@ def test_an_arm_that_is_held_is_taken_over_without_letting_go_of_it(made):
 def test_an_arm_that_was_released_is_enabled_anew(made):
     board, link, _ = made(silence_reaction=Reaction.RELEASE)
     again = left_silent(board, link)
-    assert again.status.state is State.FAULTED
+    assert again.status.state is BoardState.FAULTED
     enable(again)
-    assert again.status.state is State.ENABLED
+    assert again.status.state is BoardState.ENABLED
 
 
 def test_an_arm_that_still_slows_down_is_waited_for(made):
     board, _, _ = made()
     board.enable()
     board.send(JointCommand(np.full(6, 1.5), np.full(6, 1.5), np.zeros(6), 1.0))
-    while board.status.state is not State.STOPPING:
+    while board.status.state is not BoardState.STOPPING:
         board.receive(0.01)
     enable(board)
-    assert board.status.state is State.ENABLED
+    assert board.status.state is BoardState.ENABLED
 
 
 def test_other_faults_are_a_persons_to_look_at(made):
@@ -93,7 +93,7 @@ def test_other_faults_are_a_persons_to_look_at(made):
         enable(again)
     assert "\n" not in str(told.value)
     again.receive(0.05)
-    assert again.status.state is State.FAULTED  # nothing was cleared
+    assert again.status.state is BoardState.FAULTED  # nothing was cleared
     assert {each.fault for each in again.status.faults} >= {Fault.HOST_SILENT, Fault.POT_OPEN}
 
 
@@ -105,7 +105,7 @@ def test_an_emergency_stop_is_not_undone(made):
     with pytest.raises(DeviceError, match="emergency stop"):
         enable(board)
     board.receive(0.05)
-    assert board.status.state is State.STOPPED
+    assert board.status.state is BoardState.STOPPED
 
 
 def stands(q):

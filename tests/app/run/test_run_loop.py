@@ -19,13 +19,13 @@ from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import run_experiment
 from armsight.app.run.loop import PERIOD_S, Loop, beside, steady
 from armsight.app.run.motion_file import QUICK, read_motions
-from armsight.app.run.record import Log, Segment
+from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
 from armsight.data import JointStates, Missed, Shot
 from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator
-from armsight.robot.boards.codes import State
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
+from armsight.robot.boards.codes import BoardState
 from armsight.robot.trajectories import point_to_point
 
 ARM = open_arm("six_r")
@@ -36,11 +36,11 @@ class Standing:
 
     def __init__(self):
         self.t_s, self.sent = 0.0, []
-        self.status = SimpleNamespace(state=State.DISABLED, faults=(), t_s=0.0)
+        self.status = SimpleNamespace(state=BoardState.DISABLED, faults=(), t_s=0.0)
         self.joints = SimpleNamespace(reference_rad=ARM.home)
 
     def enable(self):
-        self.status.state = State.ENABLED
+        self.status.state = BoardState.ENABLED
 
     def receive(self, wait_s=0.0):
         count = round(wait_s * 1000)
@@ -84,7 +84,7 @@ def looped(board, **given):
 
 def stand(loop, seconds):
     still = point_to_point(ARM, ARM.home, ARM.home)
-    loop.run(Planned(still, loop.t_s, lambda q: np.zeros(6)), seconds, Segment("open_loop", "", "", False))
+    loop.run(Planned(still, loop.t_s, lambda q: np.zeros(6)), seconds, RunSegment("open_loop", "", "", False))
 
 
 def test_cameras_that_stall_end_a_run_and_a_body_that_is_hidden_does_not():
@@ -175,7 +175,7 @@ def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
     ended = threading.Event()
 
     def work():
-        board.status.state = State.HOLDING
+        board.status.state = BoardState.HOLDING
         ended.wait(10.0)
 
     with pytest.raises(DeviceError, match="went over to HOLDING"):
@@ -203,7 +203,7 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     still = point_to_point(ARM, ARM.home, ARM.home)
     planned = Planned(still, loop.t_s, lambda q: np.zeros(6))
     loop.run_until_seen(
-        planned, 0.02, Segment("calibration", "", "", False)
+        planned, 0.02, RunSegment("calibration", "", "", False)
     )  # what was begun before is not taken for it
     (name,) = [name for name, _, _ in loop.log.poses[len(names) :]]
     assert int(name) >= 60

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from armsight.app.run.record import Log, Segment, ToolTrack, assembled, errors
+from armsight.app.run.record import Log, RunSegment, ToolTrack, assembled, errors
 from armsight.data import JointStates, PoseEstimate
 from armsight.geometry.pose import exp_se3
 from armsight.loop.estimators import Delay, Mounting
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 ARM = open_arm("six_r")
 RATE_HZ, SHOTS, DELAY_S = 60.0, 600, 0.02
@@ -31,7 +31,7 @@ def assemble(rng, delay, jitter_s, off_s, exposed=EXPOSED):
         joints=[JointStates(t_s, np.tile(ARM.home, (len(t_s), 1)))],
         fused=[ToolTrack(t_s[:1], np.eye(4)[None], np.full(1, ""), np.full(1, ""), cov[None])],
         poses=[(str(n), stamps[n], PoseEstimate(Ts[n], cov, cov, 0.0, 0.0, 1.0, None)) for n in range(len(exposed))],
-        segments=[Segment("open_loop", "swing", "joints", False)],
+        segments=[RunSegment("open_loop", "swing", "joints", False)],
     )
     run = assembled(log, ARM, Mounting(np.eye(4), np.eye(4), np.zeros((12, 12))), delay, (t_s, swinging(t_s)))
     return run.vision, run.truth

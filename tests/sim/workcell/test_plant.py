@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from armsight.robot.models import MODELS, open_arm
-from armsight.sim.workcell.arm import PRESETS, drawn, pot_travel
+from armsight.robot.arm_file import open_arm
+from armsight.robot.models import MODELS
+from armsight.sim.workcell.arm import PRESETS, sample_arm, pot_travel
 from armsight.sim.workcell.board import gravity_duty
-from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, row_frames, solids, gravity_torque
+from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, gravity_torque, row_frames, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant, mjcf
 
 MODEL = open_arm("six_r")
@@ -18,7 +19,7 @@ OFF = np.zeros(6)
 
 def plant(name: str = "nominal", seed: int = 0, **changes) -> ArmPlant:
     given = replace(PRESETS[name], **changes)
-    return ArmPlant(MODEL, drawn(MODEL, given, seed), seed)
+    return ArmPlant(MODEL, sample_arm(MODEL, given, seed), seed)
 
 
 def run(arm: ArmPlant, duty, ticks: int, drives_on: bool = True) -> np.ndarray:
@@ -136,7 +137,7 @@ def test_backlash_is_as_wide_as_it_was_drawn():
         leads.append((path[-200:, 0] - path[-200:, 6]).mean())
     width = np.mean(leads[::2]) - np.mean(leads[1::2])
     drag = 2 * motors.bearing_nm[0] / arm.stiffness[0]
-    true = drawn(MODEL, PRESETS["worn"], 0)
+    true = sample_arm(MODEL, PRESETS["worn"], 0)
     assert drag < 0.1 * true.backlash_rad[0]
     assert width == pytest.approx(true.backlash_rad[0] + drag, rel=0.02)
 
@@ -144,7 +145,7 @@ def test_backlash_is_as_wide_as_it_was_drawn():
 def test_weight_pulls_the_links_through_play_and_twist():
     arm = plant("worn")
     shaft, link = arm.path[-1, :6], arm.path[-1, 6:]
-    true = drawn(MODEL, PRESETS["worn"], 0)
+    true = sample_arm(MODEL, PRESETS["worn"], 0)
     torque = gravity_torque(true.arm, arm.parts, link)
     expected = np.sign(torque) * 0.5 * true.backlash_rad + torque / arm.stiffness
     heavy = np.abs(torque) > 5 * arm.motors.bearing_nm
@@ -197,7 +198,7 @@ def test_the_same_seed_gives_the_same_numbers():
 @pytest.mark.parametrize("name", MODELS)
 def test_every_arm_can_be_built_and_driven(name):
     model = open_arm(name)
-    arm = ArmPlant(model, drawn(model, PRESETS["worn"], 0), 0)
+    arm = ArmPlant(model, sample_arm(model, PRESETS["worn"], 0), 0)
     rng = np.random.default_rng(0)
     for _ in range(300):
         arm.step(rng.uniform(-1, 1, 6), True)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from armsight.robot.models import open_arm
-from armsight.sim.workcell import raycast as cell_rays
+from armsight.robot.arm_file import open_arm
+from armsight.sim.workcell import raycast
 from armsight.sim.workcell.motors import solids
 from armsight.sim.workcell.raycast import LAMP_BASE, corner_rays, furniture, pixel_rays, view
 from armsight.vision.camera import Camera
@@ -26,7 +26,7 @@ def cast(rays, T, seed=3):
     boxes, capsules = furniture(seed)
     out = (np.empty(len(rays), np.float32), np.empty(len(rays), np.float32), np.empty(len(rays), np.int16))
     R = np.ascontiguousarray(T[:3, :3])
-    cell_rays.still(rays, R, EYE, boxes, capsules, LAMP_BASE, *out)
+    raycast.still(rays, R, EYE, boxes, capsules, LAMP_BASE, *out)
     return out
 
 

@@ -18,88 +18,88 @@ SMALL = "640x360@60"
 
 
 @pytest.fixture
-def cell():
-    with Workcell(arm="worn", cameras=SMALL, seed=3, machine="host") as made:
+def workcell():
+    with Workcell.open(arm="worn", cameras=SMALL, seed=3, emulator="host") as made:
         yield made
 
 
-def go(cell, q_from, q_to, rest_s=0.4, each=lambda: None):
+def go(workcell, q_from, q_to, rest_s=0.4, each=lambda: None):
     """Move from pose to pose as a host does, with a command every 10 ms; return the potentiometers' readings."""
-    path = point_to_point(cell.model, q_from, q_to)
+    path = point_to_point(workcell.model, q_from, q_to)
     times, readings = [], []
     for k in range(round((path.duration_s + rest_s) * 100)):
         at = path.at(0.01 * (k + 1))
-        cell.board.send(JointCommand(at.q, at.qd, cell.gravity_duty(at.q), 0.01))
-        states = cell.board.receive(0.01)
+        workcell.board.send(JointCommand(at.q, at.qd, workcell.gravity_duty(at.q), 0.01))
+        states = workcell.board.receive(0.01)
         times.append(states.t_s)
         readings.append(states.q)
         each()
     return np.concatenate(times), np.concatenate(readings)
 
 
-def test_the_arm_follows_and_comes_to_rest(cell):
-    cell.advance(0.05)
-    cell.board.enable()
-    cell.board.receive()
-    q = cell.poses[0]
-    times, readings = go(cell, cell.model.home, q)
-    assert cell.board.status.state == State.ENABLED
-    assert cell.board.status.faults == ()
+def test_the_arm_follows_and_comes_to_rest(workcell):
+    workcell.advance(0.05)
+    workcell.board.enable()
+    workcell.board.receive()
+    q = workcell.poses[0]
+    times, readings = go(workcell, workcell.model.home, q)
+    assert workcell.board.status.state == State.ENABLED
+    assert workcell.board.status.faults == ()
     # At rest the potentiometers say what was asked for, but for their noise and what friction holds.
     assert np.abs(readings[-100:].mean(axis=0) - q).max() < np.deg2rad(0.15)
-    truth = cell.truth
+    truth = workcell.truth
     at_rest = truth.q[-150:]
     assert np.ptp(at_rest, axis=0).max() < np.deg2rad(0.05)
     # A reading stamped k ms is of the shaft as it was at k ms.
     rows = np.rint(times * 1000).astype(int)
-    off = readings - truth.shaft[rows] - cell.plant.pots.error(truth.shaft[rows])
+    off = readings - truth.shaft[rows] - workcell.plant.pots.error(truth.shaft[rows])
     speed = np.gradient(truth.shaft, 1e-3, axis=0)[rows]
     late = (speed * off).sum(axis=0) / (speed**2).sum(axis=0)
     assert np.abs(late).max() < 1e-4  # s; the noise of some 1000 readings tells it to 2e-5 s
 
 
-def test_what_the_potentiometers_say_misleads_by_millimetres(cell):
-    cell.advance(0.05)
-    cell.board.enable()
-    cell.board.receive()
-    _, readings = go(cell, cell.model.home, cell.poses[1])
-    said, true = cell.model.forward(readings[-1]), cell.truth.T_base_tool[-1]
+def test_what_the_potentiometers_say_misleads_by_millimetres(workcell):
+    workcell.advance(0.05)
+    workcell.board.enable()
+    workcell.board.receive()
+    _, readings = go(workcell, workcell.model.home, workcell.poses[1])
+    said, true = workcell.model.forward(readings[-1]), workcell.truth.T_base_tool[-1]
     assert 1e-3 < np.linalg.norm(said[:3, 3] - true[:3, 3]) < 15e-3
 
 
-def test_shots_come_when_they_should(cell):
-    first = cell.source.read()
+def test_shots_come_when_they_should(workcell):
+    first = workcell.source.read()
     for _ in range(5):
-        shot = cell.source.read()
+        shot = workcell.source.read()
     assert int(shot.name) == int(first.name) + 5
-    assert 0 <= cell.t_s - shot.t_s < 1e-3  # handed out in the millisecond in which it came
-    assert shot.t_s - cell.truth.shot_t_s[shot.name] == pytest.approx(
-        cell.timing.exposure_s / 2 + cell.timing.delay_s, abs=3 * cell.timing.jitter_s
+    assert 0 <= workcell.t_s - shot.t_s < 1e-3  # handed out in the millisecond in which it came
+    assert shot.t_s - workcell.truth.shot_t_s[shot.name] == pytest.approx(
+        workcell.timing.exposure_s / 2 + workcell.timing.delay_s, abs=3 * workcell.timing.jitter_s
     )
-    assert cell.poll() is None
-    cell.advance(0.100)
-    newest = cell.poll()
+    assert workcell.poll() is None
+    workcell.advance(0.100)
+    newest = workcell.poll()
     assert int(newest.name) == int(shot.name) + 6  # those between are gone, as in a camera's queue of one
-    assert cell.poll() is None
+    assert workcell.poll() is None
     assert newest.left.shape == (360, 640)
     assert newest.left.dtype == np.uint8
 
 
 def test_the_body_is_in_the_images_where_the_truth_says():
-    with Workcell(arm="used", cameras="1280x720@30", seed=1, machine="host") as cell:
-        cell.board.enable()
-        _look_all_the_way(cell)
+    with Workcell.open(arm="used", cameras="1280x720@30", seed=1, emulator="host") as workcell:
+        workcell.board.enable()
+        _look_all_the_way(workcell)
 
 
-def _look_all_the_way(cell):
-    discs, worst = cell.target.discs, []
+def _look_all_the_way(workcell):
+    discs, worst = workcell.target.discs, []
 
     def look():
-        shot = cell.poll()
+        shot = workcell.poll()
         if shot is None:
             return
-        truth = cell.truth
-        times = cell.source.taken[shot.name]
+        truth = workcell.truth
+        times = workcell.source.taken[shot.name]
         for side, t in (("left", times.left_s), ("right", times.right_s)):
             k = int(t * 1000)
             q = truth.q[k] + (t * 1000 - k) * (truth.q[k + 1] - truth.q[k])
@@ -110,54 +110,54 @@ def _look_all_the_way(cell):
             found = discs.find(shot.image(side)).uv
             worst.append(np.median(np.linalg.norm(found[:, None] - uv, axis=2).min(axis=0)))
 
-    go(cell, cell.model.home, cell.poses[2], each=look)
+    go(workcell, workcell.model.home, workcell.poses[2], each=look)
     # A disc at a slant is found beside the image of its middle by up to some hundredths of a pixel.
     assert len(worst) > 60
     assert max(worst) < 0.1
 
 
-def test_a_card_hides_the_body_from_both_cameras(cell):
-    cell.cover(0.30, 0.40)
+def test_a_card_hides_the_body_from_both_cameras(workcell):
+    workcell.cover(0.30, 0.40)
     counts = {}
-    while cell.t_s < 0.6:
-        shot = cell.source.read()
-        counts[cell.truth.shot_t_s[shot.name]] = min(
-            len(cell.target.discs.find(shot.image(s)).uv) for s in ("left", "right")
+    while workcell.t_s < 0.6:
+        shot = workcell.source.read()
+        counts[workcell.truth.shot_t_s[shot.name]] = min(
+            len(workcell.target.discs.find(shot.image(s)).uv) for s in ("left", "right")
         )
     assert all((n < 3) == (0.30 <= t < 0.40) for t, n in counts.items() if min(abs(t - 0.3), abs(t - 0.4)) > 2e-4)
 
 
-def test_the_board_is_seen(cell):
-    before = cell.t_s
-    board = open_board(cell.board_spec)
-    for shot in cell.board_shots(4):
+def test_the_board_is_seen(workcell):
+    before = workcell.t_s
+    board = open_board(workcell.board_spec)
+    for shot in workcell.board_shots(4):
         for side in ("left", "right"):
             assert board.detect(shot.image(side)).problem is None
-    assert cell.t_s == before
+    assert workcell.t_s == before
 
 
-def test_cameras_that_are_unplugged_say_so(cell):
-    cell.source.read()
-    gone_s = cell.t_s + 0.05
-    cell.source.unplug(gone_s)
-    while cell.t_s < gone_s - 1 / 60 - 1e-9:
-        cell.source.read()
+def test_cameras_that_are_unplugged_say_so(workcell):
+    workcell.source.read()
+    gone_s = workcell.t_s + 0.05
+    workcell.source.unplug(gone_s)
+    while workcell.t_s < gone_s - 1 / 60 - 1e-9:
+        workcell.source.read()
     with pytest.raises(DeviceError, match="no frame"):
-        cell.source.read()
-    assert cell.t_s == pytest.approx(gone_s)
+        workcell.source.read()
+    assert workcell.t_s == pytest.approx(gone_s)
     with pytest.raises(DeviceError, match="no frame"):
-        cell.poll()
+        workcell.poll()
 
 
-def test_the_button_stops_the_arm(cell):
-    cell.advance(0.05)
-    cell.board.enable()
-    cell.plant.stop_pressed = True
-    cell.board.receive(0.05)
-    assert cell.board.status.state == State.STOPPED
-    before = cell.truth.shaft[-1]
-    cell.advance(0.3)
-    assert np.abs(cell.truth.shaft[-1] - before).max() < 1e-5
+def test_the_button_stops_the_arm(workcell):
+    workcell.advance(0.05)
+    workcell.board.enable()
+    workcell.plant.stop_pressed = True
+    workcell.board.receive(0.05)
+    assert workcell.board.status.state == State.STOPPED
+    before = workcell.truth.shaft[-1]
+    workcell.advance(0.3)
+    assert np.abs(workcell.truth.shaft[-1] - before).max() < 1e-5
 
 
 def test_the_same_seed_gives_the_same_numbers():
@@ -167,17 +167,17 @@ def test_the_same_seed_gives_the_same_numbers():
 
 def _numbers(seed):
     """All that a short run hands out."""
-    with Workcell(arm="worn", cameras="320x240@120", seed=seed, machine="host") as cell:
-        cell.board.enable()
+    with Workcell.open(arm="worn", cameras="320x240@120", seed=seed, emulator="host") as workcell:
+        workcell.board.enable()
         polled = []
-        _, readings = go(cell, cell.model.home, cell.poses[0], 0.0, lambda: polled.append(cell.poll()))
+        _, readings = go(workcell, workcell.model.home, workcell.poses[0], 0.0, lambda: polled.append(workcell.poll()))
         shots = [shot for shot in polled if shot is not None]
         images = np.stack([image for shot in shots for image in (shot.left, shot.right)])
-        return readings, images, [shot.t_s for shot in shots], cell.truth.q, next(cell.board_shots(1)).left
+        return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.board_shots(1)).left
 
 
-def test_a_picture_of_the_cell(cell):
-    picture = cell.picture((320, 180))
+def test_a_picture_of_the_cell(workcell):
+    picture = workcell.picture((320, 180))
     assert picture.shape == (180, 320, 3)
     assert picture.std() > 20
     orange = (picture[..., 2].astype(int) - picture[..., 0] > 60).mean()
@@ -197,28 +197,28 @@ def test_a_picture_of_the_cell(cell):
 )
 def test_a_wrong_name_is_told_with_the_right_ones(given, said):
     with pytest.raises(InputError, match=said):
-        Workcell(**{"machine": "host", "cameras": "320x240@60", **given})
+        Workcell.open(**{"machine": "host", "cameras": "320x240@60", **given})
 
 
-def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(cell):
-    off = replace(cell.model, a=cell.model.a + 0.002, name="believed")
-    with Workcell(arm="worn", cameras=SMALL, seed=3, machine="host", believed=off) as other:
+def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(workcell):
+    off = replace(workcell.model, a=workcell.model.a + 0.002, name="believed")
+    with Workcell.open(arm="worn", cameras=SMALL, seed=3, emulator="host", assumed=off) as other:
         assert other.model is off
         for name in ("T_base_rig", "T_tool_body"):
-            assert np.array_equal(getattr(other.truth, name), getattr(cell.truth, name))
-        assert np.array_equal(other.plant.arm.table, cell.plant.arm.table)
-        assert np.array_equal(other.gravity_duty(off.home), cell.gravity_duty(off.home))
-        assert other.board.configuration() == cell.board.configuration()
-        assert not np.array_equal(other.poses, cell.poses)
+            assert np.array_equal(getattr(other.truth, name), getattr(workcell.truth, name))
+        assert np.array_equal(other.plant.arm.table, workcell.plant.arm.table)
+        assert np.array_equal(other.gravity_duty(off.home), workcell.gravity_duty(off.home))
+        assert other.board.configuration() == workcell.board.configuration()
+        assert not np.array_equal(other.poses, workcell.poses)
 
 
 def test_a_cell_like_another_sees_the_same_room_at_another_rate():
-    with Workcell(seed=4, machine="host", cameras=SMALL) as one:
-        with Workcell(seed=4, machine="host", cameras="640x360@120", like=one) as other:
-            alone = Workcell(seed=4, machine="host", cameras="640x360@120")
+    with Workcell.open(seed=4, emulator="host", cameras=SMALL) as one:
+        with Workcell.open(seed=4, emulator="host", cameras="640x360@120", like=one) as other:
+            alone = Workcell.open(seed=4, emulator="host", cameras="640x360@120")
             with alone:
-                for cell in (other, alone):
-                    cell.advance(0.05)
+                for workcell in (other, alone):
+                    workcell.advance(0.05)
                 np.testing.assert_array_equal(other.source.read().left, alone.source.read().left)
         with pytest.raises(InputError, match="like"):
-            Workcell(seed=5, machine="host", cameras=SMALL, like=one)
+            Workcell.open(seed=5, emulator="host", cameras=SMALL, like=one)

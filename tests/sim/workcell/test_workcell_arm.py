@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.robot.models import open_arm
-from armsight.sim.workcell.arm import PRESETS, drawn, imperfections
+from armsight.robot.arm_file import open_arm
+from armsight.sim.workcell.arm import PRESETS, sample_arm, imperfections
 from armsight.sim.workcell.board import configuration
 from armsight.sim.workcell.motors import chosen, solids
 
@@ -13,7 +13,7 @@ MODEL = open_arm("six_r")
 
 
 def test_a_nominal_arm_is_its_table():
-    true = drawn(MODEL, PRESETS["nominal"], 3)
+    true = sample_arm(MODEL, PRESETS["nominal"], 3)
     assert (true.arm.table == MODEL.table).all()
     assert not true.backlash_rad.any()
     assert not true.pot_offset_rad.any()
@@ -23,7 +23,7 @@ def test_a_nominal_arm_is_its_table():
 @pytest.mark.parametrize("seed", range(5))
 def test_a_worn_arm_is_off_by_what_the_preset_says(seed):
     given = PRESETS["worn"]
-    true = drawn(MODEL, given, seed)
+    true = sample_arm(MODEL, given, seed)
     for name, amount, rows in (
         ("a", given.length_m, slice(0, 5)),
         ("d", given.length_m, slice(1, 5)),
@@ -41,14 +41,14 @@ def test_a_worn_arm_is_off_by_what_the_preset_says(seed):
 
 def test_what_only_moves_base_and_tool_is_not_wrong():
     """Errors in these places of the table leave every motion as it was, seen from a rig that was placed by motions."""
-    true = drawn(MODEL, PRESETS["worn"], 0).arm
+    true = sample_arm(MODEL, PRESETS["worn"], 0).arm
     assert (true.d[[0, 5]] == MODEL.d[[0, 5]]).all()
     assert (true.offset[[0, 5]] == MODEL.offset[[0, 5]]).all()
     assert (true.a[5], true.alpha[5]) == (MODEL.a[5], MODEL.alpha[5])
 
 
 def test_the_same_seed_draws_the_same_arm_and_another_another():
-    first, again, other = (drawn(MODEL, PRESETS["worn"], seed) for seed in (1, 1, 2))
+    first, again, other = (sample_arm(MODEL, PRESETS["worn"], seed) for seed in (1, 1, 2))
     assert (first.arm.table == again.arm.table).all()
     assert (first.pot_sines == again.pot_sines).all()
     assert (first.arm.table != other.arm.table).any()

@@ -5,12 +5,12 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.cameras import (
     DISTANCE_M,
     RIGS,
     WEBCAMS,
-    Timing,
+    CameraTiming,
     open_rig,
     open_timing,
     rig_pose,
@@ -19,7 +19,7 @@ from armsight.sim.workcell.cameras import (
 
 
 def test_shots_come_at_their_rate_and_are_stamped_when_they_came():
-    timing = Timing()
+    timing = CameraTiming()
     times = [shot_times(timing, 4, k) for k in range(400)]
     left = np.array([t.left_s for t in times])
     assert np.abs(np.diff(left) - 1 / 60).max() < 1e-12
@@ -29,7 +29,7 @@ def test_shots_come_at_their_rate_and_are_stamped_when_they_came():
     assert late.std() == pytest.approx(timing.jitter_s, rel=0.1)  # 400 draws tell it to 3.5 %
 
 
-@pytest.mark.parametrize("timing", [Timing(), WEBCAMS])
+@pytest.mark.parametrize("timing", [CameraTiming(), WEBCAMS])
 def test_the_right_camera_is_as_far_off_as_it_says(timing):
     times = [shot_times(timing, 1, k) for k in range(400)]
     apart = np.array([t.right_s - t.left_s for t in times]) - timing.skew_s
@@ -38,12 +38,12 @@ def test_the_right_camera_is_as_far_off_as_it_says(timing):
 
 
 def test_a_shot_is_the_same_whatever_came_before():
-    assert shot_times(Timing(), 2, 17) == shot_times(Timing(), 2, 17)
-    assert shot_times(Timing(), 2, 17) != shot_times(Timing(), 3, 17)
+    assert shot_times(CameraTiming(), 2, 17) == shot_times(CameraTiming(), 2, 17)
+    assert shot_times(CameraTiming(), 2, 17) != shot_times(CameraTiming(), 3, 17)
 
 
 def test_what_can_be_asked_for():
-    assert open_timing("1280x720@60") == Timing()
+    assert open_timing("1280x720@60") == CameraTiming()
     fast = open_timing("1920x1080@120")
     assert (fast.image_size_px, fast.rate_hz, fast.exposure_s) == ((1920, 1080), 120.0, 0.002)
     assert open_timing("webcams") == WEBCAMS

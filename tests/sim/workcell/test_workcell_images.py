@@ -1,11 +1,11 @@
-"""A camera's images of the cell: the painter's own, disc centres where they belong, and what covers what."""
+"""A camera's images of the workcell: against rays and the renderer, disc centres, and what covers what."""
 
 import numpy as np
 import pytest
 
-from armsight.geometry.pose import exp_se3, inverse, pose
+from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.sim.render.optics import Sensor, exposed, noise_start, noise_strip, shaded
 from armsight.sim.render.render import Shutter, radiance
 from armsight.sim.render.scene import PosedBody, plate
@@ -13,6 +13,9 @@ from armsight.sim.workcell.body import body_patterns, body_target
 from armsight.sim.workcell.cameras import open_rig, rig_pose
 from armsight.sim.workcell.images import LENS, ArmSeen, WorkcellCamera, moving
 from armsight.sim.workcell.motors import row_frames, solids
+from disc_rims import ellipse_through, rim
+from render_oracle import brute
+from views import pixels
 
 MODEL = open_arm("six_r")
 PARTS = solids(MODEL)
@@ -34,17 +37,33 @@ def somewhere(rng, tilt=0.25):
     return pose(exp_so3(rng.normal(0, tilt, 3)), p)
 
 
-def centre_of(camera, T, p, normal, radius):
-    """The middle of the ellipse that a disc's rim makes in the image: a conic through 64 points of it."""
-    a = np.cross(normal, [1.0, 0.0, 0.1])
-    a /= np.linalg.norm(a)
-    angle = np.arange(64) * 2 * np.pi / 64
-    rim = p + radius * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * np.cross(normal, a))
-    uv = camera.project(rim @ T[:3, :3].T + T[:3, 3])
-    middle, scale = uv.mean(axis=0), uv.std()
-    x, y = ((uv - middle) / scale).T
-    c = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(64), rcond=None)[0]
-    return middle + scale * np.linalg.solve([[2 * c[0], c[1]], [c[1], 2 * c[2]]], -c[3:5])
+@pytest.mark.parametrize("exposure_s", [0.0, 0.004])
+def test_a_pattern_is_painted_as_rays_through_every_pixel_see_it(camera, exposure_s):
+    """By brute force, as the mean over moments of the exposure, where the pattern alone is seen; then lens and sensor."""
+    rng, sensor = np.random.default_rng(5), Sensor(read_noise=0.0)
+    vignetting = shaded(np.ones(SIZE[::-1], np.float32), LENS)
+    twist = np.array([0.4, -0.2, 0.3, 0.5, -0.6, 0.7])  # 4 px in 4 ms
+    moments = exposure_s * ((np.arange(9) + 0.5) / 9 - 0.5) if exposure_s else [0.0]
+    for face in body_patterns()[:3]:
+        T = somewhere(rng)
+        image = camera.image(None, [PosedBody((face,), T, twist)], Shutter(exposure_s), QUIET, 0)
+        x, y, _, _ = face.discs[0]
+        u, v = pixels(camera.camera, transform(T @ face.T_body_pattern, np.array([[x, y, 0.0]])))[0].astype(int)
+        window = u - 9, v - 7, u + 9, v + 7
+
+        def light(ground, samples, window=window, face=face, T=T):
+            seen = [
+                brute(camera.camera, [(face, T @ exp_se3(t_s * twist))], window, 0.7, ground, samples) for t_s in moments
+            ]
+            return np.mean(seen, axis=0)
+
+        covered = np.abs(light(0.0, 4) - light(1.0, 4)) < 1e-9
+        part = np.s_[window[1] : window[3], window[0] : window[2]]
+        expected = sensor.gain * vignetting[part] * light(0.0, 16) + sensor.offset
+        assert covered.mean() > 0.5
+        assert np.ptp(expected[covered]) > 50  # the disc and what is around it
+        # Rounding takes half a level; sixteen samples a pixel and side, and nine moments, take less than the other half.
+        assert np.abs(image[part] - expected)[covered].max() <= 1.0
 
 
 @pytest.mark.parametrize("shutter", [STILL, Shutter(0.002), Shutter(0.004, 2e-5)])
@@ -77,7 +96,8 @@ def test_disc_centres_are_where_they_belong(camera, exposure_s):
         centroid = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
         path = [exp_se3(0.5 * exposure_s * x * twist) for x in (-(0.6**0.5), 0.0, 0.6**0.5)]
         at = np.array([*disc[:2], 0.0])
-        seen = [centre_of(camera.camera, T @ X, at, np.array([0, 0, -1.0]), disc[2]) for X in path]
+        rims = [transform(T @ X, rim(at, np.array([0, 0, -1.0]), disc[2])) for X in path]
+        seen = [ellipse_through(pixels(camera.camera, points))[0] for points in rims]
         errors.append(centroid - np.average(seen, axis=0, weights=(5, 8, 5)))
     # Rounding to whole levels alone makes 0.29 sqrt(sum r^2) / sum of light = 0.002 px of a disc of 6 px.
     assert np.sqrt(np.mean(np.square(errors))) < 0.003

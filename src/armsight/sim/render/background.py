@@ -14,7 +14,7 @@ _COARSEST_PX = 256  # size of the largest blobs of a texture
 
 
 def plain(image_size_px: tuple[int, int], rng: np.random.Generator) -> Reflectance:
-    """Return one value everywhere; nothing is drawn from ``rng``."""
+    """Return one value everywhere; nothing is sampled from ``rng``."""
     return np.full(image_size_px[::-1], 0.4, np.float32)
 
 
@@ -31,14 +31,14 @@ def textured(
     """
     width, height = image_size_px
     total = np.zeros((height, width), np.float32)
-    scale, weight = _COARSEST_PX, 1.0
+    scale, amplitude = _COARSEST_PX, 1.0
     while scale >= 1:
         cells = (height // scale + 3, width // scale + 3)
         noise = rng.standard_normal(cells, dtype=np.float32)
         whole = cv2.resize(noise, (cells[1] * scale, cells[0] * scale), interpolation=cv2.INTER_CUBIC)
         top, left = rng.integers(0, scale, 2)  # octaves must not share a lattice
-        total += np.float32(weight) * whole[scale + top : scale + top + height, scale + left : scale + left + width]
-        scale, weight = scale // 2, 0.7 * weight
+        total += np.float32(amplitude) * whole[scale + top : scale + top + height, scale + left : scale + left + width]
+        scale, amplitude = scale // 2, 0.7 * amplitude
     total *= np.float32(spread) / total.std()
     total += np.float32(mean) - total.mean()
     return np.asarray(np.clip(total, 0.02, 1.0))
@@ -53,7 +53,7 @@ def cluttered(image_size_px: tuple[int, int], rng: np.random.Generator, items: i
         items: how many things.
     """
     width, height = image_size_px
-    # Drawn at twice the size and averaged, for edges as smooth as a lens would make them.
+    # Rendered at twice the size and averaged, for edges as smooth as a lens would make them.
     canvas = np.full((2 * height, 2 * width), 110, np.uint8)
     for kind in rng.choice(len(_ITEMS), items, p=_SHARES):
         centre = rng.uniform(0, (2 * width, 2 * height))
@@ -76,7 +76,7 @@ def _polygon(
 def _box(
     canvas: NDArray[np.uint8], centre: NDArray[np.float64], size: float, grey: int, rng: np.random.Generator
 ) -> None:
-    """Draw a turned rectangle with a darker side, as a box seen from above."""
+    """Draw a rotated rectangle with a darker side, as a box seen from above."""
     shape = (centre.tolist(), (size, size * rng.uniform(0.3, 1.0)), rng.uniform(0, 180))
     corners = cv2.boxPoints(shape)
     cv2.fillPoly(canvas, [corners.round().astype(np.int32)], grey, cv2.LINE_AA)
@@ -110,9 +110,9 @@ def _print(
 ) -> None:
     """Draw a few letters."""
     letters = "".join(rng.choice(list("ABCDEFGHKLMNOPRSTUVXYZ0123456789o.:"), rng.integers(2, 9)))
-    place = (int(centre[0]), int(centre[1]))
+    corner = (int(centre[0]), int(centre[1]))
     face, scale = int(rng.choice([cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX])), 0.6 + size / 100
-    cv2.putText(canvas, letters, place, face, scale, grey, int(1 + 2 * scale), cv2.LINE_AA)
+    cv2.putText(canvas, letters, corner, face, scale, grey, int(1 + 2 * scale), cv2.LINE_AA)
 
 
 _ITEMS = (_polygon, _box, _rod, _ellipse, _print)

@@ -59,7 +59,7 @@ class Exposure(NamedTuple):
     Attributes:
         palette: P patterns with K discs.
         weights: (S,) share of each step in the light.
-        order: (S, P) patterns in the order they are painted in; -1 in place of those that do not face the camera.
+        order: (S, P) patterns in the order they are painted in; -1 for those that do not face the camera.
         Ms: (S, P, 1 or H, 3, 3) from rays to homogeneous coordinates of each pattern's plane, for all rows or for each;
             the third is 1 / depth along the ray.
         boxes: (P + K, 4) pixels that each pattern can cover, and after it each of its discs: first column, first row, end

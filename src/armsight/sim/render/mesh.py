@@ -1,7 +1,7 @@
 """Images of solid bodies with exact depth: triangles whose material has a grain, seen through the full camera model.
 
 Meshes and a camera go in; an 8-bit image and the depth of every pixel's centre come out. The grain is a function of the
-place in the body (value noise in octaves), so that it needs no unfolding and moves with the body. Light is even; each
+position in the body (value noise in octaves), so that it needs no unfolding and moves with the body. Light is even; each
 pixel is the mean of a few samples, so that edges are soft as a sensor's are.
 """
 

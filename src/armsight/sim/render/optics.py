@@ -1,12 +1,11 @@
-"""The lens and the sensor: from painted areas to the grey levels a camera hands out.
+"""The lens and the sensor: from painted areas to the grey levels a camera returns.
 
 The blur is a Gaussian of the image plane, integrated exactly over the pixel that receives and the pixel, or the part
-of an edge pixel, that sends: a pixel of one value is spread exactly, and an edge is placed to a part of a pixel first.
+of an edge pixel, that sends: a pixel of one value is spread exactly, and an edge is first located to a part of a pixel.
 
-The last step of a camera's image: noise and rounding, of a whole image at once.
-
-Noise comes from a long strip drawn once; each image begins somewhere else in it, which its number and the seed tell. So
-an image does not depend on which others were taken, and two threads share nothing that changes.
+Noise and rounding are the last step, for a whole image at once. The noise of the workcell's images comes from a long strip
+that is sampled once; each image begins somewhere else in it, at an index that its number and the seed determine. So an
+image does not depend on which others were taken, and two threads share nothing that changes.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from armsight.sim.render.paint import SUB, Slots
 
 Radiance = NDArray[np.float32]
 
-#: An edge drawn in parts of a pixel is as wide as this variance already, px^2 (mean over where in a part it lies).
+#: An edge rendered in parts of a pixel is as wide as this variance already, px^2 (mean over where in a part it lies).
 _PARTS_VARIANCE = 1 / (6 * SUB**2)
 
 
@@ -48,7 +47,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What turns light into numbers.
+    """How a sensor converts light into numbers.
 
     Attributes:
         gain: grey levels of a reflectance of one.
@@ -192,7 +191,7 @@ def shaded(radiance: Radiance, optics: Optics) -> Radiance:
 
 
 def exposed(radiance: Radiance, sensor: Sensor, rng: np.random.Generator | None) -> Image:
-    """Turn light into grey levels: gain, noise, saturation, rounding, JPEG.
+    """Convert light into grey levels: gain, noise, saturation, rounding, JPEG.
 
     Args:
         radiance: (H, W) light on each pixel.
@@ -203,7 +202,7 @@ def exposed(radiance: Radiance, sensor: Sensor, rng: np.random.Generator | None)
         (H, W) uint8.
 
     Raises:
-        InputError: JPEG refuses the quality asked for.
+        InputError: JPEG does not know the requested quality.
     """
     grey = radiance * np.float32(sensor.gain)
     if rng is not None and (sensor.read_noise > 0 or sensor.shot_noise > 0):
@@ -223,7 +222,7 @@ def exposed(radiance: Radiance, sensor: Sensor, rng: np.random.Generator | None)
 
 
 Window = tuple[int, int, int, int]
-_STRIP = 1 << 22  # places where an image's noise may begin
+_STRIP = 1 << 22  # indices where an image's noise may begin
 _STEP, _MASK = 0x9E3779B97F4A7C15, (1 << 64) - 1  # of the hash that chooses one
 
 

@@ -5,20 +5,12 @@ coordinates that are linear in the ray, so inside a pixel they are interpolated 
 for a pinhole, good to 1e-4 px for any lens); every straight edge of the pattern is a straight cut through the pixel.
 A pixel that lies in one cell takes its value. A pixel that an edge crosses is split into SUB x SUB parts, and the value
 of each is exact in area: one edge, or the rim of a disc, cuts a square in two, whose areas have a closed form (a rim is
-straight within a part but for a bend that is put in by its mean); where several edges meet, a part is clipped by them
-(``paint_clip``). The parts are kept, so that the blur of the lens can be laid over what is
-really there and not over whole pixels.
+straight within a part but for its mean bend there); where several edges meet, a part is clipped by half planes (Sutherland
+and Hodgman, CACM 17(1), 1974). The parts are kept, so that the lens's blur is applied to the parts and not to whole pixels.
 
-What cells and discs are painted with: pixels cast on to a plane, pixels split into parts, straight cuts through squares.
-
-See ``paint``. numba's cache on disk looks at the age of the file that calls: after a change here, or in another of the
-painter's files, delete the cache of all of them.
-
-Cells of a grid where several edges meet in a pixel: which cell a place lies in, and areas clipped by cells.
-
-See ``paint``; polygons are clipped by half planes (Sutherland and Hodgman, CACM 17(1), 1974).
-
-Paint discs as ``paint`` paints cells: a rim is straight within a part of a pixel but for its mean bend there.
+In this order: pixels cast on to a plane and split into parts; cells of a grid and areas clipped by cells; discs; the
+painters :func:`paint_disc` and :func:`paint`. numba's cache on disk looks at the age of the file that calls: after a
+change here, delete the cache of ``faces`` too.
 """
 
 from __future__ import annotations
@@ -64,7 +56,7 @@ def square_of(top: Array, bottom: Array, k: int, out: Array) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> bool:
-    """Cast n pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; tell if all see it."""
+    """Cast n pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; return if all see it."""
     least = np.inf
     for k in range(n):
         x, y, z = rays[v, u0 + k, 0], rays[v, u0 + k, 1], rays[v, u0 + k, 2]
@@ -76,7 +68,7 @@ def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> boo
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def ahead_of(top: Array, bottom: Array, k: int) -> bool:
-    """Tell whether points k and k + 1 of two lines see the plane before them."""
+    """Return whether points k and k + 1 of two lines see the plane before them."""
     return bool(min(min(top[2, k], top[2, k + 1]), min(bottom[2, k], bottom[2, k + 1])) > 0.0)
 
 
@@ -170,7 +162,7 @@ def span_of(a: Slots, b: Slots, k: int, columns: int) -> Span:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def uniform(values: Array, span: Span) -> bool:
-    """Tell whether all cells of a span have one value."""
+    """Return whether all cells of a span have one value."""
     i0, i1, j0, j1 = span
     first = values[j0, i0]
     for j in range(j0, j1 + 1):
@@ -218,7 +210,7 @@ def part_corners(top: Array, bottom: Array, k: int, out: Array) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _corners(top: Array, bottom: Array, k: int, c: Array) -> None:
-    """Gather c (4, 3), in turn around it, the corners of the area between points k and k + 1 of two lines (3, n)."""
+    """Gather c (4, 3), the corners, in cyclic order, of the area between points k and k + 1 of two lines (3, n)."""
     for n in range(3):
         c[0, n], c[1, n], c[2, n], c[3, n] = top[n, k], top[n, k + 1], bottom[n, k + 1], bottom[n, k]
 
@@ -246,8 +238,8 @@ Line = tuple[float, float, float]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
     """Return the ends of the line c + u x + v y = 0 within the square of :func:`half`; its middle where it misses."""
-    turned = abs(u) < abs(v)
-    if turned:
+    steep = abs(u) < abs(v)
+    if steep:
         u, v = v, u
     if 2 * abs(c) >= abs(u) + abs(v) or u == 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -259,7 +251,7 @@ def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
     if abs(x1) > 0.5:
         x1 = 0.5 if x1 > 0.0 else -0.5
         y1 = -(c + u * x1) / v
-    return (y0, x0, y1, x1) if turned else (x0, y0, x1, y1)
+    return (y0, x0, y1, x1) if steep else (x0, y0, x1, y1)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -293,7 +285,7 @@ def _inside(points: Array, disc: Array, out: Array) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bulge(square: Array, disc: Array) -> float:
-    """Return twice by how much a place in a pixel may be further in a disc, as :func:`_inside` counts, than its corners."""
+    """Return twice by how much a point in a pixel may be further in a disc, as :func:`_inside` counts, than its corners."""
     total = 0.0
     for k in range(1, 3):
         x, y = square[k, 0] - disc[0] * square[k, 2], square[k, 1] - disc[1] * square[k, 2]
@@ -481,7 +473,7 @@ def _paint_edge(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach(rays: Array, Ms: Array, tile: Box, corner: tuple[int, int], grid: Grid) -> tuple[bool, Span]:
-    """Tell whether all of a tile of pixels sees the plane before it, and between which cells it lies at most.
+    """Return whether all of a tile of pixels sees the plane before it, and between which cells it lies at most.
 
     Cells are convex: what lies between the corners of an area lies between the cells they lie in. The area is a pixel
     larger all around, for lenses bend lines.
@@ -523,7 +515,7 @@ def paint(
         box: first column, first row, end column, end row of what may be covered, px.
         corner: column and row of the camera's image that ``box``, ``coarse`` and ``slot`` begin at.
         grid: borders (nx + 1,), (ny + 1,) and values (ny + 2, nx + 2) of the cells; values have a clear rim.
-        coarse: (H, W) pixel values, painted in place; a cell's value below zero is clear and leaves them.
+        coarse: (H, W) pixel values, painted in-place; a cell's value below zero is clear and leaves them.
         slot: (H, W) which row of ``fine`` holds a pixel's parts, -1 where it has one value.
         fine: (capacity, SUB, SUB) the parts.
         count: rows of ``fine`` in use.

@@ -190,7 +190,7 @@ def render(
     """Render what a camera sees.
 
     Args:
-        camera: the camera; the bodies are placed in its frame.
+        camera: the camera; the bodies are posed in its frame.
         bodies: rigid bodies with patterns; the nearer cover the farther.
         background: reflectance of what is behind them: one value or an image (H, W).
         optics: the lens and the light; sharp but for a blur of 0.7 px by default.
@@ -220,7 +220,7 @@ def render_pair(
     shutter: Shutter | None = None,
     rng: np.random.Generator | None = None,
 ) -> tuple[Image, Image]:
-    """Render what two cameras see at the same moment; bodies are placed in the left one's frame."""
+    """Render what two cameras see at the same moment; bodies are posed in the left one's frame."""
     T_right_left = inverse(T_left_right)
     views = (list(bodies), [body.seen_from(T_right_left) for body in bodies])
     left, right = (

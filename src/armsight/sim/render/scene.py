@@ -52,7 +52,7 @@ class Pattern(Record):
             raise InputError("a pattern's cell borders must rise and its disc radii must be above zero")
 
     def on_body(self, T_body_pattern: Array) -> Pattern:
-        """Return the same pattern at another place (4, 4) on its body."""
+        """Return the same pattern at another pose (4, 4) on its body."""
         return Pattern(self.x_edges, self.y_edges, self.values, self.discs, T_body_pattern)
 
 

@@ -1,8 +1,9 @@
-"""What is wrong with an arm: by how much it differs from its table, from a preset or a TOML file, drawn from a seed.
+"""The imperfections of an arm: how far it differs from its table, by a preset or a TOML file, sampled from a seed.
 
-Base and tool are the frames of the true arm that the nominal table means: a wrong height or zero of joint 1 and anything
-wrong in the last row would only be another choice of these two frames, which nothing that moves can tell, so they are
-never wrong. docs/workcell.md has the amounts.
+In: the nominal arm, :class:`Imperfections` and a seed. Out: a :class:`TrueArm`. Base and tool are the frames of the true
+arm that the nominal table means: an error of joint 1's height or zero, or of the last row, would only be another choice
+of these two frames, which no motion can distinguish, so these have no errors. The documentation's page on the workcell
+has the amounts.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _CYCLES = (2.0, 9.0)  # how often they swing over its travel
 
 @dataclass(frozen=True)
 class Imperfections:
-    """How far an arm is from its table. Amounts are typical ones: each is drawn between half and one and a half of it.
+    """How far an arm is from its table. Amounts are typical ones: an arm's own are sampled from 0.5 to 1.5 of them.
 
     Attributes:
         length_m: error of link lengths and offsets, m.
         angle_rad: error of link twists, rad.
         zero_rad: error of the joints' zeros, rad.
-        backlash_rad: least and greatest play between a gear's shaft and its link, rad, from stop to stop.
-        compliance_rad: twist of a joint under the greatest weight it carries, rad.
+        backlash_rad: least and greatest backlash between a gear's shaft and its link, rad, from stop to stop.
+        compliance_rad: twist of a joint under the greatest gravity load it carries, rad.
         pot_linearity: greatest deviation of a potentiometer from its straight line, share of its travel.
         pot_offset_rad: error of a potentiometer's zero, rad.
         pot_noise_lsb: noise of one conversion, steps of the converter.
@@ -97,6 +98,10 @@ _KEYS: dict[str, tuple[str, float, float, float]] = {
 }
 
 
+#: Keys of files of earlier versions -> today's.
+_OLD_KEYS = {"sag_deg": "compliance_deg"}
+
+
 def imperfections(arm: str) -> Imperfections:
     """Return a preset by name, or what a TOML file says.
 
@@ -109,7 +114,7 @@ def imperfections(arm: str) -> Imperfections:
     if arm in PRESETS:
         return PRESETS[arm]
     if not arm.endswith(".toml"):
-        known = f"{', '.join(PRESETS)}, or a TOML file (docs/workcell.md)"
+        known = f"{', '.join(PRESETS)}, or a TOML file (docs/howto/workcell.md)"
         hint = f"; a file's name must end in .toml: {arm}" if os.path.isfile(arm) else ""
         raise InputError(f"arm {arm!r} is unknown; known are {known}{hint}")
     try:
@@ -124,6 +129,7 @@ def imperfections(arm: str) -> Imperfections:
 
 
 def _key(path: str, key: str) -> tuple[str, float, float, float]:
+    key = _OLD_KEYS.get(key, key)
     if key not in _KEYS:
         raise InputError(f"{path}: unknown key {key!r}; known are preset, {', '.join(_KEYS)}")
     return _KEYS[key]
@@ -151,10 +157,10 @@ class TrueArm(Record):
 
     Attributes:
         arm: the true table; limits, home and names are the nominal one's.
-        backlash_rad: (6,) play of each joint, from stop to stop.
+        backlash_rad: (6,) backlash of each joint, from stop to stop.
         pot_offset_rad: (6,) what each potentiometer says too much.
         pot_sines: (6, 3, 3) amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
-        imperfections: what it was drawn from.
+        imperfections: what it was sampled from.
     """
 
     arm: Arm
@@ -164,8 +170,8 @@ class TrueArm(Record):
     imperfections: Imperfections
 
 
-def drawn(model: Arm, given: Imperfections, seed: int) -> TrueArm:
-    """Draw an arm.
+def sample_arm(model: Arm, given: Imperfections, seed: int) -> TrueArm:
+    """Sample a true arm.
 
     Args:
         model: the nominal table.

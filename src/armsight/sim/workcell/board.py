@@ -1,9 +1,9 @@
 """The configuration of the workcell's board: tables, limits and gains, all from the nominal arm and its motors.
 
-What an owner would do with an arm on the bench: the potentiometers' ends from the drawing, gains from what the motors turn.
+It is what an owner would set up: the potentiometers' ends from the drawing, gains from the inertia at the motors.
 With ``J`` the inertia at the joint, ``B`` the damping of motor and friction and ``K`` the stall torque, the loop
 ``J q'' + (B + K kd) q' + K kp q = K kp r`` is given the natural frequency and the damping that are asked for; the
-feed-forward ``kv = B / K`` takes the motor's own voltage off. Weight is carried by the host (:func:`gravity_duty`).
+feed-forward ``kv = B / K`` compensates the motor's own voltage. The host compensates gravity (:func:`gravity_duty`).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     Args:
         model: the nominal table.
         parts: its solids.
-        motors: what turns it.
+        motors: what drives it.
     """
     config = np.zeros((), CONFIG)
     joint, travel = config["joint"], pot_travel(model)
-    turned = motors.rotor_inertia + inertia(model, parts, model.home)
+    inertia_kg_m2 = motors.rotor_inertia + inertia(model, parts, model.home)
     damping = motors.emf_damping + motors.viscous
     gains = joint["gains"]
-    gains["kp_per_rad"] = turned * NATURAL_RAD_S**2 / motors.stall_nm
+    gains["kp_per_rad"] = inertia_kg_m2 * NATURAL_RAD_S**2 / motors.stall_nm
     gains["ki_per_rad_s"] = INTEGRAL_PER_S * gains["kp_per_rad"]
-    gains["kd_s_per_rad"] = np.maximum(2 * DAMPING * NATURAL_RAD_S * turned - damping, 0.0) / motors.stall_nm
+    gains["kd_s_per_rad"] = np.maximum(2 * DAMPING * NATURAL_RAD_S * inertia_kg_m2 - damping, 0.0) / motors.stall_nm
     gains["kv_s_per_rad"] = damping / motors.stall_nm + gains["kd_s_per_rad"]
     gains["derivative_filter_s"], gains["anti_windup_per_s"] = FILTER_S, 20.0
     pot = joint["pot"]
@@ -67,5 +67,5 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
 
 
 def gravity_duty(model: Arm, parts: Solids, motors: Motors, q: Array) -> Array:
-    """Return the duty (6,) that carries the weight of the nominal arm at joint angles q (6,), rad."""
+    """Return the duty (6,) that compensates the gravity load of the nominal arm at joint angles q (6,), rad."""
     return np.asarray(np.clip(-gravity_torque(model, parts, q) / motors.stall_nm, -1.0, 1.0))

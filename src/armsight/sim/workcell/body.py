@@ -1,8 +1,8 @@
 """The body on the tool: a plate with four wings that lean back, nine bright discs of three sizes on dark faces.
 
-The wings put discs off the plate's plane and far from its middle, which is what tells its tilt; nothing stands before
-anything else as long as the cameras see the plate from within 30 degrees of its normal, and the three sizes tell discs
-apart. x to the right, y down and z into the plate, as one looks at it.
+The wings put discs off the plate's plane and far from its middle, which makes its tilt observable; nothing hides anything
+else as long as the cameras see the plate from within 30 degrees of its normal, and the three sizes distinguish discs.
+x to the right, y down and z into the plate, as one looks at it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class _Face(Record):
 
 
 def _wing(x: float, y: float, z: float, disc: Spot) -> _Face:
-    """Return a wing at a place, mm, leaning away from the middle."""
+    """Return a wing at a position, mm, leaning away from the middle."""
     lean = np.radians(_LEAN_DEG) * np.array([np.sign(y), -np.sign(x), 0.0])
     return _Face(pose(exp_so3(lean), np.array([x, y, z]) * 1e-3), (0.046, 0.046), (disc,))
 

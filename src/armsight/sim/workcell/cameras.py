@@ -1,10 +1,8 @@
-"""When the cell's cameras look, and when their images arrive; where they stand.
+"""The workcell's two cameras as a source of shots: when they expose, when their images arrive, where they stand.
 
-Shot k is exposed about ``phase + k / rate``; the right camera by ``skew`` later, give or take ``sync``. An image arrives
-``delay`` after its exposure has ended, and is stamped then, give or take ``jitter``. Everything about shot k follows
-from the seed and k alone.
-
-The cell's two cameras as a source of shots: reading lets the cell's time pass.
+Reading lets the workcell's time pass. Shot k is exposed about ``phase + k / rate``; the right camera by ``skew`` later,
+give or take ``sync``. An image arrives ``delay`` after its exposure has ended, and is stamped then, give or take
+``jitter``. Everything about shot k follows from the seed and k alone.
 """
 
 from __future__ import annotations
@@ -37,12 +35,12 @@ _FOCAL = 900 / 1280
 _WIDTHS, _RATES = (320, 3840), (1.0, 500.0)
 #: Where the cameras' middle is, seen from where the body is at home: distance, m; to the side and up, degrees.
 DISTANCE_M, ASIDE_DEG, ABOVE_DEG = 0.85, 14.0, 12.0
-_AIM_M = 0.10  # they aim at a place so far behind the body, at home: the arm works there
+_AIM_M = 0.10  # they aim at a point so far behind the body, at home: the arm works there
 BASELINE_M = 0.2
 
 
 @dataclass(frozen=True)
-class Timing:
+class CameraTiming:
     """How two cameras keep time.
 
     Attributes:
@@ -71,7 +69,7 @@ class Timing:
         return Shutter(self.exposure_s, self.row_s)
 
 
-WEBCAMS = Timing((1280, 720), 30.0, 0.008, 0.040, 1e-3, 5e-4, 4e-3, 2e-5)
+WEBCAMS = CameraTiming((1280, 720), 30.0, 0.008, 0.040, 1e-3, 5e-4, 4e-3, 2e-5)
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,12 @@ class ShotTimes:
 
 
 @lru_cache(maxsize=256)
-def shot_times(timing: Timing, seed: int, shot: int) -> ShotTimes:
+def shot_times(timing: CameraTiming, seed: int, shot: int) -> ShotTimes:
     """Return the times of a shot.
 
     Args:
         timing: of the cameras.
-        seed: of the cell.
+        seed: of the workcell.
         shot: its number, from 0.
     """
     phase = np.random.default_rng([seed, 6]).uniform(0.0, 1.0)
@@ -106,7 +104,7 @@ def shot_times(timing: Timing, seed: int, shot: int) -> ShotTimes:
     return ShotTimes(left, left + apart, left + max(late, timing.exposure_s / 2))
 
 
-def open_timing(spec: str) -> Timing:
+def open_timing(spec: str) -> CameraTiming:
     """Return the timing that a user asks for.
 
     Args:
@@ -116,7 +114,7 @@ def open_timing(spec: str) -> Timing:
         InputError: of another form, or out of range.
     """
     text = spec.strip()
-    base = WEBCAMS if text.startswith("webcams") else Timing()
+    base = WEBCAMS if text.startswith("webcams") else CameraTiming()
     if text == "webcams":
         return base
     match = re.fullmatch(r"(?:webcams:)?(\d+)x(\d+)@(\d+(?:\.\d+)?)", text)
@@ -135,8 +133,8 @@ def open_timing(spec: str) -> Timing:
     )
 
 
-#: Name -> by how much the right camera turns to the left one's axis, as a share of what would make them look at one
-#: place DISTANCE_M away; parallel cameras are parallel to a fraction of a degree, as mounts are.
+#: Name -> by how much the right camera is rotated to the left one's axis, as a share of what would make them look at one
+#: point DISTANCE_M away; parallel cameras are parallel to a fraction of a degree, as mounts are.
 RIGS = {"parallel": 0.02, "verging": 1.0}
 
 
@@ -199,21 +197,21 @@ _BODY_M = 0.12
 _CARD_M, _CARD_BEFORE_M, _CARD_GREY = (0.34, 0.30), 0.08, 0.55
 #: So many ticks after an exposure the path is there on both sides of all its times.
 _SPARE_TICKS = 3
-#: Where the path is looked at within an exposure: its mean is the body's place in the image.
+#: Where the path is looked at within an exposure: its mean is the body's position in the image.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 class WorkcellSource:
-    """The cell's cameras.
+    """The workcell's cameras.
 
-    Fulfils :class:`armsight.vision.sources.source.Source`: ``read`` waits for the next shot, in the cell's time.
+    Fulfils :class:`armsight.vision.sources.source.Source`: ``read`` waits for the next shot, in the workcell's time.
     """
 
     def __init__(
         self,
         plant: ArmPlant,
         cameras: tuple[WorkcellCamera, WorkcellCamera],
-        timing: Timing,
+        timing: CameraTiming,
         body: tuple[tuple[Pattern, ...], Array],
         clock: tuple[Callable[[], float], Callable[[float], None]],
         seed: int,
@@ -225,7 +223,7 @@ class WorkcellSource:
             cameras: left and right.
             timing: when they look.
             body: the patterns on the tool, and T_tool_body (4, 4), m.
-            clock: says the cell's time, s; lets so many seconds of it pass.
+            clock: returns the workcell's time, s; lets so many seconds of it pass.
             seed: of noise and timing.
         """
         self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
@@ -237,7 +235,7 @@ class WorkcellSource:
         self._covers: list[tuple[float, float]] = []
         self._gone_s, self._gone = np.inf, ""
         self._pool = ThreadPoolExecutor(2)
-        #: Name of each shot that was handed out -> when it was taken, for judging only.
+        #: Name of each shot that was handed out -> when it was taken, for evaluation only.
         self.taken: dict[str, ShotTimes] = {}
 
     def cover(self, from_s: float, to_s: float) -> None:
@@ -245,7 +243,7 @@ class WorkcellSource:
         self._covers.append((from_s, to_s))
 
     def unplug(self, at_s: float, what: str = "left camera: no frame for 5 s: unplugged or stalled") -> None:
-        """Let the cameras be gone from a time on: what is read then raises DeviceError with these words."""
+        """Let the cameras be gone from a time on: what is read then raises DeviceError with this text."""
         self._gone_s, self._gone = at_s, what
 
     def read(self) -> Shot | None:
@@ -279,7 +277,7 @@ class WorkcellSource:
         self._pool.shutdown()
 
     def clear(self, pattern: Pattern, T_left_body: Array) -> bool:
-        """Tell whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
+        """Return whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
 
         Args:
             pattern: what is held.
@@ -362,7 +360,7 @@ class WorkcellSource:
             bodies.append(held.seen_from(T_this_left))
         if any(start <= t_s < end for start, end in self._covers):
             bodies.append(_card(body.T_camera_body))
-        # A shot that is held for the calibration draws its noise from numbers of its own.
+        # A shot for the calibration takes its noise from numbers of its own.
         start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
         return camera.image(ArmSeen(self._plant.parts, frames), bodies, shutter, self._strip, start)
 
@@ -384,7 +382,7 @@ class WorkcellSource:
     def _bodies(self, t_s: Array, shutter: Shutter) -> list[PosedBody]:
         """Return where the body is to each camera in an exposure about its time (2,).
 
-        That is its mean place during the exposure of its own rows, and its velocity.
+        That is its mean pose during the exposure of its own rows, and its velocity.
         """
         Ts_camera_base = np.array([inverse(camera.T_base_camera) for camera in self._cameras])[:, None]
 
@@ -400,9 +398,9 @@ class WorkcellSource:
                 row = camera.camera.project(T[None, :3, 3])[0, 1]
                 rows_s[side] = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
         Ts = at((t_s + rows_s)[:, None] + reach * np.array([*_NODES, -1.0, 1.0]))
-        turned = log_se3(inverse(Ts[:, [1, 1, 1, 3]]) @ Ts[:, [0, 1, 2, 4]])
-        twists = turned[:, 3] / (2 * reach)
-        shifts = 0.5 * (_WEIGHTS @ turned[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
+        moved = log_se3(inverse(Ts[:, [1, 1, 1, 3]]) @ Ts[:, [0, 1, 2, 4]])
+        twists = moved[:, 3] / (2 * reach)
+        shifts = 0.5 * (_WEIGHTS @ moved[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
         to_mean, to_row = exp_se3(np.stack([shifts, -rows_s[:, None] * twists]))
         Ts_camera_body = Ts[:, 1] @ to_mean @ to_row
         return [PosedBody(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]

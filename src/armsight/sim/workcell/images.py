@@ -1,15 +1,13 @@
-"""One camera's images of the cell: what stands still is kept, the arm and the body are drawn where they are.
+"""One camera's images of the workcell: what stands still is kept, the arm and the body are rendered where they are.
 
-The arm is cast anew within the pixels it can cover (cell_links), at the middle of the exposure. Flat patterns (the body, a
-board, a card) are painted exactly over it by ``paint``, once for about every pixel they move during the exposure, and
-what of the arm is nearer stays before them. Then the lens's blur, light and vignetting, noise and rounding, as in
-``optics``. Noise comes from a long strip drawn once, begun elsewhere for every image.
+The arm's links, capsules, are rendered anew within the pixels they can cover, at the middle of the exposure; light as in
+``raycast``, with a Phong highlight. Flat patterns (the body, a board, a card) are painted exactly over it by ``faces``,
+once for about every pixel they move during the exposure, and what of the arm is nearer stays before them. Then the lens's
+blur, light and vignetting, noise and rounding, as in ``optics``. Noise comes from a long strip sampled once, begun
+elsewhere for every image.
 
-Draw the arm's links over what stands still: capsules in a camera's image, without GL.
-
-Light as in ``cell_rays``, with a Phong highlight.
-
-The cell seen from aside, in colour: arm, body, table and the two cameras that watch. For people, not for measuring.
+:func:`picture` is the workcell seen from the side, in colour: arm, body, table and the two cameras. It is for people, not
+for measuring.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from armsight.sim.workcell.raycast import (
     LAMP_BASE,
     PLAIN,
     Light,
-    View,
+    StillView,
     arm_capsules,
     block,
     capsule_boxes,
@@ -52,7 +50,7 @@ from armsight.vision.rig import StereoRig
 GLOSS = 0.25
 _TILE = 16  # pixels on a side that are passed over together
 _BALL = 1e-12  # square of the length, m^2, of what has none: it has no sides
-# Numbers of single precision, for a row is drawn in that: four times as many pixels at once.
+# Numbers of single precision, for a row is rendered in that: four times as many pixels at once.
 _ZERO, _QUARTER, _HALF, _THREE_QUARTERS, _ONE, _TWO, _LEAST = (
     np.float32(number) for number in (0.0, 0.25, 0.5, 0.75, 1.0, 2.0, 1e-12)
 )
@@ -99,8 +97,8 @@ def _row(
 ) -> None:
     """Draw a capsule into a part of a row: its rays (n,) x, y, z; its light, depth and ids. Without branches.
 
-    Light falls off with the cosine to the lamp, and what faces away from the viewer is a little darker: that tells one
-    link from the next. ``shown`` is the capsule's albedo and its id.
+    Light falls off with the cosine to the lamp, and what faces away from the viewer is a little darker, which distinguishes
+    one link from the next. ``shown`` is the capsule's albedo and its id.
     """
     bx, by, bz, long, ba, radius = axis[0], axis[1], axis[2], axis[3], axis[4], axis[5]
     ax, ay, az = axis[11], axis[12], axis[13]
@@ -155,9 +153,9 @@ def moving(
         boxes_px: (K, 4) the same of what each capsule can cover.
         capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
         lamp: (3,) unit vector to the lamp.
-        light: drawn over.
+        light: rendered over.
         depth: distance of what is there, m; brought up to date.
-        ids: the number of the capsule that is drawn, counted from 1, is written here.
+        ids: the number of the capsule that is rendered, counted from 1, is written here.
     """
     ends, radius, albedo = capsules
     u_first, v_first, u_end, v_end = window
@@ -225,7 +223,7 @@ def _moved(body: PosedBody, t_s: Array) -> Array:
 
 
 class WorkcellCamera:
-    """A camera that stands in the cell.
+    """A camera that stands in the workcell.
 
     Attributes:
         camera: its lens.
@@ -243,7 +241,7 @@ class WorkcellCamera:
         sensor: Sensor | None = None,
         more: Array | None = None,
     ) -> None:
-        """Look at the cell once.
+        """Look at the workcell once.
 
         Args:
             camera: its lens.
@@ -251,13 +249,13 @@ class WorkcellCamera:
             foot: the arm's solids, whose base stands still.
             seed: of the clutter.
             sensor: noise of 2 grey levels by default.
-            more: boxes that stand there besides, see cell_scene.
+            more: boxes that stand there besides, see ``raycast``.
         """
         self.camera, self.T_base_camera = camera, T_base_camera
         self._sensor = sensor or Sensor()
         self._corners = corner_rays(camera)
         rays = pixel_rays(self._corners)
-        self.still: View = view(camera, rays, T_base_camera, seed, foot, more)
+        self.still: StillView = view(camera, rays, T_base_camera, seed, foot, more)
         self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
@@ -272,7 +270,7 @@ class WorkcellCamera:
 
         Args:
             arm: where the arm is; None leaves it out.
-            bodies: flat patterns, placed in the camera's frame in the middle of the exposure of its middle row.
+            bodies: flat patterns, posed in the camera's frame in the middle of the exposure of its middle row.
             shutter: how long it looks.
             strip: standard normal noise, from :func:`~armsight.sim.render.optics.noise_strip`.
             start: where in it this image's noise begins.
@@ -332,18 +330,18 @@ class WorkcellCamera:
         ends_s = np.add.outer(np.array([-0.5, 0.5]) * shutter.exposure_s, rows_s[[0, -1] if rolling else [0]]).ravel()
         uv = self._each(lambda body: self._outlines(_moved(body, ends_s), body.patterns), bodies)
         bounds = np.concatenate([np.floor(uv.min(axis=(0, 2))) - 1, np.ceil(uv.max(axis=(0, 2))) + 2], axis=1)
-        # What is behind the camera has no number there, and so no place in the image.
+        # What is behind the camera has no number there, and so no position in the image.
         boxes = np.fmax(np.fmin(bounds, (width, height, width, height)), 0.0).astype(np.int64)
         way_px = float(np.fmax.reduce(np.abs(uv[len(uv) // 2 :] - uv[: len(uv) // 2]), axis=None, initial=0.0))
         nodes, weights = _nodes(1 + math.ceil(max(way_px - _STILL_PX, 0.0)))
         t_s = np.add.outer(0.5 * shutter.exposure_s * nodes, rows_s)
 
-        def placed(body: PosedBody) -> Array:
+        def posed(body: PosedBody) -> Array:
             Ts = _moved(body, t_s.ravel()).reshape(*t_s.shape, 4, 4)
             on = np.array([pattern.T_body_pattern for pattern in body.patterns])
             return np.asarray(Ts[:, None] @ on[:, None])
 
-        Ts = self._each(placed, bodies)  # (S, P, R, 4, 4)
+        Ts = self._each(posed, bodies)  # (S, P, R, 4, 4)
         # Its face is on the side that z points away from; what is behind the camera is not seen.
         faces = ((Ts[..., :3, 2] * Ts[..., :3, 3]).sum(axis=-1) > 0).all(axis=2) & (Ts[..., 2, 3] > 0).all(axis=2)
         order = np.argsort(np.where(faces, -np.linalg.norm(Ts[:, :, 0, :3, 3], axis=2), np.inf), axis=1, kind="stable")
@@ -394,7 +392,7 @@ def _reach(sigma_px: float) -> int:
 
 #: Where it is seen from and what is in the middle, m; focal length over the image's width.
 _EYE, _MIDDLE, _FOCAL = np.array([2.05, -1.75, 1.25]), np.array([0.62, -0.08, 0.30]), 0.95
-#: Tints, BGR, of what is grey otherwise: wood, wall and floor, the arm's links, its housings; things take turns.
+#: Tints, BGR, of what is grey otherwise: wood, wall and floor, the arm's links, its housings; things use them alternately.
 _WOOD, _ROOM, _LINK, _HOUSING = (0.62, 0.85, 1.10), (1.06, 1.02, 0.98), (0.55, 0.85, 1.30), (1.05, 1.0, 1.0)
 _THINGS = ((1.25, 0.95, 0.7), (0.75, 1.15, 0.85), (0.75, 0.85, 1.3), (1.1, 1.1, 0.7), (1.0, 0.8, 1.15))
 _CAMERAS = (1.0, 1.0, 1.0)
@@ -408,7 +406,7 @@ def picture(
     rig: tuple[Array, StereoRig],
     seed: int,
 ) -> Image:
-    """Return the cell as it is now.
+    """Return the workcell as it is now.
 
     Args:
         size_px: (width, height).
@@ -431,8 +429,8 @@ def picture(
     eye = WorkcellCamera(camera, T_base_eye, plant.parts, seed, sensor=Sensor(read_noise=0.0), more=more)
     q = plant.path[-1, 6:]
     arm = ArmSeen(plant.parts, row_frames(plant.arm, q))
-    placed = PosedBody(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
-    grey = eye.image(arm, [placed], Shutter(), np.zeros(width * height, np.float32), 0)
+    posed = PosedBody(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
+    grey = eye.image(arm, [posed], Shutter(), np.zeros(width * height, np.float32), 0)
     bare = eye.image(arm, [], Shutter(), np.zeros(width * height, np.float32), 0)
     tints = _tints(len(furniture(seed)[0]), len(more))
     tint = tints[np.minimum(eye.still.ids, len(tints) - 1)]
@@ -457,14 +455,14 @@ def _rig_boxes(T_base_rig: Array, rig: StereoRig) -> Array:
     Ts = (T_base_rig, T_base_rig @ rig.T_left_right)
     boxes = []
     for T in Ts:
-        turn = float(np.degrees(np.arctan2(T[1, 2], T[0, 2])))
+        heading_deg = float(np.degrees(np.arctan2(T[1, 2], T[0, 2])))
         p, ahead = T[:3, 3], T[:3, 2]
         for back, size, albedo in ((0.035, (0.06, 0.062, 0.05), 0.10), (-0.005, (0.03, 0.04, 0.04), 0.22)):
             x, y, z = (p - back * ahead).tolist()
-            boxes.append(block((x, y, z), size, turn, albedo, PLAIN))
+            boxes.append(block((x, y, z), size, heading_deg, albedo, PLAIN))
     middle = 0.5 * (Ts[0][:3, 3] + Ts[1][:3, 3]) - 0.04 * T_base_rig[:3, 2]
-    turn = float(np.degrees(np.arctan2(T_base_rig[1, 2], T_base_rig[0, 2])))
+    heading_deg = float(np.degrees(np.arctan2(T_base_rig[1, 2], T_base_rig[0, 2])))
     x, y, z = middle.tolist()
-    boxes.append(block((x, y, z - 0.04), (0.04, rig.baseline_m + 0.12, 0.02), turn, 0.4, PLAIN))
-    boxes.append(block((x, y, (z - 0.05 - 0.74) / 2), (0.035, 0.035, z - 0.05 + 0.74), turn, 0.3, PLAIN))
+    boxes.append(block((x, y, z - 0.04), (0.04, rig.baseline_m + 0.12, 0.02), heading_deg, 0.4, PLAIN))
+    boxes.append(block((x, y, (z - 0.05 - 0.74) / 2), (0.035, 0.035, z - 0.05 + 0.74), heading_deg, 0.3, PLAIN))
     return np.array(boxes)

@@ -1,14 +1,14 @@
-"""The motors of an arm: direct-current motors with gears, chosen by a rule that suits any table.
+"""The solids an arm is made of, their gravity torque and inertia; and its motors, chosen by a rule that suits any table.
 
-What each joint needs is looked up over many poses of the nominal arm: the greatest torque of its weight, the greatest
-inertia. A gear and a motor are then chosen so that a 24 V supply gives a speed and a torque to spare. Current
-``i = (duty U - k n w) / R`` within its limit, torque ``n k i`` less friction, at the joint's speed w.
+Solids are capsules along the rows of the table, with mass. A row's frame is the one that rotates with its joint: frame
+i-1 of the table after ``Rz(theta_i)``. Link i's capsules are given in row frame i, row frame 0 is the base. The gravity
+torque is the sum over all solids beyond a joint of ``z . (c - p) x m g`` (Siciliano et al., "Robotics", 2009, section
+7.1.2).
 
-The solids an arm is made of: capsules along the rows of its table, with mass; where they are, and what they weigh.
-
-A row's frame is the one that turns with its joint: frame i-1 of the table after ``Rz(theta_i)``. Link i's capsules are
-given in row frame i, row frame 0 is the base. The weight's torque is the sum over all solids beyond a joint of
-``z . (c - p) x m g`` (Siciliano et al., "Robotics", 2009, section 7.1.2).
+Motors are direct-current motors with gears. What each joint needs is evaluated over many poses of the nominal arm: the
+greatest gravity torque, the greatest inertia. A gear and a motor are then chosen so that a 24 V supply gives a speed and a
+torque to spare. Current ``i = (duty U - k n w) / R`` within its limit, torque ``n k i`` less friction, at the joint's
+speed w.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, store
-from armsight.robot.kinematics.chain import sincos
+from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos, store
 
 GRAVITY_M_S2 = 9.81
 #: Radii of the links, share of the arm's whole length; of a joint's housing, share of its link's; density, kg/m^3.
 _RADII = np.array([0.052, 0.040, 0.034, 0.029, 0.026, 0.022])
 _HOUSING, _DENSITY = 1.2, 900.0
-#: What the tool and the body on it weigh, share of the arm; a ball that turns as hard as they do, share of link 6's radius.
+#: Mass of the tool and the body on it, share of the arm; radius of a ball of their inertia, share of link 6's radius.
 _TOOL_SHARE, _TOOL_RADIUS = 0.03, 2.0
 _SHORTEST_M = 1e-3
 
@@ -108,8 +107,8 @@ def row_frames(arm: Arm, q: Array) -> Array:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _weight(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
-    """Add the torque of the weight of solids at centre (K, 3) of their row frames about the joints' axes to out (6,)."""
+def _gravity(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
+    """Add the gravity torque of solids at centre (K, 3) of their row frames about the joints' axes, N m, to out (6,)."""
     for k in range(link.size):
         T = Ts[link[k]]
         x = T[0, 0] * centre[k, 0] + T[0, 1] * centre[k, 1] + T[0, 2] * centre[k, 2] + T[0, 3]
@@ -121,14 +120,14 @@ def _weight(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> Non
 
 
 def gravity_torque(arm: Arm, parts: Solids, q: Array) -> Array:
-    """Return the torque (6,), N m, with which the weight of an arm's solids turns its joints at angles q (6,), rad."""
+    """Return the torque (6,), N m, with which gravity acts on the joints through an arm's solids at angles q (6,), rad."""
     out = np.zeros(6)
-    _weight(row_frames(arm, q), parts.link, parts.ends.mean(axis=1), parts.mass, out)
+    _gravity(row_frames(arm, q), parts.link, parts.ends.mean(axis=1), parts.mass, out)
     return np.asarray(arm.direction * out)
 
 
 def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
-    """Return the inertia (6,), kg m^2, of all that each joint turns, as points, at angles q (6,), rad."""
+    """Return the inertia (6,), kg m^2, of all that each joint rotates, as points, at angles q (6,), rad."""
     Ts, out = row_frames(arm, q), np.zeros(6)
     centres = transform(Ts[parts.link], parts.ends.mean(axis=1))
     for i in range(6):
@@ -154,10 +153,10 @@ _POSES = 400  # at which the arm is looked at
 
 @dataclass(frozen=True, eq=False)
 class Motors(Record):
-    """Six geared motors; what turns is given at the joint.
+    """Six geared motors; inertia and friction are given at the joint.
 
     Attributes:
-        gear_ratio: (6,) turns of the motor for one of the joint.
+        gear_ratio: (6,) revolutions of the motor for one of the joint.
         torque_constant: (6,) N m/A, also V s/rad, at the motor.
         resistance_ohm: (6,) of the winding.
         rotor_inertia: (6,) kg m^2, of rotor and gear, at the joint.
@@ -166,8 +165,8 @@ class Motors(Record):
         viscous: (6,) friction that grows with speed, N m s/rad.
         bearing_nm: (6,) dry friction of the link's own bearing, N m.
         brake_nm: (6,) what the brake holds, N m; closed while the drivers are off.
-        needed_nm: (6,) torque that the joint needs, N m: of weight and of its greatest acceleration.
-        gravity_nm: (6,) greatest torque of the weight, N m.
+        needed_nm: (6,) torque that the joint needs, N m: of gravity and of its greatest acceleration.
+        gravity_nm: (6,) greatest gravity torque, N m.
     """
 
     gear_ratio: Array
@@ -208,9 +207,9 @@ def chosen(model: Arm, parts: Solids, friction: float = 1.0) -> Motors:
     """
     rng = np.random.default_rng(0)
     poses = rng.uniform(model.q_min, model.q_max, (_POSES, 6))
-    weight = np.max([np.abs(gravity_torque(model, parts, q)) for q in poses], axis=0)
+    gravity = np.max([np.abs(gravity_torque(model, parts, q)) for q in poses], axis=0)
     load = np.max([inertia(model, parts, q) for q in poses], axis=0)
-    needed = weight + _ACCELERATION_SPARE * load * model.qdd_max
+    needed = gravity + _ACCELERATION_SPARE * load * model.qdd_max
     needed = np.maximum(needed, _LEAST * needed.max())
     constant = np.full(6, _TORQUE_CONSTANT)
     gear = SUPPLY_V / (constant * _SPEED_SPARE * model.qd_max)
@@ -227,5 +226,5 @@ def chosen(model: Arm, parts: Solids, friction: float = 1.0) -> Motors:
         friction * _BEARING * needed,
         _BRAKE * needed,
         needed,
-        weight,
+        gravity,
     )

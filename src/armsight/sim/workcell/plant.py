@@ -1,21 +1,17 @@
-"""The arm at the board's motors: duties go in, what the converters read comes out, and the truth is kept apart.
+"""The arm at the board's motors: duties go in, the converters' readings come out, and the truth is kept apart.
 
-:class:`ArmPlant` fulfils :class:`armsight.robot.boards.link.Plant`. The arm is a MuJoCo model made of its true table
-(cell_mjcf): motors with current limit and friction, backlash and twist in every joint, potentiometers on the gears'
-shafts, which see neither backlash nor twist. Brakes hold the shafts while the drivers are off. Steps are 1 ms.
+:class:`ArmPlant` fulfils :class:`armsight.robot.boards.link.Plant`. Steps are 1 ms. Brakes hold the shafts while the
+drivers are off.
 
-An arm as a MuJoCo model: twelve degrees of freedom, six gear shafts and six links, joined by play and a spring each.
+The arm is a MuJoCo model made of its true table (:func:`mjcf`): twelve degrees of freedom, six gear shafts and six links,
+each pair joined by backlash and a spring. A motor rotates its shaft; the potentiometer sits on the shaft, so it sees
+neither backlash nor twist. In MuJoCo that is a fixed tendon of the length (shaft - link) whose spring has a dead band. Dry
+friction is MuJoCo's friction loss, so hard that a resting joint stays; the motor is an actuator whose force falls with
+speed and is bounded by the driver's current limit. Bodies touch nothing.
 
-A motor turns its shaft; the potentiometer sits on the shaft; between shaft and link lie the backlash and the twist. In
-MuJoCo that is a fixed tendon of the length (shaft - link) whose spring has a dead band. Dry friction is MuJoCo's friction
-loss, made so hard that what stands stays; the motor is an actuator whose force falls with speed and is bounded by the
-driver's current limit. Bodies touch nothing.
-
-Potentiometers and the converter behind them: from shaft angles to the counts that a board reads.
-
-A potentiometer spans a joint's travel with nine tenths of its supply. What its wiper says differs from the straight line
-by a smooth error and an offset; each conversion adds noise and is rounded to the converter's step, and a tick's conversions
-are averaged: noise of a step or so makes up for the rounding.
+A potentiometer (:class:`Potentiometers`) spans a joint's travel with nine tenths of its supply. Its reading differs from
+the straight line by a smooth error and an offset; each conversion adds noise and is rounded to the converter's step, and a
+tick's conversions are averaged: noise of a step or so compensates the rounding.
 """
 
 from __future__ import annotations
@@ -46,8 +42,8 @@ def mjcf(arm: Arm, parts: Solids, motors: Motors, backlash_rad: Array, stiffness
     Args:
         arm: the table to build.
         parts: what its links are made of.
-        motors: what turns it.
-        backlash_rad: (6,) play from stop to stop.
+        motors: what drives it.
+        backlash_rad: (6,) backlash from stop to stop, rad.
         stiffness: (6,) of each joint's twist, N m/rad.
         damping: (6,) between shaft and link, N m s/rad.
 
@@ -84,16 +80,16 @@ def _links(arm: Arm, parts: Solids, motors: Motors) -> str:
     T_6_tool = np.vstack([arm.table[TOOL : TOOL + 12].reshape(3, 4), [0, 0, 0, 1]])
     T, opened = np.vstack([arm.table[BASE : BASE + 12].reshape(3, 4), [0, 0, 0, 1]]), ""
     for i, (a, d, c, s, offset, way) in enumerate(rows):
-        turned = T @ pose(exp_so3(np.array([0.0, 0.0, offset])), np.zeros(3))
+        rotated = T @ pose(exp_so3(np.array([0.0, 0.0, offset])), np.zeros(3))
         opened += (
-            f'<body {_place(turned)}><joint name="link{i + 1}" axis="0 0 {way}" frictionloss="{motors.bearing_nm[i]}" '
+            f'<body {_pose_text(rotated)}><joint name="link{i + 1}" axis="0 0 {way}" frictionloss="{motors.bearing_nm[i]}" '
             f"{_HARD}/>" + "".join(_capsule(parts, k) for k in np.flatnonzero(parts.link == i + 1).tolist())
         )
         T = link(a, d, c, s)
-    return f'{opened}<site name="tool" {_place(T @ T_6_tool)}/>' + 6 * "</body>"
+    return f'{opened}<site name="tool" {_pose_text(T @ T_6_tool)}/>' + 6 * "</body>"
 
 
-def _place(T: Array) -> str:
+def _pose_text(T: Array) -> str:
     """Write a pose."""
     return f'pos="{_row(T[:3, 3])}" quat="{_row(quaternion_wxyz(T[:3, :3]))}"'
 
@@ -115,7 +111,7 @@ def _row(numbers: Array) -> str:
 #: Shares of the supply at the ends of the travel.
 LOW_SHARE, HIGH_SHARE = 0.05, 0.95
 COUNTS = 65536  # of the supply, as the board gives them
-_BLOCK = 256  # ticks whose noise is drawn at once
+_BLOCK = 256  # ticks whose noise is sampled at once
 
 Counts = NDArray[np.uint32]
 
@@ -213,7 +209,7 @@ class ArmPlant:
     Attributes:
         arm: the true table.
         parts: the solids it is made of.
-        motors: what turns it.
+        motors: what drives it.
         stop_pressed: whether the emergency stop button is pressed; may be set.
         supply_mv: motor supply, mV; may be set.
     """
@@ -230,7 +226,7 @@ class ArmPlant:
         self.motors: Motors = chosen(model, solids(model), true.imperfections.friction)
         self.stop_pressed, self.supply_mv = False, round(1e3 * SUPPLY_V)
         self.pots = Potentiometers(true, pot_travel(model), seed)
-        # The twist under the greatest weight; joints that carry none are as stiff for the torque they need.
+        # The twist under the greatest gravity load; joints that carry none are as stiff for the torque they need.
         load = np.maximum(self.motors.gravity_nm, 0.5 * self.motors.needed_nm)
         self.stiffness = load / true.imperfections.compliance_rad
         damping = 2 * _DAMPING * np.sqrt(self.stiffness * inertia(model, self.parts, model.home))

@@ -1,13 +1,11 @@
-"""Cast rays at capsules and boxes: what stands still around an arm looks like, without GL.
+"""Cast rays at capsules and boxes: what stands still around the arm (table, floor, wall, clutter), without GL.
 
-Surfaces are dull: a lamp's light falls off with the cosine, and some comes from everywhere (Lambert).
-Capsules are met as in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end.
+In: a camera, its pose T_base_camera and a seed. Out: a :class:`StillView`: light, depth and surface of each pixel. All is
+in the base frame: x runs away from the wall, towards the cameras; z up; the table's top is z = 0.
 
-All compiled functions that call each other stay in this file: numba's cache on disk looks at one file's age only.
-
-What stands in the cell: table, floor, wall, clutter, the arm's links; where a camera sees each of them.
-
-All in the base frame: x runs away from the wall, towards the cameras; z up; the table's top is z = 0.
+Surfaces are dull: a lamp's light falls off with the cosine, and some comes from everywhere (Lambert). Capsules are met as
+in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end. All compiled functions that
+call each other stay in this file: numba's cache on disk looks at one file's age only.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from armsight.vision.camera import Camera
 
 #: Share of the light that comes from everywhere, and of the lamp's.
 AMBIENT, LAMP = 0.45, 0.75
-#: Columns of a box: middle 0-2, half sides 3-5, cosine and sine of its turn about z 6, 7; albedo 8, texture 9.
+#: Columns of a box: middle 0-2, half sides 3-5, cosine and sine of its rotation about z 6, 7; albedo 8, texture 9.
 BOX = 10
 PLAIN, TILES, GRAIN, PRINT = 0, 1, 2, 3
 _FAR = 1e9
@@ -112,7 +110,7 @@ def _box(o: Array, d: Array, box: Array) -> tuple[float, int]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _hash(i: int, j: int, k: int) -> float:
-    """Return a number from 0 to 1 that looks drawn."""
+    """Return a number from 0 to 1 that looks random."""
     n = (i * 374761393 + j * 668265263 + k * 974711) & 0x7FFFFFFF
     n = ((n ^ (n >> 13)) * 1274126177) & 0x7FFFFFFF
     return float((n ^ (n >> 16)) & 0xFFFF) / 65535.0
@@ -131,7 +129,7 @@ def _smooth(x: float, y: float, k: int) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _texture(kind: int, x: float, y: float) -> float:
-    """Return by how much a surface is brighter or darker at a place on it, m."""
+    """Return by how much a surface is brighter or darker at a point on it, m."""
     if kind == TILES:
         joint = min(abs(x / 0.4 - np.rint(x / 0.4)), abs(y / 0.4 - np.rint(y / 0.4)))
         return (0.9 + 0.2 * _hash(int(np.floor(x / 0.4)), int(np.floor(y / 0.4)), 1)) * (0.7 if joint < 0.01 else 1.0)
@@ -140,7 +138,7 @@ def _texture(kind: int, x: float, y: float) -> float:
         seam = abs(y / 0.15 - np.rint(y / 0.15)) < 0.012
         rings = _smooth(x * 6.0 + 7.0 * plank, y * 90.0, plank)
         return (0.86 + 0.2 * rings + 0.1 * _hash(plank, 0, 5)) * (0.75 if seam else 1.0)
-    if kind == PRINT:  # lines of words
+    if kind == PRINT:  # lines of print
         line, column = int(np.floor(y / 0.022)), int(np.floor(x / 0.007))
         on = (y / 0.022 - line) < 0.45 and _hash(line, column // 5, 3) > 0.25 and _hash(line, column, 9) > 0.2
         return 0.35 if on else 1.0
@@ -300,7 +298,7 @@ _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
 @dataclass(frozen=True, eq=False)
-class View(Record):
+class StillView(Record):
     """What stands still before a camera.
 
     Attributes:
@@ -321,9 +319,9 @@ def block(
     albedo: float = 0.5,
     texture: int = PLAIN,
 ) -> Array:
-    """Return a row of boxes (BOX,): middle and size, m; turn about z; albedo and texture."""
-    turn = np.radians(rotation_deg)
-    return np.array([*middle, *(0.5 * s for s in size), np.cos(turn), np.sin(turn), albedo, texture])
+    """Return a row of boxes (BOX,): middle and size, m; rotation about z; albedo and texture."""
+    angle = np.radians(rotation_deg)
+    return np.array([*middle, *(0.5 * s for s in size), np.cos(angle), np.sin(angle), albedo, texture])
 
 
 def _standing(x: float, y: float, height: float, radius: float) -> tuple[Array, float]:
@@ -385,7 +383,9 @@ def pixel_rays(corners: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
 
 
-def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None) -> View:
+def view(
+    camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None
+) -> StillView:
     """Return what stands still before a camera: a ray a pixel, four more where light changes.
 
     Args:
@@ -399,9 +399,9 @@ def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Sol
     boxes, (ends, radius, albedo) = furniture(seed)
     if more is not None:
         boxes = np.concatenate([boxes, more])
-    still = foot.link == 0
-    ends, radius = np.concatenate([ends, foot.ends[still]]), np.append(radius, foot.radius[still])
-    capsules = (ends, radius, np.append(albedo, np.full(int(still.sum()), HOUSING_ALBEDO)))
+    fixed = foot.link == 0
+    ends, radius = np.concatenate([ends, foot.ends[fixed]]), np.append(radius, foot.radius[fixed])
+    capsules = (ends, radius, np.append(albedo, np.full(int(fixed.sum()), HOUSING_ALBEDO)))
     R, p = np.ascontiguousarray(T_base_camera[:3, :3]), np.ascontiguousarray(T_base_camera[:3, 3])
 
     def cast(some: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Image]:
@@ -411,15 +411,15 @@ def view(camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Sol
 
     height, width = rays.shape[:2]
     order = _tiled(height, width)
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    light, depth, ids = (flat[place].reshape(height, width) for flat in cast(rays.reshape(-1, 3)[order]))
+    inverse_order = np.empty_like(order)
+    inverse_order[order] = np.arange(len(order))
+    light, depth, ids = (flat[inverse_order].reshape(height, width) for flat in cast(rays.reshape(-1, 3)[order]))
     square = np.ones((3, 3), np.uint8)
     again = (cv2.dilate(light, square) - cv2.erode(light, square) > _EDGE).ravel()
     edges = order[again[order]]
     v, u = np.divmod(edges, width)
     light[v, u] = np.mean([cast(camera.unproject(np.stack([u + x, v + y], axis=1)))[0] for x, y in _SAMPLES], axis=0)
-    return View(light, depth, ids)
+    return StillView(light, depth, ids)
 
 
 def _tiled(height: int, width: int) -> Ids:

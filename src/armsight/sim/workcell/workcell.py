@@ -1,9 +1,9 @@
 """The workcell: an arm with motors, a board that runs the firmware, two cameras, a body on the tool, and time.
 
 Time is the plant's, in milliseconds. It passes when a board is listened to, when a shot is waited for, and by
-:meth:`Workcell.advance`; each millisecond the firmware runs once and the arm moves on. What is handed out are a Board and
-a Source: nothing that uses them can tell that they are simulated. The truth is in :attr:`Workcell.truth`, for judges only.
-Presets and amounts: docs/workcell.md.
+:meth:`Workcell.advance`; each millisecond the firmware runs once and the arm moves on. The workcell gives out a Board and a
+Source, which behave as real ones do. The truth is in :attr:`Workcell.truth`, for evaluation only. Presets and amounts: the
+documentation's page on the workcell.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -21,18 +21,27 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
+from armsight.robot.arm_file import open_arm
+from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
-from armsight.robot.models import open_arm
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.scene import chessboard
-from armsight.sim.workcell.arm import drawn, imperfections
+from armsight.sim.workcell.arm import imperfections, sample_arm
 from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.body import body_patterns, body_target, body_text
-from armsight.sim.workcell.cameras import BASELINE_M, DISTANCE_M, WorkcellSource, open_rig, open_timing, rig_pose
+from armsight.sim.workcell.cameras import (
+    BASELINE_M,
+    DISTANCE_M,
+    CameraTiming,
+    WorkcellSource,
+    open_rig,
+    open_timing,
+    rig_pose,
+)
 from armsight.sim.workcell.images import WorkcellCamera, picture
-from armsight.sim.workcell.motors import chosen, solids
+from armsight.sim.workcell.motors import Motors, Solids, chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
@@ -40,9 +49,9 @@ from armsight.vision.rig import StereoRig
 #: The board that is shown to the cameras.
 BOARD = "chessboard:9x6:30mm"
 _BOARD_FILL = (0.35, 1.0)  # of the image's height
-#: The body on the tool: turned half about y, so that its z runs into the plate; on a bracket, towards the cameras.
+#: The body on the tool: rotated by 180 degrees about y, so that its z runs into the plate, on a bracket to the cameras.
 _MOUNT_M, _MOUNT_RAD = np.array([0.003, -0.004, 0.035]), np.radians([-10.0, 12.0, 4.0])
-#: The chapter's five poses, seen from home: the tool's shift, m, base axes, and turn about its own axes, degrees.
+#: Five poses, seen from home: the tool's shift, m, base axes, and its rotation vector about its own axes, degrees.
 _POSES = (
     ((-0.17, 0.20, 0.08), (-8.0, 12.0, 12.0)),
     ((-0.17, -0.20, 0.11), (-12.0, -12.0, -20.0)),
@@ -54,7 +63,7 @@ _POSES = (
 
 @dataclass(frozen=True, eq=False)
 class WorkcellTruth(Record):
-    """What is true of a cell up to now. No estimator gets it.
+    """What is true of a workcell up to now. No estimator gets it.
 
     Attributes:
         arm: the true table.
@@ -82,11 +91,57 @@ class WorkcellTruth(Record):
         return self.arm.forward(self.q)
 
 
-class Workcell:
-    """An arm, its board, two cameras and a body.
+class _Parts(NamedTuple):
+    """What a workcell is made of.
 
     Attributes:
-        model: the arm as it is believed to be: all that anybody may know of it.
+        built_to: the table that the arm was built to.
+        model: the table that it is assumed to have.
+        timing: of the cameras.
+        seed: of all that is sampled.
+        solids: what the nominal arm is made of, and ``motors`` what drives it.
+        motors: see ``solids``.
+        plant: the arm.
+        rig: the true cameras.
+        T_base_rig: (4, 4) where the left camera is, m.
+        T_tool_body: (4, 4) where the body is on the tool, m.
+        cameras: left and right.
+        room: what must be the same for another workcell to use these cameras.
+        link: to the board.
+        board: configured.
+    """
+
+    built_to: Arm
+    model: Arm
+    timing: CameraTiming
+    seed: int
+    solids: Solids
+    motors: Motors
+    plant: ArmPlant
+    rig: StereoRig
+    T_base_rig: Array
+    T_tool_body: Array
+    cameras: tuple[WorkcellCamera, WorkcellCamera]
+    room: tuple[object, ...]
+    link: EmulatedLink
+    board: Board
+
+
+def _standing(
+    rig: StereoRig, T_base_rig: Array, plant: ArmPlant, seed: int, sensor: Sensor
+) -> tuple[WorkcellCamera, WorkcellCamera]:
+    """Return a rig's cameras where they stand; each casts what stands still before it, in a thread of its own."""
+    stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor)
+    with ThreadPoolExecutor(2) as pool:
+        left, right = pool.map(stand, rig.cameras, (T_base_rig, T_base_rig @ rig.T_left_right))
+    return left, right
+
+
+class Workcell:
+    """An arm, its board, two cameras and a body; :meth:`open` builds one.
+
+    Attributes:
+        model: the arm as it is assumed to be: all that an estimator may know of it.
         link: the wire to the board, and all of its inside; see EmulatedLink.
         board: the board, configured, its drives off; the arm is at home, held by brakes.
         source: the cameras.
@@ -96,35 +151,49 @@ class Workcell:
         timing: how the cameras keep time, as their maker says: rate, exposure, how well they are synchronised.
     """
 
-    def __init__(
-        self,
+    def __init__(self, parts: _Parts) -> None:
+        """Put the parts together; :meth:`open` makes them."""
+        self._built_to, self.model, self.timing, self._seed = parts.built_to, parts.model, parts.timing, parts.seed
+        self._solids, self._motors, self.plant = parts.solids, parts.motors, parts.plant
+        self._rig, self._room, self._cameras = parts.rig, parts.room, parts.cameras
+        self._T_tool_body, self._T_base_rig = parts.T_tool_body, parts.T_base_rig
+        self.link, self.board = parts.link, parts.board
+        self.target: Composite = body_target()
+        self.body_text, self.board_spec = body_text(), BOARD
+        clock = (lambda: self.t_s, self.advance)
+        body = (body_patterns(), self._T_tool_body)
+        self.source = WorkcellSource(self.plant, self._cameras, self.timing, body, clock, self._seed)
+
+    @classmethod
+    def open(
+        cls,
         *,
         arm: str = "used",
         cameras: str = "1280x720@60",
         seed: int = 0,
-        machine: str = "unicorn",
+        emulator: str = "unicorn",
         rig: str = "parallel",
         model: Arm | None = None,
-        believed: Arm | None = None,
+        assumed: Arm | None = None,
         distance_m: float = DISTANCE_M,
         baseline_m: float = BASELINE_M,
         noise: float = 2.0,
         like: Workcell | None = None,
-    ) -> None:
-        """Build a cell; a second or so.
+    ) -> Self:
+        """Build a workcell; a second or so.
 
         Args:
             arm: how far the arm is from its table: nominal, used, worn, or a TOML file.
             cameras: ``1280x720@60``, ``1920x1080@120``, ``webcams`` and their like.
-            seed: of all that is drawn; the same seed gives the same numbers.
-            machine: what runs the firmware: unicorn, qemu or host.
+            seed: of all that is sampled; the same seed gives the same numbers.
+            emulator: the emulator that runs the firmware: unicorn, qemu or host.
             rig: parallel or verging.
-            model: the table that the arm was built to; the chapter's arm by default.
-            believed: the table that it is believed to have, as an identification found; ``model`` by default.
+            model: the table that the arm was built to; ``six_r`` by default.
+            assumed: the table that it is assumed to have, as an identification found; ``model`` by default.
             distance_m: from the cameras to the body of the arm at home.
             baseline_m: between the cameras.
             noise: of the sensors, grey levels.
-            like: a cell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
+            like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
 
         Raises:
             InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
@@ -134,43 +203,26 @@ class Workcell:
             raise InputError(f"seed {seed!r}: must be a whole number from 0 to {2**32 - 1}")
         if not 0 <= noise <= 50:
             raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
-        self.timing, amounts = open_timing(cameras), imperfections(arm)
-        self._built_to = model if model is not None else open_arm("six_r")
-        self.model = believed if believed is not None else self._built_to
-        self._rig, self._seed = open_rig(rig, self.timing.image_size_px, baseline_m), seed
-        self._parts = solids(self._built_to)
-        self._motors = chosen(self._built_to, self._parts)  # as the drawing has them: friction as usual
-        self.plant = ArmPlant(self._built_to, drawn(self._built_to, amounts, seed), seed)
-        size, table = self.timing.image_size_px, self._built_to.table.tobytes()
-        self._room = (arm, rig, seed, baseline_m, distance_m, noise, size, table)
-        self._stand(distance_m, noise, like)
-        self.target: Composite = body_target()
-        self.body_text, self.board_spec = body_text(), BOARD
-        self.link = EmulatedLink(open_emulator(machine), self.plant)
-        self.board = configured(self.link, configuration(self._built_to, self._parts, self._motors))
-
-    def _stand(self, distance_m: float, noise: float, like: Workcell | None) -> None:
-        """Screw the body to the tool and stand the cameras before it."""
-        if like is not None and like._room != self._room:
-            told = f"this cell is {self._room[:-1]}, the one it is to be like is {like._room[:-1]}"
-            raise InputError(f"{told}: arm, rig, seed, distances, noise, image size and table must be the same")
-        seed = self._seed
+        timing, amounts = open_timing(cameras), imperfections(arm)
+        built_to = model if model is not None else open_arm("six_r")
+        true_rig, links = open_rig(rig, timing.image_size_px, baseline_m), solids(built_to)
+        motors = chosen(built_to, links)  # as the drawing has them: friction as usual
+        plant = ArmPlant(built_to, sample_arm(built_to, amounts, seed), seed)
+        room = (arm, rig, seed, baseline_m, distance_m, noise, timing.image_size_px, built_to.table.tobytes())
+        if like is not None and like._room != room:
+            both = f"this workcell is {room[:-1]}, the one it is to be like is {like._room[:-1]}"
+            raise InputError(f"{both}: arm, rig, seed, distances, noise, image size and table must be the same")
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
-        self._T_tool_body = mount @ exp_se3(off)
-        self._T_base_rig = rig_pose(self._built_to, self._rig, mount, seed, distance_m)
-        if like is not None:
-            cameras = like._cameras
-        else:
-            places = (self._T_base_rig, self._T_base_rig @ self._rig.T_left_right)
-            stand = partial(WorkcellCamera, foot=self.plant.parts, seed=seed, sensor=Sensor(read_noise=noise))
-            with ThreadPoolExecutor(2) as pool:
-                left, right = pool.map(stand, self._rig.cameras, places)
-            cameras = left, right
-        self._cameras: tuple[WorkcellCamera, WorkcellCamera] = cameras
-        clock = (lambda: self.t_s, self.advance)
-        body = (body_patterns(), self._T_tool_body)
-        self.source = WorkcellSource(self.plant, cameras, self.timing, body, clock, seed)
+        T_base_rig = rig_pose(built_to, true_rig, mount, seed, distance_m)
+        sensor = Sensor(read_noise=noise)
+        seen = _standing(true_rig, T_base_rig, plant, seed, sensor) if like is None else like._cameras
+        link = EmulatedLink(open_emulator(emulator), plant)
+        board = configured(link, configuration(built_to, links, motors))
+        known = assumed if assumed is not None else built_to
+        T_tool_body = mount @ exp_se3(off)
+        parts = (built_to, known, timing, seed, links, motors, plant, true_rig, T_base_rig, T_tool_body, seen, room)
+        return cls(_Parts(*parts, link, board))
 
     @property
     def t_s(self) -> float:
@@ -186,27 +238,27 @@ class Workcell:
         return self.source.poll()
 
     def gravity_duty(self, q: Array) -> Array:
-        """Return the duty (6,) that carries the nominal arm's weight at joint angles q (6,), rad."""
-        return gravity_duty(self._built_to, self._parts, self._motors, q)
+        """Return the duty (6,) that compensates the nominal arm's gravity load at joint angles q (6,), rad."""
+        return gravity_duty(self._built_to, self._solids, self._motors, q)
 
     @cached_property
     def poses(self) -> Array:
-        """(5, 6) the joint angles of the chapter's five poses, rad, as the nominal table has them; body in view.
+        """(5, 6) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view.
 
         Raises:
             InputError: the arm does not reach one.
         """
         T_home, found = self.model.forward(self.model.home), []
-        for n, (shift, turn) in enumerate(_POSES, start=1):
-            T = pose(T_home[:3, :3] @ exp_so3(np.radians(turn)), T_home[:3, 3] + np.array(shift))
+        for n, (shift, rotation) in enumerate(_POSES, start=1):
+            T = pose(T_home[:3, :3] @ exp_so3(np.radians(rotation)), T_home[:3, 3] + np.array(shift))
             solutions = self.model.inverse(T, near=self.model.home)
             if solutions.best is None:
-                raise InputError(f"{self.model.name} does not reach pose {n} of the cell: {solutions.reason}")
+                raise InputError(f"{self.model.name} does not reach pose {n} of the workcell: {solutions.reason}")
             found.append(solutions.best)
         return np.array(found)
 
     def board_shots(self, count: int) -> Iterator[Shot]:
-        """Show a board at many places and turns, as a person would who calibrates, past the arm; no time passes.
+        """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.
 
         Args:
             count: how many shots.
@@ -224,13 +276,13 @@ class Workcell:
         self.source.cover(from_s, to_s)
 
     def picture(self, size_px: tuple[int, int] = (1280, 720)) -> Image:
-        """Return the cell as it is now, seen from aside, (H, W, 3) BGR."""
+        """Return the workcell as it is now, seen from the side, (H, W, 3) BGR."""
         body = (body_patterns(), self._T_tool_body)
         return picture(size_px, self.plant, body, (self._T_base_rig, self._rig), self._seed)
 
     @property
     def truth(self) -> WorkcellTruth:
-        """What is true up to now; for judging only."""
+        """What is true up to now; for evaluation only."""
         path = self.plant.path.copy()
         taken = {name: times.left_s for name, times in self.source.taken.items()}
         return WorkcellTruth(
