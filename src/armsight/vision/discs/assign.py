@@ -1,7 +1,8 @@
-"""Which detection is which disc where the pose is about known: gates, and a choice only where there is one.
+"""Identify discs where the pose is known approximately: chi-square gates, and an assignment only where it is unique.
 
-A disc's two detections are judged together: what is not known of the pose moves both images of a disc as one, so the
-epipolar distance and the disparity count by themselves. What is settled narrows the pose, and with it the other gates.
+A disc's two detections are tested together: an error of the pose moves both images of a disc together, so the epipolar
+distance and the disparity are tested independently of it. Every assignment reduces the covariance of the pose, and with
+it the other gates.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from armsight.vision.discs.pairing import DiscView
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
-#: A detection beyond this quantile of the chi-square distribution of its distance is of something else.
+#: A detection beyond this quantile of the chi-square distribution of its distance is not of this disc.
 GATE_QUANTILE = 1.0 - 1e-5
 _GATE_ONE, _GATE_BOTH = (float(chdtri(n, 1 - GATE_QUANTILE)) for n in (2, 4))
 _NONE = np.zeros(0, np.int64)
@@ -30,11 +31,11 @@ Claim = tuple[Ids, Ids]
 
 @dataclass(frozen=True, eq=False)
 class Assigned(Record):
-    """Detections named by a pose.
+    """Detections identified by a pose.
 
     Attributes:
         rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
-        T_left_body: (4, 4) the pose, improved by what was settled.
+        T_left_body: (4, 4) the pose, updated by the assigned detections.
         dropped: discs for which detections compete.
     """
 
@@ -46,19 +47,19 @@ class Assigned(Record):
 def assign(
     rig: StereoRig, target: DiscTarget, T_left_body: Array, cov: Array, left: Discs, right: Discs
 ) -> Correspondences | Missed:
-    """Name the discs of a body whose pose is about known.
+    """Identify the discs of a body whose pose is known approximately.
 
     Args:
         rig: the calibrated pair.
         target: the discs.
-        T_left_body: (4, 4) about where the body is: predicted, or from its coded markers.
+        T_left_body: (4, 4) approximate pose: predicted, or from its coded markers.
         cov: (6, 6) covariance of its tangent.
-        left: what the left camera saw.
-        right: what the right camera saw.
+        left: the discs detected in the left image.
+        right: the discs detected in the right image.
 
     Returns:
-        Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed where
-        nothing is left.
+        Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed
+        where nothing is left.
     """
     view = DiscView.of(rig, target, left, right)
     found = settle(view, T_left_body, cov, np.full((len(target.radii_m), 2), -1))
@@ -71,7 +72,7 @@ def assign(
 
 
 def correspondences(view: DiscView, found: Assigned) -> Correspondences:
-    """Return what was named as correspondences of ellipse centres."""
+    """Return the assigned detections as correspondences of ellipse centres."""
     ids = np.flatnonzero((found.rows >= 0).any(axis=1))
     uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
     for side, seen in enumerate(view.discs):
@@ -82,13 +83,13 @@ def correspondences(view: DiscView, found: Assigned) -> Correspondences:
 
 
 def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
-    """Name detections by a pose, the clear ones first.
+    """Assign detections to discs by a pose, the unambiguous ones first.
 
     Args:
-        view: what both cameras saw.
-        T_left_body: (4, 4) about where the body is.
+        view: the discs that both cameras detected.
+        T_left_body: (4, 4) approximate pose.
         cov: (6, 6) covariance of its tangent.
-        rows: (M, 2) what is settled already and is part of the pose; -1 elsewhere.
+        rows: (M, 2) detections already assigned, which the pose includes; -1 elsewhere.
     """
     T, rows = T_left_body, rows.copy()
     while True:
@@ -100,11 +101,11 @@ def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigne
             left, right = (_near(view, expected, cov, m, s, free[s]) if see[m, s] else _NONE for s in (0, 1))
             if len(left) or len(right):
                 claims[m] = _together(view, expected, cov, m, (left, right))
-        clear = _clear(claims)
-        if not len(clear):
+        unique = _unambiguous(claims)
+        if not len(unique):
             break
-        rows[clear[:, 0]] = clear[:, 1:]
-        T, cov = _improved(view, expected, T, cov, clear)
+        rows[unique[:, 0]] = unique[:, 1:]
+        T, cov = _improved(view, expected, T, cov, unique)
     names = view.target.body.point_names
     return Assigned(rows, T, tuple(Dropped(names[m], _competing(claim)) for m, claim in claims.items()))
 
@@ -120,7 +121,7 @@ def _near(view: DiscView, expected: Expected, cov: Array, m: int, side: int, fre
 
 
 def _together(view: DiscView, expected: Expected, cov: Array, m: int, near: Claim) -> Claim:
-    """Return what is left of a disc's detections where those of both cameras must agree; all of one camera's."""
+    """Return those of a disc's detections with which both cameras agree; all of them where only one camera has any."""
     if not len(near[0]) or not len(near[1]):
         return near
     a, b = (grid.ravel() for grid in np.meshgrid(*near, indexing="ij"))
@@ -133,22 +134,22 @@ def _together(view: DiscView, expected: Expected, cov: Array, m: int, near: Clai
     return np.unique(a[good]), np.unique(b[good])
 
 
-def _clear(claims: dict[int, Claim]) -> Ids:
-    """Return (K, 3) disc, left and right row of every disc that has one choice and shares it with no other disc."""
-    wanted = [np.concatenate([claim[side] for claim in claims.values()] or [_NONE]) for side in (0, 1)]
-    clear = []
+def _unambiguous(claims: dict[int, Claim]) -> Ids:
+    """Return (K, 3) disc, left and right row of every disc that has one candidate and shares it with no other disc."""
+    claimed = [np.concatenate([claim[side] for claim in claims.values()] or [_NONE]) for side in (0, 1)]
+    unique = []
     for m, claim in claims.items():
-        alone = all((wanted[s] == claim[s]).sum() == 1 for s in (0, 1) if len(claim[s]) == 1)
+        alone = all((claimed[s] == claim[s]).sum() == 1 for s in (0, 1) if len(claim[s]) == 1)
         if max(map(len, claim)) == 1 and alone:
-            clear.append((m, *(rows[0] if len(rows) else -1 for rows in claim)))
-    return np.array(clear, np.int64).reshape(-1, 3)
+            unique.append((m, *(rows[0] if len(rows) else -1 for rows in claim)))
+    return np.array(unique, np.int64).reshape(-1, 3)
 
 
-def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, clear: Ids) -> tuple[Array, Array]:
+def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, unique: Ids) -> tuple[Array, Array]:
     """Return the pose and its covariance with discs (K, 3) more, by a Kalman update."""
     J, gap, noises = [], [], []
     for side in (0, 1):
-        m, rows = clear[clear[:, 1 + side] >= 0][:, [0, 1 + side]].T
+        m, rows = unique[unique[:, 1 + side] >= 0][:, [0, 1 + side]].T
         J.append(expected.J[m, side].reshape(-1, 6))
         gap.append((view.discs[side].uv[rows] - expected.uv[m, side]).ravel())
         noises += list(view.covariances(expected, m, side, rows))
@@ -159,8 +160,8 @@ def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, clear: I
 
 
 def _competing(claim: Claim) -> str:
-    """Say which detections compete for a disc."""
+    """Return which detections compete for a disc, as text."""
     if not any(map(len, claim)):
-        return "what the two cameras show in its place does not belong together"
+        return "the detections of the two cameras at its position do not agree"
     counts = ", ".join(f"{len(rows)} in the {side} image" for side, rows in zip(SIDES, claim, strict=True))
     return f"several detections may be it: {counts}"

@@ -1,4 +1,4 @@
-"""The image of a disc: an ellipse whose centre is not the image of the disc's centre.
+"""The image of a disc: an ellipse whose centre is not the image of the disc's centre (perspective bias).
 
 A disc of radius r around P (camera's frame) with unit normal n has the dual conic r^2 (I - n n^T) - P P^T (Hartley and
 Zisserman, "Multiple View Geometry", 2nd ed., 8.3: the dual of the image of a conic). Its last column is the pole of the
@@ -6,17 +6,16 @@ line at infinity, so a pinhole shows the ellipse's centre where it shows the poi
 
     Q = P + (r^2 / P_z) (n_z n - e_z)
 
-and Q takes the place of P in every projection. A lens that distorts bends the ellipse; the centre of the ellipse that
+and Q replaces P in every projection. A lens that distorts bends the ellipse; the centre of the ellipse that
 fits its rim best moves by the curvature of the distortion over the ellipse, to second order
 
     1/8 (tr G_k + 2 sum_l G_l,kl)     (k, l: axes in which the ellipse is a unit circle, G_l: Hessians of the distortion).
 
-What both cameras should see of a body's discs where the body is at a given pose, and the bias of their centres.
-
-An ellipse's centre is not the image of its disc's centre (:mod:`~armsight.vision.discs.bias`). The difference depends on how
-the disc is turned, so it is known once the pose is. Of a disc whose normal nobody gave only the size of it is known: the
-centre seems to move by -(r^2 / z) times the part of the optical axis e that lies in the disc, e - (n e) n, which over all
-directions n has the second moments 1/15 across e and 8/15 along it.
+:func:`expect` predicts what both cameras see of a body's discs at a pose, with that bias and its derivatives;
+:func:`centred` subtracts it. The bias depends on the orientation of the disc, so it is known once the pose is. For a
+disc of unknown normal only its distribution is known: the centre seems to move by -(r^2 / z) times the part of the
+optical axis e that lies in the disc, e - (n e) n, which over all directions n has the second moments 1/15 across e and
+8/15 along it.
 """
 
 from __future__ import annotations
@@ -146,7 +145,7 @@ def _each(
 
 
 def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> tuple[Array, Array, Array, Array]:
-    """Say where a camera shows the centres of discs' ellipses, and the ellipses.
+    """Project discs to the ellipses that a camera shows, and their centres.
 
     Args:
         camera: the camera.
@@ -168,9 +167,9 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
     return out
 
 
-#: A disc turned further away than this cosine is not found, and its back is not seen.
+#: A disc is not found where the cosine between its normal and the direction to the camera is below this.
 LEAST_FACING = 0.09
-#: Points this share of their spread off a plane still count as in it.
+#: Points count as coplanar where their third singular value is below this share of the first.
 _FLAT = 1e-3
 
 
@@ -181,9 +180,9 @@ class Expected(Record):
     Attributes:
         uv: (M, 2, 2) disc, camera: centres of the ellipses, raw px.
         bias: (M, 2, 2) centres of the ellipses less images of the centres, px.
-        shape: (M, 2, 3) S11, S12, S22 of the ellipses, px^2; as if turned to the camera where the normal is not known.
+        shape: (M, 2, 3) S11, S12, S22 of the ellipses, px^2; as if facing the camera where the normal is not known.
         radius_px: (M, 2) longer half axes of the ellipses, px.
-        facing: (M, 2) cosine between a disc's normal and its direction to the camera; NaN where the body does not say.
+        facing: (M, 2) cosine between a disc's normal and its direction to the camera; NaN where the normal is unknown.
         J: (M, 2, 2, 6) derivative of ``uv`` by the tangent of the pose.
         J_bias: (M, 2, 2, 6) derivative of ``bias`` by the tangent of the pose.
         J_rig: (M, 2, 2, P) derivative of ``uv`` by the rig's parameters.
@@ -205,7 +204,7 @@ def bias_normals(target: DiscTarget) -> Array:
     """Return normals for the perspective bias, for which their sign does not matter.
 
     Returns:
-        (M, 3) those given; where none is given, that of the plane in which all discs lie; NaN where they lie in none.
+        (M, 3) those given; where none is given, that of the plane of all discs; NaN where they are not coplanar.
     """
     normals = np.array(target.normals)
     unknown = np.isnan(normals[:, 0])
@@ -218,7 +217,7 @@ def bias_normals(target: DiscTarget) -> Array:
 
 
 def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
-    """Say what both cameras should see of a body's discs.
+    """Predict what both cameras see of a body's discs.
 
     Args:
         rig: the calibrated pair.
@@ -261,18 +260,18 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
 def centred(
     rig: StereoRig, target: DiscTarget, T_left_body: Array, cov_pose: Array, seen: Correspondences
 ) -> Correspondences:
-    """Turn centres of ellipses into images of the discs' centres.
+    """Convert centres of ellipses to images of the discs' centres: subtract the perspective bias.
 
     Args:
         rig: the calibrated pair.
         target: the discs; ``seen.ids`` are rows of its body.
-        T_left_body: (4, 4) about where the body is.
-        cov_pose: (6, 6) covariance of its tangent: what is not known of the pose is not known of the bias.
+        T_left_body: (4, 4) approximate pose of the body.
+        cov_pose: (6, 6) covariance of its tangent; it adds to the covariance of the bias.
         seen: centres of ellipses.
 
     Returns:
-        The same correspondences less the bias, with the covariance of both. Detections whose disc would have no image at
-        the pose become NaN.
+        The same correspondences less the bias, with the covariance of both. Detections whose disc would have no image
+        at the pose become NaN.
     """
     expected = expect(rig, target, T_left_body)
     J = expected.J_bias[seen.ids]
@@ -282,7 +281,7 @@ def centred(
 
 
 def visible(rig: StereoRig, expected: Expected) -> NDArray[np.bool_]:
-    """(M, 2) whether a disc's ellipse lies wholly in a camera's image and its face, where known, is turned to it enough."""
+    """(M, 2) whether a disc's ellipse lies wholly in a camera's image and its face, where known, faces it enough."""
     size = np.array([camera.image_size_px for camera in rig.cameras])
     low, high = expected.uv - expected.radius_px[..., None], expected.uv + expected.radius_px[..., None]
     inside = ((low >= -0.5) & (high <= size - 0.5)).all(axis=2)

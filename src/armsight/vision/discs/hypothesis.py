@@ -1,11 +1,11 @@
 """How likely it is that given discs are those of a body at one pose, rather than discs of something else.
 
-The score is the logarithm of a Bayes factor: the body at some pose, of which nothing is known beforehand, against the
-better of two other explanations, discs of the same looks strewn as densely over each image as it shows them, and real discs
-strewn in space as densely as pairs are found that the body does not explain (Bar-Shalom and Li, "Multitarget-Multisensor
-Tracking", 1995, 6: association likelihoods). What each explanation leaves open, a pose or places, is integrated out in
-Laplace's approximation. It weighs in one number how well the discs fit, how many there are, how sharply they could have
-contradicted, and how easily something else would do the same.
+The score is the logarithm of a Bayes factor: the body at some pose, with no prior knowledge of it, against the better
+of two other explanations: discs of the same appearance spread as densely over each image as it shows them, and real
+discs spread in space as densely as there are pairs that the body does not explain (Bar-Shalom and Li,
+"Multitarget-Multisensor Tracking", 1995, 6: association likelihoods). The free parameters of each explanation, a pose
+or positions, are integrated out by Laplace's approximation. The score combines how well the discs fit, how many there
+are, how precisely they could have contradicted, and how easily something else would produce the same.
 """
 
 from __future__ import annotations
@@ -77,16 +77,16 @@ class _Fit(Record):
 
 
 def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> Hypothesis | str:
-    """Grow a few named detections into a hypothesis over all discs.
+    """Extend a few named detections to a hypothesis over all discs.
 
     Args:
-        view: what both cameras saw.
+        view: the discs that both cameras detected.
         pairs: all pairs of discs that may be one disc of the body.
-        T_left_body: (4, 4) about the pose.
+        T_left_body: (4, 4) the approximate pose.
         rows: (M, 2) detections of three discs or more, -1 elsewhere.
 
     Returns:
-        The hypothesis, or why it is none.
+        The hypothesis, or the reason why it is rejected.
     """
     fit = _fit(view, T_left_body, rows)
     if fit is None:
@@ -99,24 +99,24 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
     if fit.chi2 > _limit(2 * int((found.rows >= 0).sum()) - 6):
         return "the discs do not fit the body"
     expected = expect(view.rig, view.target, fit.T_left_body)
-    turned = 3.0 * np.sqrt(np.linalg.eigvalsh(fit.cov[3:, 3:])[-1])
-    if (expected.facing[found.rows >= 0] + turned < LEAST_FACING).any():
+    tilt_rad = 3.0 * np.sqrt(np.linalg.eigvalsh(fit.cov[3:, 3:])[-1])
+    if (expected.facing[found.rows >= 0] + tilt_rad < LEAST_FACING).any():
         return "its discs would be seen from behind"
     sizes = _size_chi2(view, expected, found.rows)
     if sizes is None:
-        return "the discs do not look as the body's would"
+        return "the discs do not have the shape that the body's would have"
     score = _score(view, pairs, expected, found.rows, fit) - sizes / 2
     return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(view, found), score)
 
 
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
-    """Chi-square beyond which a fit is none."""
+    """Chi-square above which a fit is rejected."""
     return float(chdtri(freedom, 1 - FIT_QUANTILE))
 
 
 def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
-    """Fit a pose to named ellipse centres; the rig's errors weigh as noise that all detections share."""
+    """Fit a pose to named ellipse centres; the rig's errors count as noise that all detections share."""
     side, m = np.nonzero(rows.T >= 0)
     uv = np.concatenate([view.discs[s].uv[rows[m[side == s], s]] for s in (0, 1)])
     for _ in range(_STEPS):
@@ -150,7 +150,7 @@ def _size_chi2(view: DiscView, expected: Expected, rows: Ids) -> float | None:
         row, long = rows[m, side], float(expected.radius_px[m, side])
         if not view.congruent(expected, m, side)[row]:
             return None
-        sigma2 = (SIZE_SHARE * long) ** 2 + float(view.slack_px[side][row] / SIZE_SIGMAS) ** 2
+        sigma2 = (SIZE_SHARE * long) ** 2 + float(view.tolerance_px[side][row] / SIZE_SIGMAS) ** 2
         total += (float(view.radius_px[side][row]) - long) ** 2 / sigma2
     return total
 
@@ -167,36 +167,39 @@ def _score(view: DiscView, pairs: Pairs, expected: Expected, rows: Ids, fit: _Fi
     in_image = np.log(
         [_density(view, expected, rows[:, s], i, s) for i, s in zip(m.tolist(), side.tolist(), strict=True)]
     )
-    flat = _left_open(fit.weight, np.eye(2 * len(m))) + in_image.sum()
+    flat = _integrated(fit.weight, np.eye(2 * len(m))) + in_image.sum()
     both = np.asarray((rows >= 0).all(axis=1))
     ids = np.flatnonzero(both)
-    places = np.zeros((len(m), 2, 3 * len(ids)))  # derivative of what is seen by the places of the discs seen twice
+    # Derivative of the pixels by the positions of the discs seen in both images.
+    by_position = np.zeros((len(m), 2, 3 * len(ids)))
     for n, i in enumerate(ids):
-        places[m == i, :, 3 * n : 3 * n + 3] = expected.J[i, side[m == i], :, :3]
+        by_position[m == i, :, 3 * n : 3 * n + 3] = expected.J[i, side[m == i], :, :3]
     once = np.eye(2 * len(m)).compress(np.repeat(~both[m], 2), axis=1)
-    J = np.hstack([places.reshape(2 * len(m), -1), once])
+    J = np.hstack([by_position.reshape(2 * len(m), -1), once])
     solid = (
-        _left_open(fit.weight, J) + in_image[~both[m]].sum() + len(ids) * np.log(_pairs_density(view, pairs, rows, fit))
+        _integrated(fit.weight, J)
+        + in_image[~both[m]].sum()
+        + len(ids) * np.log(_pairs_density(view, pairs, rows, fit))
     )
     return float(pose + seen - fit.chi2 / 2 - max(flat, solid))
 
 
-def _left_open(weight: Array, J: Array) -> float:
-    """Return the logarithm of what integrating over parameters with Jacobian J (N, K) gives, at the best of them."""
+def _integrated(weight: Array, J: Array) -> float:
+    """Return the logarithm of what integrating over parameters with Jacobian J (N, K) gives, at their optimum."""
     return float(J.shape[1] * np.log(2 * np.pi) - np.linalg.slogdet(J.T @ weight @ J)[1]) / 2
 
 
 def _volume(view: DiscView, z: float) -> float:
-    """Return the volume that the left camera sees up to a distance, m^3, its lens taken as straight."""
+    """Return the volume that the left camera sees up to a distance, m^3, without lens distortion."""
     camera = view.rig.left
     width, height = camera.image_size_px
     return float(width * height / (camera.intrinsics[0] * camera.intrinsics[1]) * z**3 / 3)
 
 
 def _pairs_density(view: DiscView, pairs: Pairs, rows: Ids, fit: _Fit) -> float:
-    """Return how many pairs of discs a cubic metre has that the body does not explain.
+    """Return the number of pairs of discs per cubic metre that the body does not explain.
 
-    In view, to twice the body's distance at the least, and one more than are seen; or about the body if denser there.
+    Counted in view, to twice the body's distance at the least, plus one; or about the body where they are denser.
     """
     points = view.target.body.points
     middle = points.mean(axis=0)
@@ -209,7 +212,7 @@ def _pairs_density(view: DiscView, pairs: Pairs, rows: Ids, fit: _Fit) -> float:
 
 
 def _density(view: DiscView, expected: Expected, mine: Ids, m: int, side: int) -> float:
-    """Return how many discs that may be disc m a square pixel has: in the image, or others about the body if denser."""
+    """Return the number per square pixel of discs that may be disc m: in the image, or about the body where denser."""
     long = float(expected.radius_px[m, side])
     alike = view.congruent(expected, m, side)
     other = np.array(alike)

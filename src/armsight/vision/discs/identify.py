@@ -1,16 +1,11 @@
-"""Which of a body's discs each detection is, with nothing known beforehand: both cameras and the body's distances tell.
+"""Identify a body's discs with no prior pose: both cameras and the distances on the body determine which disc is which.
 
 Pairs of discs that the epipolar planes, the depth and their size allow are triangulated
-(:mod:`~armsight.vision.discs.pairing`); three of them with three of the body's distances give a pose
-(:mod:`~armsight.vision.discs.identify`); every pose is grown over all discs and weighed against clutter
-(:mod:`~armsight.vision.discs.hypothesis`). The best is the answer only where the odds against everything else, clutter and all
-other namings together, are those of ERROR_ODDS: an ambiguous answer is a miss and never a guess.
-
-Three pairs of discs whose distances are those of three discs of the body: where the body may be.
-
-Every pair of discs (:mod:`~armsight.vision.discs.pairing`) with every name that fits it is a node; two nodes are joined where
+(:mod:`~armsight.vision.discs.pairing`). Every pair with every name that fits it is a node; two nodes are joined where
 their distance is that of the two discs on the body, within what noise and calibration allow; every triangle of nodes
-gives a pose by a rigid fit.
+gives a pose by a rigid fit (:func:`triples`). Every pose is extended over all discs and weighted against clutter
+(:mod:`~armsight.vision.discs.hypothesis`). The best is accepted only where the odds against everything else, clutter
+and all other namings together, are those of ERROR_ODDS: an ambiguous answer is a miss and never a guess.
 """
 
 from __future__ import annotations
@@ -27,8 +22,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
-from armsight.vision.discs.assign import assign
-from armsight.vision.discs.bias import centred
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
 from armsight.vision.markers.disc.target import MOST_REPORTED, DiscTarget
@@ -36,9 +29,9 @@ from armsight.vision.rig import StereoRig
 
 #: Distances that differ by more standard deviations than this are different.
 DISTANCE_SIGMAS = 4.5
-#: Three discs whose height is less than this share of their longest side fix no pose.
+#: Three discs whose height is less than this share of their longest side do not determine a pose.
 SLIM = 0.05
-#: More edges than these are not looked at, and no more triples are listed.
+#: With more edges than this none is examined; no more triples than this are listed.
 MOST_EDGES, MOST_TRIPLES = 500_000, 5_000
 _NONE = np.zeros(0, np.int64)
 
@@ -51,7 +44,7 @@ class Triples(Record):
         ids: (T, 3) rows of the body's discs.
         rows: (T, 3) rows of the pairs.
         Ts_left_body: (T, 4, 4) the rigid fits.
-        most: (T,) how many of the body's discs can be seen at most where this triple is right.
+        most: (T,) how many of the body's discs can be visible at most if this triple is right.
         left_out: the same for the triples that were too many to be listed; 0 where none were.
     """
 
@@ -74,7 +67,7 @@ def triples(view: DiscView, pairs: Pairs) -> Triples | None:
     start = np.searchsorted(first, np.arange(len(nodes) + 1))
     shared = np.zeros(len(nodes), np.int64)
     _triangles(start, second, shared, 0, np.empty((0, 5), np.int64))
-    # A triple's least shared node; the most shared are listed. One node of n that fit together is in C(n - 1, 2) triples.
+    # The triples with the most shared nodes are listed. One node of n that fit together is in C(n - 1, 2) triples.
     enough = 1
     while (
         count := _triangles(start, second, shared, enough, found := np.empty((MOST_TRIPLES, 5), np.int64))
@@ -99,7 +92,7 @@ def _most(support: Ids) -> Ids:
 
 def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     """Return nodes (V, 2) of pair and disc, the first and second node (E,) of every edge, and its chi-square (E,)."""
-    points, slack = view.target.body.points, view.unmade_m
+    points, tolerance = view.target.body.points, view.made_sigma_m
     sides = np.linalg.norm(points[:, None] - points[None], axis=2)
     pair, disc = np.nonzero(pairs.fits)
     node = np.full(pairs.fits.shape, -1)
@@ -110,7 +103,7 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     # No two discs lie farther apart than this, the least certain pairs included.
     sigma = np.sqrt(np.linalg.eigvalsh(pairs.cov)[:, -1].max() * 2)
     tree = cKDTree(pairs.p_left)
-    reach = sides.max() + DISTANCE_SIGMAS * (sigma + slack)
+    reach = sides.max() + DISTANCE_SIGMAS * (sigma + tolerance)
     if tree.count_neighbors(tree, reach) > 2 * MOST_EDGES:
         return None
     i, j = tree.query_pairs(reach, output_type="ndarray").T
@@ -120,7 +113,9 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     distance = np.linalg.norm(along, axis=1)
     along /= np.maximum(distance, 1e-12)[:, None]
     by_rig = np.einsum("ni,nir->nr", along, pairs.by_rig[i] - pairs.by_rig[j])
-    variance = np.einsum("ni,nij,nj->n", along, pairs.cov[i] + pairs.cov[j], along) + (by_rig**2).sum(axis=1) + slack**2
+    variance = (
+        np.einsum("ni,nij,nj->n", along, pairs.cov[i] + pairs.cov[j], along) + (by_rig**2).sum(axis=1) + tolerance**2
+    )
     order = np.argsort(distance)
     i, j, distance, variance = i[order], j[order], distance[order], variance[order]
     widest = DISTANCE_SIGMAS * np.sqrt(variance.max(initial=0.0))
@@ -182,14 +177,14 @@ def _triangles(start: Ids, second: Ids, shared: Ids, enough: int, found: Ids) ->
 
 
 def spread(p: Array) -> NDArray[np.bool_]:
-    """(T,) whether triangles (T, 3, 3) are no lines."""
+    """(T,) whether triangles (T, 3, 3) are not degenerate to lines."""
     u, v, w = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], p[:, 2] - p[:, 1]
     longest2 = np.max([(s**2).sum(axis=1) for s in (u, v, w)], axis=0)
     return np.asarray(np.linalg.norm(np.cross(u, v), axis=1) >= SLIM * longest2)
 
 
 def _rigid(p_b: Array, p_a: Array) -> Array:
-    """Lay triangles p_b (T, 3, 3) on p_a (T, 3, 3): (T, 4, 4) transforms; as :func:`~armsight.geometry.rigid.fit_rigid`."""
+    """Fit (T, 4, 4) transforms of triangles p_b (T, 3, 3) to p_a: :func:`~armsight.geometry.rigid.fit_rigid`, batched."""
     mean_b, mean_a = p_b.mean(axis=1), p_a.mean(axis=1)
     U, _, Vt = np.linalg.svd(np.swapaxes(p_a - mean_a[:, None], 1, 2) @ (p_b - mean_b[:, None]))
     flip = np.ones((len(U), 1, 3))
@@ -200,25 +195,23 @@ def _rigid(p_b: Array, p_a: Array) -> Array:
     return T
 
 
-__all__ = ["Identified", "assign", "centred", "identify"]
-
-#: A naming is given only where it is so many times likelier than all others together, and than clutter.
+#: A naming is accepted only where it is so many times likelier than all others together, and than clutter.
 ERROR_ODDS = 1e6
-#: More ways than these to lay the body on the discs are not weighed.
+#: No more poses of the body than this are weighted against each other.
 MOST_HYPOTHESES = 64
-#: A triple whose discs a rough rigid fit turns away by more than this (cosine) is not looked at more closely.
+#: A triple is skipped where a rough rigid fit rotates one of its discs away by more than this (cosine).
 _ROUGHLY_AWAY = -0.3
-#: How many times more a disc may count elsewhere: nearer to the cameras, or with less clutter about it.
+#: How many times more a disc may contribute elsewhere: nearer to the cameras, or with less clutter around it.
 _ALLOWANCE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Identified(Record):
-    """The discs of a body, found and named.
+class IdentifiedDiscs(Record):
+    """The discs of a body, detected and identified.
 
     Attributes:
         T_left_body: (4, 4) pose of the body, the perspective bias of the discs taken into account.
-        cov: (6, 6) covariance of its tangent, wide: it holds what neither noise nor calibration explain.
+        cov: (6, 6) covariance of its tangent, wide: it includes what neither noise nor calibration explain.
         seen: ellipse centres by rows of the target's body, the perspective bias still in them.
         rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
         log_odds: natural logarithm of the odds against the next best explanation.
@@ -231,52 +224,52 @@ class Identified(Record):
     log_odds: float
 
 
-def identify(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> Identified | Missed:
+def identify(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> IdentifiedDiscs | Missed:
     """Find a body by its discs.
 
     Args:
         rig: the calibrated pair.
         target: the discs.
-        left: what the left camera saw.
-        right: what the right camera saw.
+        left: the discs detected in the left image.
+        right: the discs detected in the right image.
 
     Returns:
-        Pose and names, or why there are none: too few discs, none with the body's distances, all turned away, or more
+        Pose and names, or why there are none: too few discs, none with the body's distances, all facing away, or more
         than one way to name them.
     """
     body = target.body
     if len(body.points) < 3 or not spread(body.points[list(combinations(range(len(body.points)), 3))]).any():
-        return Missed(f"the discs of {body.name} fix no pose: three that are not on one line are needed")
+        return Missed(f"the discs of {body.name} do not determine a pose: three that are not on one line are needed")
     discs = (left, right)
     if min(len(seen.uv) for seen in discs) < 3:
         return Missed(_too_few(target, discs))
     view = DiscView.of(rig, target, left, right)
     pairs = pair(view)
     if pairs is None:
-        return Missed(f"{_counts(discs)} make more than {MOST_PAIRS} pairs: too many to tell which are of {body.name}")
+        return Missed(f"{_counts(discs)} make more than {MOST_PAIRS} pairs: too many to identify those of {body.name}")
     found = triples(view, pairs)
     if found is None:
-        return Missed(f"ambiguous: {_counts(discs)} fit {body.name} in too many ways to look at")
-    weighed = _weighed(view, pairs, found)
-    return weighed if isinstance(weighed, Missed) else _decided(view, weighed)
+        return Missed(f"ambiguous: {_counts(discs)} fit {body.name} in too many ways to examine")
+    hypotheses = _hypotheses(view, pairs, found)
+    return hypotheses if isinstance(hypotheses, Missed) else _decided(view, hypotheses)
 
 
-def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] | Missed:
-    """Grow every triple into a hypothesis, those that another has grown into already left out."""
+def _hypotheses(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] | Missed:
+    """Extend every triple to a hypothesis, except those that an earlier hypothesis contains."""
     target, discs, count = view.target, view.discs, len(view.target.radii_m)
     reasons: Counter[str] = Counter()
-    forward_selection: list[Hypothesis] = []
+    accepted: list[Hypothesis] = []
     both = np.stack([pairs.left, pairs.right], axis=1)
-    possible = np.flatnonzero(_turned_to(view, found)).tolist()
-    many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} in more than {MOST_HYPOTHESES} places or turns")
+    possible = np.flatnonzero(_facing_cameras(view, found)).tolist()
+    many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} at more than {MOST_HYPOTHESES} poses")
     if len(possible) > MOST_HYPOTHESES * comb(count, 3):  # each body has so many triples, and no more
         return many
     tried = 0
     for n in possible:
-        if _settled(forward_selection, int(found.most[n])):
-            return forward_selection
+        if _settled(accepted, int(found.most[n])):
+            return accepted
         ids, detections = found.ids[n], both[found.rows[n]]
-        if any((h.rows[ids] == detections).all() for h in forward_selection):
+        if any((h.rows[ids] == detections).all() for h in accepted):
             continue
         if tried == MOST_HYPOTHESES:
             return many
@@ -286,12 +279,12 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
         result = hypothesis(view, pairs, found.Ts_left_body[n], rows)
         if isinstance(result, str):
             reasons[result] += 1
-        elif not any((h.rows == result.rows).all() for h in forward_selection):
-            forward_selection.append(result)
-    if found.left_out and not _settled(forward_selection, found.left_out):
+        elif not any((h.rows == result.rows).all() for h in accepted):
+            accepted.append(result)
+    if found.left_out and not _settled(accepted, found.left_out):
         return many
-    if forward_selection:
-        return forward_selection
+    if accepted:
+        return accepted
     what = f"{len(pairs.left)} pairs of discs may be of {target.body.name}"
     if reasons:
         return Missed(f"{what}, and three have its distances, but {reasons.most_common(1)[0][0]}")
@@ -301,20 +294,21 @@ def _weighed(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis] |
     return Missed(hint or f"{what}, but no three have its distances; {_too_few(target, discs)}")
 
 
-def _settled(forward_selection: list[Hypothesis], most: int) -> bool:
+def _settled(accepted: list[Hypothesis], most: int) -> bool:
     """Whether no hypothesis of at most so many discs can come near the best one.
 
-    A score is about proportional to the number of discs, less what the pose costs; half as much again is allowed for.
+    A score is about proportional to the number of discs, less a constant for the pose; a margin of half as much again
+    is allowed.
     """
-    best = max(forward_selection, key=lambda h: h.score, default=None)
+    best = max(accepted, key=lambda h: h.score, default=None)
     if best is None:
         return False
     count = int((best.rows >= 0).all(axis=1).sum())
     return bool((1 - _ALLOWANCE * most / count) * best.score > np.log(ERROR_ODDS))
 
 
-def _turned_to(view: DiscView, found: Triples) -> Array:
-    """(T,) whether no disc of a triple is turned well away from a camera."""
+def _facing_cameras(view: DiscView, found: Triples) -> Array:
+    """(T,) whether no disc of a triple clearly faces away from a camera."""
     points, normals = view.target.body.points[found.ids], view.target.normals[found.ids]
     R, t = found.Ts_left_body[:, :3, :3], found.Ts_left_body[:, :3, 3]
     p, n = np.einsum("tij,tmj->tmi", R, points) + t[:, None], np.einsum("tij,tmj->tmi", R, normals)
@@ -325,16 +319,16 @@ def _turned_to(view: DiscView, found: Triples) -> Array:
     return good
 
 
-def _decided(view: DiscView, weighed: list[Hypothesis]) -> Identified | Missed:
-    """Take the best hypothesis where nothing else comes near it, and no second body of the kind is there."""
-    best = max(weighed, key=lambda h: h.score)
-    others = [h for h in weighed if best.contradicts(h)]
+def _decided(view: DiscView, hypotheses: list[Hypothesis]) -> IdentifiedDiscs | Missed:
+    """Accept the best hypothesis where no other comes near it and no second body of its kind is in view."""
+    best = max(hypotheses, key=lambda h: h.score)
+    others = [h for h in hypotheses if best.contradicts(h)]
     scores = [0.0, *(h.score for h in others)]
     odds = best.score - float(np.logaddexp.reduce(scores))
     rival = max(others, key=lambda h: h.score, default=None)
     twin = any(h.score >= np.log(ERROR_ODDS) and not best.shares_with(h) for h in others)
     if odds >= np.log(ERROR_ODDS) and not twin:
-        return Identified(best.T_left_body, best.cov, best.seen, best.rows, odds)
+        return IdentifiedDiscs(best.T_left_body, best.cov, best.seen, best.rows, odds)
     if rival is None or rival.score < 0:
         return Missed(
             f"ambiguous: {int((best.rows >= 0).all(axis=1).sum())} discs fit {view.target.body.name}, but with so many in "
@@ -344,32 +338,34 @@ def _decided(view: DiscView, weighed: list[Hypothesis]) -> Identified | Missed:
 
 
 def _ambiguous(target: DiscTarget, best: Hypothesis, rival: Hypothesis) -> str:
-    """Say between which two explanations there is nothing to choose."""
+    """Return the message that names two explanations which are equally likely."""
     name, names = target.body.name, target.body.point_names
     here, there = ({tuple(pair) for pair in h.rows if (pair >= 0).all()} for h in (best, rival))
     if here == there:
         order = [names[m] for row in best.rows for m in np.flatnonzero((rival.rows == row).all(axis=1)) if row[0] >= 0]
         given = [names[m] for m, row in enumerate(best.rows) if row[0] >= 0 and row[1] >= 0]
         return f"ambiguous: the same discs may be {' '.join(given)} of {name}, or {' '.join(order)}"
-    places = " and at ".join("({:.0f} {:.0f} {:.0f}) mm".format(*(1e3 * h.T_left_body[:3, 3])) for h in (best, rival))
-    return f"ambiguous: {name} may be at {places}"
+    positions = " and at ".join(
+        "({:.0f} {:.0f} {:.0f}) mm".format(*(1e3 * h.T_left_body[:3, 3])) for h in (best, rival)
+    )
+    return f"ambiguous: {name} may be at {positions}"
 
 
 def _counts(discs: tuple[Discs, Discs]) -> str:
-    """Say how many discs each camera saw."""
+    """Return the number of discs in each image, as text."""
     return (
         " and ".join(f"{len(seen.uv)} discs in the {side}" for side, seen in zip(SIDES, discs, strict=True)) + " image"
     )
 
 
 def _too_few(target: DiscTarget, discs: tuple[Discs, Discs]) -> str:
-    """Say how many discs each camera found and what it threw away."""
+    """Return the number of discs found and of candidates rejected in each image, as text."""
     parts = []
     for side, seen in zip(SIDES, discs, strict=True):
         text = f"{side}: {len(seen.uv)} disc{'' if len(seen.uv) == 1 else 's'} found"
         if seen.rejected:
             many, first = len(seen.rejected), seen.rejected[0].reason  # the one that looks most like a disc
             count = f"{many} or more" if many >= MOST_REPORTED else f"{many}"
-            text += f" ({count} other place{'' if many == 1 else 's'} looked at; the most likely: {first})"
+            text += f" ({count} other candidate{'' if many == 1 else 's'} rejected; the most likely: {first})"
         parts.append(text)
     return f"{'; '.join(parts)}; {target.body.name} has {len(target.radii_m)}"

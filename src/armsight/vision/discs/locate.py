@@ -1,7 +1,7 @@
-"""Bodies that carry plain discs: named by their coded parts' pose or by themselves, freed of their bias, located together.
+"""Locate bodies that carry plain discs: identify the discs, subtract their perspective bias, locate all points together.
 
 discs, detections --identify or assign--> ellipse centres --centred--> disc centres --locate--> PoseEstimate --.
-                                              ^-------------- until the bias stays ---------------------------'
+                                              ^-------------- until the bias settles -------------------------'
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs, Ids, Missed, PoseEstimate
 from armsight.vision.discs.assign import assign
 from armsight.vision.discs.bias import centred
-from armsight.vision.discs.identify import Identified, identify
+from armsight.vision.discs.identify import IdentifiedDiscs, identify
 from armsight.vision.locate import locate
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.match import match
@@ -29,22 +29,23 @@ def locate_composite(
     coded: tuple[Detections, Detections],
     discs: tuple[Discs, Discs],
     *,
-    flips: tuple[Ids, ...] = (),
+    symmetries: tuple[Ids, ...] = (),
 ) -> PoseEstimate | Missed:
-    """Locate a body from what both cameras saw of its coded parts and of its discs.
+    """Locate a body from both cameras' detections of its coded parts and of its discs.
 
     Args:
         rig: the calibrated pair.
-        body: all points; the discs' come last.
+        body: all points; those of the discs come last.
         target: the discs.
-        coded: what each camera saw of the coded parts, by rows of ``body``.
+        coded: each camera's detections of the coded parts, by rows of ``body``.
         discs: the discs each camera saw.
-        flips: as in :func:`~armsight.vision.match.match`.
+        symmetries: as in :func:`~armsight.vision.match.match`.
 
     Returns:
-        The pose. The coded parts name the discs where they fix a pose by themselves; else the discs name themselves.
+        The pose. The coded parts identify the discs where they determine a pose by themselves; else the discs are
+        identified by their distances.
     """
-    names = match(rig, body, *coded, flips=flips)
+    names = match(rig, body, *coded, symmetries=symmetries)
     by_code = locate(rig, body, triangulate(rig, body, names)) if len(names.ids) else None
     if isinstance(by_code, PoseEstimate):
         seen = assign(rig, target, by_code.T_left_body, by_code.cov, *discs)
@@ -53,11 +54,13 @@ def locate_composite(
         return locate_discs(rig, body, target, names, seen, by_code.T_left_body, by_code.cov)
     found = identify(rig, target, *discs)
     if isinstance(found, Missed):
-        if isinstance(identify(rig, target, discs[1], discs[0]), Identified):
+        if isinstance(identify(rig, target, discs[1], discs[0]), IdentifiedDiscs):
             return Missed(f"left and right are exchanged: the discs fit the rig the other way round ({found.reason})")
-        told = [f"{side}: {d.problem}" for side, d in zip(SIDES, coded, strict=True) if d.problem]
-        told += [by_code.reason] if by_code is not None and not told else []
-        return Missed("; ".join([*told, found.reason]) if len(body.points) > len(target.body.points) else found.reason)
+        reasons = [f"{side}: {d.problem}" for side, d in zip(SIDES, coded, strict=True) if d.problem]
+        reasons += [by_code.reason] if by_code is not None and not reasons else []
+        return Missed(
+            "; ".join([*reasons, found.reason]) if len(body.points) > len(target.body.points) else found.reason
+        )
     return locate_discs(rig, body, target, names, found.seen, found.T_left_body, found.cov)
 
 
@@ -70,15 +73,15 @@ def locate_discs(
     T_left_body: Array,
     cov: Array,
 ) -> PoseEstimate | Missed:
-    """Locate a body from named discs and coded points, the perspective bias of the discs taken off.
+    """Locate a body from named discs and coded points, the perspective bias of the discs subtracted.
 
     Args:
         rig: the calibrated pair.
-        body: all points; the discs' come last.
+        body: all points; those of the discs come last.
         target: the discs.
-        coded: what is known of coded points, by rows of ``body``; may be empty.
+        coded: detections of coded points, by rows of ``body``; may be empty.
         seen: ellipse centres by rows of ``target.body``.
-        T_left_body: (4, 4) about where the body is.
+        T_left_body: (4, 4) approximate pose of the body.
         cov: (6, 6) covariance of its tangent.
     """
     first = len(body.points) - len(target.body.points)

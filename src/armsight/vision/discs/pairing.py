@@ -1,22 +1,20 @@
-"""Which disc of the left image and which of the right may be one disc of a body, and where it is then.
+"""Which disc of the left image and which of the right may be one disc of a body, and its position then.
 
-Uncoded discs have no names. A pair is possible where both rays lie in one epipolar plane within what pixel noise and the
-rig's own covariance allow, where they meet in front of both cameras within reach, and where a disc of one of the body's
-radii at that distance looks as large as both ellipses do. The first pass runs over the sorted angles of the epipolar
-planes, so its time grows with the pairs that the planes allow and not with all of them.
+Uncoded discs have no names. A pair is possible where both rays lie in one epipolar plane within what pixel noise and
+the rig's own covariance allow, where they meet in front of both cameras within reach, and where a disc of one of the
+body's radii at that distance looks as large as both ellipses do. The first pass runs over the sorted angles of the
+epipolar planes, so its time grows with the pairs that the planes allow and not with all of them.
 
-What two cameras saw of a body's discs, and how closely a detection must agree with the body to be one of its discs.
-
-Why discs that are in view are not the body's: a wrong radius, or a body of another size than it was said to be.
-
-For the message of a miss only. The pairs that the epipolar planes allow are triangulated with nothing asked of their size;
-where a few discs tell one ratio, it is named.
+:class:`DiscView` is one shot of a body's discs with the tolerances for size and position. :func:`wrong_size` explains a
+miss: the pairs that the epipolar planes allow are triangulated without a test of their size, and a common ratio of
+radii or distances to the body's is reported.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -33,28 +31,30 @@ from armsight.vision.match import GATE_PX, epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import midpoints, optimal_points
 
-#: An ellipse may be this much longer or shorter than the disc would look, beyond so many standard deviations of its rim.
+#: An ellipse may be this much longer or shorter than the disc would look, beyond so many standard deviations of its
+#: rim.
 SIZE_TOLERANCE, SIZE_SIGMAS = 0.15, 6.0
-#: The same along any of its axes, where it is known how the disc is turned.
+#: The same along any of its axes, where the orientation of the disc is known.
 SHAPE_TOLERANCE = 0.25
-#: What neither noise nor calibration explain: shutters that are not quite simultaneous, ink that ran, px; and a body that
-#: is not made as drawn, as a share of its size. One standard deviation each.
+#: Errors that neither noise nor calibration explain: exposures that are not quite simultaneous, ink that ran, px; and a
+#: body that deviates from its file, as a share of its size. One standard deviation each.
 UNMODELLED_PX, UNMODELLED_SHARE = 0.1, 2e-3
 
 
 @dataclass(frozen=True, eq=False)
 class DiscView(Record):
-    """One shot of a body's discs, with what is asked of it again and again.
+    """One shot of a body's discs, with the quantities that every test of it needs.
 
     Attributes:
         rig: the calibrated pair.
         target: the body's discs.
-        discs: what the left and the right camera saw.
-        cov_uv: per camera (N, 2, 2) covariance of the centres with all that adds to what the image tells, px^2.
-        radius_px: per camera (N,) longer half axes; NaN, which fits nothing, where a disc was found a second time.
-        slack_px: per camera (N,) how far noise alone may take a half axis.
+        discs: the discs detected in the left and the right image.
+        cov_uv: per camera (N, 2, 2) covariance of the centres: that of the image, the rig's and the unmodelled, px^2.
+        radius_px: per camera (N,) longer half axes; NaN, which matches nothing, where a disc was detected a second
+            time.
+        tolerance_px: per camera (N,) how far noise alone may change a half axis.
         rig_root: (P, R) with rig_root @ rig_root.T the rig's covariance, without the directions that are exact.
-        unmade_m: standard deviation of a disc's place on the body as it was made, m.
+        made_sigma_m: standard deviation of a disc's position on the body as it was made, m.
     """
 
     rig: StereoRig
@@ -62,34 +62,35 @@ class DiscView(Record):
     discs: tuple[Discs, Discs]
     cov_uv: tuple[Array, Array]
     radius_px: tuple[Array, Array]
-    slack_px: tuple[Array, Array]
+    tolerance_px: tuple[Array, Array]
     rig_root: Array
-    unmade_m: float
+    made_sigma_m: float
 
     @staticmethod
     def of(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> DiscView:
         """Gather one shot."""
         more = (rig.sigma_px**2 + UNMODELLED_PX**2) * np.eye(2)
-        slack = (SIZE_SIGMAS * np.sqrt(np.trace(seen.cov_uv, axis1=1, axis2=2) / 2) for seen in (left, right))
+        tolerance = (SIZE_SIGMAS * np.sqrt(np.trace(seen.cov_uv, axis1=1, axis2=2) / 2) for seen in (left, right))
         return DiscView(
             rig,
             target,
             (left, right),
             (left.cov_uv + more, right.cov_uv + more),
             (_radius_once(left), _radius_once(right)),
-            (next(slack), next(slack)),
+            (next(tolerance), next(tolerance)),
             _root(rig.cov),
             UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(target.body.points, axis=0))),
         )
 
     def alike(self, m: int, side: int, radius_px: float) -> NDArray[np.bool_]:
         """(N,) whether detections of one camera have disc m's brightness and about a longer half axis of ``radius_px``."""
-        seen, slack = self.radius_px[side], self.slack_px[side]
-        size = (seen >= (1 - SIZE_TOLERANCE) * radius_px - slack) & (seen <= (1 + SIZE_TOLERANCE) * radius_px + slack)
+        seen, tolerance = self.radius_px[side], self.tolerance_px[side]
+        low, high = (1 - SIZE_TOLERANCE) * radius_px - tolerance, (1 + SIZE_TOLERANCE) * radius_px + tolerance
+        size = (seen >= low) & (seen <= high)
         return np.asarray(size & (self.discs[side].bright == self.target.bright[m]))
 
     def congruent(self, expected: Expected, m: int, side: int) -> NDArray[np.bool_]:
-        """(N,) whether detections of one camera are as large and as slim as disc m, and lie the same way."""
+        """(N,) whether detections of one camera have the size, the slenderness and the direction of disc m's ellipse."""
         alike = self.alike(m, side, float(expected.radius_px[m, side]))
         if np.isnan(expected.facing[m, side]):
             return alike
@@ -99,21 +100,21 @@ class DiscView(Record):
         # Squares of how many times longer each ellipse is: the eigenvalues of S_expected^-1 S.
         mean, product = (c * s11 - 2 * b * s12 + a * s22) / (2 * det), (s11 * s22 - s12**2) / det
         half = np.sqrt(np.maximum(mean**2 - product, 0.0))
-        slack = SHAPE_TOLERANCE + self.slack_px[side][alike] / np.sqrt(det / max(a, c))
-        slim = (np.sqrt(np.maximum(mean - half, 0.0)) < 1 - slack) | (np.sqrt(mean + half) > 1 + slack)
+        tolerance = SHAPE_TOLERANCE + self.tolerance_px[side][alike] / np.sqrt(det / max(a, c))
+        slim = (np.sqrt(np.maximum(mean - half, 0.0)) < 1 - tolerance) | (np.sqrt(mean + half) > 1 + tolerance)
         alike[np.flatnonzero(alike)[slim]] = False
         return alike
 
     def covariances(self, expected: Expected, m: Ids, side: int, rows: Ids) -> Array:
-        """Return (K, 2, 2) covariance of detections ``rows`` as discs ``m``, px^2: noise, and how the body was made."""
-        made = self.unmade_m * expected.radius_px[m, side] / self.target.radii_m[m]
+        """Return (K, 2, 2) covariance of detections ``rows`` as discs ``m``, px^2: noise, and the tolerance of the body."""
+        made = self.made_sigma_m * expected.radius_px[m, side] / self.target.radii_m[m]
         return np.asarray(
             self.cov_uv[side][rows] + made[:, None, None] ** 2 * np.eye(2) + expected.cov_bias[m, side], np.float64
         )
 
 
 def _radius_once(discs: Discs) -> Array:
-    """Return (N,) longer half axes, NaN where a disc as large lies within half of it: that is the same disc again."""
+    """Return (N,) longer half axes, NaN where one as large lies within half of it: the same disc detected again."""
     radius = discs.radius_px
     if len(radius) < 2:
         return radius
@@ -133,14 +134,14 @@ def _root(cov: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, keep] * np.sqrt(values[keep]))
 
 
-#: With more discs than these in view, or other ratios than these, nothing is said.
+#: With more discs than this in view, or a ratio outside of these, nothing is reported.
 _MOST_DISCS, _LEAST, _MOST = 12, 0.2, 5.0
-#: Ratios of one body agree within this; nearer to 1 they are no reason.
+#: Ratios of one body agree within this; a ratio nearer to 1 explains nothing.
 _ALIKE_RADIUS, _ALIKE_LENGTH = 0.08, 0.01
 
 
 def wrong_size(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> str | None:
-    """Say that discs in view have another radius, or lie further apart, than the body's, each by one ratio; or None."""
+    """Report that the discs in view have another radius or other distances than the body's, by one ratio; or None."""
     if max(len(left.uv), len(right.uv)) > _MOST_DISCS or min(len(left.uv), len(right.uv)) < 3:
         return None
     i, j = np.divmod(np.arange(len(left.uv) * len(right.uv)), len(right.uv))
@@ -154,22 +155,22 @@ def wrong_size(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) ->
     radii = left.radius_px[i] * p[:, 2] / rig.left.intrinsics[0]
     ratio = float(np.median(radii)) / float(np.median(target.radii_m))
     alike = np.abs(radii / np.median(radii) - 1).max() < _ALIKE_RADIUS
-    if alike and len(set(target.radii_m)) == 1 and _telling(ratio, 2 * _ALIKE_RADIUS):
+    if alike and len(set(target.radii_m)) == 1 and _explains(ratio, 2 * _ALIKE_RADIUS):
         return (
             f"the discs in view have a radius of about {1e3 * np.median(radii):.1f} mm, those of {target.body.name} "
             f"{1e3 * target.radii_m[0]:.1f} mm: is radius_mm right?"
         )
     scale = _size_scale(p, target.body.points)
-    if scale is None or not _telling(scale, _ALIKE_LENGTH):
+    if scale is None or not _explains(scale, _ALIKE_LENGTH):
         return None
     return (
-        f"three discs in view lie {scale:.3f} times as far apart as those of {target.body.name}: are the places in the "
-        "body file right, and is it the body that the cameras see?"
+        f"three discs in view lie {scale:.3f} times as far apart as those of {target.body.name}: are the positions in "
+        "the body file right, and is it the body that the cameras see?"
     )
 
 
-def _telling(ratio: float, tolerance: float) -> bool:
-    """Whether a ratio is one that a mistake makes."""
+def _explains(ratio: float, tolerance: float) -> bool:
+    """Whether a ratio is one that a mistake in the body file gives."""
     return _LEAST < ratio < _MOST and abs(ratio - 1) > tolerance
 
 
@@ -189,9 +190,9 @@ def _size_scale(p: Array, points: Array) -> float | None:
 
 #: Nearest and farthest disc, m.
 DEPTHS_M = (0.1, 10.0)
-#: Two rays farther apart than so many standard deviations do not meet.
+#: Two rays do not meet where their distance is more than so many standard deviations.
 GATE_SIGMAS = 5.0
-#: More pairs than these are not looked at.
+#: With more pairs than this none is examined.
 MOST_PAIRS = 20_000
 _STEP_PX = 0.5  # to differentiate the angle of an epipolar plane
 
@@ -203,9 +204,9 @@ class Pairs(Record):
     Attributes:
         left: (K,) rows of the left camera's discs.
         right: (K,) rows of the right camera's discs.
-        p_left: (K, 3) where the disc would be, m, left frame.
+        p_left: (K, 3) position of the disc, m, left frame.
         cov: (K, 3, 3) its covariance from the pixel noise, m^2.
-        by_rig: (K, 3, R) what the rig's R independent errors of one standard deviation each do to it, m.
+        by_rig: (K, 3, R) its change by each of the rig's R independent errors of one standard deviation, m.
         fits: (K, M) whether it may be a disc of the body, by size and brightness.
     """
 
@@ -225,8 +226,8 @@ class _Lines(Record):
         angle: (N,) of the epipolar plane about the baseline, rad; NaN where a pixel has no ray.
         by_pixel: (N, 2) its derivative, rad/px.
         variance: (N,) of the angle from the noise of the disc's centre, rad^2.
-        along: (N,) how far the ray goes along the baseline for one unit away from it.
-        out: (N, 3) the ray, scaled to go one unit away from the baseline, left frame.
+        along: (N,) component of the ray along the baseline for one unit away from it.
+        out: (N, 3) the ray, scaled to end one unit away from the baseline, left frame.
         scale: (N, 2) smallest and largest half axis, px, of a disc of unit radius at unit distance.
     """
 
@@ -248,16 +249,14 @@ def pair(view: DiscView) -> Pairs | None:
     order = order[np.isfinite(lines[1].angle[order])]
     kinds = np.unique(np.column_stack([target.radii_m, target.bright]), axis=0)
     rows = np.empty((MOST_PAIRS, 2), np.int64)
-    found = _walk(
-        gate, order, lines[0].angle, lines[1].angle[order], lines[0].along, lines[1].along, lines[0].out, baseline,
-        lines[0].scale, lines[1].scale, view.radius_px[0], view.slack_px[0], view.radius_px[1], view.slack_px[1],
-        left.bright, right.bright, kinds[:, 0].copy(), kinds[:, 1] > 0.5, rows,
-    )  # fmt: skip
+    in_left, in_right = _side(view, lines[0], 0), _side(view, lines[1], 1)
+    radii, bright = kinds[:, 0].copy(), kinds[:, 1] > 0.5
+    found = _sweep(gate, order, lines[1].angle[order], in_left, in_right, baseline, radii, bright, rows)
     return None if found > MOST_PAIRS else _triangulated(view, lines, rows[:found])
 
 
 def _lines(rig: StereoRig, side: int, uv: Array, cov_uv: Array) -> _Lines:
-    """Turn the discs of one image into epipolar planes about the baseline."""
+    """Convert the discs of one image to epipolar planes about the baseline."""
     camera, R = rig.cameras[side], np.eye(3) if side == 0 else rig.T_left_right[:3, :3]
     along = rig.T_left_right[:3, 3] / rig.baseline_m
     ahead = rig.T_left_right[:3, 2] + np.array([0.0, 0.0, 1.0])
@@ -279,7 +278,7 @@ def _lines(rig: StereoRig, side: int, uv: Array, cov_uv: Array) -> _Lines:
 
 
 def _scale(camera: Camera, p: Array) -> Array:
-    """Return (N, 2) smallest and largest half axis, px, of a disc of unit radius at points (N, 3), however it is turned."""
+    """Return (N, 2) smallest and largest half axis, px, of a disc of unit radius at points (N, 3), any orientation."""
     good = np.asarray(np.isfinite(p).all(axis=1))
     J = camera.project_jacobians(np.where(good[:, None], p, [0.0, 0.0, 1.0]))[1]
     a, b, c = (J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)
@@ -291,7 +290,7 @@ def _scale(camera: Camera, p: Array) -> Array:
 def _share_of_rig(view: DiscView, lines: _Lines) -> Array:
     """Return (N,) variance of the gap between the planes of a pair from the rig's covariance, rad^2, for each left disc.
 
-    Taken where the disc would be nearest, at the smallest radius; nearer than that, no pair is.
+    Evaluated at the nearest possible position of the disc, that of the smallest radius.
     """
     rig, left = view.rig, view.discs[0]
     if not view.rig_root.size or not len(left.uv):
@@ -319,27 +318,71 @@ def _by_rig(rig: StereoRig, p_left: Array) -> Array:
     return J
 
 
+class _Side(NamedTuple):
+    """The N discs of one image as the compiled sweep needs them; the first four as in :class:`_Lines`.
+
+    Attributes:
+        angle: (N,) of the epipolar plane, rad.
+        along: (N,) component of the ray along the baseline.
+        out: (N, 3) the ray, one unit away from the baseline.
+        scale: (N, 2) smallest and largest half axis, px, of a disc of unit radius at unit distance.
+        radius_px: (N,) longer half axis of the ellipse.
+        tolerance_px: (N,) of that half axis.
+        bright: (N,) whether the disc is bright.
+    """
+
+    angle: Array
+    along: Array
+    out: Array
+    scale: Array
+    radius_px: Array
+    tolerance_px: Array
+    bright: NDArray[np.bool_]
+
+
+def _side(view: DiscView, of: _Lines, s: int) -> _Side:
+    """Gather the discs of one image, camera s, for the sweep."""
+    return _Side(of.angle, of.along, of.out, of.scale, view.radius_px[s], view.tolerance_px[s], view.discs[s].bright)
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _walk(
-    gate: Array, order: Ids, angle_l: Array, angle_r: Array, along_l: Array, along_r: Array, out_l: Array,
-    t: Array, scale_l: Array, scale_r: Array, radius_l: Array, slack_l: Array, radius_r: Array, slack_r: Array,
-    bright_l: NDArray[np.bool_], bright_r: NDArray[np.bool_], radii: Array, bright: NDArray[np.bool_],
+def _sweep(
+    gate: Array,
+    order: Ids,
+    angle_r: Array,
+    left: _Side,
+    right: _Side,
+    t: Array,
+    radii: Array,
+    bright: NDArray[np.bool_],
     rows: Ids,
-) -> int:  # fmt: skip
-    """Write the possible pairs into ``rows``; return how many there are, more than its length when it overflows."""
+) -> int:
+    """Write the possible pairs into ``rows``; return their number, more than its length when it overflows.
+
+    Args:
+        gate: (N,) largest difference of the epipolar planes' angles, rad, for each left disc.
+        order: (K,) rows of the right discs that have a ray, by the angle of their plane.
+        angle_r: (K,) those angles, ascending, rad.
+        left: the left discs.
+        right: the right discs.
+        t: (3,) position of the right camera, m, left frame.
+        radii: (R,) radii of the body's kinds of disc, m.
+        bright: (R,) whether a kind is bright.
+        rows: (L, 2) filled with rows of the left and the right discs.
+    """
     count, baseline = 0, np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
-    for i in range(len(angle_l)):
-        if not np.isfinite(gate[i] + angle_l[i]):
+    for i in range(len(left.angle)):
+        if not np.isfinite(gate[i] + left.angle[i]):
             continue
-        k = np.searchsorted(angle_r, angle_l[i] - gate[i])
-        while k < len(order) and angle_r[k] <= angle_l[i] + gate[i]:
+        k = np.searchsorted(angle_r, left.angle[i] - gate[i])
+        while k < len(order) and angle_r[k] <= left.angle[i] + gate[i]:
             j = order[k]
             k += 1
-            parallax = along_l[i] - along_r[j]
-            if bright_l[i] != bright_r[j] or not parallax > 0.0:
+            parallax = left.along[i] - right.along[j]
+            if left.bright[i] != right.bright[j] or not parallax > 0.0:
                 continue
             h = baseline / parallax
-            x, y, z = h * out_l[i, 0], h * out_l[i, 1], h * out_l[i, 2]
+            x, y, z = h * left.out[i, 0], h * left.out[i, 1], h * left.out[i, 2]
             if not DEPTHS_M[0] <= z <= DEPTHS_M[1]:
                 continue
             far_l = np.sqrt(x * x + y * y + z * z)
@@ -347,11 +390,11 @@ def _walk(
             for m in range(len(radii)):
                 a_l, a_r = radii[m] / far_l, radii[m] / far_r
                 if (
-                    bright[m] == bright_l[i]
-                    and radius_l[i] >= (1 - SIZE_TOLERANCE) * scale_l[i, 0] * a_l - slack_l[i]
-                    and radius_l[i] <= (1 + SIZE_TOLERANCE) * scale_l[i, 1] * a_l + slack_l[i]
-                    and radius_r[j] >= (1 - SIZE_TOLERANCE) * scale_r[j, 0] * a_r - slack_r[j]
-                    and radius_r[j] <= (1 + SIZE_TOLERANCE) * scale_r[j, 1] * a_r + slack_r[j]
+                    bright[m] == left.bright[i]
+                    and left.radius_px[i] >= (1 - SIZE_TOLERANCE) * left.scale[i, 0] * a_l - left.tolerance_px[i]
+                    and left.radius_px[i] <= (1 + SIZE_TOLERANCE) * left.scale[i, 1] * a_l + left.tolerance_px[i]
+                    and right.radius_px[j] >= (1 - SIZE_TOLERANCE) * right.scale[j, 0] * a_r - right.tolerance_px[j]
+                    and right.radius_px[j] <= (1 + SIZE_TOLERANCE) * right.scale[j, 1] * a_r + right.tolerance_px[j]
                 ):
                     if count >= len(rows):
                         return len(rows) + 1
@@ -362,7 +405,7 @@ def _walk(
 
 
 def _triangulated(view: DiscView, lines: tuple[_Lines, _Lines], rows: Ids) -> Pairs:
-    """Triangulate pairs (K, 2) and keep those whose rays meet and whose size fits at the place where they do."""
+    """Triangulate pairs (K, 2) and keep those whose rays meet and whose size fits at that position."""
     rig, target, discs = view.rig, view.target, view.discs
     i, j = rows[:, 0], rows[:, 1]
     uv, cov_uv = (
@@ -378,9 +421,9 @@ def _triangulated(view: DiscView, lines: tuple[_Lines, _Lines], rows: Ids) -> Pa
     met = gap**2 <= GATE_SIGMAS**2 * (lines[0].variance[i] + lines[1].variance[j] + (share**2).sum(axis=1))
     kind = np.array(discs[0].bright[i][:, None] == target.bright[None])
     for side, chosen, p_camera in ((0, i, p), (1, j, transform(inverse(rig.T_left_right), p))):
-        radius, slack = view.radius_px[side][chosen][:, None], view.slack_px[side][chosen][:, None]
+        radius, tolerance = view.radius_px[side][chosen][:, None], view.tolerance_px[side][chosen][:, None]
         scale = _scale(rig.cameras[side], p_camera)
-        kind &= radius >= (1 - SIZE_TOLERANCE) * scale[:, :1] * target.radii_m - slack
-        kind &= radius <= (1 + SIZE_TOLERANCE) * scale[:, 1:] * target.radii_m + slack
+        kind &= radius >= (1 - SIZE_TOLERANCE) * scale[:, :1] * target.radii_m - tolerance
+        kind &= radius <= (1 + SIZE_TOLERANCE) * scale[:, 1:] * target.radii_m + tolerance
     keep = met & kind.any(axis=1)
     return Pairs(i[keep], j[keep], p[keep], cov[good][keep], by_rig[good][keep] @ view.rig_root, kind[keep])

@@ -1,7 +1,7 @@
-"""How well two cameras will know a body before it is built: predicted covariance, and how far apart two readings are.
+"""Predict how well two cameras will measure a body before it is built: pose covariance, separation of two hypotheses.
 
-A body is put before the cameras, its points are projected, and the information of their pixels is summed: the covariance
-of the pose is its inverse (the Cramer-Rao bound), and what the rig's own covariance does comes on top.
+A body is set before the cameras, its points are projected, and the information of their pixels is summed: the
+covariance of the pose is its inverse (the Cramer-Rao bound), to which the share of the rig's own covariance is added.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import Model, Observations, State, predict
+from armsight.vision.bundle import BundleModel, BundleState, Observations, predict
 from armsight.vision.camera import Camera
-from armsight.vision.discs.symmetry import Relabeling
+from armsight.vision.discs.symmetry import Symmetry
 from armsight.vision.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 
-#: A face turned away from a camera by more than this is not relied on, cosine.
+#: A face is relied on where the cosine between its normal and the direction to the camera is above this (70 degrees).
 FACING = float(np.cos(np.radians(70.0)))
-#: Turns of the body at which two readings are compared, besides that which faces the cameras, rad.
-_TURN = np.radians(45.0)
+#: Rotations of the body at which two hypotheses are compared, besides the one that faces the cameras, rad.
+_TILT = np.radians(45.0)
 
 
 def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
@@ -34,13 +34,13 @@ def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
 
 
 @dataclass(frozen=True, eq=False)
-class View(Record):
+class PredictedView(Record):
     """A body before two cameras.
 
     Attributes:
-        T_left_body: (4, 4) where it is.
+        T_left_body: (4, 4) its pose.
         forward: (3,) unit vector from the cameras to it, left camera's frame.
-        seen: (M, 2) whether a camera sees a point: in its image, and its face not turned away.
+        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away.
     """
 
     T_left_body: Array
@@ -61,8 +61,8 @@ def look_direction(points: Array, normals: Array) -> Array:
         normals: (M, 3) out of their faces; NaN where unknown.
 
     Returns:
-        The direction from the body to who looks at it; where no normal is known, square to the flattest plane through
-        the points, on the side of -z.
+        The direction from the body to who looks at it; where no normal is known, perpendicular to the flattest plane
+        through the points, on the side of -z.
     """
     known = normals[np.isfinite(normals).all(axis=1)]
     if not len(known):
@@ -75,47 +75,47 @@ def look_direction(points: Array, normals: Array) -> Array:
 
 
 def view(
-    rig: StereoRig, points: Array, normals: Array, distance_m: float, turn: tuple[float, float] = (0.0, 0.0)
-) -> View:
-    """Put a body before the cameras, its faces towards them and its middle between their axes.
+    rig: StereoRig, points: Array, normals: Array, distance_m: float, rotation: tuple[float, float] = (0.0, 0.0)
+) -> PredictedView:
+    """Set a body before the cameras, its faces towards them and its middle between their axes.
 
     Args:
         rig: the cameras.
         points: (M, 3) points, m.
         normals: (M, 3) out of their faces; NaN where unknown.
         distance_m: from the cameras to the body's middle.
-        turn: about the horizontal and the vertical axis of the image, rad.
+        rotation: about the horizontal and the vertical axis of the image, rad.
     """
     towards = look_direction(points, normals)
     ahead = np.array([0.0, 0.0, distance_m, 1.0])
     middle = (ahead[:3] + (rig.T_left_right @ ahead)[:3]) / 2
     forward = middle - rig.T_left_right[:3, 3] / 2
     forward = forward / np.linalg.norm(forward)
-    R = _axes(forward, np.array([1.0, 0.0, 0.0])) @ exp_so3(np.array([*turn, 0.0])) @ face_axes(towards).T
+    R = _axes(forward, np.array([1.0, 0.0, 0.0])) @ exp_so3(np.array([*rotation, 0.0])) @ face_axes(towards).T
     facing = normals @ towards > FACING
     used = facing | ~np.isfinite(normals).all(axis=1)
     T = pose(R, middle - R @ points[used].mean(axis=0))
-    return View(T, forward, _seen(rig, T, points, normals))
+    return PredictedView(T, forward, _seen(rig, T, points, normals))
 
 
 def face_axes(normal: Array) -> Array:
     """Return (3, 3) axes of a face as columns, body frame: right, down, and into it, as one looks at it.
 
-    The body's x axis runs to the right; where it is square to the face, the body's y axis runs down.
+    The body's x axis runs to the right; where it is perpendicular to the face, the body's y axis runs down.
     """
     right = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.cross([0.0, 1.0, 0.0], -normal)
     return _axes(-normal, right)
 
 
 def _axes(z: Array, x: Array) -> Array:
-    """Return (3, 3) orthonormal axes as columns: z as given, x as near as can be to what is given."""
+    """Return (3, 3) orthonormal axes as columns: z as given, x as near as possible to the given one."""
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
 
 
 def _seen(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
-    """(M, 2) whether a camera has a point in its image, its face not turned away."""
+    """(M, 2) whether a camera has a point in its image, its face not rotated away."""
     columns = []
     for camera, T in ((rig.left, T_left_body), (rig.right, inverse(rig.T_left_right) @ T_left_body)):
         uv = camera.project(transform(T, points))
@@ -125,7 +125,7 @@ def _seen(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> 
 
 
 def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
-    """(M, 2) whether a point's face is not turned away from a camera; true where it is unknown."""
+    """(M, 2) whether a point's face is not rotated away from a camera; true where it is unknown."""
     columns = []
     for T in (T_left_body, inverse(rig.T_left_right) @ T_left_body):
         p = transform(T, points)
@@ -134,25 +134,25 @@ def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -
     return np.stack(columns, axis=1)
 
 
-def pose_covariance(rig: StereoRig, points: Array, seen: View, sigma_px: float) -> Array | None:
+def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px: float) -> Array | None:
     """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
 
     Args:
-        rig: the cameras; what their calibration does is in it where the rig's covariance is known.
+        rig: the cameras; the share of their calibration is included where the rig's covariance is known.
         points: (M, 3) points, m.
-        seen: where the body is.
-        sigma_px: standard deviation of a place in the image, px.
+        seen: the body's pose and which points are visible.
+        sigma_px: standard deviation of a measured pixel position, px.
 
     Returns:
-        The covariance, or None where what is seen fixes no pose.
+        The covariance, or None where the visible points do not determine a pose.
     """
     rows, sides = np.nonzero(seen.seen)
     if len(seen.paired) < 3:
         return None
-    state = State(rig.cameras, rig.T_left_right, seen.T_left_body[None], np.zeros(0))
+    state = BundleState(rig.cameras, rig.T_left_right, seen.T_left_body[None], np.zeros(0))
     cov_uv = np.tile(sigma_px**2 * np.eye(2), (len(rows), 1, 1))
     observed = Observations(np.zeros(len(rows), np.int64), sides, rows, np.zeros((len(rows), 2)), cov_uv, 1)
-    _, J_rig, J_pose = predict(Model(points, np.zeros((0, len(points), 3)), 1.0, False), state, observed)
+    _, J_rig, J_pose = predict(BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False), state, observed)
     A, B = J_pose.reshape(-1, 6) / sigma_px, J_rig.reshape(-1, rig.parameter_count) / sigma_px
     information = A.T @ A
     scale = np.sqrt(np.diag(information))
@@ -167,36 +167,36 @@ def separation(
     rig: StereoRig,
     points: Array,
     normals: Array,
-    relabeling: Relabeling,
+    symmetry: Symmetry,
     distance_m: float,
     sigma_px: float,
     hidden: int = -1,
 ) -> float:
-    """Tell by how many standard deviations taking discs for others misses what the cameras see, at the worst turn tried.
+    """Return the least separation of a wrong naming of the discs from the true one, sigmas, over five rotations.
 
     Args:
         rig: the cameras.
-        points: (M, 3) places of the discs, m.
+        points: (M, 3) positions of the discs, m.
         normals: (M, 3) out of their faces; NaN where unknown.
-        relabeling: which are taken for which.
+        symmetry: the wrong naming: which discs are taken for which.
         distance_m: of the body.
-        sigma_px: standard deviation of a disc's place in the image.
+        sigma_px: standard deviation of a disc's measured centre, px.
         hidden: a disc that something hides; none where below zero.
 
     Returns:
-        The root of the weighted sum of squares that the wrong reading leaves; infinity where its discs would always be seen
-        from behind, NaN where there is no turn at which the discs in view are seen and no others.
+        The root of the weighted sum of squares of the wrong naming's residuals; infinity where its discs would always
+        be seen from behind, NaN where there is no rotation at which the discs in view are visible and no others.
     """
-    seen, taken = relabeling.seen, relabeling.taken_for
+    seen, taken = symmetry.seen, symmetry.taken_for
     others = np.setdiff1d(np.arange(len(points)), [*seen, hidden])
     worst = np.nan
-    for turn in ((0.0, 0.0), (_TURN, 0.0), (-_TURN, 0.0), (0.0, _TURN), (0.0, -_TURN)):
-        true = view(rig, points[seen], normals[seen], distance_m, turn)
+    for rotation in ((0.0, 0.0), (_TILT, 0.0), (-_TILT, 0.0), (0.0, _TILT), (0.0, -_TILT)):
+        true = view(rig, points[seen], normals[seen], distance_m, rotation)
         here = np.asarray(_facing(rig, true.T_left_body, points, normals).all(axis=1))
         if not here[seen].all() or here[others].any():
             continue
         worst = np.fmin(worst, np.inf)
-        start = true.T_left_body @ inverse(relabeling.T)
+        start = true.T_left_body @ inverse(symmetry.T)
         if not _facing(rig, start, points[taken], normals[taken]).all():
             continue
         p = transform(true.T_left_body, points[seen])

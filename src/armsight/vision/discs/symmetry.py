@@ -1,7 +1,7 @@
-"""Which discs of a body may be taken for which: the turns and mirror images that lay a body, or part of it, on itself.
+"""Symmetries of a body of discs: the rotations and reflections that map the body, or a part of it, onto itself.
 
-Three points not on one line fix a motion, so every triple of discs that three chosen ones may be taken for is tried, and
-the others must then lie on discs too.
+Three points not on one line determine a rigid motion, so every triple of discs that three chosen ones may be taken for
+is tried, and the others must then coincide with discs too.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
 
-#: A place that is carried on from three others may be off by more than these are: by how many times.
+#: A position extrapolated from three others may be off by so many times more than they are.
 _LEVER = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Relabeling(Record):
+class Symmetry(Record):
     """One way to take discs for others.
 
     Attributes:
         seen: (V,) the discs in view, rows of the body's points.
         taken_for: (V,) what each may be taken for.
-        T: (4, 4) the turn that lays the former on the latter, p_taken_for ~ T @ p_seen; of the body's mirror image in
-            z = 0 where ``mirrored``.
-        mirrored: whether it takes a mirror image.
-        off_m: by how much two discs' distance differs from that of those they are taken for, at most.
+        T: (4, 4) the motion that maps the former onto the latter, p_taken_for ~ T @ p_seen; of the body's mirror image
+            in z = 0 where ``mirrored``.
+        mirrored: whether it is a reflection.
+        off_m: largest difference of two discs' distance from that of the discs they are taken for, m.
     """
 
     seen: Ids
@@ -40,41 +40,41 @@ class Relabeling(Record):
     off_m: float
 
 
-def relabelings(
+def symmetries(
     points: Array, alike: NDArray[np.bool_], seen: Ids, tolerance_m: float, *, mirrored: bool = False
-) -> list[Relabeling]:
-    """Find the ways to take discs in view for others of the same body.
+) -> list[Symmetry]:
+    """Find the ways in which discs in view may be taken for others of the same body.
 
     Args:
-        points: (M, 3) places of all discs, m.
-        alike: (M, M) whether two discs look alike; others are never taken for each other.
+        points: (M, 3) positions of all discs, m.
+        alike: (M, M) whether two discs look alike; discs that do not are never taken for each other.
         seen: (V,) the discs in view, V >= 3, not all on one line.
-        tolerance_m: how far two distances may differ and still be taken for each other, m.
-        mirrored: look for mirror images instead of turns.
+        tolerance_m: largest difference of two distances that counts as equal, m.
+        mirrored: find reflections instead of rotations.
 
     Returns:
-        Each once, without that which takes every disc for itself, the closest first.
+        Each once, without the identity, the closest first.
     """
     p = points * [1.0, 1.0, -1.0] if mirrored else points
     base = _widest(points, seen)
-    wanted = [np.linalg.norm(points[base[a]] - points[base[b]]) for a, b in ((0, 1), (0, 2), (1, 2))]
+    sides = [np.linalg.norm(points[base[a]] - points[base[b]]) for a, b in ((0, 1), (0, 2), (1, 2))]
     all_ids = range(len(points))
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     own = distance[seen][:, list(base)]
-    found: dict[tuple[int, ...], Relabeling] = {}
+    found: dict[tuple[int, ...], Symmetry] = {}
     for a, b in permutations(all_ids, 2):
-        if abs(distance[a, b] - wanted[0]) > tolerance_m:
+        if abs(distance[a, b] - sides[0]) > tolerance_m:
             continue
         for c in all_ids:
             triple = (a, b, c)
             if (
                 c in (a, b)
-                or abs(distance[a, c] - wanted[1]) > tolerance_m
-                or abs(distance[b, c] - wanted[2]) > tolerance_m
+                or abs(distance[a, c] - sides[1]) > tolerance_m
+                or abs(distance[b, c] - sides[2]) > tolerance_m
                 or not alike[list(base), list(triple)].all()
             ):
                 continue
-            # Every disc in view needs one whose distances from the three are right: cheap to see, and few triples have it.
+            # Every disc in view needs one whose distances from the three are right: a cheap test that few triples pass.
             fits = np.abs(own[:, None] - distance[:, triple]).max(axis=2) <= tolerance_m
             if not (fits & alike[seen]).any(axis=1).all():
                 continue
@@ -84,7 +84,7 @@ def relabelings(
                 continue
             off = float(np.abs(distance[np.ix_(taken, taken)] - distance[np.ix_(seen, seen)]).max())
             if off <= tolerance_m:
-                found[tuple(taken)] = Relabeling(seen, taken, fit_rigid(p[seen], points[taken]), mirrored, off)
+                found[tuple(taken)] = Symmetry(seen, taken, fit_rigid(p[seen], points[taken]), mirrored, off)
     return sorted(found.values(), key=lambda r: r.off_m)
 
 
@@ -94,11 +94,11 @@ def flat(points: Array, tolerance_m: float) -> bool:
     return bool(np.abs(middle @ np.linalg.svd(middle)[2][2]).max() <= tolerance_m)
 
 
-def other_side(relabeling: Relabeling, points: Array) -> bool:
-    """Whether the turn shows the other side of the flat body (M, 3): a normal of its plane changes its sign."""
-    seen = points[relabeling.seen]
+def other_side(symmetry: Symmetry, points: Array) -> bool:
+    """Whether the motion shows the other side of the flat body (M, 3): a normal of its plane changes its sign."""
+    seen = points[symmetry.seen]
     normal = np.linalg.svd(seen - seen.mean(axis=0))[2][2]
-    return bool(normal @ relabeling.T[:3, :3] @ normal < 0)
+    return bool(normal @ symmetry.T[:3, :3] @ normal < 0)
 
 
 def _widest(points: Array, seen: Ids) -> tuple[int, int, int]:
@@ -111,7 +111,7 @@ def _widest(points: Array, seen: Ids) -> tuple[int, int, int]:
 
 
 def _nearest(p: Array, points: Array, alike: NDArray[np.bool_], seen: Ids, tolerance_m: float) -> Ids | None:
-    """Return (V,) the disc that lies at each place p (V, 3), or None where one has none or two have the same."""
+    """Return (V,) the disc at each position p (V, 3), or None where one has none or two have the same."""
     gap = np.linalg.norm(p[:, None] - points[None], axis=2)
     gap[~alike[seen]] = np.inf
     taken = gap.argmin(axis=1)

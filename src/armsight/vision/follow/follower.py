@@ -1,16 +1,13 @@
-"""Following a body of discs from shot to shot: once seen, only the places where it should be are looked at.
+"""Follow a body of discs from shot to shot: after the first pose, only its predicted surroundings are searched.
 
-The pose is carried on with the velocity of the last two; each disc is searched within a margin that follows how wrong the
-last predictions were, and everything from pixels to covariance is one compiled call
-(:mod:`~armsight.vision.follow.kernel`). What does not fit, and any first shot, goes the slow way through
-:func:`~armsight.vision.measure.measure`, which searches the whole image and takes no hint from the past.
+The pose is extrapolated with the velocity of the last two; each disc is searched within a margin that adapts to the
+errors of the last predictions, and everything from pixels to covariance is one compiled call
+(:mod:`~armsight.vision.follow.kernel`). A shot that does not fit, and any first shot, is measured by
+:func:`~armsight.vision.measure.measure`, which searches the whole image and uses no prediction.
 
-Everything that finding a body of discs runs is run once before a live loop, so that nothing is compiled within it.
-
-A body that is nowhere in the images leaves most of it untouched; so the discs are put where a body before the cameras would
-show them.
-
-What is known of a body's motion between two shots: where it should be next.
+:func:`warm_up` runs everything that a shot may need once before a live loop, so that nothing is compiled within it. A
+body that is nowhere in the images would leave most of the code unused, so the discs are set where a body before the
+cameras would show them.
 """
 
 from __future__ import annotations
@@ -39,13 +36,21 @@ from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.discs.bias import LEAST_FACING, bias_normals, expect
 from armsight.vision.discs.locate import locate_composite, locate_discs
 from armsight.vision.discs.pairing import DEPTHS_M
-from armsight.vision.discs.pose import SEEN, Found, Scene, velocity
 from armsight.vision.discs.predict import view
-from armsight.vision.follow.kernel import NOT_THERE, OTHER_SIZE, OUTSIDE, TURNED_AWAY, follow_pair
+from armsight.vision.follow.kernel import (
+    FACING_AWAY,
+    NOT_THERE,
+    OTHER_SIZE,
+    OUTSIDE,
+    SEEN,
+    DiscMeasurement,
+    DiscScene,
+    follow_pair,
+    velocity,
+)
 from armsight.vision.image import grey
 from armsight.vision.locate import misfit_limit
-from armsight.vision.markers.disc import search as disc_outline
-from armsight.vision.markers.disc import search as disc_search
+from armsight.vision.markers.disc import search
 from armsight.vision.markers.disc.fit import REASONS, workspace
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -54,12 +59,12 @@ from armsight.vision.measure import measure
 from armsight.vision.posefit import moved
 from armsight.vision.rig import StereoRig
 
-#: Where the body is put, in sizes of it from the cameras; and how well its discs are known, px.
+#: Distance of the body from the cameras in its own sizes, and sigma of its discs, px, for the warm-up.
 _AWAY, _SIGMA_PX = 5.0, 0.05
 
 
 def warm_up(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
-    """Search for a body in black images, and name and locate it where its discs are given.
+    """Run every function that a shot may need: search black images, and identify and locate given discs.
 
     Args:
         rig: the calibrated pair.
@@ -80,29 +85,29 @@ def warm_up(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
     )
     coded = Detections.none("")
     locate_composite(rig, target.body, discs, (coded, coded), (left, right))
-    # A body whose naming is ambiguous there may not be so elsewhere: it is located by the names it is known to have too.
+    # A body whose discs are ambiguous at that pose may not be so elsewhere: it is located with the true names too.
     seen = Correspondences(rows, expected.uv[rows], cov)
     nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
     locate_discs(rig, target.body, discs, nothing, seen, T, _SIGMA_PX**2 * np.eye(6))
 
 
-#: A prediction older than so many shots, or so many times the time between the last two poses, is none; poses nearer to
-#: each other than so many seconds tell no velocity.
+#: A prediction expires after so many shots, or so many times the time between the last two poses; poses less than so
+#: many seconds apart give no velocity.
 _OLDEST_SHOTS, _OLDEST_STEPS, LEAST_S = 3, 4.0, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Track(Record):
-    """What is known of a body's motion.
+class BodyTrack(Record):
+    """The motion of a body between shots: where it should be next.
 
     Attributes:
         T_left_body: (4, 4) last pose.
         twist: (6,) its velocity in the body's axes, per second, or per shot where shots carry no time.
         t_s: time of the last pose, or the number of its shot.
-        shots: how many shots ago it was seen.
-        margin_px: how far off predictions may be.
-        step_s: from the pose before to the last; infinite where the twist is not known.
-        proven: whether the motion has foretold a pose before; what is far from it then is a jump.
+        shots: number of shots since then.
+        margin_px: largest error of a prediction, px.
+        step_s: from the pose before to the last; infinite where the twist is unknown.
+        proven: whether the motion has predicted a pose before; a pose far from the prediction is then a jump.
     """
 
     T_left_body: Array
@@ -113,8 +118,8 @@ class Track(Record):
     step_s: float
     proven: bool
 
-    def foretells(self, t_s: float) -> bool:
-        """Whether it is known where to look at a time: not before the last pose, nor too long after."""
+    def predicts(self, t_s: float) -> bool:
+        """Whether there is a prediction for a time: not before the last pose, nor too long after."""
         since = t_s - self.t_s
         return self.shots < _OLDEST_SHOTS and LEAST_S <= since < math.inf and since <= _OLDEST_STEPS * self.step_s
 
@@ -130,16 +135,16 @@ Way = Literal["followed", "searched", "lost"]
 #: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
 #: least and at the most; and in sizes of the last errors of prediction.
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
-#: While it is looked for where it is expected, the whole image is searched once in so many shots.
+#: While it is searched where it is expected, the whole image is searched once in so many shots.
 _SEARCH_EVERY = 8
-#: A pose found by searching that turned or moved further from the prediction than this is told as a jump: rad; image px.
+#: A pose found by searching that differs from the prediction by more than this is reported as a jump: rad; image px.
 _JUMP_RAD, _JUMP_PX = 0.35, 2 * _MARGIN_FIRST_PX
-_WORDS = {
+_TEXTS = {
     **REASONS,
-    TURNED_AWAY: "turned away from the camera",
+    FACING_AWAY: "facing away from the camera",
     OUTSIDE: "outside the image",
-    NOT_THERE: "not where it should be",
-    OTHER_SIZE: "not of the size it should have",
+    NOT_THERE: "not where it is predicted",
+    OTHER_SIZE: "not of the predicted size",
 }
 
 
@@ -148,32 +153,33 @@ class Follower:
 
     Attributes:
         way: how the last shot was measured.
-        jump: what was unbelievable about the last pose, seen from the ones before; None where nothing was.
+        jump: what was implausible about the last pose, given the ones before; None where nothing was.
     """
 
     way: Way
     jump: str | None
 
     def __init__(self, rig: StereoRig, target: Target) -> None:
-        """Make ready to follow; compiles where that was not done on this machine yet (a minute or two, once).
+        """Prepare to follow; compiles where that was not done on this computer yet (a minute or two, once).
 
         Args:
             rig: the calibrated pair.
             target: a body whose markers are discs and nothing else, with the normals of all known.
         """
         self.way, self.jump = "lost", None
-        self._track: Track | None = None
+        self._track: BodyTrack | None = None
         self._count = self._vain = 0
         if not follows(target):
             raise ValueError(
-                f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no codes"
+                f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no "
+                "coded markers"
             )
         discs = target.discs
         assert discs is not None
         self.rig, self.target = rig, target
         kernel = [camera.kernel_arguments() for camera in rig.cameras]
         sizes = [camera.parameters.size for camera in rig.cameras]
-        self._scene = Scene(
+        self._scene = DiscScene(
             np.array([k[0] for k in kernel]),
             np.stack([k[1] for k in kernel]),
             np.stack([k[2] for k in kernel]),
@@ -188,26 +194,26 @@ class Follower:
             np.array(discs.radii_m),
             np.where(discs.bright, 1, -1),
         )
-        self._found = _room(len(discs.radii_m), rig.parameter_count)
+        self._found = _buffers(len(discs.radii_m), rig.parameter_count)
         self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
-        self._work, self._outline = workspace(), disc_outline.workspace()
-        # All that a shot will run, on the kinds of arrays it will have: nothing is compiled within a live loop.
+        self._work, self._outline = workspace(), search.workspace()
+        # Everything that a shot runs, on arrays of the same types: nothing is compiled within a live loop.
         warm_up(rig, target, discs)
         black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
-        track = Track(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
+        track = BodyTrack(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
         track.predicted(1.0)
         velocity(track.T_left_body, track.T_left_body, 1.0, np.zeros(6))
-        self._noise = disc_search.noise_of(black[0])
+        self._noise = search.noise_of(black[0])
         self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
 
     def measure(self, shot: Shot, expected: Array | None = None) -> PoseEstimate | Missed:
-        """Measure one shot; shots come in the order of their time.
+        """Measure one shot; shots must come in the order of their time.
 
         Args:
             shot: the pair of images.
-            expected: T_left_body (4, 4) where somebody else has the body, an arm's joints say, for when it is lost: it is
-                looked for there, and in the whole image only every so often, for that takes long.
+            expected: T_left_body (4, 4) from another source, such as an arm's joints, used while the body is lost: it
+                is searched there, and in the whole image only once in several shots, for that takes long.
         """
         self._count += 1
         t_s = float(self._count) if shot.t_s is None else shot.t_s
@@ -215,7 +221,7 @@ class Follower:
         result: PoseEstimate | Missed | None = None
         track = self._track
         usable = shot.left is not None and shot.right is not None and shot.problem is None
-        if usable and track is not None and track.foretells(t_s):
+        if usable and track is not None and track.predicts(t_s):
             result = self._followed(shot, track, t_s)
         lost = self.way == "lost"
         if usable and result is None and lost and expected is not None:
@@ -233,7 +239,7 @@ class Follower:
             self.way = "lost"
             self._vain += 1
             if track is not None:
-                self._track = Track(
+                self._track = BodyTrack(
                     track.T_left_body,
                     track.twist,
                     track.t_s,
@@ -247,43 +253,43 @@ class Follower:
         self._begin(shot, result, track, t_s)
         return result
 
-    def _begin(self, shot: Shot, result: PoseEstimate, track: Track | None, t_s: float) -> None:
-        """Take up the track at a pose that was found by searching."""
+    def _begin(self, shot: Shot, result: PoseEstimate, track: BodyTrack | None, t_s: float) -> None:
+        """Start the track at a pose that was found by searching."""
         assert shot.left is not None
-        self._noise = disc_search.noise_of(grey(shot.left))
+        self._noise = search.noise_of(grey(shot.left))
         self._found.contrast[:] = 0.0
-        if track is not None and track.proven and track.foretells(t_s):
+        if track is not None and track.proven and track.predicts(t_s):
             before = track.predicted(t_s)
             xi = log_se3(inverse(before) @ result.T_left_body)
             px = (
                 self.rig.left.intrinsics[0] * float(np.linalg.norm(xi[:3])) / max(float(result.T_left_body[2, 3]), 1e-3)
             )
-            turned = float(np.linalg.norm(xi[3:]))
-            if turned > _JUMP_RAD or px > _JUMP_PX:
+            rotated_rad = float(np.linalg.norm(xi[3:]))
+            if rotated_rad > _JUMP_RAD or px > _JUMP_PX:
                 self.jump = (
-                    f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(turned):.0f} degrees from where it was "
-                    "expected"
+                    f"jumped {1e3 * np.linalg.norm(xi[:3]):.0f} mm and {np.degrees(rotated_rad):.0f} degrees from where it "
+                    "was predicted"
                 )
         twist, step_s = np.zeros(6), math.inf
         if track is not None and track.shots == 0 and LEAST_S <= t_s - track.t_s < math.inf and self.jump is None:
-            step_s = t_s - track.t_s  # two poses found by searching tell the velocity as well
+            step_s = t_s - track.t_s  # two poses found by searching give the velocity as well
             velocity(track.T_left_body, result.T_left_body, step_s, twist)
-        self._track = Track(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
+        self._track = BodyTrack(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
 
     def _expected(self, shot: Shot, T_left_body: Array, t_s: float) -> PoseEstimate | None:
-        """Measure where somebody else has the body; None where that gives nothing to be believed."""
+        """Measure around a pose from another source; None where that gives no plausible pose."""
         assert shot.left is not None
-        self._noise = disc_search.noise_of(grey(shot.left))
+        self._noise = search.noise_of(grey(shot.left))
         self._found.contrast[:] = 0.0
         result = self._followed(
-            shot, Track(T_left_body, np.zeros(6), t_s - 1.0, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
+            shot, BodyTrack(T_left_body, np.zeros(6), t_s - 1.0, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
         )
-        if result is not None:  # where it was expected tells no velocity
-            self._track = Track(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
+        if result is not None:  # that pose gives no velocity
+            self._track = BodyTrack(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
         return result
 
-    def _followed(self, shot: Shot, track: Track, t_s: float) -> PoseEstimate | None:
-        """Measure where the body should be; None where that gives nothing to be believed."""
+    def _followed(self, shot: Shot, track: BodyTrack, t_s: float) -> PoseEstimate | None:
+        """Measure around the predicted pose; None where that gives no plausible pose."""
         assert shot.left is not None
         assert shot.right is not None
         left, right = grey(shot.left), grey(shot.right)
@@ -296,14 +302,14 @@ class Follower:
             return None
         margin = min(max(_MARGIN_ERRORS * wrong, 0.7 * track.margin_px, _MARGIN_LEAST_PX), _MARGIN_MOST_PX)
         T = self._found.T.copy()
-        self._track = Track(T, twist, t_s, 0, margin, t_s - track.t_s, True)
+        self._track = BodyTrack(T, twist, t_s, 0, margin, t_s - track.t_s, True)
         return self._estimate(T, seen, chi_square)
 
     def _pair(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, margin: float
     ) -> tuple[int, float, float]:
         """Run the compiled call."""
-        least = max(disc_search.LEAST_CONTRAST, 5.0 * self._noise)
+        least = max(search.LEAST_CONTRAST, 5.0 * self._noise)
         arguments = (self._limits, self._found, self._cov_noise, self._work, self._outline)
         seen, chi_square, wrong = follow_pair(
             left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments
@@ -311,7 +317,7 @@ class Follower:
         return seen, chi_square, wrong
 
     def _estimate(self, T: Array, count: int, chi_square: float) -> PoseEstimate:
-        """Make the record of what the compiled call found: ``count`` ellipses."""
+        """Make the record of the compiled call's result: ``count`` ellipses."""
         found = self._found
         freedom = 2 * count - 6
         misfit = max(chi_square / freedom, 1.0) if chi_square > self._limits[count] else 1.0
@@ -338,25 +344,26 @@ class Follower:
         )
 
     def _dropped(self, good: NDArray[np.bool_]) -> tuple[Dropped, ...]:
-        """Say which discs which camera did not see, and why."""
+        """Return which discs which camera did not see, and why."""
         names = self.target.body.point_names
         return tuple(
-            Dropped(names[m], f"{side}: {_WORDS[int(self._found.codes[m, c])]}")
+            Dropped(names[m], f"{side}: {_TEXTS[int(self._found.codes[m, c])]}")
             for c, side in enumerate(SIDES)
             for m in np.flatnonzero(~good[:, c])
         )
 
 
 def follows(target: Target) -> TypeGuard[Composite]:
-    """Whether a target can be followed: three discs or more and nothing else, their normals known or of no account."""
-    if not isinstance(target, Composite) or target.parts or target.discs is None:
+    """Whether a target can be followed: three discs or more and no coded points, their normals known or not needed."""
+    discs = target.discs  # only a Composite has discs
+    if discs is None or len(discs.body.points) < len(target.body.points):
         return False
-    return len(target.discs.radii_m) >= 3 and bool(np.isfinite(bias_normals(target.discs)).all())
+    return len(discs.radii_m) >= 3 and bool(np.isfinite(bias_normals(discs)).all())
 
 
-def _room(count: int, parameters: int) -> Found:
+def _buffers(count: int, parameters: int) -> DiscMeasurement:
     """Return arrays for the results of one pair."""
-    return Found(
+    return DiscMeasurement(
         np.full((count, 2), NOT_THERE),
         np.zeros((count, 2, 2)),
         np.zeros((count, 2, 2, 2)),
