@@ -195,7 +195,7 @@ def test_tables_are_read_as_cells(tmp_path):
     assert read_table(path) == [["name", "x"], ["a, b", "1"], [], ["two\nlines", "2"]]
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         path.write_text(f"a{mark}b\n1{mark}2\n")
-        with pytest.raises(InputError, match=rf"table\.csv: line 1: columns are parted by {name}"):
+        with pytest.raises(InputError, match=rf"table\.csv: line 1: columns are separated by {name}"):
             read_table(path)
     path.write_text("x" * 200_000)
     with pytest.raises(InputError, match=r"table\.csv: not a table: field larger than field limit"):

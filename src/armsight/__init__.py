@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
     from armsight.robot.arm import Arm
-    from armsight.robot.models import open_arm
+    from armsight.robot.arm_file import open_arm
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.camera import Camera
@@ -55,7 +55,7 @@ _HOME = {
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
     "Follower": "armsight.vision.follow.follower",
-    "open_arm": "armsight.robot.models",
+    "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
     "measure": "armsight.vision.measure",

@@ -2,7 +2,7 @@
 
     camera --Shot--> markers --Detections--> match --Correspondences--> triangulate --Points--> locate --PoseEstimate-->
 
-Arrays in a record are read-only. Frames, units and the meaning of a covariance: docs/conventions.md.
+Arrays in a record are read-only. Frames, units and the meaning of a covariance: the documentation's page on conventions.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Detections(Record):
 
     Attributes:
         ids: (N,) rows of the body's points, strictly increasing.
-        uv: (N, 2) their places, raw pixels.
-        cov_uv: (N, 2, 2) covariance of the places as far as the image itself tells it, px^2; zero where unknown.
+        uv: (N, 2) their positions, raw pixels.
+        cov_uv: (N, 2, 2) covariance of the positions from the image's own noise, px^2; zero where unknown.
         problem: why nothing was found; None when something was.
     """
 
@@ -95,7 +95,7 @@ class Detections(Record):
 
 @dataclass(frozen=True)
 class Rejected:
-    """A place in an image that looked like a marker and is none, and why.
+    """A position in an image that looked like a marker and is none, and why.
 
     Attributes:
         uv: (column, row), raw pixels.
@@ -126,7 +126,7 @@ class Discs(Record):
 
     @property
     def radius_px(self) -> Array:
-        """(N,) the longer half axis of each ellipse, px: a disc's radius over its distance, however it is turned."""
+        """(N,) the longer half axis of each ellipse, px: a disc's radius over its distance, whatever its orientation."""
         mean, half = (self.shape[:, 0] + self.shape[:, 2]) / 2, (self.shape[:, 0] - self.shape[:, 2]) / 2
         return np.asarray(np.sqrt(mean + np.hypot(half, self.shape[:, 1])))
 
@@ -146,7 +146,7 @@ class Correspondences(Record):
     Attributes:
         ids: (N,) rows of the body's points, strictly increasing, seen by at least one camera.
         uv: (N, 2, 2) point, camera, raw pixel; NaN where that camera did not see the point.
-        cov_uv: (N, 2, 2, 2) covariance of each place, px^2.
+        cov_uv: (N, 2, 2, 2) covariance of each position, px^2.
         dropped: what was thrown away, and why.
     """
 
@@ -229,7 +229,7 @@ class JointCommand(Record):
     Attributes:
         q_ref: (6,) joint angles to be at when ``duration_s`` has passed, rad.
         qd_ref: (6,) speeds to have there, rad/s.
-        gravity_duty: (6,) duty that carries the arm's weight, -1 to 1.
+        gravity_duty: (6,) duty that compensates the gravity load, -1 to 1.
         duration_s: usually the time until the next command; a whole number of the board's ticks.
     """
 
@@ -241,7 +241,7 @@ class JointCommand(Record):
 
 @dataclass(frozen=True, eq=False)
 class JointStates(Record):
-    """What the potentiometers said since the last time, oldest first.
+    """The potentiometers' readings since the last time, oldest first.
 
     Attributes:
         t_s: (N,) times on the board's clock, s.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 
 class ArmsightError(Exception):
-    """Anything a user can put right; the message is the one line they read."""
+    """Anything a user can correct; the message is the one line they read."""
 
 
 class InputError(ArmsightError):

@@ -37,7 +37,7 @@ def read_table(path: str | Path) -> list[list[str]]:
     """Read a CSV file into rows of cells; a byte-order mark before the first is left out.
 
     Raises:
-        InputError: missing, unreadable, not text or not a table, or one whose cells are parted by semicolons or tabs.
+        InputError: missing, unreadable, not text or not a table, or one whose cells are separated by semicolons or tabs.
     """
     try:
         rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
@@ -45,11 +45,11 @@ def read_table(path: str | Path) -> list[list[str]]:
         raise InputError(f"{path}: not a table: {error}") from None
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         if rows and len(rows[0]) == 1 and mark in rows[0][0]:
-            raise InputError(f"{path}: line 1: columns are parted by {name}; save it with commas between them")
+            raise InputError(f"{path}: line 1: columns are separated by {name}; save it with commas between them")
     return rows
 
 
-class _Named(io.FileIO):
+class _NamedFile(io.FileIO):
     """A new file whose errors all carry its name: the system leaves it out when a write or a close fails."""
 
     def __init__(self, path: Path) -> None:
@@ -72,13 +72,13 @@ class _Named(io.FileIO):
             super().close()
 
     def abandon(self) -> None:
-        """Close without a word: the file is thrown away."""
+        """Close without an error: the file is discarded."""
         with contextlib.suppress(OSError):
             super().close()
 
 
 def _target(path: str | Path) -> Path:
-    """Return the file that ``path`` is, or links to, or is to be; refuse what cannot be one."""
+    """Return the file that ``path`` is, or links to, or is to be; reject what cannot be one."""
     target = Path(os.path.realpath(path))
     if not os.path.isdir(target.parent):
         raise InputError(f"{path}: cannot be written: there is no folder {target.parent}; make it first")
@@ -90,9 +90,9 @@ def _target(path: str | Path) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """Open a file for writing that takes the place of ``path`` only when the block ends well.
+    """Open a file for writing that replaces ``path`` only when the block ends well.
 
-    Blocks may be nested; an error is told of the file it happened to, and one of another file passes through.
+    Blocks may be nested; an error names the file it happened to; an error of another file passes through.
 
     Args:
         path: the file to be, or a link to it; its folder must exist.
@@ -105,9 +105,9 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     target = _target(path)
     # The name is chosen first: whatever happens from here on, there is only one file to take away.
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    raw: _Named | None = None
+    raw: _NamedFile | None = None
     try:
-        raw = _Named(temporary)
+        raw = _NamedFile(temporary)
         buffered = io.BufferedWriter(raw)
         # A name that is not text (an undecodable file name) is written with escapes rather than not at all.
         file = buffered if "b" in mode else io.TextIOWrapper(buffered, encoding="utf-8", errors="backslashreplace")
@@ -121,7 +121,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     finally:
         try:
             if raw is not None:
-                raw.abandon()  # below its buffers: what they still hold is not wanted any more
+                raw.abandon()  # below its buffers: what they still hold is discarded
         finally:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)

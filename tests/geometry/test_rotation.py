@@ -7,12 +7,12 @@ from hypothesis import given
 
 from armsight.geometry.rotation import (
     SINGULAR_COS_PITCH,
+    euler_zyx,
     exp_so3,
+    from_euler_zyx,
     from_quaternion_wxyz,
-    from_roll_pitch_yaw,
     log_so3,
     quaternion_wxyz,
-    roll_pitch_yaw,
     skew,
 )
 from asserts import assert_jacobian, assert_rotation
@@ -88,25 +88,25 @@ def test_quaternion_of_a_quarter_turn_about_z():
 @given(finite(-np.pi, np.pi), finite(-np.pi / 2, np.pi / 2), finite(-np.pi, np.pi))
 def test_roll_pitch_yaw_is_z_y_x(roll, pitch, yaw):
     Rz, Ry, Rx = (scipy.linalg.expm(skew(a * e)) for a, e in zip((roll, pitch, yaw), np.eye(3)[::-1], strict=True))
-    R = from_roll_pitch_yaw(roll, pitch, yaw)
+    R = from_euler_zyx(roll, pitch, yaw)
     np.testing.assert_allclose(R, Rz @ Ry @ Rx, atol=TIGHT)
 
 
 @given(rotations())
 def test_roll_pitch_yaw_comes_back(R):
-    (roll, pitch, yaw), singular = roll_pitch_yaw(R)
+    (roll, pitch, yaw), singular = euler_zyx(R)
     assert abs(pitch) <= np.pi / 2
     # Taken as singular, the remaining cos(pitch) is left out of the matrix: at most that much is lost.
     atol = 2 * SINGULAR_COS_PITCH if singular else 1e-13
-    np.testing.assert_allclose(from_roll_pitch_yaw(roll, pitch, yaw), R, atol=atol)
+    np.testing.assert_allclose(from_euler_zyx(roll, pitch, yaw), R, atol=atol)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_singular_pitch_is_told_and_roll_carries_what_is_left(sign):
     roll, yaw = 0.7, -0.4
-    (found, pitch, zero), singular = roll_pitch_yaw(from_roll_pitch_yaw(roll, sign * np.pi / 2, yaw))
+    (found, pitch, zero), singular = euler_zyx(from_euler_zyx(roll, sign * np.pi / 2, yaw))
     assert singular
     assert zero == 0
     assert pitch == pytest.approx(sign * np.pi / 2, abs=1e-12)
     assert found == pytest.approx(roll - sign * yaw, abs=1e-12)
-    assert not roll_pitch_yaw(from_roll_pitch_yaw(roll, sign * (np.pi / 2 - 1e-5), yaw))[1]
+    assert not euler_zyx(from_euler_zyx(roll, sign * (np.pi / 2 - 1e-5), yaw))[1]

@@ -15,7 +15,7 @@ from armsight.data import Body, Correspondences, PoseEstimate
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision import closed_form as chapter
 from armsight.vision.closed_form import (
     T_world_camera,
@@ -248,17 +248,17 @@ def test_orientation_agrees_with_locate(phi):
 @given(rotations())
 def test_orientation_gives_the_angles_of_18_16(R):
     found = orientation(*(PLATE @ R.T))
-    angles, singular = roll_pitch_yaw(R)
+    angles, singular = euler_zyx(R)
     assert found.singular_pitch == singular
     # Near +-90 degrees of pitch, roll and yaw drown one another: compare the rotation they stand for.
-    np.testing.assert_allclose(rotation_from_angles(*found.roll_pitch_yaw), rotation_from_angles(*angles), atol=1e-6)
+    np.testing.assert_allclose(rotation_from_angles(*found.euler_zyx), rotation_from_angles(*angles), atol=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [[150, 20, -170], [-120, -60, 95], [10, 89, 10]])
 def test_angles_in_every_quadrant(degrees):
     R = rotation_from_angles(*np.radians(degrees))
     found = orientation(*(PLATE @ R.T))
-    np.testing.assert_allclose(np.degrees(found.roll_pitch_yaw), degrees, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(found.euler_zyx), degrees, atol=1e-9)
     assert not found.singular_pitch
 
 
@@ -266,7 +266,7 @@ def test_angles_in_every_quadrant(degrees):
 def test_singular_pitch_is_told(pitch):
     found = orientation(*(PLATE @ rotation_from_angles(*np.radians([40, pitch, 15])).T))
     assert found.singular_pitch
-    np.testing.assert_allclose(np.degrees(found.roll_pitch_yaw), [40 - np.sign(pitch) * 15, pitch, 0], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(found.euler_zyx), [40 - np.sign(pitch) * 15, pitch, 0], atol=1e-6)
 
 
 @given(poses(), finite(-0.04, 0.04))
@@ -320,7 +320,7 @@ def test_misprint_18_15_row_1_column_3(phi, theta, psi):
 def test_misprint_18_16_arctan_loses_the_quadrant(phi, theta, psi):
     assume(min(abs(np.cos(phi)), abs(np.cos(psi))) > 1e-3)
     R = rotation_from_angles(phi, theta, psi)
-    (roll, pitch, yaw), _ = roll_pitch_yaw(R)
+    (roll, pitch, yaw), _ = euler_zyx(R)
     assert np.abs(np.exp(1j * np.array([roll, pitch, yaw])) - np.exp(1j * np.array([phi, theta, psi]))).max() < 1e-12
     printed_roll, printed_yaw = np.arctan(R[1, 0] / R[0, 0]), np.arctan(R[2, 1] / R[2, 2])
     assert (abs(printed_roll - phi) > 3) == (np.cos(phi) < 0)

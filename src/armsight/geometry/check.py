@@ -12,8 +12,8 @@ def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArr
     """Return ``value`` as a finite float64 array of the given shape.
 
     Args:
-        value: anything numpy can turn into numbers.
-        shape: the wanted shape; ``None`` stands for any length.
+        value: anything that numpy can convert into numbers.
+        shape: the required shape; ``None`` stands for any length.
         name: what the array is called in the error.
 
     Raises:

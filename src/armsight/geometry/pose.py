@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.geometry.rotation import Array, log_so3, skew
+from armsight.geometry.rotation import Array, log_so3, nearest_rotation, skew
 
 
 def pose(R: Array, t: Array) -> Array:
@@ -33,8 +33,28 @@ def transform(T_a_b: Array, p_b: Array) -> Array:
     return np.asarray((T_a_b[..., :3, :3] @ p_b[..., None])[..., 0] + T_a_b[..., :3, 3])
 
 
-def _left_jacobian(phi: Array) -> Array:
-    """Return V of (..., 3) rotation vectors: the translation of exp_se3 is V @ rho."""
+def adjoint(T: Array) -> Array:
+    """Return the adjoints Ad (..., 6, 6) of transforms (..., 4, 4): ``T exp(xi) T^-1 = exp(Ad xi)``."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = skew(T[..., :3, 3]) @ R
+    return out
+
+
+def small_adjoint(xi: Array) -> Array:
+    """Return ad(xi) (..., 6, 6) of tangent vectors (..., 6): ``Ad(exp(xi)) = expm(ad(xi))``."""
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = skew(xi[..., 3:])
+    out[..., :3, 3:] = skew(xi[..., :3])
+    return out
+
+
+def left_jacobian(phi: Array) -> Array:
+    """Return the left Jacobian V (..., 3, 3) of SO(3) at rotation vectors (..., 3), rad.
+
+    ``exp(phi + d) = exp(V d) exp(phi)`` to first order, and the translation of exp_se3([rho; phi]) is V rho.
+    """
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
@@ -45,7 +65,7 @@ def _left_jacobian(phi: Array) -> Array:
 
 
 def exp_se3(xi: Array) -> Array:
-    """Turn tangent vectors (..., 6), [translation; rotation], into transforms (..., 4, 4)."""
+    """Convert tangent vectors (..., 6), [translation; rotation], into transforms (..., 4, 4)."""
     phi = xi[..., 3:]
     square = (phi * phi).sum(axis=-1)[..., None, None]
     small = square < 1e-8
@@ -65,14 +85,12 @@ def exp_se3(xi: Array) -> Array:
 
 
 def log_se3(T: Array) -> Array:
-    """Turn transforms (..., 4, 4) into tangent vectors (..., 6), [translation; rotation]."""
+    """Convert transforms (..., 4, 4) into tangent vectors (..., 6), [translation; rotation]."""
     phi = log_so3(np.ascontiguousarray(T[..., :3, :3]))
-    rho = np.linalg.solve(_left_jacobian(phi), T[..., :3, 3, None])[..., 0]
+    rho = np.linalg.solve(left_jacobian(phi), T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
 
 
 def mean_pose(Ts: Array) -> Array:
     """Return the mean (4, 4) of transforms (N, 4, 4): mean translation, chordal mean rotation."""
-    U, _, Vt = np.linalg.svd(Ts[:, :3, :3].sum(axis=0))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return pose(R, Ts[:, :3, 3].mean(axis=0))
+    return pose(nearest_rotation(Ts[:, :3, :3].sum(axis=0)), Ts[:, :3, 3].mean(axis=0))

@@ -1,4 +1,4 @@
-"""The rigid motion that best lays one set of points on another.
+"""The rigid motion that best maps one set of points on another.
 
 Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4), 1991.
 """
@@ -33,7 +33,7 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     mean_b, mean_a = w @ p_b, w @ p_a
     U, _, Vt = np.linalg.svd((w[:, None] * (p_a - mean_a)).T @ (p_b - mean_b))
     R = U @ Vt
-    if np.linalg.det(R) < 0:  # a mirror image lies better: the least spread is given up
+    if np.linalg.det(R) < 0:  # a mirror image fits better: flip the direction of least spread
         U[:, 2] = -U[:, 2]
         R = U @ Vt
     return pose(R, mean_a - R @ mean_b)

@@ -1,7 +1,7 @@
-"""Rotations: vectors, matrices, quaternions (wxyz) and the chapter's roll, pitch, yaw.
+"""Rotations: vectors, matrices, quaternions (wxyz) and Euler angles about z, y, x.
 
 Rotation matrices go in and out; scipy's Rotation does the conversions it has. Formulas: Sola, "A micro Lie theory",
-2018; roll, pitch, yaw: chapter equations 18.15 and 18.16.
+2018; Euler angles: equations 18.15 and 18.16 of "Application of Stereo Vision and ARM Processor for Motion Control".
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-#: Below this cos(pitch) only roll -+ yaw is determined (18.16 is singular at +-90 degrees).
+#: Below this cos(pitch) only roll -+ yaw is determined (Euler angles are singular at +-90 degrees).
 SINGULAR_COS_PITCH = 1e-7
 
 
@@ -33,34 +33,49 @@ def skew(v: Array) -> Array:
 
 
 def exp_so3(phi: Array) -> Array:
-    """Turn rotation vectors (..., 3), rad, into rotation matrices (..., 3, 3)."""
+    """Convert rotation vectors (..., 3), rad, into rotation matrices (..., 3, 3)."""
     flat = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()
     return np.asarray(flat.reshape((*phi.shape, 3)))
 
 
 def log_so3(R: Array) -> Array:
-    """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3), rad, of length at most pi."""
+    """Convert rotation matrices (..., 3, 3) into rotation vectors (..., 3), rad, of length at most pi."""
     flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(flat.reshape(R.shape[:-1]))
 
 
+def nearest_rotation(M: Array, *, mirrored: bool = False) -> Array:
+    """Project a matrix (3, 3) onto SO(3): the rotation nearest to it in the Frobenius norm.
+
+    Args:
+        M: (3, 3) any matrix of rank two or more.
+        mirrored: return the nearest orthogonal matrix of determinant -1 instead, a reflection.
+    """
+    U, _, Vt = np.linalg.svd(M)
+    sign = -1.0 if mirrored else 1.0
+    return np.asarray(U @ np.diag([1.0, 1.0, sign * np.linalg.det(U @ Vt)]) @ Vt)
+
+
 def quaternion_wxyz(R: Array) -> Array:
-    """Turn a rotation matrix (3, 3) into a unit quaternion (4,), w x y z, with w >= 0."""
+    """Convert a rotation matrix (3, 3) into a unit quaternion (4,), w x y z, with w >= 0."""
     return np.asarray(np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1))
 
 
 def from_quaternion_wxyz(q: Array) -> Array:
-    """Turn a quaternion (4,), w x y z, of any length but zero, into a rotation matrix (3, 3)."""
+    """Convert a quaternion (4,), w x y z, of any length but zero, into a rotation matrix (3, 3)."""
     return np.asarray(Rotation.from_quat(np.roll(q, -1)).as_matrix())
 
 
-def from_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Array:
-    """Return R_z(roll) R_y(pitch) R_x(yaw), chapter equation 18.15 (phi, theta, psi in its naming), rad."""
+def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
+    """Return R_z(roll) R_y(pitch) R_x(yaw), (3, 3), from Euler angles about z, y, x, rad (equation 18.15: phi, theta, psi).
+
+    Roll is about z and yaw about x, as in the source; ROS's roll is about x.
+    """
     return np.asarray(Rotation.from_euler("ZYX", [roll, pitch, yaw]).as_matrix())
 
 
-def roll_pitch_yaw(R: Array) -> tuple[Array, bool]:
-    """Split a rotation into the chapter's roll, pitch, yaw (18.16 with atan2).
+def euler_zyx(R: Array) -> tuple[Array, bool]:
+    """Split a rotation into Euler angles about z, y, x: roll, pitch, yaw in the source's words (18.16 with atan2).
 
     Args:
         R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).

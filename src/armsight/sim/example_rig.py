@@ -196,7 +196,7 @@ def tag_plate() -> tuple[tuple[Pattern, ...], str]:
             "[[markers]]",
             f'name = "T{k}"',
             f"position_mm = [{x * 1e3:g}, {y * 1e3:g}, 0.0]",
-            "roll_pitch_yaw_deg = [0.0, 0.0, 0.0]",
+            "euler_zyx_deg = [0.0, 0.0, 0.0]",
             f'tag = {{ family = "{TAG_FAMILY}", id = {k}, size_mm = {TAG_M * 1e3:g} }}',
         ]
     return tuple(patterns), "\n".join(lines) + "\n"

@@ -19,7 +19,7 @@ from armsight.data import Array, Record, Side
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
-from armsight.geometry.rotation import from_roll_pitch_yaw, roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 
@@ -183,14 +183,14 @@ class Orientation(Record):
 
     Attributes:
         R: (3, 3) rotation with columns x_b y_b z_b, from the body's axes to those the points were given in.
-        roll_pitch_yaw: (3,) phi, theta, psi, rad.
+        euler_zyx: (3,) phi, theta, psi, rad.
         singular_pitch: whether the pitch is +-90 degrees: yaw is then set to zero, and roll holds roll - yaw at +90
             degrees, roll + yaw at -90.
         off_square_rad: by how much the angle between the printed x_b and z_b differs from 90 degrees.
     """
 
     R: Array
-    roll_pitch_yaw: Array
+    euler_zyx: Array
     singular_pitch: bool
     off_square_rad: float
 
@@ -228,13 +228,13 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
     z_b = square / sine
     y_b = np.cross(z_b, x_b)  # 18.11 to 18.14
     R = np.stack([x_b, y_b, z_b], axis=1)  # 18.11 to 18.14
-    angles, singular = roll_pitch_yaw(R)  # 18.16, with atan2
+    angles, singular = euler_zyx(R)  # 18.16, with atan2
     return Orientation(R, angles, singular, float(np.arctan2(abs(cosine), sine)))
 
 
 def rotation_from_angles(phi: float, theta: float, psi: float) -> Array:
     """Return R_z(phi) R_y(theta) R_x(psi) (18.15), rad; phi roll, theta pitch, psi yaw in the chapter's naming."""
-    return from_roll_pitch_yaw(phi, theta, psi)  # 18.15; row 1, column 3 is C_phi S_theta C_psi + S_phi S_psi
+    return from_euler_zyx(phi, theta, psi)  # 18.15; row 1, column 3 is C_phi S_theta C_psi + S_phi S_psi
 
 
 def _direction(v: Array, problem: str) -> Array:

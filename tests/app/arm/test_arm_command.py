@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_roll_pitch_yaw
+from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.models import MODELS
 from armsight.robot.reach import reach
 from armsight.robot.urdf_write import write_urdf
@@ -65,7 +65,7 @@ def test_inverse_kinematics_gives_every_solution_with_its_configuration(armsight
     said = armsight("arm", "ik", "ur5", *pose_of, "--json")
     assert said.code == 0
     (facts,) = said.lines
-    T = pose(from_roll_pitch_yaw(*np.radians(pose_of[3:])), np.array(pose_of[:3]) / 1e3)
+    T = pose(from_euler_zyx(*np.radians(pose_of[3:])), np.array(pose_of[:3]) / 1e3)
     np.testing.assert_allclose(facts["T_base_tool"], T, atol=1e-15)
     assert facts["reachable"]
     assert facts["reason"] is None

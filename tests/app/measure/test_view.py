@@ -27,7 +27,7 @@ from armsight.app.measure.view import CHART, EACH_UP_TO, View, view_folder
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.targets import open_body
@@ -189,7 +189,7 @@ def test_the_sigmas_of_the_angles_are_those_of_turns_drawn_at_random():
     rng, count = np.random.default_rng(1), 4000
     turns = rng.multivariate_normal(np.zeros(3), np.array(record["covariance"])[3:, 3:], count)
     R = result.T_left_body[:3, :3]
-    angles = np.degrees([roll_pitch_yaw(exp_so3(w) @ R)[0] for w in turns])
+    angles = np.degrees([euler_zyx(exp_so3(w) @ R)[0] for w in turns])
     # A sample's standard deviation has a relative error of 1/sqrt(2 n): four of them.
     np.testing.assert_allclose(angles.std(axis=0), angle_sigmas_deg(record), rtol=4 / np.sqrt(2 * count))
     assert np.isnan(angle_sigmas_deg({**record, "pitch_singular": True})).all()

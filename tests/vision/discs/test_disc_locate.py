@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from armsight.data import Body, Correspondences, Detections, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
-from armsight.geometry.rotation import exp_so3, roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.closed_form import orientation
 from armsight.vision.discs.bias import expect
 from armsight.vision.discs.locate import locate_composite, locate_discs
@@ -176,7 +176,7 @@ def test_three_discs_in_the_chapters_frame_report_its_angles(seed):
     T = someplace(rng) @ inverse(facing)
     left, right, _ = views(rig, chapter, [T], rng, sigma=1e-7)
     estimate = alone(rig, replace(chapter), left, right)
-    angles, _ = roll_pitch_yaw(estimate.T_left_body[:3, :3])
+    angles, _ = euler_zyx(estimate.T_left_body[:3, :3])
     p = estimate.points.p_left
-    assert angles == pytest.approx(orientation(*p).roll_pitch_yaw, abs=1e-5)
-    assert angles == pytest.approx(roll_pitch_yaw(T[:3, :3])[0], abs=1e-5)
+    assert angles == pytest.approx(orientation(*p).euler_zyx, abs=1e-5)
+    assert angles == pytest.approx(euler_zyx(T[:3, :3])[0], abs=1e-5)

@@ -16,11 +16,11 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import check_writable
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_roll_pitch_yaw
+from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.arm import Arm
+from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.chain import MOST_RADIANS
-from armsight.robot.models import MODELS, open_arm
-from armsight.robot.urdf import read_urdf
+from armsight.robot.models import MODELS
 from armsight.robot.urdf_write import write_urdf
 
 #: A minus before a number is no option.
@@ -58,7 +58,7 @@ def list_(as_json: bool) -> None:
 @_JSON
 def show(model: str, tool_link: str | None, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
-    arm = _open(model, tool_link)
+    arm = open_arm(model, tool_link=tool_link)
     if output is not None:
         check_writable(output, apart_from=(model,))
         write_arm_figure(arm, output)
@@ -72,7 +72,7 @@ def show(model: str, tool_link: str | None, output: Path | None, as_json: bool) 
 @_JSON
 def fk(model: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
     """Print where the tool is at six joint angles, in degrees."""
-    arm = _open(model, tool_link)
+    arm = open_arm(model, tool_link=tool_link)
     q = _joints(arm, angles)
     facts = arm_facts.forward(arm, q)
     click.echo(json.dumps(facts) if as_json else arm_facts.forward_text(facts))
@@ -84,7 +84,7 @@ def fk(model: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool
 @_JSON
 def jacobian(model: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the Jacobian of the tool's point in base axes at six joint angles, in degrees."""
-    arm = _open(model, tool_link)
+    arm = open_arm(model, tool_link=tool_link)
     q = _joints(arm, angles)
     facts = arm_facts.jacobian(arm, q)
     click.echo(json.dumps(facts) if as_json else arm_facts.jacobian_text(facts))
@@ -100,11 +100,11 @@ def ik(model: str, tool_link: str | None, numbers: tuple[str, ...], as_json: boo
     The rotation is Rz(roll) Ry(pitch) Rx(yaw). Exit code 1 where no joint angles within the limits reach the pose: then the
     reason and the nearest pose that can be reached are the answer.
     """
-    arm = _open(model, tool_link)
+    arm = open_arm(model, tool_link=tool_link)
     if len(_no_options(numbers)) != len(_POSE):
         raise InputError(f"a pose is six numbers, {' '.join(_POSE)} (mm, degrees); {len(numbers)} were given")
     x, y, z, roll, pitch, yaw = (_number(text, name) for text, name in zip(numbers, _POSE, strict=True))
-    T = pose(from_roll_pitch_yaw(*np.radians([roll, pitch, yaw])), np.array([x, y, z]) / 1e3)
+    T = pose(from_euler_zyx(*np.radians([roll, pitch, yaw])), np.array([x, y, z]) / 1e3)
     facts = arm_facts.inverse(arm, T)
     click.echo(json.dumps(facts) if as_json else arm_facts.inverse_text(facts))
     return 0 if any(solution["within_limits"] for solution in facts["solutions"]) else 1
@@ -116,17 +116,8 @@ def ik(model: str, tool_link: str | None, numbers: tuple[str, ...], as_json: boo
 def urdf(model: str, tool_link: str | None, output: Path) -> None:
     """Write an arm as a URDF file."""
     check_writable(output, apart_from=(model,))
-    write_urdf(_open(model, tool_link), output)
+    write_urdf(open_arm(model, tool_link=tool_link), output)
     click.echo(str(output))
-
-
-def _open(model: str, tool_link: str | None) -> Arm:
-    """Return the arm of a name or of a URDF file."""
-    if model.lower().endswith((".urdf", ".xml")) or "/" in model:
-        return read_urdf(model, tool_link=tool_link)
-    if tool_link is not None:
-        raise InputError(f"--tool-link belongs to .urdf files; {model} is none")
-    return open_arm(model)
 
 
 def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from armsight.data import Array
-from armsight.geometry.rotation import roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm import Arm
 from armsight.robot.reach import reach
 
@@ -191,7 +191,7 @@ def _angles(q: Array) -> Facts:
 
 def _pose(T: Array) -> Facts:
     """Return a pose: the matrix, and mm and degrees."""
-    angles, singular = roll_pitch_yaw(T[:3, :3])
+    angles, singular = euler_zyx(T[:3, :3])
     return {
         "T_base_tool": T.tolist(),
         "position_mm": (1e3 * T[:3, 3]).tolist(),
@@ -202,7 +202,7 @@ def _pose(T: Array) -> Facts:
 
 def _where(T: Array) -> str:
     """Return a pose in words."""
-    angles, singular = roll_pitch_yaw(T[:3, :3])
+    angles, singular = euler_zyx(T[:3, :3])
     xyz, rpy = (", ".join(map(_fixed, values)) for values in (1e3 * T[:3, 3], np.degrees(angles)))
     note = " (pitch singular: only roll and yaw together are determined)" if singular else ""
     return f"({xyz}) mm, roll pitch yaw ({rpy}) deg{note}"

@@ -2,7 +2,7 @@
 
 Everything is in the left camera's frame; ``covariance`` is that of [translation m; rotation rad] along the axes of the
 left camera (the true pose is the estimate turned by the rotation vector about the body's origin, and shifted), and
-``covariance_body`` the same along the body's axes, as docs/conventions.md has it (perturbation on the right).
+``covariance_body`` the same along the body's axes, as docs/concepts/conventions.md has it (perturbation on the right).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from armsight.data import Body, Missed, PoseEstimate
-from armsight.geometry.rotation import quaternion_wxyz, roll_pitch_yaw
+from armsight.geometry.rotation import euler_zyx, quaternion_wxyz
 
 #: Elements of a 6x6 covariance that are written.
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
@@ -44,7 +44,7 @@ def pose_record(name: str, t_s: float | None, body: Body, result: PoseEstimate |
     if isinstance(result, Missed):
         return {**head, "status": "missed", "reason": result.reason}
     T = result.T_left_body
-    angles, singular = roll_pitch_yaw(T[:3, :3])
+    angles, singular = euler_zyx(T[:3, :3])
     names = body.point_names
     return {
         **head,

@@ -1,4 +1,8 @@
-"""A motion file (TOML) becomes motions that are known to be possible before the first step; docs/run.md has the keys."""
+"""Motion files: TOML in, a plan of trajectories out; all of it is checked and planned before the arm moves.
+
+A file has ``start_deg`` (joint angles; default: the arm's home) and one table ``[[motion]]`` a motion. Its ``kind`` is
+joints, home, line or circle; ``_KINDS`` lists the keys of each. Lengths are in mm, angles in degrees.
+"""
 
 from __future__ import annotations
 
@@ -13,35 +17,37 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import exp_so3, from_roll_pitch_yaw
+from armsight.geometry.rotation import exp_so3, from_euler_zyx
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
 
-#: The chapter's motion: home to five poses and back, a line, a circle.
+#: Five poses and home again, a straight line, a circle.
 DEFAULT_MOTION = Path(__file__).with_name("default_motion.toml")
-#: Less of it.
+#: One pose, a line, a circle.
 QUICK = Path(__file__).with_name("quick_motion.toml")
 _REST_S = 2.0
 _MOST = 1e9  # of any number; NaN is not below it
-#: Kind -> its own keys and how many numbers each has; those in the second place must be there.
+#: Kind -> its own keys with the number of values of each, and the keys that are required.
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "joints": ({"q_deg": 6}, ("q_deg",)),
     "home": ({}, ()),
-    "line": ({"by_mm": 3, "rotation_deg": 3, "to_mm": 3, "roll_pitch_yaw_deg": 3}, ()),
+    "line": ({"by_mm": 3, "rotation_deg": 3, "to_mm": 3, "euler_zyx_deg": 3}, ()),
     "circle": ({"center_mm": 3, "axis": 3, "angle_deg": 1}, ("center_mm", "axis")),
 }
 _COMMON = {"kind": 0, "name": 0, "duration_s": 1, "rest_s": 1}
+#: Older name of a key -> its name.
+_OLD_KEYS = {"roll_pitch_yaw_deg": "euler_zyx_deg"}
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Record):
+class PlannedMotion(Record):
     """One motion of a run.
 
     Attributes:
-        name: what it is called, unique in the run.
+        name: its name, unique in the run.
         kind: joints, home, line or circle.
         trajectory: joint angles over time.
-        rest_s: how long the arm stands at its end.
+        rest_s: how long the arm rests at its end, s.
     """
 
     name: str
@@ -60,7 +66,7 @@ class MotionPlan(Record):
     """
 
     start: Array
-    motions: tuple[Motion, ...]
+    motions: tuple[PlannedMotion, ...]
 
 
 def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
@@ -85,15 +91,16 @@ def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
         raise InputError(f"{path}: no motion; give each as a table [[motion]] with a kind: {', '.join(_KINDS)}")
     q_start = q = np.radians(start)
-    motions: list[Motion] = []
+    motions: list[PlannedMotion] = []
     for number, entry in enumerate(entries, start=1):
         where = f"{path}: motion {number}"
-        motions.append(_motion(where, arm, q, dict(entry), [m.name for m in motions], number))
+        entry = {_OLD_KEYS.get(key, key): value for key, value in entry.items()}
+        motions.append(_motion(where, arm, q, entry, [m.name for m in motions], number))
         q = motions[-1].trajectory.at(motions[-1].trajectory.duration_s).q
     return MotionPlan(q_start, tuple(motions))
 
 
-def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> Motion:
+def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> PlannedMotion:
     """Plan one motion."""
     kind = entry.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
@@ -118,13 +125,13 @@ def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[s
         trajectory = _planned(where, kind, arm, q, values, duration)
     except InputError as error:
         raise InputError(f"{where} ({name}): {error}" if where not in str(error) else str(error)) from None
-    return Motion(name, kind, trajectory, rest)
+    return PlannedMotion(name, kind, trajectory, rest)
 
 
 def _planned(
     where: str, kind: str, arm: Arm, q: Array, values: dict[str, Array], duration_s: float | None
 ) -> Trajectory:
-    """Plan the motion of a kind from joint angles q."""
+    """Plan a motion of a kind from joint angles q (6,), rad."""
     if kind in ("joints", "home"):
         goal = arm.home if kind == "home" else np.radians(values["q_deg"])
         return point_to_point(arm, q, goal, duration_s=duration_s)
@@ -135,15 +142,15 @@ def _planned(
 
 
 def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Array:
-    """Return where a line ends: a step from where the tool is, or a place."""
+    """Return the pose (4, 4) at which a line ends: relative to the tool's pose, or a position in the base frame."""
     if ("by_mm" in values) == ("to_mm" in values):
-        raise InputError(f"{where} (line): give either by_mm, a step in the base frame, or to_mm, a place in it")
+        raise InputError(f"{where} (line): give either by_mm, a step in the base frame, or to_mm, a position in it")
     if "by_mm" in values:
-        turn = exp_so3(np.radians(values.get("rotation_deg", np.zeros(3))))
-        return pose(turn @ T_base_tool[:3, :3], T_base_tool[:3, 3] + 1e-3 * values["by_mm"])
+        R_step = exp_so3(np.radians(values.get("rotation_deg", np.zeros(3))))
+        return pose(R_step @ T_base_tool[:3, :3], T_base_tool[:3, 3] + 1e-3 * values["by_mm"])
     R = T_base_tool[:3, :3]
-    if "roll_pitch_yaw_deg" in values:
-        R = from_roll_pitch_yaw(*np.radians(values["roll_pitch_yaw_deg"]))
+    if "euler_zyx_deg" in values:  # angles about z, y, x, in this order
+        R = from_euler_zyx(*np.radians(values["euler_zyx_deg"]))
     return pose(R, 1e-3 * values["to_mm"])
 
 

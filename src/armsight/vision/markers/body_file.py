@@ -25,7 +25,7 @@ from armsight.errors import InputError
 from armsight.files import read_table, read_text, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_quaternion_wxyz, from_roll_pitch_yaw
+from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
 
 #: The version of the format that is documented; a file without the key ``version`` has version 1.
 VERSION = 2
@@ -109,7 +109,7 @@ class Marker(Record):
         if given == {"quaternion_wxyz"}:
             return pose(from_quaternion_wxyz(_unit(self, "quaternion_wxyz")), self.position)
         if given == {"euler_zyx_deg"}:
-            return pose(from_roll_pitch_yaw(*np.radians(self.orientation["euler_zyx_deg"])), self.position)
+            return pose(from_euler_zyx(*np.radians(self.orientation["euler_zyx_deg"])), self.position)
         raise self.error(
             f"give its orientation by exactly one of: {'; '.join(ORIENTATIONS)}; got {', '.join(given) or 'none'}"
         )
