@@ -1,4 +1,4 @@
-"""A simple arm on the firmware's core: six motors that turn joints with potentiometers, and a host that can command."""
+"""A simple arm on the firmware's core: six motors that drive joints with potentiometers, and a host that can command."""
 
 import ctypes
 import math
@@ -12,7 +12,7 @@ Library = ctypes.CDLL
 
 
 def declare(library: Library) -> Library:
-    """Tell ctypes what the core's functions take and give."""
+    """Declare to ctypes what the core's functions take and give."""
     flag, real, word, pointer = ctypes.c_bool, ctypes.c_float, ctypes.c_uint32, ctypes.c_void_p
     signatures = {
         "host_size": (word, [ctypes.c_char_p]),
@@ -73,7 +73,7 @@ class LabArm:
         self.spoil: Callable[[LabArm], None] = lambda arm: None
         self.history: list[bytes] = []
 
-    def _turn(self) -> None:
+    def _move(self) -> None:
         for i in JOINTS:
             drive = self.outputs.duty[i] * 5.0 if self.outputs.drives_on else 0.0
             self.speed_rad_s[i] += 0.001 / 0.03 * (drive - self.speed_rad_s[i])
@@ -89,7 +89,7 @@ class LabArm:
     def tick(self, ticks: int = 1):
         """Run ticks of 1 ms; ``spoil(arm)`` may change the inputs of each before it runs."""
         for _ in range(ticks):
-            self._turn()
+            self._move()
             self.inputs.tick = (self.inputs.tick + 1) % 2**32
             for i in JOINTS:
                 self.inputs.counts[i] = self.counts(i)
@@ -128,7 +128,7 @@ class LabArm:
         return self.outputs
 
     def acknowledged(self) -> bool:
-        """Tell whether the last command was acknowledged; it was refused otherwise."""
+        """Return whether the last command was acknowledged; it was rejected otherwise."""
         acknowledged = self.outputs.acknowledged_sequence == self.sequence
         assert acknowledged != (self.outputs.rejected_sequence == self.sequence)
         return acknowledged

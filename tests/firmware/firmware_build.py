@@ -16,24 +16,24 @@ SHARED = ("-O2", "-shared", "-fPIC")
 
 
 def own_compiler() -> list[str] | None:
-    """This machine's own C compiler."""
+    """This computer's own C compiler."""
     path = shutil.which("gcc") or shutil.which("cc")
     return [path] if path else None
 
 
-#: More flags, for the machine's own compiler alone.
+#: More flags, for the computer's own compiler alone.
 MORE_FLAGS = os.environ.get("ARMSIGHT_FIRMWARE_CFLAGS", "").split()
 
 
 def compilers() -> dict[str, list[str]]:
-    """The compilers for this machine, by name: its own, and the one that comes from PyPI."""
+    """The compilers for this computer, by name: its own, and the one that comes from PyPI."""
     own, found = own_compiler(), build.compilers()
     with_zig = "zig" in found and not MORE_FLAGS
     return ({"own": own} if own else {}) | ({"zig": [*found["zig"].host]} if with_zig else {})
 
 
 def is_gcc(compiler: list[str] | None) -> bool:
-    """Tell whether a compiler is GNU's."""
+    """Return whether a compiler is GNU's."""
     if compiler is None:
         return False
     return "Free Software Foundation" in subprocess.check_output([*compiler, "--version"], text=True)

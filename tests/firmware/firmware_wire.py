@@ -27,7 +27,7 @@ class Periods(ctypes.Structure):
 
 
 def declare_wire(library):
-    """Tell ctypes what the wire's functions take and give."""
+    """Declare to ctypes what the wire's functions take and give."""
     pointer, word = ctypes.c_void_p, ctypes.c_uint32
     library.wire_periods_at.restype, library.wire_periods_at.argtypes = Periods, [word]
     library.wire_init.argtypes = [pointer, ctypes.POINTER(Setup)]
@@ -62,11 +62,11 @@ class BareWire:
         self.library.wire_receive(self.state, data, len(data), overrun)
 
     def to_store(self) -> bool:
-        """Tell whether a configuration waits to be stored."""
+        """Return whether a configuration waits to be stored."""
         return self.library.wire_to_store(self.state) is not None
 
     def stored(self, done: bool) -> None:
-        """Tell the wire what became of it."""
+        """Report to the wire what became of it."""
         self.library.wire_stored(self.state, done)
 
     def tick(self, ticks: int = 1) -> None:
@@ -84,11 +84,11 @@ class BareWire:
             self._take()
 
     def _take(self) -> None:
-        place = ctypes.POINTER(ctypes.c_uint8)()
+        start = ctypes.POINTER(ctypes.c_uint8)()
         while self.line >= 1.0:
-            length = min(self.library.wire_output(self.state, ctypes.byref(place)), int(self.line))
+            length = min(self.library.wire_output(self.state, ctypes.byref(start)), int(self.line))
             if length == 0:
                 return
-            self.sent += ctypes.string_at(place, length)
+            self.sent += ctypes.string_at(start, length)
             self.library.wire_sent(self.state, length)
             self.line -= length

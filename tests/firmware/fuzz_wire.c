@@ -2,7 +2,7 @@
  * content is not. Aborts if what comes out is not what it must be, or if the link is not usable again 20 ms after the
  * last bad byte.
  *
- * Built with clang's -fsanitize=fuzzer, or with -DSHAKE by any compiler: then it draws its own inputs, as many as its
+ * Built with clang's -fsanitize=fuzzer, or with -DSHAKE by any compiler: then it generates its own inputs, as many as its
  * argument says. */
 #include <stdio.h>
 #include <stdlib.h>
@@ -19,7 +19,7 @@
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 static const uint32_t kinds[] = {
-    MAVLINK_MSG_ID_HELLO, MAVLINK_MSG_ID_MOVE,        MAVLINK_MSG_ID_ORDER,       MAVLINK_MSG_ID_STOP,
+    MAVLINK_MSG_ID_HELLO, MAVLINK_MSG_ID_MOVE,        MAVLINK_MSG_ID_COMMAND,     MAVLINK_MSG_ID_STOP,
     MAVLINK_MSG_ID_GAINS, MAVLINK_MSG_ID_CONFIG_READ, MAVLINK_MSG_ID_CONFIG_PART, MAVLINK_MSG_ID_CONFIG_STORE,
     MAVLINK_MSG_ID_PING,  MAVLINK_MSG_ID_ANGLES,      MAVLINK_MSG_ID_BOARD_STATUS,
 };
@@ -106,8 +106,8 @@ static void store(void)
         memcpy(part.bytes, (const uint8_t *)&config + offset, part.length);
         say(MAVLINK_MSG_ID_CONFIG_PART, &part, sizeof part);
     }
-    const mavlink_config_store_t order = {.sequence = 1u, .crc = config_crc(&config, sizeof config)};
-    say(MAVLINK_MSG_ID_CONFIG_STORE, &order, sizeof order);
+    const mavlink_config_store_t store = {.sequence = 1u, .crc = config_crc(&config, sizeof config)};
+    say(MAVLINK_MSG_ID_CONFIG_STORE, &store, sizeof store);
     tick(nothing, 0u);
 }
 
@@ -190,8 +190,8 @@ int main(int count, char **arguments)
     for (long round = 0; round < rounds; round++) {
         const uint32_t size = draw() % sizeof data;
         for (uint32_t i = 0u; i < size; i++) {
-            const uint32_t drawn = draw() >> 16; /* zeros and small ones make numbers small */
-            data[i] = (uint8_t)(drawn % 3u == 0u ? 0u : drawn % 3u == 1u ? (drawn >> 8) % 8u : drawn >> 8);
+            const uint32_t random = draw() >> 16; /* zeros and small ones make numbers small */
+            data[i] = (uint8_t)(random % 3u == 0u ? 0u : random % 3u == 1u ? (random >> 8) % 8u : random >> 8);
         }
         LLVMFuzzerTestOneInput(data, size);
     }

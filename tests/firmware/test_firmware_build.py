@@ -55,12 +55,12 @@ def test_for_a_cortex_m4f_the_core_needs_only_memory_copies(name, tmp_path):
     if compiler is None:
         pytest.skip(f"needs {name} for a Cortex-M4F")
     own = {word for header in (FIRMWARE / "core").glob("*.h") for word in re.findall(r"\b(\w+)\(", header.read_text())}
-    wanted = set()
+    expected = set()
     for source in CORE:
         build.compile_c(compiler.arm, tmp_path / "core.o", [source], "-O2", "-Icore", "-c")
-        wanted |= read_elf(tmp_path / "core.o").undefined
+        expected |= read_elf(tmp_path / "core.o").undefined
     # ARM's run-time ABI has names of its own for copying and clearing.
-    foreign = {re.sub(r"^__aeabi_(mem[a-z]+?)[48]?$", r"\1", word) for word in wanted - own}
+    foreign = {re.sub(r"^__aeabi_(mem[a-z]+?)[48]?$", r"\1", word) for word in expected - own}
     assert foreign <= {"memcpy", "memset", "memclr"}
 
 

@@ -46,19 +46,19 @@ def test_a_run_takes_no_more_stack_than_the_bound(tmp_path, name):
         pytest.skip(f"needs {name}, and gcc for the bound")
     image = build.build_board("pil", tmp_path / "pil.elf", found[name])
     try:
-        machine = open_emulator("unicorn", image)
+        emulator = open_emulator("unicorn", image)
     except InputError as missing:
         pytest.skip(str(missing))
     top = read_elf(image).symbols["stack_top"]
-    machine.uc.mem_write(top - STACK_BYTES, bytes([PAINT]) * STACK_BYTES)
+    emulator.uc.mem_write(top - STACK_BYTES, bytes([PAINT]) * STACK_BYTES)
     for request in requests():
-        machine.tick(request)
-    left = bytes(machine.uc.mem_read(top - STACK_BYTES, STACK_BYTES))
+        emulator.tick(request)
+    left = bytes(emulator.uc.mem_read(top - STACK_BYTES, STACK_BYTES))
     used = len(left.lstrip(bytes([PAINT])))
     use = stack.stack_use("pil")
     bound = max(use.main.stack_bytes, use.tick.stack_bytes)
     assert 1000 < used <= bound + (64 if name == "gcc" else bound // 4), "64: what calls them; zig's frames are its own"
-    machine.close()
+    emulator.close()
 
 
 def requests():
@@ -93,7 +93,7 @@ def test_an_unknown_compiler_is_named_with_those_there_are(monkeypatch):
         build.open_compiler()
 
 
-def test_no_compiler_at_all_is_told(monkeypatch):
+def test_no_compiler_at_all_is_reported(monkeypatch):
     monkeypatch.setattr(build, "compilers", dict)
     monkeypatch.delenv(build.COMPILER_VARIABLE, raising=False)
     with pytest.raises(InputError, match=r"no firmware compiler \(none found\)"):
@@ -122,7 +122,7 @@ def test_a_failed_build_leaves_the_last_one(tmp_path, compiler, monkeypatch):
     assert (built / firmware.IMAGE).read_bytes() == b"the last one"
 
 
-def test_firmware_that_is_not_built_is_told_with_what_to_do(tmp_path, monkeypatch):
+def test_firmware_that_is_not_built_is_reported_with_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(firmware, "BUILT", tmp_path)
     for find in (firmware.image, firmware.host_library, firmware.dialect):
         with pytest.raises(DeviceError, match=r"not built; run python -m armsight\.firmware\.build"):
@@ -130,14 +130,14 @@ def test_firmware_that_is_not_built_is_told_with_what_to_do(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("content", [b"", b"\x7fELF", b"MZ" * 50, b"\x7fELF\x02\x01" + bytes(60)])
-def test_a_file_that_is_no_image_is_refused(tmp_path, content):
+def test_a_file_that_is_no_image_is_rejected(tmp_path, content):
     path = tmp_path / "x.elf"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"x\.elf: not a"):
         read_elf(path)
 
 
-def test_an_image_cut_short_is_refused(tmp_path):
+def test_an_image_cut_short_is_rejected(tmp_path):
     whole = firmware.image().read_bytes()
     for length in (60, len(whole) // 2):
         path = tmp_path / "x.elf"
@@ -162,7 +162,7 @@ def test_without_pymavlink_it_is_said_what_to_install(tmp_path, monkeypatch):
         build.generate("Python3", tmp_path / "dialect.py")
 
 
-def test_a_dialect_that_is_wrong_is_refused(tmp_path, monkeypatch):
+def test_a_dialect_that_is_wrong_is_rejected(tmp_path, monkeypatch):
     pytest.importorskip("pymavlink", reason="needs pymavlink")
     source = tmp_path / "source" / "wire"
     source.mkdir(parents=True)
@@ -174,17 +174,17 @@ def test_a_dialect_that_is_wrong_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["gcc", "zig"])
-def test_memory_is_copied_and_filled_at_any_place_and_length(tmp_path, name):
+def test_memory_is_copied_and_filled_at_any_address_and_length(tmp_path, name):
     found = build.compilers()
     if name not in found:
         pytest.skip(f"needs {name} for a Cortex-M4F")
     image = build.build_board("pil", tmp_path / "pil.elf", found[name])
     try:
-        machine = open_emulator("unicorn", image)
+        emulator = open_emulator("unicorn", image)
     except InputError as missing:
         pytest.skip(str(missing))
     arm = pytest.importorskip("unicorn.arm_const")
-    symbols, uc = read_elf(image).symbols, machine.uc
+    symbols, uc = read_elf(image).symbols, emulator.uc
     memory, space, back = 0x20008000, 256, 0x3FFE0
     rng = np.random.default_rng(3)
 
@@ -205,4 +205,4 @@ def test_memory_is_copied_and_filled_at_any_place_and_length(tmp_path, name):
             assert call("memset", memory + to + 104, 0x1A5, length % 20) == memory + to + 104
             before[to + 104 : to + 104 + length % 20] = b"\xa5" * (length % 20)
             assert bytes(uc.mem_read(memory, space)) == bytes(before), (length, to, source)
-    machine.close()
+    emulator.close()

@@ -68,13 +68,13 @@ def test_a_fuzzer_finds_nothing_in_the_wire(tmp_path, mavlink):
         pytest.skip("this clang has no fuzzer")
     assert done.returncode == 0, done.stderr
     (tmp_path / "corpus").mkdir()
-    wanted = int(os.environ.get("ARMSIGHT_FUZZ_RUNS", str(FUZZ_RUNS)))
-    given = [program, f"-runs={wanted}", "-rss_limit_mb=0", "-max_len=2048", "-seed=1", "-close_fd_mask=0", "corpus"]
+    expected = int(os.environ.get("ARMSIGHT_FUZZ_RUNS", str(FUZZ_RUNS)))
+    given = [program, f"-runs={expected}", "-rss_limit_mb=0", "-max_len=2048", "-seed=1", "-close_fd_mask=0", "corpus"]
     ran = subprocess.run([*map(str, given)], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr[-3000:]
     runs = re.search(r"Done (\d+) runs", ran.stderr)
     assert runs
-    assert int(runs[1]) >= wanted
+    assert int(runs[1]) >= expected
 
 
 @pytest.mark.parametrize("source", [*BOARD, "boards/host/host.c"])
@@ -120,14 +120,14 @@ def test_the_tests_reach_the_branches_of_the_core(tmp_path, gcc):
         [*again, *chosen], cwd=FIRMWARE.parent, env=counting, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stdout[-3000:]
-    told = subprocess.run(
+    reported = subprocess.run(
         [gcov, "-b", "-n", *map(str, counted.glob("*.gcda"))], cwd=FIRMWARE, capture_output=True, text=True, check=True
     ).stdout
     taken = total = 0.0
     for name, percent, branches in re.findall(
-        r"File '(?:\./)?(core/\w+\.c)'\n.*\n.*\nTaken at least once:([\d.]+)% of (\d+)", told
+        r"File '(?:\./)?(core/\w+\.c)'\n.*\n.*\nTaken at least once:([\d.]+)% of (\d+)", reported
     ):
         assert name in CORE
         taken, total = taken + float(percent) / 100 * int(branches), total + int(branches)
-    assert total > 100, told
-    assert 100 * taken / total >= BRANCHES_PERCENT, told
+    assert total > 100, reported
+    assert 100 * taken / total >= BRANCHES_PERCENT, reported

@@ -60,7 +60,7 @@ def test_the_wheel_is_for_this_platform_and_any_python_3(wheel):
 
 
 def test_what_is_unpacked_from_the_wheel_runs_and_builds(wheel, tmp_path):
-    """Without a package beside it, in another place: the host library ticks, and the image is built again."""
+    """Without a package beside it, in another folder: the host library ticks, and the image is built again."""
     with zipfile.ZipFile(wheel) as file:
         file.extractall(tmp_path)
     script = (

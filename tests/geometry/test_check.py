@@ -1,4 +1,4 @@
-"""The checks at the public door: what passes, and what each refusal says."""
+"""The checks at the public door: what passes, and what each rejection says."""
 
 import numpy as np
 import pytest

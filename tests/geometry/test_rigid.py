@@ -35,7 +35,7 @@ def test_same_as_scipy(T_a_b, seed, n, weighted):
     mean_b, mean_a = np.average(p_b, axis=0, weights=w), np.average(p_a, axis=0, weights=w)
     R, _ = Rotation.align_vectors(p_a - mean_a, p_b - mean_b, weights=w)
     assert_rotation(T[:3, :3])
-    # Nearly collinear draws condition the rotation badly, so the cost is compared, which has a minimum there.
+    # Nearly collinear samples condition the rotation badly, so the cost is compared, which has a minimum there.
     cost = [(w[:, None] * (p_a - mean_a - (p_b - mean_b) @ M.T) ** 2).sum() for M in (T[:3, :3], R.as_matrix())]
     assert cost[0] <= cost[1] * (1 + 1e-9) + 1e-18
     np.testing.assert_allclose(transform(T, mean_b), mean_a, atol=1e-14 * 8)

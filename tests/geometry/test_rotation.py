@@ -54,7 +54,7 @@ def test_exp_undoes_log(R):
 
 
 @given(rotation_vectors())
-def test_turning_back_is_the_transpose(phi):
+def test_the_inverse_is_the_transpose(phi):
     np.testing.assert_allclose(exp_so3(-phi), exp_so3(phi).T, atol=TIGHT)
 
 
@@ -79,7 +79,7 @@ def test_quaternion_comes_back_with_w_first_and_positive(R):
     np.testing.assert_allclose(from_quaternion_wxyz(-3.0 * q), R, atol=TIGHT)
 
 
-def test_quaternion_of_a_quarter_turn_about_z():
+def test_quaternion_of_90_degrees_about_z():
     half = np.sqrt(0.5)
     R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(quaternion_wxyz(R), [half, 0, 0, half], atol=1e-15)
@@ -102,7 +102,7 @@ def test_roll_pitch_yaw_comes_back(R):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_singular_pitch_is_told_and_roll_carries_what_is_left(sign):
+def test_singular_pitch_is_reported_and_roll_carries_what_is_left(sign):
     roll, yaw = 0.7, -0.4
     (found, pitch, zero), singular = euler_zyx(from_euler_zyx(roll, sign * np.pi / 2, yaw))
     assert singular

@@ -12,7 +12,7 @@ from armsight.robot.models import MODELS
 
 
 def odd(arm, name, seed):
-    """The same links between a turned base and a turned tool, with joints that turn the other way and offsets."""
+    """The same links between a rotated base and a rotated tool, with joints of the other direction and offsets."""
     rng = np.random.default_rng(seed)
     return dataclasses.replace(
         arm,
@@ -103,9 +103,9 @@ def frames(arm, q):
     """Frame 0, links 1 to 6 and the tool, as products of 4x4 matrices straight from the convention's definition."""
     out = [arm.T_base_0]
     for i in range(6):
-        turn = _rz(arm.direction[i] * q[i] + arm.offset[i]) @ _shift(0, arm.d[i])
+        joint = _rz(arm.direction[i] * q[i] + arm.offset[i]) @ _shift(0, arm.d[i])
         side = _shift(arm.a[i], 0) @ _rx(arm.alpha[i])
-        out.append(out[-1] @ (turn @ side if arm.convention == "standard" else side @ turn))
+        out.append(out[-1] @ (joint @ side if arm.convention == "standard" else side @ joint))
     return np.stack([*out, out[-1] @ arm.T_flange_tool])
 
 
@@ -113,15 +113,15 @@ def forward(arm, q):
     return frames(arm, q)[-1]
 
 
-def off(T, T_wanted):
+def off(T, T_expected):
     """Distance, m, and angle, rad, between poses (..., 4, 4)."""
-    far = np.linalg.norm(T[..., :3, 3] - T_wanted[..., :3, 3], axis=-1)
-    chord = np.linalg.norm(T[..., :3, :3] - T_wanted[..., :3, :3], axis=(-2, -1)) / np.sqrt(8)
+    far = np.linalg.norm(T[..., :3, 3] - T_expected[..., :3, 3], axis=-1)
+    chord = np.linalg.norm(T[..., :3, :3] - T_expected[..., :3, :3], axis=(-2, -1)) / np.sqrt(8)
     return far, 2 * np.arcsin(np.minimum(chord, 1.0))
 
 
 def apart(q, p):
-    """Largest joint difference, whole turns aside, of joint angles (..., 6)."""
+    """Largest joint difference, whole revolutions aside, of joint angles (..., 6)."""
     return np.abs((q - p + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
 
 

@@ -1,6 +1,6 @@
 """Other people's kinematics of the same arms, for tests and benchmarks: pinocchio, EAIK, roboticstoolbox.
 
-For standard tables without base, tool or turned joints, as all models are. A peer not installed raises ImportError.
+For standard tables without base, tool or reversed joints, as all models are. A peer not installed raises ImportError.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ class Pinocchio:
 
         self._pin, self._arm = pin, arm
         self.model = pin.Model()
-        place, parent = pin.SE3.Identity(), 0
+        placement, parent = pin.SE3.Identity(), 0
         for i in range(6):
-            parent = self.model.addJoint(parent, pin.JointModelRZ(), place, f"joint{i + 1}")
-            place = pin.SE3(pin.utils.rotate("x", float(arm.alpha[i])), np.array([arm.a[i], 0.0, arm.d[i]]))
-        self.tool = self.model.addFrame(pin.Frame("tool", parent, place, pin.FrameType.OP_FRAME))
+            parent = self.model.addJoint(parent, pin.JointModelRZ(), placement, f"joint{i + 1}")
+            placement = pin.SE3(pin.utils.rotate("x", float(arm.alpha[i])), np.array([arm.a[i], 0.0, arm.d[i]]))
+        self.tool = self.model.addFrame(pin.Frame("tool", parent, placement, pin.FrameType.OP_FRAME))
         self.data = self.model.createData()
 
     def forward(self, q):

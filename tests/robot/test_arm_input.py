@@ -1,4 +1,4 @@
-"""What an arm refuses, and how it says so; the models that come along."""
+"""What an arm rejects, and how it says so; the models that come along."""
 
 import dataclasses
 
@@ -26,13 +26,13 @@ T = ARM.forward(ARM.home)
         ([[0, 1], [2]], "q must be numbers"),
     ],
 )
-def test_joint_angles_that_are_none_are_refused(q, said):
+def test_joint_angles_that_are_none_are_rejected(q, said):
     for call in (ARM.forward, ARM.jacobian, ARM.manipulability):
         with pytest.raises(InputError, match=said):
             call(q)
 
 
-def test_one_configuration_is_wanted_where_only_one_makes_sense():
+def test_one_configuration_is_needed_where_only_one_makes_sense():
     for call in (ARM.links, lambda q: ARM.inverse(T, near=q), lambda q: ARM.jacobian_rate(q, np.zeros(6))):
         with pytest.raises(InputError, match=r"must be \(6,\)$"):
             call(np.zeros((2, 6)))
@@ -68,7 +68,7 @@ def test_what_is_wrong_with_near_is_said_of_near():
         (lambda T: "T", "must be numbers"),
     ],
 )
-def test_a_pose_that_is_none_is_refused(change, said):
+def test_a_pose_that_is_none_is_rejected(change, said):
     with pytest.raises(InputError, match=said):
         ARM.inverse(change(T))
     batch = change(T)
@@ -93,7 +93,7 @@ def test_a_pose_that_is_none_is_refused(change, said):
         ({"T_flange_tool": np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0.1}, "T_flange_tool is no rigid motion"),
     ],
 )
-def test_a_table_that_is_none_is_refused(change, said):
+def test_a_table_that_is_none_is_rejected(change, said):
     with pytest.raises(InputError, match=said):
         dataclasses.replace(ARM, **change)
 

@@ -1,4 +1,4 @@
-"""URDF: what is written comes back to the last digit; what no table holds, and what is malformed, is refused by name."""
+"""URDF: what is written comes back to the last digit; what no table holds, and what is malformed, is rejected by name."""
 
 import itertools
 import tempfile
@@ -36,7 +36,7 @@ def returned(arm, tmp_path):
 
 
 def chain_pose(path, q):
-    """The tool by the URDF's own words: every joint's origin, then its turn, up to the last link (slow and obvious)."""
+    """The tool by the URDF itself: every joint's origin, then its rotation, up to the last link (slow and obvious)."""
     T, angles = np.eye(4), iter(q)
     joints = {joint.find("parent").get("link"): joint for joint in ET.parse(path).getroot().findall("joint")}
     link = (set(joints) - {joint.find("child").get("link") for joint in joints.values()}).pop()
@@ -106,7 +106,7 @@ def test_a_standard_table_comes_back_where_it_is_unique(arm):
 
 
 def moved(text, rng):
-    """The same arm with its frames put anywhere: links turned and shifted, axes no longer along z."""
+    """The same arm with its frames put anywhere: links rotated and shifted, axes no longer along z."""
     robot = ET.fromstring(text)
     frames = {"base": np.eye(4), "tool": np.eye(4)}
     for joint in robot.findall("joint"):
@@ -114,7 +114,7 @@ def moved(text, rng):
         origin = joint.find("origin")
         xyz, rpy = (np.array(origin.get(key).split(), float) for key in ("xyz", "rpy"))
         T = pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
-        # A child's new frame must stay on its joint's axis: turn it anyhow, shift it along the axis.
+        # A child's new frame must stay on its joint's axis: rotate it anyhow, shift it along the axis.
         R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
         F = frames.setdefault(child, pose(R, np.array([0, 0, rng.normal() * 0.1])))
         T = np.linalg.inv(frames[parent]) @ T @ F
@@ -122,8 +122,8 @@ def moved(text, rng):
         origin.set("rpy", " ".join(map(repr, map(float, Rotation.from_matrix(T[:3, :3]).as_euler("xyz")))))
         axis = joint.find("axis")
         if axis is not None:
-            turned = F[:3, :3].T @ np.array(axis.get("xyz").split(), float)
-            axis.set("xyz", " ".join(map(repr, map(float, 2.5 * turned))))
+            axis_new = F[:3, :3].T @ np.array(axis.get("xyz").split(), float)
+            axis.set("xyz", " ".join(map(repr, map(float, 2.5 * axis_new))))
     return ET.tostring(robot, encoding="unicode")
 
 
@@ -143,14 +143,18 @@ def test_a_step_between_axes_is_split_exactly(C):
     if 0 < sine < 1e-3:  # the common normal of nearly parallel axes is far away
         return
 
-    def turn(axis, angle):
+    def rotation(axis, angle):
         return pose(Rotation.from_euler(axis, angle).as_matrix(), np.zeros(3))
 
     def shift(x, z):
         return pose(np.eye(3), np.array([x, 0, z]))
 
     made = (
-        turn("z", step.beta) @ shift(step.a, step.d) @ turn("x", step.alpha) @ shift(0, step.e) @ turn("z", step.gamma)
+        rotation("z", step.beta)
+        @ shift(step.a, step.d)
+        @ rotation("x", step.alpha)
+        @ shift(0, step.e)
+        @ rotation("z", step.gamma)
     )
     np.testing.assert_allclose(made, C, atol=1e-14 / max(sine, 1e-3) ** 2)
 
@@ -223,7 +227,7 @@ PRISMATIC = (
         (changed("home_rad", "home_deg"), '<armsight>: home_rad="" must be six numbers'),
     ],
 )
-def test_a_malformed_file_is_refused_in_one_line_that_names_the_element(text, said, tmp_path):
+def test_a_malformed_file_is_rejected_in_one_line_that_names_the_element(text, said, tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(text)
     with pytest.raises(InputError, match=said) as found:
@@ -232,7 +236,7 @@ def test_a_malformed_file_is_refused_in_one_line_that_names_the_element(text, sa
     assert "\n" not in str(found.value)
 
 
-def test_files_that_are_none_are_refused(tmp_path):
+def test_files_that_are_none_are_rejected(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_urdf(tmp_path / "none.urdf")
     (tmp_path / "b.urdf").write_bytes(b"\xff\xfe\x00")
@@ -241,17 +245,17 @@ def test_files_that_are_none_are_refused(tmp_path):
 
 
 def tilted(arm, sizes, seed=0):
-    """URDF text of an arm whose joints' origins are turned a little, and its forward kinematics as a plain product."""
+    """URDF text of an arm whose joints' origins are rotated a little, and its forward kinematics as a plain product."""
     rng, robot = np.random.default_rng(seed), ET.fromstring(urdf_text(arm))
     frames = []
     for i, joint in enumerate(robot.findall("joint")):
         origin = joint.find("origin")
-        turn = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy").split()])
+        rotation = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy").split()])
         if 0 < i < 6:
-            turn = turn * Rotation.from_rotvec(rng.normal(0, sizes, 3))
-            origin.set("rpy", " ".join(repr(float(v)) for v in turn.as_euler("xyz")))
+            rotation = rotation * Rotation.from_rotvec(rng.normal(0, sizes, 3))
+            origin.set("rpy", " ".join(repr(float(v)) for v in rotation.as_euler("xyz")))
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = turn.as_matrix(), [float(word) for word in origin.get("xyz").split()]
+        T[:3, :3], T[:3, 3] = rotation.as_matrix(), [float(word) for word in origin.get("xyz").split()]
         frames.append(T)
 
     def forward(q):
@@ -283,7 +287,7 @@ def test_axes_a_little_off_parallel_are_read_exactly_and_inverted(name, size, tm
     assert arm.size_m == pytest.approx(MODELS[name].size_m, rel=0.03)
 
 
-def test_axes_too_near_to_parallel_for_any_digits_are_refused(tmp_path):
+def test_axes_too_near_to_parallel_for_any_digits_are_rejected(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(changed('xyz="0.2515 0.0 0.0" rpy="0.0 0.0 0.0"', 'xyz="0.2515 0.1 0.0" rpy="0.00000001 0.0 0.0"'))
     with pytest.raises(InputError, match=r"joints 'joint2' and 'joint3' are 5.7e-07 deg from parallel"):

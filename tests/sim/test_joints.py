@@ -38,8 +38,8 @@ def test_the_speed_rises_as_the_motors_equation_says():
 def test_the_current_is_what_drives_it():
     plant = run(JointPlant(), ON, 400)
     torque = joints.DRY_N_M + joints.VISCOUS_N_M_S * plant.qd
-    wanted_ma = torque / joints.CONSTANT_V_S * 1e3
-    assert np.abs(plant.sense().current_ma - wanted_ma).max() < 2  # whole mA of the tick's end
+    expected_ma = torque / joints.CONSTANT_V_S * 1e3
+    assert np.abs(plant.sense().current_ma - expected_ma).max() < 2  # whole mA of the tick's end
     assert plant.sense().current_ma.dtype == np.uint32
 
 
@@ -121,6 +121,6 @@ def test_a_broken_potentiometer_shows_as_it_says(fault, shows):
 
 
 @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, 2.6), [np.nan] * 6])
-def test_angles_beyond_the_stops_are_refused(q):
+def test_angles_beyond_the_stops_are_rejected(q):
     with pytest.raises(InputError, match="six angles within the stops"):
         JointPlant(q)

@@ -95,7 +95,7 @@ def test_board_poses_are_in_view_spread_and_tilted(make, model):
     assert Ts[:, 2, 3].max() > 1.4 * Ts[:, 2, 3].min()
 
 
-def test_a_board_that_is_in_view_of_neither_is_refused():
+def test_a_board_that_is_in_view_of_neither_is_rejected():
     with pytest.raises(InputError, match="no pose of the board"):
         board_poses(np.random.default_rng(0), example_rig(convergence_deg=100.0), chessboard(9, 6, 0.025), 1)
 
@@ -110,7 +110,7 @@ def test_a_path_stays_in_view_and_knows_its_velocity(rig):
     np.testing.assert_allclose(Ts[1:], Ts[:-1] @ exp_se3(0.025 * (twists[1:] + twists[:-1])), atol=2e-4)
 
 
-def test_the_bench_is_what_it_says():
+def test_the_example_rig_is_what_it_says():
     rig = example_rig(baseline_m=0.22, convergence_deg=5.0)
     assert rig.baseline_m == pytest.approx(0.22)
     assert rig.convergence_deg == pytest.approx(5.0, abs=0.1)
@@ -127,7 +127,7 @@ def test_the_demo_makes_two_recordings_and_a_body(tmp_path):
     assert Truth.load(tmp_path / "arm").times_s[1] == pytest.approx(1 / 15)
 
 
-def test_a_truth_that_is_none_is_refused_by_name(tmp_path, recording):
+def test_a_truth_that_is_none_is_rejected_by_name(tmp_path, recording):
     with pytest.raises(InputError, match=r"truth\.json: no such file"):
         Truth.load(tmp_path)
     good = json.loads((recording[0] / "truth.json").read_text())
@@ -138,7 +138,7 @@ def test_a_truth_that_is_none_is_refused_by_name(tmp_path, recording):
             Truth.load(tmp_path)
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path, recording, board):
+def test_a_folder_that_cannot_be_is_reported(tmp_path, recording, board):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
         record(tmp_path / "file" / "below", recording[1], [board])

@@ -1,4 +1,4 @@
-"""Commands, acknowledged or refused; limits that are no faults; the core's own soundness."""
+"""Commands, acknowledged or rejected; limits that are no faults; the core's own soundness."""
 
 import ctypes
 
@@ -11,7 +11,7 @@ NAN, INF = float("nan"), float("inf")
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 @pytest.mark.parametrize("field", ["position_rad", "speed_rad_s", "gravity_duty"])
-def test_a_number_that_is_none_is_refused_and_changes_nothing(moving, field, value):
+def test_a_number_that_is_none_is_rejected_and_changes_nothing(moving, field, value):
     moving.move(0.1)
     acknowledged = moving.outputs.acknowledged_sequence
     twin = twin_of(moving)
@@ -24,12 +24,12 @@ def test_a_number_that_is_none_is_refused_and_changes_nothing(moving, field, val
 
 
 @pytest.mark.parametrize(("gravity", "ticks"), [(1.01, 10), (-1.01, 10), (0.0, 0), (0.0, 10001), (0.0, 2**32 - 1)])
-def test_a_number_out_of_its_range_is_refused(moving, gravity, ticks):
+def test_a_number_out_of_its_range_is_rejected(moving, gravity, ticks):
     moving.move(0.1, gravity=gravity, ticks=ticks)
     assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_OUT_OF_RANGE)
 
 
-def test_an_unknown_command_is_refused(moving):
+def test_an_unknown_command_is_rejected(moving):
     moving.command(99)
     assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_UNKNOWN_COMMAND)
     assert moving.outputs.state == c.STATE_ENABLED
@@ -42,11 +42,11 @@ def test_a_fault_whose_cause_stands_cannot_be_cleared(moving):
     assert (moving.acknowledged(), moving.outputs.rejection) == (False, c.REJECTION_FAULT_STANDS)
 
 
-def test_every_command_is_counted_as_obeyed_or_refused(moving):
+def test_every_command_is_counted_as_acknowledged_or_rejected(moving):
     before = moving.outputs.acknowledged_count, moving.outputs.rejected_count
     kinds = [c.COMMAND_MOVE, 99, c.COMMAND_ENABLE, c.COMMAND_DISABLE, c.COMMAND_CLEAR_FAULTS, c.COMMAND_CLEAR_STOP]
-    told = [(moving.command(kind), moving.acknowledged())[1] for kind in kinds]
-    assert told == [True, False, False, True, True, False]
+    reported = [(moving.command(kind), moving.acknowledged())[1] for kind in kinds]
+    assert reported == [True, False, False, True, True, False]
     assert (moving.outputs.acknowledged_count, moving.outputs.rejected_count) == (before[0] + 3, before[1] + 3)
 
 
@@ -138,7 +138,7 @@ def test_a_jump_of_the_target_is_travelled_at_the_speed_limit(moving):
     assert moving.outputs.faults == 0
 
 
-def test_a_speed_beyond_the_limit_is_cut_and_told(moving):
+def test_a_speed_beyond_the_limit_is_cut_and_reported(moving):
     moving.move(0.0, speed_rad_s=9.0, ticks=200)
     assert moving.outputs.limited[0] & c.LIMITED_SPEED
     assert moving.tick(200).reference_rad_s[0] <= 2.0
@@ -146,7 +146,7 @@ def test_a_speed_beyond_the_limit_is_cut_and_told(moving):
 
 def test_too_much_current_takes_duty_away_and_gives_it_back(moving):
     moving.wander(1000, amplitude_rad=0.0)
-    duties, told = {}, {}
+    duties, reported = {}, {}
     for milliamperes in (1000, 1500, 0):
         for i in JOINTS:
             moving.inputs.current_ma[i] = milliamperes
@@ -154,14 +154,14 @@ def test_too_much_current_takes_duty_away_and_gives_it_back(moving):
         # 0.5 A beyond the limit take 2.5 duty per second, so that nothing is left of 0.8 after 0.32 s.
         outputs = [c.core_outputs.from_buffer_copy(raw) for raw in moving.history[-1500:]]
         duties[milliamperes] = max(abs(out.duty[0]) for out in outputs)
-        told[milliamperes] = any(out.limited[0] & c.LIMITED_CURRENT for out in outputs)
+        reported[milliamperes] = any(out.limited[0] & c.LIMITED_CURRENT for out in outputs)
     assert duties[1500] == 0.0
-    assert told == {1000: False, 1500: True, 0: False}
+    assert reported == {1000: False, 1500: True, 0: False}
     assert duties[0] == pytest.approx(duties[1000], rel=0.2)
     assert moving.outputs.faults == 0
 
 
-def test_a_motor_wired_the_other_way_is_turned_by_its_configuration(library):
+def test_a_motor_wired_the_other_way_is_reversed_by_its_configuration(library):
     config = lab_config(library)
     config.joint[0].motor_direction = -1
     arm = LabArm(library, config)

@@ -56,7 +56,7 @@ def overrun(arm):
 
 
 def block(short_rad):
-    """Block the arm and ask it for a place so far away."""
+    """Block the arm and ask it for an angle so far away."""
 
     def provoke(arm):
         arm.blocked = True
@@ -200,7 +200,7 @@ def test_a_jump_of_the_reading_is_no_speed(moving):
     assert out.speed_rad_s[3] == 0.0
 
 
-def test_a_joint_driven_hard_that_turns_does_not_stall(library):
+def test_a_joint_driven_hard_that_moves_does_not_stall(library):
     config = lab_config(library)
     for joint in config.joint:
         joint.stall_duty = 0.2

@@ -70,7 +70,7 @@ class Pid:
 
 
 def respond(controller, reference, ticks=3000):
-    """The duties and angles of a joint (5 rad/s at full duty, 30 ms, half a duty of weight) under a controller."""
+    """The duties and angles of a joint (5 rad/s at full duty, 30 ms, half a duty of gravity load) under a controller."""
     angle, speed, duties, angles = 0.0, 0.0, [], []
     for k in range(ticks):
         at, rate = reference(k * DT)
@@ -115,7 +115,7 @@ def test_the_duty_stays_within_its_limit_and_says_so(library, gains):
     assert held == c.LIMITED_DUTY
 
 
-def test_a_current_limit_is_told_apart_from_a_duty_limit(library):
+def test_a_current_limit_is_reported_apart_from_a_duty_limit(library):
     pid = Pid(library, 10, 0, 0, 0, 0, 0, limit=0.8, cap=0.2)
     assert pid.step(1.0) == ctypes.c_float(0.2).value
     assert pid.limited == c.LIMITED_CURRENT
@@ -186,7 +186,7 @@ def test_a_slew_limit_does_not_wind_up_either(library):
 
 @pytest.mark.parametrize("after", [(8, 8, 0.1, 0.2, 0.005, 20), (4, 8, 0.4, 0, 0.02, 20), (1, 80, 0, 1, 0, 20)])
 def test_a_change_of_gains_does_not_move_the_duty(library, after):
-    """The tick after a change gives what it would have given without it, to one tick of the new integral's growth."""
+    """The tick after a change gives what it would have given without it, to one tick of the new integral's change."""
     old, new = (Pid(library, 4, 8, 0.1, 0.2, 0.005, 20) for _ in range(2))
     for k in range(100):
         for pid in (old, new):

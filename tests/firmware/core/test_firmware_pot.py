@@ -1,4 +1,4 @@
-"""Potentiometers: counts to angle, and which counts are not believed."""
+"""Potentiometers: counts to angle, and which counts are not accepted."""
 
 import ctypes
 
@@ -73,7 +73,7 @@ def reader(library):
 )
 def test_a_reading_that_cannot_be_is_a_fault_once_it_lasts(reader, counts, fault):
     assert reader.read(counts, CONFIRM - 1) == c.FAULT_NONE
-    assert reader.state.angle_rad == pytest.approx(0.0, abs=1e-6)  # it is not believed meanwhile
+    assert reader.state.angle_rad == pytest.approx(0.0, abs=1e-6)  # it is not accepted meanwhile
     assert reader.state.bad_ticks == CONFIRM - 1
     assert reader.read(counts) == fault
 
@@ -103,21 +103,21 @@ def test_after_missing_readings_the_joint_may_be_as_far_as_it_can_have_moved(rea
     assert reader.state.angle_rad == pytest.approx(0.0399, abs=1e-6)
 
 
-def test_a_jump_is_told_once_and_the_new_place_is_read(reader):
+def test_a_jump_is_reported_once_and_the_new_angle_is_read(reader):
     assert reader.read(40000, CONFIRM) == c.FAULT_POT_JUMP
     assert reader.read(40000) == c.FAULT_NONE
     assert reader.state.angle_rad == pytest.approx(0.7, abs=1e-6)
 
 
-def test_after_an_open_wire_any_place_is_believed(reader):
+def test_after_an_open_wire_any_angle_is_accepted(reader):
     assert reader.read(65535, 100) == c.FAULT_POT_OPEN
     assert reader.read(10000) == c.FAULT_NONE
     assert reader.state.angle_rad == pytest.approx(-2.3, abs=1e-6)
 
 
 @given(st.lists(st.integers(0, 65535), max_size=200))
-def test_a_believed_angle_never_moves_faster_than_the_joint_can(library, readings):
-    """Unless a fault was told: what the arm acts on is continuous."""
+def test_a_accepted_angle_never_moves_faster_than_the_joint_can(library, readings):
+    """Unless a fault was reported: what the arm acts on is continuous."""
     reader, last, since = Reader(library), None, 1
     for counts in readings:
         fault = reader.read(counts)

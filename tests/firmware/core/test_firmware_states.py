@@ -112,7 +112,7 @@ def test_only_motion_commands_feed_the_silence_timer(moving):
     assert moving.outputs.first_fault == c.FAULT_HOST_SILENT
 
 
-def test_a_refused_motion_command_does_not_feed_it_either(moving):
+def test_a_rejected_motion_command_does_not_feed_it_either(moving):
     for _ in range(12):
         moving.move(NAN)
         moving.tick(8)

@@ -11,7 +11,7 @@ from armsight import firmware
 
 
 def fate(host):
-    """What the board said last of its commands: acknowledged, refused, why."""
+    """What the board said last of its commands: acknowledged, rejected, why."""
     status = host.newest("BOARD_STATUS")
     return status.acknowledged_sequence, status.rejected_sequence, status.rejection
 
@@ -23,14 +23,14 @@ def test_every_hello_is_answered_with_who_the_board_is(fresh):
     board.tick(host.hello(nonce=4711))
     board.tick()
     welcome = host.newest("WELCOME")
-    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (1, 1, 4711)
+    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (2, 1, 4711)
     assert (welcome.board, welcome.joints, welcome.baud) == ("pil", c.JOINTS, 921600)
     assert (welcome.ticks_per_s, welcome.config_source) == (c.TICKS_PER_S, c.CONFIG_FACTORY)
     assert welcome.firmware == version("armsight")
 
 
 @pytest.mark.parametrize("other", [{"dialect": 2}, {"config": 2}, {"dialect": 0}])
-def test_a_host_of_another_version_is_told_who_the_board_is_and_may_only_stop_it(working, other):
+def test_a_host_of_another_version_is_reported_who_the_board_is_and_may_only_stop_it(working, other):
     board, host = working
     board.run(2, host.hello(nonce=9, **other))
     host.listen()
@@ -46,7 +46,7 @@ def test_a_host_of_another_version_is_told_who_the_board_is_and_may_only_stop_it
 
 
 @pytest.mark.parametrize("message", ["move", "command", "gains", "store"])
-def test_nothing_is_obeyed_before_a_hello(fresh, message):
+def test_nothing_is_acknowledged_before_a_hello(fresh, message):
     board, host = fresh
     sent = {
         "move": host.move,
@@ -65,7 +65,7 @@ def test_what_asks_for_no_command_is_not_answered_before_a_hello(fresh):
     assert host.listen() == []
 
 
-def test_commands_are_obeyed_by_number_and_old_ones_dropped(working):
+def test_commands_are_acknowledged_by_number_and_old_ones_dropped(working):
     board, host = working
     board.run(2, host.command(c.COMMAND_ENABLE, sequence=5))
     assert board.answer.outputs.state == c.STATE_ENABLED
@@ -107,7 +107,7 @@ def test_one_command_a_tick_in_their_order_and_only_the_newest_move(working):
     assert host.newest("BOARD_STATUS").stale_commands == 2
 
 
-def test_more_commands_than_can_wait_are_refused(working):
+def test_more_commands_than_can_wait_are_rejected(working):
     board, host = working
     board.tick(b"".join(host.command(c.COMMAND_DISABLE) for _ in range(10)))
     board.run(30)
@@ -129,27 +129,27 @@ def test_a_stop_is_taken_in_its_tick_and_drops_what_waits(working):
     assert board.answer.outputs.state == c.STATE_DISABLED
 
 
-def test_a_stop_is_taken_whatever_its_number_and_told_only_when_taken(working):
+def test_a_stop_is_taken_whatever_its_number_and_reported_only_when_taken(working):
     board, host = working
     board.run(2, host.command(c.COMMAND_ENABLE, sequence=100))
     board.tick(host.pack("stop", 3))
     board.run(6)
     statuses = [message for message in host.listen() if message.get_type() == "BOARD_STATUS"]
-    told = [message.state for message in statuses if message.acknowledged_sequence == 3]
-    assert told
-    assert set(told) == {c.STATE_STOPPED}
+    reported = [message.state for message in statuses if message.acknowledged_sequence == 3]
+    assert reported
+    assert set(reported) == {c.STATE_STOPPED}
     board.run(2, host.command(c.COMMAND_CLEAR_STOP, sequence=50))
     assert board.answer.outputs.state == c.STATE_STOPPED, "an older number than 100 is stale still"
 
 
 @pytest.mark.parametrize("kind", [0, c.COMMAND_MOVE, c.COMMAND_GAINS, 8, 0x100, 2**32 - 1])
-def test_an_order_of_an_unknown_kind_is_refused(working, kind):
+def test_a_command_of_an_unknown_kind_is_rejected(working, kind):
     board, host = working
     board.run(30, host.command(kind))
     assert fate(host) == (0, host.sequence, c.REJECTION_UNKNOWN_COMMAND)
 
 
-def test_a_refusal_of_the_core_is_told_with_its_reason(working):
+def test_a_rejection_of_the_core_is_reported_with_its_reason(working):
     board, host = working
     board.run(2, host.command(c.COMMAND_ENABLE))
     board.run(30, host.move(float("nan")))

@@ -18,7 +18,7 @@ from armsight.robot.boards.opening import open_emulator
 
 RETURN = 0x3FFE0
 STACKED = 26 * 4 + 8
-#: Primes, so that in time every kind of place is met.
+#: Primes, so that in time every kind of instruction is met.
 EVERY = {"pil_begin": 11, "pil_end": 5}
 
 
@@ -30,10 +30,10 @@ class Interrupted:
         self.arm = pytest.importorskip("unicorn.arm_const")
         self.unicorn = unicorn
         try:
-            self.machine = open_emulator("unicorn")
+            self.emulator = open_emulator("unicorn")
         except InputError as missing:
             pytest.skip(str(missing))
-        self.uc, self.elf = self.machine.uc, read_elf(firmware.image())
+        self.uc, self.elf = self.emulator.uc, read_elf(firmware.image())
         self.host = Host(None)
         self.number, self.said = 0, {}
         self.answer_at = self.elf.symbols["pil_answer_frame"]
@@ -49,8 +49,8 @@ class Interrupted:
         return bytes(request)
 
     def whole(self, data=b"", *, restart=0) -> c.pil_answer:
-        """A tick without an interrupt in a wrong place."""
-        answer = c.pil_answer.from_buffer_copy(self.machine.tick(self.frame(data, restart=restart)))
+        """A tick without an interrupt at a wrong instruction."""
+        answer = c.pil_answer.from_buffer_copy(self.emulator.tick(self.frame(data, restart=restart)))
         self.keep(answer)
         return answer
 

@@ -90,7 +90,7 @@ def test_a_begin_of_a_long_message_in_noise_swallows_nothing(working):
 
 
 @pytest.mark.parametrize("flag", [1, 2, 0x80])
-def test_signed_and_other_kinds_of_messages_are_refused_at_their_header(working, flag):
+def test_signed_and_other_kinds_of_messages_are_rejected_at_their_header(working, flag):
     board, host = working
     before = settle(board, host)
     stream = bytearray(b"".join(disables(host)))
@@ -100,7 +100,7 @@ def test_signed_and_other_kinds_of_messages_are_refused_at_their_header(working,
 
 
 @pytest.mark.parametrize("length", [0, 9, 200, 255])
-def test_a_length_no_message_has_is_refused_at_the_header(working, length):
+def test_a_length_no_message_has_is_rejected_at_the_header(working, length):
     board, host = working
     before = settle(board, host)
     stream = bytearray(b"".join(disables(host)))
@@ -149,7 +149,7 @@ def test_the_link_is_usable_20_ms_after_the_last_bad_byte(working):
         assert board.answer.outputs.acknowledged_count == before + 1, case
 
 
-def test_bytes_the_board_had_no_room_for_are_told(fresh_wire):
+def test_bytes_the_board_had_no_room_for_are_reported(fresh_wire):
     fresh_wire.receive(fresh_wire.host.hello(), overrun=3)
     fresh_wire.receive(b"", overrun=4)
     fresh_wire.tick(30)

@@ -83,7 +83,7 @@ def test_nothing_is_stored_while_the_drives_are_on(working):
     assert (status.rejected_sequence, status.rejection) == (host.sequence, c.REJECTION_WRONG_STATE)
 
 
-def test_storing_keeps_its_place_among_the_commands(working):
+def test_storing_keeps_its_order_among_the_commands(working):
     """Enable and store in one breath: the arm is enabled by then, and nothing is stored."""
     board, host = working
     config = lab_config(board.library)
@@ -134,7 +134,7 @@ def test_a_power_cut_takes_the_motion_but_not_the_configuration(working):
     assert host.listen() == [], "it has forgotten its host"
 
 
-def test_a_restart_by_the_watchdog_is_told_until_cleared(working):
+def test_a_restart_by_the_watchdog_is_reported_until_cleared(working):
     board, host = working
     restart(board, host, c.RESTART_WATCHDOG)
     assert (board.answer.outputs.state, board.answer.outputs.first_fault) == (c.STATE_FAULTED, c.FAULT_WATCHDOG)
@@ -143,20 +143,20 @@ def test_a_restart_by_the_watchdog_is_told_until_cleared(working):
 
 
 @pytest.mark.parametrize(("field", "value"), [("magic", 1), ("version", 2), ("length", 513), ("length", 2**32 - 1)])
-def test_a_frame_that_is_none_is_refused_and_no_tick_is_run(working, field, value):
+def test_a_frame_that_is_none_is_rejected_and_no_tick_is_run(working, field, value):
     board, _ = working
     before = copy.copy(bytes(board.answer.outputs))
     kept = getattr(board.request, field)
     setattr(board.request, field, value)
     board.library.pil_tick()
-    assert (board.answer.magic, board.answer.version, board.answer.length) == (c.FRAME_REFUSED, c.FRAME_VERSION, 0)
+    assert (board.answer.magic, board.answer.version, board.answer.length) == (c.FRAME_REJECTED, c.FRAME_VERSION, 0)
     assert bytes(board.answer.outputs) == before
     setattr(board.request, field, kept)
     board.request.magic = c.FRAME_REQUEST
     board.tick()
 
 
-def test_what_could_not_be_stored_is_refused_and_what_comes_meanwhile_waits(fresh_wire):
+def test_what_could_not_be_stored_is_rejected_and_what_comes_meanwhile_waits(fresh_wire):
     """A board whose memory fails; it takes its time to say so."""
     wire, host = fresh_wire, fresh_wire.host
     wire.receive(host.hello())
@@ -180,7 +180,7 @@ def test_what_could_not_be_stored_is_refused_and_what_comes_meanwhile_waits(fres
     assert wire.to_store(), "the part that came meanwhile was left out"
 
 
-def test_a_name_may_take_all_its_place(library):
+def test_a_name_may_take_all_its_bytes(library):
     wire = BareWire(library, BAUD, name=b"sixteen_letters_")
     wire.receive(wire.host.hello())
     wire.tick(5)

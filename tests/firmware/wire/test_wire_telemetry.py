@@ -71,7 +71,7 @@ def test_a_second_of_telemetry(library, baud):
     assert angles[-1].angle_rad == list(wire.outputs.angle_rad)
 
 
-def test_a_change_of_state_is_told_in_its_own_tick(working):
+def test_a_change_of_state_is_reported_in_its_own_tick(working):
     board, host = working
     board.run(37)
     host.listen()
@@ -81,7 +81,7 @@ def test_a_change_of_state_is_told_in_its_own_tick(working):
     assert (first.tick, first.state, first.acknowledged_sequence) == (tick, c.STATE_ENABLED, 1)
 
 
-def test_moves_alone_ask_for_no_status_out_of_turn(working):
+def test_moves_alone_ask_for_no_status_out_of_schedule(working):
     board, host = working
     board.run(3, host.command(c.COMMAND_ENABLE))
     host.listen()
@@ -92,7 +92,7 @@ def test_moves_alone_ask_for_no_status_out_of_turn(working):
     assert host.newest("BOARD_STATUS").acknowledged_count >= 95
 
 
-def test_a_flood_of_refused_commands_leaves_room_for_the_angles(working):
+def test_a_flood_of_rejected_commands_leaves_room_for_the_angles(working):
     board, host = working
     for _ in range(500):
         board.run(1, host.command(99))
@@ -138,7 +138,7 @@ def test_a_telemetry_message_says_what_the_core_said(working):
     assert host.newest("JOINTS").duty != [0.0] * 6
 
 
-def test_faults_are_told_with_their_joint(working):
+def test_faults_are_reported_with_their_joint(working):
     board, host = working
     board.request.counts[4] = 65535
     board.run(30)

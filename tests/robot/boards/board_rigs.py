@@ -1,4 +1,4 @@
-"""Boards for tests: the host build behind a lock-step link, and a link that plays back what a board might say."""
+"""Boards for tests: the host build behind a lock-step link, and a link that replays what a board might send."""
 
 import os
 import pty
@@ -72,8 +72,8 @@ class Speaker:
     def welcome(self, *, dialect_version=1, config_version=1, tick=0):
         return self.say("welcome", dialect_version, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9")
 
-    def status(self, tick=0, *, state=0, refused=(0, 0, 0)):
-        sequence, count, rejection = refused
+    def status(self, tick=0, *, state=0, rejected=(0, 0, 0)):
+        sequence, count, rejection = rejected
         head = (tick, state, 0, [0] * 6, 0, 255, 0, 0, sequence, count, rejection)
         return self.say("board_status", *head, 12000, 0, 0, 0, 0, 0, 0)
 

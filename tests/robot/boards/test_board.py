@@ -17,7 +17,7 @@ ZERO = np.zeros(6)
 
 
 def talking(speaker, **welcome):
-    """A far side that answers the hello, tells its configuration's end, and then says nothing."""
+    """A far side that answers the hello, sends its configuration's end, and then says nothing."""
 
     def answer(data):
         if data[7] == 0x28 and data[8] == 0xA0:  # HELLO, message 41000
@@ -28,7 +28,7 @@ def talking(speaker, **welcome):
     return answer
 
 
-def test_a_hello_tells_who_the_board_is():
+def test_a_hello_says_who_the_board_is():
     board, _, _ = host_board()
     assert (board.welcome.board, board.welcome.ticks_per_s, board.welcome.baud) == ("pil", 1000, 921600)
     assert board.welcome.config_source == ConfigSource.NEWEST
@@ -46,18 +46,18 @@ def test_a_fresh_board_runs_on_factory_values_and_cannot_be_enabled():
 
 
 @pytest.mark.parametrize("versions", [{"dialect_version": 2}, {"config_version": 7}])
-def test_a_board_of_another_version_is_refused_by_name(versions):
+def test_a_board_of_another_version_is_rejected_by_name(versions):
     link = ScriptedLink(talking(Speaker(), **versions))
-    with pytest.raises(DeviceError) as told:
+    with pytest.raises(DeviceError) as raised:
         Board.connect(link, name="/dev/ttyACM0")
-    text = str(told.value)
+    text = str(raised.value)
     for word in ("/dev/ttyACM0", "stm32f4", "9.9.9", "armsight board flash", *map(str, versions.values())):
         assert word in text
     assert len(link.written) == 1  # the hello, and no command
     assert link.closed
 
 
-def test_nothing_on_the_wire_is_told_as_such():
+def test_nothing_on_the_wire_is_reported_as_such():
     link = ScriptedLink()
     with pytest.raises(DeviceError, match=r"no board answers .nothing comes.: is it the right port"):
         Board.connect(link)
@@ -65,12 +65,12 @@ def test_nothing_on_the_wire_is_told_as_such():
     assert link.waited_s == pytest.approx(1.0)  # 20 hellos, 50 ms each
 
 
-def test_something_else_on_the_wire_is_told_as_such():
+def test_something_else_on_the_wire_is_reported_as_such():
     with pytest.raises(DeviceError, match="bytes come, but no answer"):
         Board.connect(ScriptedLink(lambda data: b"Marlin 2.1\nok\n\xfd\x00\xff"))
 
 
-def test_a_board_without_telemetry_is_told_as_such():
+def test_a_board_without_telemetry_is_reported_as_such():
     speaker = Speaker()
     with pytest.raises(DeviceError, match="answers the hello, but sends no telemetry"):
         Board.connect(ScriptedLink(lambda data: speaker.welcome()))
@@ -102,18 +102,18 @@ def test_readings_that_come_while_waiting_are_not_lost():
     assert np.allclose(np.diff(states.t_s), 1e-3)
 
 
-def test_reports_tell_how_joints_are_driven():
+def test_reports_say_how_joints_are_driven():
     board, link, _ = host_board()
     board.enable()
     for _ in range(30):
         board.send(JointCommand([2.9] * 6, ZERO, ZERO, 0.01))
         board.receive(0.01)
-    told, core = board.joints, link.answer["outputs"]
-    assert abs(told.t_s - link.t_s) < 0.02
-    assert np.abs(told.reference_rad - core["reference_rad"]).max() < 0.05
-    assert (told.speed_rad_s > 0.5).all()
-    assert (told.duty > 0.1).all()
-    assert all(each & Limited.SPEED and each & Limited.SOFT for each in told.limited)
+    reported, core = board.joints, link.answer["outputs"]
+    assert abs(reported.t_s - link.t_s) < 0.02
+    assert np.abs(reported.reference_rad - core["reference_rad"]).max() < 0.05
+    assert (reported.speed_rad_s > 0.5).all()
+    assert (reported.duty > 0.1).all()
+    assert all(each & Limited.SPEED and each & Limited.SOFT for each in reported.limited)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_an_emergency_stop_survives_a_disturbed_copy_of_itself():
     board.enable()
 
 
-def test_gains_are_taken_whole_or_refused_by_name():
+def test_gains_are_taken_whole_or_rejected_by_name():
     board, _, _ = host_board()
     gains = gains_array(board.configuration())
     gains[2, 1] = 40.0
@@ -227,7 +227,7 @@ def test_a_configuration_is_not_stored_with_the_drives_on():
         board.store(broken)
 
 
-def test_faults_are_told_with_their_joint_and_text():
+def test_faults_are_reported_with_their_joint_and_text():
     board, _, plant = host_board()
     plant.break_pot(3, PotFault.OPEN)
     board.receive(0.05)
@@ -240,7 +240,7 @@ def test_faults_are_told_with_their_joint_and_text():
 
 
 @pytest.mark.parametrize(("reaction", "does"), [(1, "slows down and holds the arm"), (2, "switches the drives off")])
-def test_a_silent_board_is_told_with_what_its_arm_does(reaction, does):
+def test_a_silent_board_is_reported_with_what_its_arm_does(reaction, does):
     config = lab_configuration()
     config["silence_reaction"], config["silence_ticks"] = reaction, 250
     board, link, _ = host_board(config)
@@ -258,7 +258,7 @@ def test_a_silent_board_is_told_with_what_its_arm_does(reaction, does):
         keep_on(board)
 
 
-def test_a_link_that_breaks_is_told_with_what_the_arm_does():
+def test_a_link_that_breaks_is_reported_with_what_the_arm_does():
     board, link, _ = host_board()
 
     def gone(*_):
@@ -272,7 +272,7 @@ def test_a_link_that_breaks_is_told_with_what_the_arm_does():
         board.send(hold(ZERO))
 
 
-def test_a_board_that_started_anew_is_told():
+def test_a_board_that_started_anew_is_reported():
     board, link, _ = host_board()
     link.restart(watchdog=True)
     with pytest.raises(DeviceError, match="has started anew: its drives are off; connect to it again"):
@@ -280,7 +280,7 @@ def test_a_board_that_started_anew_is_told():
     assert [each.fault for each in Board.connect(link).status.faults] == [Fault.WATCHDOG]
 
 
-def test_a_clock_that_starts_again_is_told():
+def test_a_clock_that_starts_again_is_reported():
     speaker = Speaker()
     link = ScriptedLink(talking(speaker, tick=50_000))
     board = Board.connect(link)

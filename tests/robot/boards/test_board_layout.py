@@ -16,8 +16,8 @@ NUMBERS = {"JOINTS": 6, "POT_NODES": 9, "FRAME_BYTES": 512}
 KINDS = {"float": "<f4", "uint32_t": "<u4", "uint16_t": "<u2", "int32_t": "<i4", "uint8_t": "|u1"}
 
 
-def header(*place):
-    return re.sub(r"/\*.*?\*/", "", FIRMWARE.joinpath(*place).read_text(encoding="utf-8"), flags=re.DOTALL)
+def header(*path):
+    return re.sub(r"/\*.*?\*/", "", FIRMWARE.joinpath(*path).read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 TYPES, FRAMES, CONFIG_H = header("core", "types.h"), header("boards", "pil", "frame.h"), header("core", "config.h")
@@ -64,14 +64,14 @@ def listed(which, text=TYPES):
     [
         ("FAULT", codes.Fault, codes.FAULT_TEXTS),
         ("STATE", codes.BoardState, codes.STATE_TEXTS),
-        ("REFUSAL", codes.Rejection, codes.REJECTION_TEXTS),
+        ("REJECTION", codes.Rejection, codes.REJECTION_TEXTS),
     ],
 )
 def test_codes_and_texts_are_the_headers(which, ours, texts):
     theirs = listed(which)
     assert len(theirs) > 5
-    told = {member.name: (member.value, texts[member]) for member in ours if member.name != "NONE"}
-    assert told == theirs
+    reported = {member.name: (member.value, texts[member]) for member in ours if member.name != "NONE"}
+    assert reported == theirs
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_what_a_tick_packs_and_reads_is_laid_out_alike():
     packed = rng.bytes(frames.ANSWER.itemsize)
     answer = np.frombuffer(packed, frames.ANSWER)[0]
     outputs = answer["outputs"]
-    told = [answer["magic"], answer["version"], answer["tick"], outputs["drives_on"], answer["length"]]
-    assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == told
+    reported = [answer["magic"], answer["version"], answer["tick"], outputs["drives_on"], answer["length"]]
+    assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == reported
     assert packed[frames.DUTY_AT : frames.DUTY_AT + 24] == outputs["duty"].tobytes()
     assert packed[frames.BYTES_AT :] == answer["bytes"].tobytes()

@@ -22,14 +22,14 @@ class Pipe:
         pass
 
 
-def told(message):
+def reported(message):
     if message.get_type() == "ANGLES":
         return ("ANGLES", message.tick, *message.angle_rad)
     return message.get_type(), bytes(message.get_msgbuf())
 
 
 def stream(rng, disturbed, count=100):
-    """Frames of all kinds a board sends most; some missing, some with a bit turned, some with noise before them."""
+    """Frames of all kinds a board sends most; some missing, some with a bit flipped, some with noise before them."""
     spoken = dialect()
     mav, out = spoken.MAVLink(None), b""
     for tick in range(count):
@@ -58,6 +58,6 @@ def test_a_wire_hears_what_the_parser_hears(monkeypatch, disturbed):
             count = rng.choice([1, 5, 40, 92, 368])
             fast._link.waiting = slow._link.waiting = sent[:count]
             sent = sent[count:]
-            assert list(map(told, fast.receive(0.0))) == list(map(told, slow.receive(0.0)))
+            assert list(map(reported, fast.receive(0.0))) == list(map(reported, slow.receive(0.0)))
             assert (fast.heard, fast.broken, fast.lost) == (slow.heard, slow.broken, slow.lost)
         assert fast.broken == 0 or disturbed

@@ -59,15 +59,15 @@ EDGES = [
 
 def changed(path, joint, item, value):
     config = lab_configuration()
-    place = config
+    field = config
     for name in path[:-1]:
-        place = place[name]
-    place = place[path[-1]]
+        field = field[name]
+    field = field[path[-1]]
     index = (joint,) if path[0] == "joint" else ()
-    if place.ndim > len(index):
+    if field.ndim > len(index):
         index += (item,)
     with np.errstate(all="ignore"):
-        place[index] = np.array(value).astype(place.dtype)
+        field[index] = np.array(value).astype(field.dtype)
     return config
 
 
@@ -90,7 +90,7 @@ values = st.one_of(st.sampled_from(EDGES), st.floats(-2e4, 7e4), st.just(float("
 @given(path=st.sampled_from(FIELDS), joint=st.integers(0, 5), item=st.integers(0, 8), value=values)
 @example(path=("silence_ticks",), joint=0, item=0, value=1)
 @example(path=("joint", "pot", "jump_rad"), joint=2, item=0, value=1e-4)
-def test_the_host_refuses_what_the_board_would(is_valid, path, joint, item, value):
+def test_the_host_rejects_what_the_board_would(is_valid, path, joint, item, value):
     config = changed(path, joint, item, value)
     assert is_good(config) == is_valid(config), path
 

@@ -13,7 +13,7 @@ from armsight.robot.boards.opening import EMULATORS, configured, open_board, ope
 from armsight.sim.joints import JointPlant
 
 
-class RecordingMachine:
+class RecordingEmulator:
     """Keeps the requests and answers each with its tick."""
 
     def __init__(self, **changed):
@@ -33,11 +33,11 @@ class RecordingMachine:
 
 
 def test_requests_carry_what_is_sensed():
-    machine, plant = RecordingMachine(), JointPlant()
+    emulator, plant = RecordingEmulator(), JointPlant()
     plant.supply_mv, plant.stop_pressed = 11500, True
-    link = EmulatedLink(machine, plant)
+    link = EmulatedLink(emulator, plant)
     link.step(2)
-    first, second = machine.requests
+    first, second = emulator.requests
     assert (first["magic"], first["version"], first["tick"], second["tick"]) == (REQUEST_MAGIC, 1, 1, 2)
     assert (first["supply_mv"], first["stop_pressed"]) == (11500, 1)
     assert np.abs(first["counts"].astype(int) - 32768).max() < 40
@@ -46,15 +46,15 @@ def test_requests_carry_what_is_sensed():
 
 @pytest.mark.parametrize("baud", [9600, 115200, 921600])
 def test_bytes_ride_in_at_the_baud_rate(baud):
-    machine = RecordingMachine()
-    link = EmulatedLink(machine, JointPlant(), baud)
+    emulator = RecordingEmulator()
+    link = EmulatedLink(emulator, JointPlant(), baud)
     link.step(50)  # what the wire could have carried meanwhile does not add up
     sent = bytes(k % 251 for k in range(700))
     link.write(sent[:400])
     link.write(sent[400:])
     link.step(900)
-    lengths = [int(frame["length"]) for frame in machine.requests[50:]]
-    arrived = b"".join(frame["bytes"][: frame["length"]].tobytes() for frame in machine.requests)
+    lengths = [int(frame["length"]) for frame in emulator.requests[50:]]
+    arrived = b"".join(frame["bytes"][: frame["length"]].tobytes() for frame in emulator.requests)
     assert arrived == sent
     ticks = len(sent) / (baud / 10_000)
     last = max(k for k, length in enumerate(lengths) if length) + 1
@@ -63,33 +63,33 @@ def test_bytes_ride_in_at_the_baud_rate(baud):
 
 
 def test_wire_faults_stand_between_both_sides():
-    class Swap:
+    class Reverse:
         def to_board(self, tick, data):
             return data[::-1]
 
         def to_host(self, tick, data):
             return data + bytes([tick])
 
-    machine = RecordingMachine(length=2)
-    link = EmulatedLink(machine, JointPlant(), faults=Swap())
+    emulator = RecordingEmulator(length=2)
+    link = EmulatedLink(emulator, JointPlant(), faults=Reverse())
     link.write(b"abc")
     assert link.read(0.002) == b"\0\0\1\0\0\2"
-    assert machine.requests[0]["bytes"][:3].tobytes() == b"cba"
+    assert emulator.requests[0]["bytes"][:3].tobytes() == b"cba"
 
 
 def test_a_world_that_owns_the_time_steps_the_link():
-    machine, asked = RecordingMachine(), []
+    emulator, asked = RecordingEmulator(), []
 
     def advance(dt_s):
         asked.append(dt_s)
         for _ in range(round(dt_s * 1000)):
             link.step()
 
-    link = EmulatedLink(machine, JointPlant(), advance=advance)
+    link = EmulatedLink(emulator, JointPlant(), advance=advance)
     link.read(0.003)
     link.read()
     assert asked == [0.003]
-    assert len(machine.requests) == 3
+    assert len(emulator.requests) == 3
 
 
 def test_a_whole_board_runs_in_a_world_that_owns_the_time():
@@ -100,20 +100,20 @@ def test_a_whole_board_runs_in_a_world_that_owns_the_time():
 
 
 @pytest.mark.parametrize("changed", [{"magic": 0}, {"version": 2}, {"tick": 9}])
-def test_an_answer_of_another_image_is_refused(changed):
-    link = EmulatedLink(RecordingMachine(**changed), JointPlant())
+def test_an_answer_of_another_image_is_rejected(changed):
+    link = EmulatedLink(RecordingEmulator(**changed), JointPlant())
     with pytest.raises(
         DeviceError, match="did not answer tick 1 with a frame of version 1: its image and this armsight"
     ):
         link.step()
 
 
-def test_a_closed_link_says_so_and_ends_its_machine():
-    machine = RecordingMachine()
-    link = EmulatedLink(machine, JointPlant())
+def test_a_closed_link_says_so_and_ends_its_emulator():
+    emulator = RecordingEmulator()
+    link = EmulatedLink(emulator, JointPlant())
     link.close()
     link.close()
-    assert machine.closed
+    assert emulator.closed
     for use in (link.read, link.step, lambda: link.write(b"x")):
         with pytest.raises(DeviceError, match="the emulated board is closed"):
             use()
@@ -122,10 +122,10 @@ def test_a_closed_link_says_so_and_ends_its_machine():
 @pytest.mark.parametrize("baud", [0, -1])
 def test_a_baud_rate_must_be_one(baud):
     with pytest.raises(InputError, match="baud"):
-        EmulatedLink(RecordingMachine(), JointPlant(), baud)
+        EmulatedLink(RecordingEmulator(), JointPlant(), baud)
 
 
-def test_lost_time_is_told_by_its_own_fault():
+def test_lost_time_is_reported_by_its_own_fault():
     for spoil, fault in (
         (lambda link: link.miss(3), Fault.TICK_MISSED),
         (lambda link: link.overrun(), Fault.TICK_OVERRUN),
@@ -171,6 +171,6 @@ def test_boards_are_opened_by_name():
         open_board("/dev/ttyACM0")
     with pytest.raises(InputError, match="emulated:host needs a plant"):
         open_board("emulated:host")
-    with pytest.raises(InputError, match="no machine 'bochs'; there are unicorn, qemu, host"):
+    with pytest.raises(InputError, match="no emulator 'bochs'; there are unicorn, qemu, host"):
         open_emulator("bochs")
     assert set(EMULATORS) == {"unicorn", "qemu", "host"}

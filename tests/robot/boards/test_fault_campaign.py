@@ -32,20 +32,20 @@ def test_nothing_is_violated_by_any_kind_of_fault(campaign):
 
 
 class Changed:
-    """The firmware with something wrong: its answers, or what it is told, are changed."""
+    """The firmware with something wrong: its answers, or what it is reported, are changed."""
 
     def __init__(self, *, answer=lambda frame: None, request=lambda frame: None):
-        self.machine, self.answer, self.request = open_emulator("host"), answer, request
+        self.emulator, self.answer, self.request = open_emulator("host"), answer, request
 
     def tick(self, request):
         asked = np.frombuffer(bytearray(request), REQUEST)
         self.request(asked[0])
-        said = np.frombuffer(bytearray(self.machine.tick(asked.tobytes())), ANSWER)
+        said = np.frombuffer(bytearray(self.emulator.tick(asked.tobytes())), ANSWER)
         self.answer(said[0])
         return said.tobytes()
 
     def close(self):
-        self.machine.close()
+        self.emulator.close()
 
 
 def never_releases(frame):
@@ -72,7 +72,7 @@ def overdrives(frame):
     ("change", "kind", "found"),
     [
         ({"answer": never_releases}, "dip", "leaves the drives on"),
-        ({"request": blind_to_supply}, "dip", "SUPPLY_LOW of joint None is told as None"),
+        ({"request": blind_to_supply}, "dip", "SUPPLY_LOW of joint None is reported as None"),
         ({"answer": forgets_numbers}, "flip", "as acknowledged last, the core"),
         ({"answer": overdrives}, "jump", "of its limit"),
     ],
@@ -83,7 +83,7 @@ def test_a_firmware_with_a_mistake_is_found(campaign, monkeypatch, change, kind,
     assert any(found in each for each in outcome.violations), outcome.violations[:5]
 
 
-def test_noise_strikes_as_it_is_told(campaign):
+def test_noise_strikes_as_it_is_reported(campaign):
     noise = campaign.Noise(np.random.default_rng(1))
     data = bytes(range(60))
     assert noise.to_board(1, data) == noise.to_host(1, data) == data

@@ -41,11 +41,11 @@ def cable():
         ("/tmp", "/tmp: not a serial port"),
     ],
 )
-def test_a_wrong_port_is_told(monkeypatch, port, said):
+def test_a_wrong_port_is_reported(monkeypatch, port, said):
     monkeypatch.setattr("armsight.robot.boards.serial.list_ports", list)
-    with pytest.raises(DeviceError) as told:
+    with pytest.raises(DeviceError) as raised:
         SerialLink.open(port)
-    assert said in str(told.value)
+    assert said in str(raised.value)
 
 
 def test_ports_that_are_there_are_named(monkeypatch):
@@ -63,16 +63,16 @@ def test_ports_that_are_there_are_named(monkeypatch):
         (errno.EIO, "cannot be opened"),
     ],
 )
-def test_a_port_that_is_refused_is_told(monkeypatch, code, said):
-    def refuse(*_, **__):
+def test_a_port_that_is_rejected_is_reported(monkeypatch, code, said):
+    def reject(*_, **__):
         raise serial.SerialException(code, os.strerror(code))
 
-    monkeypatch.setattr(serial, "Serial", refuse)
+    monkeypatch.setattr(serial, "Serial", reject)
     with pytest.raises(DeviceError, match=f"/dev/ttyACM0: {said}"):
         SerialLink.open("/dev/ttyACM0")
 
 
-def test_a_missing_pyserial_is_told(monkeypatch):
+def test_a_missing_pyserial_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(InputError, match=r"pip install 'armsight.board.'"):
         SerialLink.open("/dev/ttyACM0")
@@ -120,16 +120,16 @@ def test_a_board_behind_a_port_follows_as_one_in_lock_step(cable):
         assert (np.diff(states.t_s) > 0).all()
 
 
-def test_a_cable_pulled_in_motion_is_told_and_the_arm_stops_by_itself(cable):
+def test_a_cable_pulled_in_motion_is_reported_and_the_arm_stops_by_itself(cable):
     board = open_board(f"serial:{cable.port}")
     board.enable()
     far = hold([2.0] * 6, 1.0)
     until(board, lambda: board.joints.reference_rad_s.min() > 0.3, far)
     cable.pull()
-    wanted = (
+    expected = (
         f"{cable.port} is gone: was the cable pulled.*without commands the board slows down and holds.* after 100 ms"
     )
-    with pytest.raises(DeviceError, match=wanted):
+    with pytest.raises(DeviceError, match=expected):
         keep_on(board, sends=far, wait_s=0.001)
     board.close()
     # The board knows nothing of cables: it hears nothing for 100 ms and then slows the arm down and holds it.
@@ -173,7 +173,7 @@ def test_a_bare_board_passes_at_rest():
     assert [each.problems for each in result.scenarios.values()] == [()] * 4
 
 
-def test_a_board_of_another_baud_rate_or_none_at_all_is_told():
+def test_a_board_of_another_baud_rate_or_none_at_all_is_reported():
     master, slave = pty.openpty()
     os.write(master, b"\xfd\x03garbage")
     with pytest.raises(DeviceError, match="no board answers"):

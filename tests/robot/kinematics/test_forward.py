@@ -25,9 +25,9 @@ def draw(seed, n=50):
 @every
 def test_forward_and_links_are_the_products_of_the_table(arm):
     for q in draw(1):
-        wanted = arms.frames(arm, q)
-        np.testing.assert_allclose(arm.forward(q), wanted[-1], rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(arm.links(q), wanted, rtol=0, atol=ROUNDING)
+        expected = arms.frames(arm, q)
+        np.testing.assert_allclose(arm.forward(q), expected[-1], rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(arm.links(q), expected, rtol=0, atol=ROUNDING)
 
 
 def test_frame_0_of_a_modified_table_is_before_its_first_twist_and_length():
@@ -64,37 +64,37 @@ def test_jacobian_is_the_derivative_of_forward(arm):
             return np.concatenate([Tp[:3, 3], log_so3(Tp[:3, :3] @ T[:3, :3].T)])
 
         # Richardson's error is of order step^4 = 1e-12; rounding leaves 1e-15 / 1e-3 times a few.
-        wanted = numeric_jacobian(moved, q, 1e-3)
-        np.testing.assert_allclose(arm.jacobian(q), wanted, rtol=0, atol=3e-11)
-        turn = np.kron(np.eye(2), T[:3, :3].T)
-        np.testing.assert_allclose(arm.jacobian(q, "tool"), turn @ arm.jacobian(q), rtol=0, atol=ROUNDING)
+        expected = numeric_jacobian(moved, q, 1e-3)
+        np.testing.assert_allclose(arm.jacobian(q), expected, rtol=0, atol=3e-11)
+        rotate = np.kron(np.eye(2), T[:3, :3].T)
+        np.testing.assert_allclose(arm.jacobian(q, "tool"), rotate @ arm.jacobian(q), rtol=0, atol=ROUNDING)
 
 
 @every
 @pytest.mark.parametrize("frame", ["base", "tool"])
 def test_jacobian_rate_is_its_derivative_by_time(arm, frame):
     for q, qd in zip(draw(4, 10), draw(5, 10), strict=True):
-        wanted = numeric_jacobian(lambda t, q=q, qd=qd: arm.jacobian(q + t[0] * qd, frame), np.zeros(1), 3e-4)[..., 0]
+        expected = numeric_jacobian(lambda t, q=q, qd=qd: arm.jacobian(q + t[0] * qd, frame), np.zeros(1), 3e-4)[..., 0]
         # Richardson's error: step^4 times the fifth derivative, below (6 pi)^5 x 3 m.
-        np.testing.assert_allclose(arm.jacobian_rate(q, qd, frame), wanted, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(arm.jacobian_rate(q, qd, frame), expected, rtol=0, atol=1e-8)
 
 
 @every
 def test_manipulability_is_the_volume_of_the_velocity_ellipsoid(arm):
     q = draw(6, 20)
-    wanted = [np.prod(np.linalg.svd(J)[1]) for J in arm.jacobian(q)]
-    np.testing.assert_allclose(arm.manipulability(q), wanted, rtol=0, atol=1e-13)
+    expected = [np.prod(np.linalg.svd(J)[1]) for J in arm.jacobian(q)]
+    np.testing.assert_allclose(arm.manipulability(q), expected, rtol=0, atol=1e-13)
     assert arm.manipulability(q[0]) == arm.manipulability(q)[0]
 
 
 @given(st.floats(-4000, 4000))
-def test_sine_and_cosine_are_within_two_last_places(x):
+def test_sine_and_cosine_are_within_two_units_in_the_last_place(x):
     s, c = sincos(x)
     assert abs(s - np.sin(x)) <= 2 * np.spacing(max(abs(np.sin(x)), 1e-300)) + 1e-19
     assert abs(c - np.cos(x)) <= 2 * np.spacing(max(abs(np.cos(x)), 1e-300)) + 1e-19
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-def test_the_angle_of_a_point_is_within_two_last_places(y, x):
+def test_the_angle_of_a_point_is_within_two_units_in_the_last_place(y, x):
     y, x = (0.0 if abs(v) < 1e-150 else v for v in (y, x))
     assert abs(angle_of(y, x) - np.arctan2(y + 0.0, x + 0.0)) <= 2 * np.spacing(abs(np.arctan2(y, x)))

@@ -22,11 +22,11 @@ def check(arm, T, answer):
     """What every answer must be, whatever the pose."""
     assert np.isfinite(answer.rows).all()
     for k, q in enumerate(answer.q):
-        far, turned = arms.off(arms.forward(arm, q), T)
+        far, rotation = arms.off(arms.forward(arm, q), T)
         assert far < 1e-9
-        assert turned < 1e-9
+        assert rotation < 1e-9
         assert abs(answer.residual_m[k] - far) < 1e-14
-        assert abs(answer.residual_rad[k] - turned) < 3e-8  # the chord's own rounding
+        assert abs(answer.residual_rad[k] - rotation) < 3e-8  # the chord's own rounding
         assert answer.within_limits[k] == arm.within_limits(q)
         for other in answer.q[:k]:
             assert arms.apart(q, other) > 1e-7
@@ -53,14 +53,14 @@ def test_every_solution_brings_the_tool_there_and_the_known_one_is_found(arm):
         T = arms.forward(arm, q)
         answer = arm.inverse(T)
         check(arm, T, answer)
-        # Both halves of the way there round in the 16th place; a Jacobian this bad is not drawn in 300.
+        # Both halves of the way there round in the 16th digit; a Jacobian this bad is not sampled in 300.
         assert arms.apart(answer.q, q).min() < 1e-8
         assert (answer.residual_m < 1e-12).all()
         assert (answer.residual_rad < 1e-12).all()
 
 
 @given(st.sampled_from(arms.EXACT), vectors(-np.pi, np.pi, 6), st.integers(0, 63))
-def test_any_angles_come_back_even_with_joints_at_nothing_or_half_a_turn(arm, q, which):
+def test_any_angles_come_back_even_with_joints_at_nothing_or_half_a_revolution(arm, q, which):
     flags = np.array([which >> i & 1 for i in range(6)], dtype=bool)
     q = np.where(flags, np.round(q / np.pi) * np.pi, q)
     T = arms.forward(arm, q)
@@ -76,12 +76,12 @@ def test_any_pose_is_answered(arm, p, phi):
 
 
 @pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
-def test_configurations_are_all_different_and_told_right(arm):
+def test_configurations_are_all_different_and_reported_right(arm):
     for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
         answer = arm.inverse(arm.forward(q))
-        told = answer.configurations
-        assert len(set(told)) == len(told)
-        for configuration, angles in zip(told, answer.q, strict=True):
+        reported = answer.configurations
+        assert len(set(reported)) == len(reported)
+        for configuration, angles in zip(reported, answer.q, strict=True):
             theta = arm.direction * angles + arm.offset
             L = arm.links(angles)
             ahead = L[1][:3, 0] @ (L[5][:3, 3] - L[1][:3, 3]) + arm.a[0]
@@ -103,9 +103,9 @@ def test_poses_near_singularities_are_answered_as_well(arm):
     assert (many.count > 0).mean() > 0.999  # where wrist, elbow and shoulder are singular at once one may be lost
     there = np.arange(many.q.shape[1]) < many.count[:, None]
     assert np.isfinite(many.q).all()
-    far, turned = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
+    far, rotation = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
     assert far.max() < 1e-9
-    assert turned.max() < 1e-9
+    assert rotation.max() < 1e-9
     for i in range(many.q.shape[1]):
         for j in range(i):
             both = there[:, i] & there[:, j]
@@ -113,13 +113,13 @@ def test_poses_near_singularities_are_answered_as_well(arm):
 
 
 @pytest.mark.parametrize("arm", arms.IDENTIFIED, ids=arms.names(arms.IDENTIFIED))
-def test_an_identified_arm_is_hardly_ever_told_that_a_pose_it_is_in_is_out_of_reach(arm):
+def test_an_identified_arm_is_hardly_ever_reported_that_a_pose_it_is_in_is_out_of_reach(arm):
     Ts = arm.forward(arms.near_singular(arm, 300, np.random.default_rng(11)))
     many = arm.inverse_batch(Ts)
-    assert (many.count > 0).mean() > 0.99  # beside a singularity descent may end in a place nearby
+    assert (many.count > 0).mean() > 0.99  # beside a singularity descent may end at a pose nearby
     there = np.arange(many.q.shape[1]) < many.count[:, None]
-    far, turned = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
-    assert max(far.max(), turned.max()) < 1e-9
+    far, rotation = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
+    assert max(far.max(), rotation.max()) < 1e-9
 
 
 @exact
@@ -136,7 +136,7 @@ def test_a_batch_is_its_single_calls(arm):
 
 
 @exact
-def test_near_orders_and_takes_whole_turns_within_the_limits(arm):
+def test_near_sorts_and_takes_whole_revolutions_within_the_limits(arm):
     rng = np.random.default_rng(11)
     for _ in range(50):
         q = rng.uniform(arm.q_min, arm.q_max)
@@ -146,14 +146,14 @@ def test_near_orders_and_takes_whole_turns_within_the_limits(arm):
         inside = answer.q[answer.within_limits]
         distance = np.linalg.norm(inside - q, axis=1)
         assert (np.diff(distance) >= 0).all()
-        for k in range(6):  # no whole turn would bring a joint nearer without leaving its limits
-            for turn in (-2 * np.pi, 2 * np.pi):
-                other = inside[:, k] + turn
+        for k in range(6):  # no whole revolution would bring a joint nearer without leaving its limits
+            for revolution in (-2 * np.pi, 2 * np.pi):
+                other = inside[:, k] + revolution
                 allowed = (other >= arm.q_min[k]) & (other <= arm.q_max[k])
                 assert (np.abs(other - q[k]) > np.abs(inside[:, k] - q[k]) - 1e-9)[allowed].all()
 
 
-def test_a_whole_turn_is_taken_where_only_that_is_within_limits():
+def test_a_whole_revolution_is_taken_where_only_that_is_within_limits():
     q = np.deg2rad([10, 200, -100, 20, 30, 40])  # joint 2 of the PUMA goes from -45 to 225 degrees
     answer = PUMA.inverse(PUMA.forward(q))
     assert np.abs(answer.q[answer.within_limits] - q).max(axis=1).min() < 1e-12
@@ -161,34 +161,34 @@ def test_a_whole_turn_is_taken_where_only_that_is_within_limits():
 
 @pytest.mark.parametrize("free", [None, 0.7])
 @pytest.mark.parametrize("arm", [PUMA, IRB, arms.CRAIG], ids=["puma560", "irb120", "craig"])
-def test_a_stretched_wrist_leaves_joint_4_where_it_is_wanted(arm, free):
+def test_a_straight_wrist_leaves_joint_4_where_near_has_it(arm, free):
     near = None if free is None else np.full(6, free)
     q = np.array([0.3, 0.2, -0.6, 0.4, 0.0, 0.5])
     answer = arm.inverse(arm.forward(q), near)
     check(arm, arm.forward(q), answer)
     assert answer.reason.startswith("singular: wrist")
-    wanted = free or 0.0
+    expected = free or 0.0
     held = answer.q[answer.singular]
     assert len(held)
-    np.testing.assert_allclose(held[:, 3], wanted, atol=1e-12)
+    np.testing.assert_allclose(held[:, 3], expected, atol=1e-12)
     # On the singularity axes 4 and 6 are one: of the known solution only the sum of both joints comes back.
-    same = np.abs(held - [0.3, 0.2, -0.6, wanted, 0.0, 0.9 - wanted]).max(axis=1)
+    same = np.abs(held - [0.3, 0.2, -0.6, expected, 0.0, 0.9 - expected]).max(axis=1)
     assert same.min() < 1e-7
 
 
-def test_axis_6_parallel_to_three_others_leaves_joint_6_where_it_is_wanted():
+def test_axis_6_parallel_to_three_others_leaves_joint_6_where_near_has_it():
     q = np.array([0.3, -1.0, 1.2, 0.4, 0.0, 0.5])
-    for near, wanted in ((None, 0.0), (np.full(6, 0.2), 0.2)):
+    for near, expected in ((None, 0.0), (np.full(6, 0.2), 0.2)):
         answer = UR5.inverse(UR5.forward(q), near)
         check(UR5, UR5.forward(q), answer)
         assert "singular: wrist" in answer.reason
-        np.testing.assert_allclose(answer.q[answer.singular][:, 5], wanted, atol=1e-12)
+        np.testing.assert_allclose(answer.q[answer.singular][:, 5], expected, atol=1e-12)
 
 
 def test_joint_6_gives_way_where_the_arm_would_not_reach():
     gave_way = 0
     for q4 in np.linspace(-3, 3, 13):
-        q = np.array([0.3, -0.2, 0.05, q4, 0.0, 2.5])  # nearly stretched
+        q = np.array([0.3, -0.2, 0.05, q4, 0.0, 2.5])  # nearly straight
         T = UR5.forward(q)
         answer = UR5.inverse(T)
         check(UR5, T, answer)
@@ -199,7 +199,7 @@ def test_joint_6_gives_way_where_the_arm_would_not_reach():
 
 
 @pytest.mark.parametrize("arm", [SIX, IRB], ids=["six_r", "irb120"])
-def test_a_wrist_on_axis_1_leaves_joint_1_where_it_is_wanted(arm):
+def test_a_wrist_on_axis_1_leaves_joint_1_where_near_has_it(arm):
     q = np.array([0.3, 0.0, 1.2, 0.4, 0.6, 0.5])
     q[1] = arms.over_axis1(arm, q)
     for near in (None, np.full(6, 0.31)):
@@ -210,7 +210,7 @@ def test_a_wrist_on_axis_1_leaves_joint_1_where_it_is_wanted(arm):
             np.testing.assert_allclose(answer.q[:, 0], 0.0 if near is None else 0.31, atol=1e-12)
 
 
-def test_a_stretched_elbow_is_one_solution_and_says_so():
+def test_a_straight_elbow_is_one_solution_and_says_so():
     answer = SIX.inverse(SIX.forward(SIX.home))
     assert answer.reason.startswith("singular: elbow")
     np.testing.assert_allclose(answer.best, SIX.home, atol=1e-7)
@@ -226,7 +226,7 @@ def test_a_pose_too_far_out_is_answered_with_the_nearest():
     assert answer.best is None
     assert answer.reason.startswith("unreachable: upper arm")
     nearest = answer.nearest
-    # Straight out of a stretched arm: the nearest pose is the stretched arm itself, 100 mm short.
+    # Straight out of a straight arm: the nearest pose is the straight arm itself, 100 mm short.
     assert abs(nearest.off_m - 0.1) < 1e-6
     assert nearest.off_rad < 1e-3
     np.testing.assert_allclose(nearest.T_base_tool, arms.forward(SIX, nearest.q), atol=1e-14)
@@ -250,8 +250,8 @@ def test_the_nearest_pose_is_no_worse_than_any_tried(arm):
         nearest = arm.inverse(T).nearest
         if nearest is None:
             continue
-        far, turned = arms.off(tried, T)
-        assert np.hypot(nearest.off_m, nearest.off_rad) <= np.hypot(far, turned).min()
+        far, rotation = arms.off(tried, T)
+        assert np.hypot(nearest.off_m, nearest.off_rad) <= np.hypot(far, rotation).min()
         assert arm.within_limits(nearest.q)
 
 

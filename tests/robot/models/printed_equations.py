@@ -1,6 +1,6 @@
-"""The chapter's equations 18.18 (pose) and 18.20 (Jacobian) of its 6R arm, written out element by element.
+"""The printed equations 18.18 (pose) and 18.20 (Jacobian) of the 6R arm, written out element by element.
 
-An oracle for tests: nothing here is shared with the library. ``printed=True`` gives the equations with the chapter's
+An oracle for tests: nothing here is shared with the library. ``printed=True`` gives the equations with the print's
 misprints.
 """
 

@@ -1,4 +1,4 @@
-"""The six_r model against the chapter's own equations, printed and put right."""
+"""The six_r model against its source's own equations, printed and put right."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_the_printed_pose_agrees_in_all_twelve_elements():
         np.testing.assert_allclose(ARM.forward(q), pose(q), rtol=0, atol=ROUNDING)
 
 
-def test_home_and_zero_are_where_the_chapter_has_them():
+def test_home_and_zero_are_where_the_source_has_them():
     home = ARM.forward(ARM.home)
     np.testing.assert_allclose(home[:3, :3].T, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=ROUNDING)
     np.testing.assert_allclose(home[:3, 3], [0.6578, 0, 0.438], atol=ROUNDING)
@@ -46,7 +46,7 @@ def test_a_misprint_matters(row, column, worst):
 
 
 def test_the_chapters_steps_give_each_solution():
-    """theta_5 of either sign from c5, theta_234 and theta_6 by the chapter's formulas, of every solution found."""
+    """theta_5 of either sign from c5, theta_234 and theta_6 by the source's formulas, of every solution found."""
     for q in ANGLES[:40]:
         T = ARM.forward(q)
         for s in ARM.inverse(T).q:

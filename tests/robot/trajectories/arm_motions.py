@@ -23,9 +23,9 @@ def start(name):
     return np.radians(START_DEG[name])
 
 
-def shifted(T, step, turn=(0.0, 0.0, 0.0)):
-    """A pose moved in base axes, and turned about them where it is."""
-    return pose(exp_so3(np.array(turn)) @ T[:3, :3], T[:3, 3] + step)
+def shifted(T, step, rotation=(0.0, 0.0, 0.0)):
+    """A pose moved in base axes, and rotated about them where it is."""
+    return pose(exp_so3(np.array(rotation)) @ T[:3, :3], T[:3, 3] + step)
 
 
 def ordinary(member, name, q_start=None):

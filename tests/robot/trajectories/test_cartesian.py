@@ -1,4 +1,4 @@
-"""Motions of the tool in space: on the path by forward kinematics, refused at the place plain geometry says."""
+"""Motions of the tool in space: on the path by forward kinematics, rejected at the position plain geometry says."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -15,7 +15,7 @@ from armsight.robot.trajectories.trajectory import check_times, pieces
 
 SIX_R = MODELS["six_r"]
 #: Joint angles, deg, and 300 mm that each arm has room for. The tool of six_r goes across in front of it.
-FIGURE_3 = {
+LINES = {
     "six_r": ((-26, -68.9, 79.4, -10.5, -64, 90), (0, 0.3, 0)),
     "puma560": ((0, 60, -150, 20, 60, 10), (0, 0, -0.3)),
     "ur5": ((0, -90, 90, -80, -90, 20), (0, 0.3, 0)),
@@ -31,10 +31,10 @@ def off_line(arm, q, T, step):
     return np.linalg.norm(p - (p @ along)[:, None] * along, axis=1).max()
 
 
-@pytest.mark.parametrize("name", FIGURE_3)
-def test_figure_3_a_line_of_300_mm_in_1_s(name):
+@pytest.mark.parametrize("name", LINES)
+def test_a_line_of_300_mm_in_1_s(name):
     arm = MODELS[name]
-    q, step = np.radians(FIGURE_3[name][0]), np.array(FIGURE_3[name][1]) * 0.3 / np.linalg.norm(FIGURE_3[name][1])
+    q, step = np.radians(LINES[name][0]), np.array(LINES[name][1]) * 0.3 / np.linalg.norm(LINES[name][1])
     T = arm.forward(q)
     motion = line(arm, q, shifted(T, step), duration_s=1.0)
     assert motion.duration_s == pytest.approx(1.0, abs=1e-8)
@@ -44,7 +44,7 @@ def test_figure_3_a_line_of_300_mm_in_1_s(name):
     np.testing.assert_allclose(arm.forward(motion.at(1.0).q), shifted(T, step), atol=1e-9)
 
 
-def test_orientation_turns_evenly_with_the_way():
+def test_orientation_rotates_evenly_with_the_way():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)
     goal = shifted(T, [0.05, 0.08, -0.04], [0.4, -0.5, 0.3])
@@ -67,9 +67,9 @@ def test_a_motion_without_a_duration_is_brought_to_a_limit():
     goal = shifted(SIX_R.forward(start("six_r")), [0.0, 0.1, 0.0])
     with pytest.raises(InputError, match=r"duration_s is 0\.5; within the arm's limits this motion takes") as found:
         line(SIX_R, start("six_r"), goal, duration_s=0.5)
-    told = float(str(found.value).split()[-2])
-    assert motion.duration_s <= told < motion.duration_s + 3e-4
-    assert line(SIX_R, start("six_r"), goal, duration_s=told).duration_s == pytest.approx(told, abs=1e-8)
+    reported = float(str(found.value).split()[-2])
+    assert motion.duration_s <= reported < motion.duration_s + 3e-4
+    assert line(SIX_R, start("six_r"), goal, duration_s=reported).duration_s == pytest.approx(reported, abs=1e-8)
 
 
 def test_a_full_circle_comes_back_and_keeps_its_radius():
@@ -86,11 +86,11 @@ def test_a_full_circle_comes_back_and_keeps_its_radius():
     np.testing.assert_allclose(radius, radius[0], atol=1e-9)
     np.testing.assert_allclose(Ts[:, :3, :3], np.tile(T[:3, :3], (len(Ts), 1, 1)), atol=1e-9)
     np.testing.assert_allclose(Ts[-1], T, atol=1e-9)
-    turned = np.unwrap(np.arctan2(*(out @ np.stack([np.cross(axis, out[0]), out[0] - height[0] * axis], axis=1)).T))
-    assert turned[-1] == pytest.approx(2 * np.pi, abs=1e-7)
+    swept = np.unwrap(np.arctan2(*(out @ np.stack([np.cross(axis, out[0]), out[0] - height[0] * axis], axis=1)).T))
+    assert swept[-1] == pytest.approx(2 * np.pi, abs=1e-7)
 
 
-def test_the_tool_turns_with_the_circle_where_asked():
+def test_the_tool_rotates_with_the_circle_where_asked():
     arm, q = MODELS["ur10"], start("ur10")
     T = arm.forward(q)
     axis = np.array([0.0, 0.0, 1.0])
@@ -208,7 +208,7 @@ def test_a_long_motion_is_looked_through_in_pieces():
 
 
 def said_of(found, arm, motion_start, step):
-    """Hold a refusal's share, place and words together."""
+    """Hold a rejection's share, position and text together."""
     T = arm.forward(motion_start)
     np.testing.assert_allclose(found.p_base, T[:3, 3] + found.share * np.array(step), atol=1e-9)
     x, y, z = 1e3 * found.p_base
@@ -219,7 +219,7 @@ def said_of(found, arm, motion_start, step):
     assert "\n" not in text
 
 
-def test_a_joint_limit_is_refused_where_geometry_says():
+def test_a_joint_limit_is_rejected_where_geometry_says():
     arm = replace(SIX_R, q_max=np.radians([20.0, 45, 150, 150, 170, 180]))
     q = start("six_r")
     T, step = arm.forward(q), np.array([-0.01, 0.15, 0.0])
@@ -240,7 +240,7 @@ def test_a_joint_limit_is_refused_where_geometry_says():
     assert sooner.value.t_s == pytest.approx(found.value.t_s / 2, rel=1e-6)
 
 
-def test_leaving_the_reach_is_refused_where_the_elbow_is_straight():
+def test_leaving_the_reach_is_rejected_where_the_elbow_is_straight():
     q = np.radians([0, -60, 70, -10, -90, 0])
     T, step = SIX_R.forward(q), np.array([0.4, 0.0, 0.0])
     with pytest.raises(MotionRejected, match=r"the path leaves the reach of the arm \(unreachable") as found:
@@ -255,32 +255,34 @@ def test_leaving_the_reach_is_refused_where_the_elbow_is_straight():
 
 
 @pytest.mark.parametrize(("name", "q_deg"), [("puma560", (10, 60, -150, 20, 5, 0)), ("irb120", (10, 0, -20, 20, 5, 0))])
-def test_a_wrist_singularity_is_refused_before_axes_4_and_6_are_in_line(name, q_deg):
+def test_a_wrist_singularity_is_rejected_before_axes_4_and_6_are_in_line(name, q_deg):
     arm, before = MODELS[name], np.radians(q_deg)
     at = before * [1, 1, 1, 1, 0, 1]
     T, through = arm.forward(before), arm.forward(at)
     step = 2 * (through[:3, 3] - T[:3, 3])
     goal = shifted(T, step)
-    turn = Rotation.from_matrix(through[:3, :3] @ T[:3, :3].T).as_rotvec()
-    goal[:3, :3] = Rotation.from_rotvec(2 * turn).as_matrix() @ T[:3, :3]
-    with pytest.raises(MotionRejected, match=r"a singularity: joints 4 and 6 can turn with hardly any motion") as found:
+    rotation = Rotation.from_matrix(through[:3, :3] @ T[:3, :3].T).as_rotvec()
+    goal[:3, :3] = Rotation.from_rotvec(2 * rotation).as_matrix() @ T[:3, :3]
+    with pytest.raises(
+        MotionRejected, match=r"a singularity: joints 4 and 6 can rotate with hardly any motion"
+    ) as found:
         line(arm, before, goal)
-    # Half way axis 5 is at zero; it is refused where the tool's slowest way needs joints 200 times as fast.
+    # Half way axis 5 is at zero; it is rejected where the tool's slowest way needs joints 200 times as fast.
     assert found.value.share < 0.5
-    there = shifted(T, found.value.share * step, 2 * found.value.share * turn)
+    there = shifted(T, found.value.share * step, 2 * found.value.share * rotation)
     J = arm.jacobian(arm.inverse(there, near=before).q[0])
     J[:3] /= np.hypot(arm.a, arm.d).sum()
     assert np.linalg.svd(J, compute_uv=False)[-1] == pytest.approx(1 / 200, rel=1e-6)
     said_of(found.value, arm, before, step)
 
 
-def test_a_start_in_a_singularity_is_refused_at_once():
+def test_a_start_in_a_singularity_is_rejected_at_once():
     with pytest.raises(MotionRejected, match=r"a singularity: joints 2, 3 and 4 .* 0.0 % of the way, 0.000 s") as found:
         line(SIX_R, SIX_R.home, shifted(SIX_R.forward(SIX_R.home), [-0.1, 0.0, 0.0]))
     assert (found.value.share, found.value.t_s) == (0.0, 0.0)
 
 
-def test_whole_turns_are_kept():
+def test_whole_revolutions_are_kept():
     arm = MODELS["ur5"]
     q = start("ur5")
     q[5] += 2 * np.pi - 0.5
@@ -306,7 +308,7 @@ def test_a_line_goes_on_from_a_line_without_a_step():
     assert off_line(arm, second.at(check_times(second.duration_s)).q, T, [0, 1, 0]) < 1e-9
 
 
-def test_a_start_that_moves_elsewhere_is_refused():
+def test_a_start_that_moves_elsewhere_is_rejected():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)
     now = (first := line(arm, q, shifted(T, [0.0, 0.3, 0.0]))).at(0.4 * first.duration_s)
@@ -341,7 +343,7 @@ def test_a_start_that_moves_elsewhere_is_refused():
         (lambda a, q, T: waypoints(a, q, "north", blend_m=0.1), "must be poses"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(make, said):
+def test_bad_input_is_rejected_in_one_line(make, said):
     arm, q = MODELS["ur5"], start("ur5")
     with pytest.raises(InputError, match=said) as found:
         make(arm, q, arm.forward(q))

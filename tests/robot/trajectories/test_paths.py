@@ -16,14 +16,14 @@ from armsight.robot.trajectories.path import checked_pose
 from armsight.robot.trajectories.waypoints import BlendedPath, blended
 
 
-def random_poses(seed, n, reach=0.4, turn=1.0):
+def random_poses(seed, n, reach=0.4, rotation=1.0):
     rng = np.random.default_rng(seed)
-    return np.array([pose(exp_so3(rng.normal(size=3) * turn), rng.normal(size=3) * reach) for _ in range(n)])
+    return np.array([pose(exp_so3(rng.normal(size=3) * rotation), rng.normal(size=3) * reach) for _ in range(n)])
 
 
 PATHS = {
     "line": LinePath.between(*random_poses(0, 2)),
-    "turn on the spot": LinePath.between(np.eye(4), pose(exp_so3(np.array([0.3, 1.0, -0.2])), np.zeros(3))),
+    "rotation on the spot": LinePath.between(np.eye(4), pose(exp_so3(np.array([0.3, 1.0, -0.2])), np.zeros(3))),
     "arc": ArcPath(
         random_poses(1, 1)[0], np.array([0.1, 0.2, -0.1]), np.array([0.5, -2.0, 1.0]), np.array([1.0, 0.2, -0.4])
     ),
@@ -37,8 +37,8 @@ def test_twist_and_bend_are_the_derivatives(name):
     path, h = PATHS[name], 1e-6
     share = np.linspace(2 * h, 1 - 2 * h, 1001)
     here, before, after = path.at(share), path.at(share - h), path.at(share + h)
-    turned = after.T_base_tool[:, :3, :3] @ np.swapaxes(before.T_base_tool[:, :3, :3], 1, 2)
-    twist = np.hstack([after.T_base_tool[:, :3, 3] - before.T_base_tool[:, :3, 3], log_so3(turned)]) / (2 * h)
+    change = after.T_base_tool[:, :3, :3] @ np.swapaxes(before.T_base_tool[:, :3, :3], 1, 2)
+    twist = np.hstack([after.T_base_tool[:, :3, 3] - before.T_base_tool[:, :3, 3], log_so3(change)]) / (2 * h)
     third = 10 * np.abs(here.bend).max() / 0.02  # the bend of the shortest blend changes within some percent of the way
     bound = 8 * np.finfo(float).eps / h * 4 + h**2 * third + 1e-9
     np.testing.assert_allclose(here.twist, twist, atol=bound)
@@ -49,7 +49,7 @@ def test_twist_and_bend_are_the_derivatives(name):
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_every_place_is_a_pose(name):
+def test_every_point_is_a_pose(name):
     T = PATHS[name].at(np.linspace(0, 1, 201)).T_base_tool
     R = T[:, :3, :3]
     np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (201, 1, 1)), atol=1e-14)
@@ -57,8 +57,8 @@ def test_every_place_is_a_pose(name):
 
 
 @given(ours.poses(), ours.poses())
-def test_a_line_is_straight_and_turns_as_slerp_does(a, b):
-    if np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3])) > 3.1:  # half a turn may go either way
+def test_a_line_is_straight_and_rotates_as_slerp_does(a, b):
+    if np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3])) > 3.1:  # half a revolution may go either way
         return
     share = np.linspace(0, 1, 9)
     T = LinePath.between(a, b).at(share).T_base_tool if (a != b).any() else None
@@ -120,11 +120,11 @@ def test_a_blend_takes_no_more_than_half_a_line():
         ("here", "must be numbers"),
     ],
 )
-def test_what_is_no_pose_is_refused(T, said):
+def test_what_is_no_pose_is_rejected(T, said):
     with pytest.raises(InputError, match=said):
         checked_pose(T, "T_base_goal")
 
 
-def test_a_line_to_where_the_tool_is_is_refused():
+def test_a_line_to_where_the_tool_is_is_rejected():
     with pytest.raises(InputError, match="nothing to travel"):
         LinePath.between(np.eye(4), np.eye(4))

@@ -60,7 +60,7 @@ def test_the_slowest_joint_takes_the_time_of_the_closed_form(joint, way):
     assert motion.duration_s == pytest.approx(shortest_s(way, *limits), abs=1e-8)
 
 
-def test_a_duration_is_met_and_one_too_short_is_refused():
+def test_a_duration_is_met_and_one_too_short_is_rejected():
     a, b = np.zeros(6), np.full(6, 0.4)
     fastest = point_to_point(SIX_R, a, b).duration_s
     slow = point_to_point(SIX_R, a, b, duration_s=3.0)
@@ -94,7 +94,7 @@ def test_a_motion_in_the_middle_of_another_goes_on_without_a_step():
         np.testing.assert_allclose(before, after, atol=1e-9)
 
 
-def test_a_start_that_cannot_turn_round_before_a_limit_says_which_joint_and_when():
+def test_a_start_that_cannot_reverse_before_a_limit_says_which_joint_and_when():
     q = np.zeros(6)
     q[1] = np.deg2rad(44.0)
     qd = np.zeros(6)
@@ -126,14 +126,14 @@ def test_a_start_that_cannot_turn_round_before_a_limit_says_which_joint_and_when
         ),
     ],
 )
-def test_bad_states_are_refused_in_one_line(change, said):
+def test_bad_states_are_rejected_in_one_line(change, said):
     given_ = {"q_start": np.zeros(6), "q_goal": np.full(6, 0.1), **change}
     with pytest.raises(InputError, match=said) as found:
         point_to_point(SIX_R, **given_)
     assert "\n" not in str(found.value)
 
 
-def test_a_time_that_is_no_number_is_refused():
+def test_a_time_that_is_no_number_is_rejected():
     motion = point_to_point(SIX_R, np.zeros(6), np.full(6, 0.1))
     with pytest.raises(InputError, match="t_s is nan"):
         motion.at(np.nan)

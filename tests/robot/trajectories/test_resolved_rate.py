@@ -1,4 +1,4 @@
-"""The resolved-rate tracker: on the path where it is free, past singularities where exact motions are refused."""
+"""The resolved-rate tracker: on the path where it is free, past singularities where exact motions are rejected."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def passed():
     return q, path, resolved_rate(SIX_R, q, path, duration_s=5.0, tolerance_m=0.02)
 
 
-def test_a_singularity_at_which_the_exact_line_is_refused_is_passed(passed):
+def test_a_singularity_at_which_the_exact_line_is_rejected_is_passed(passed):
     q, path, motion = passed
     goal = path.at(np.ones(1)).T_base_tool[0]
     with pytest.raises(MotionRejected, match="a singularity: joints 2, 3, 4 and 6"):
@@ -90,7 +90,7 @@ def _share(p, path):
     return (p - path.T_base_start[:3, 3]) @ path.step / (path.step @ path.step)
 
 
-def test_a_goal_out_of_reach_is_refused_with_the_place_where_it_leaves_the_path():
+def test_a_goal_out_of_reach_is_rejected_with_the_position_where_it_leaves_the_path():
     q = np.radians([0, -60, 70, -10, -90, 0])
     T = SIX_R.forward(q)
     with pytest.raises(MotionRejected, match="near a singularity the tool would leave the path") as found:
@@ -101,7 +101,7 @@ def test_a_goal_out_of_reach_is_refused_with_the_place_where_it_leaves_the_path(
     assert 0 < found.value.t_s < 4.0
 
 
-def test_a_joint_limit_is_refused():
+def test_a_joint_limit_is_rejected():
     arm, q = MODELS["ur5"], start("ur5")
     q[5] += 2 * np.pi - 0.5
     T = arm.forward(q)
@@ -109,7 +109,7 @@ def test_a_joint_limit_is_refused():
         resolved_rate(arm, q, LinePath.between(T, shifted(T, [0.02, 0.0, 0.0], [0, 0, -0.6])), duration_s=3.0)
 
 
-def test_a_duration_is_kept_or_refused_with_the_limit():
+def test_a_duration_is_kept_or_rejected_with_the_limit():
     arm, q = MODELS["ur5"], start("ur5")
     T = arm.forward(q)
     path = ArcPath(T, T[:3, 3] + [0.05, 0, 0], np.array([0, 0, 3.0]), np.zeros(3))
@@ -128,7 +128,7 @@ def test_a_duration_is_kept_or_refused_with_the_limit():
         ({"duration_s": 0.0}, "positive number of seconds"),
     ],
 )
-def test_bad_options_are_refused(options, said):
+def test_bad_options_are_rejected(options, said):
     q, path = through_the_wrist(2.0)
     with pytest.raises(InputError, match=said):
         resolved_rate(SIX_R, q, path, **options)
@@ -166,7 +166,7 @@ def test_the_tracker_takes_up_a_line_that_is_under_way():
         resolved_rate(arm, now.q, near, qd_start=now.qd, qdd_start=now.qdd)
 
 
-def test_a_start_off_the_path_is_refused():
+def test_a_start_off_the_path_is_rejected():
     q, path = through_the_wrist(2.0)
     for T, said in (
         (shifted(path.T_base_start, [0.0, 0.03, 0.04]), "it is 50.000 mm and 0.000 deg away"),

@@ -47,6 +47,6 @@ def test_a_motion_to_where_it_begins_stands():
         assert np.array_equal(Tabled(motion).at(t_s).q, HERE)
 
 
-def test_a_time_that_is_none_is_refused():
+def test_a_time_that_is_none_is_rejected():
     with pytest.raises(InputError, match="t_s is nan"):
         Tabled(MOTIONS["joints"]).at(float("nan"))

@@ -57,6 +57,6 @@ def test_a_motion_is_frozen_and_says_what_it_returns(member):
         ),
     ],
 )
-def test_bad_starts_are_refused(member, q, said):
+def test_bad_starts_are_rejected(member, q, said):
     with pytest.raises(InputError, match=said):
         ordinary(member, "ur5", q)

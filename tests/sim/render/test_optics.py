@@ -12,7 +12,7 @@ pytestmark = pytest.mark.opencv
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0])
 @pytest.mark.parametrize("parts", [1, 4])
-def test_the_blur_keeps_all_light_and_its_place(sigma, parts):
+def test_the_blur_keeps_all_light_and_its_position(sigma, parts):
     taps = psf_taps(sigma, parts)
     np.testing.assert_allclose(taps.sum(axis=1), 1.0)
     pixel = np.arange(taps.shape[1]) - taps.shape[1] // 2
@@ -39,7 +39,7 @@ def test_noise_has_the_spread_it_says():
     light = np.full((400, 500), 100 / 255, np.float32)
     image = exposed(light, Sensor(read_noise=2.0, shot_noise=0.05), rng).astype(float)
     variance = 4.0 + 5.0 + 1 / 12  # read, shot, rounding
-    # A variance estimated from n draws of a Gaussian has a relative sigma of sqrt(2 / n).
+    # A variance estimated from n samples of a Gaussian has a relative sigma of sqrt(2 / n).
     assert image.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / n))
     assert image.mean() == pytest.approx(100, abs=4 * np.sqrt(variance / n))
 

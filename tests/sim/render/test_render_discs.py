@@ -1,4 +1,4 @@
-"""Discs in rendered images: their place, size and shape against closed forms, OpenCV's rims and brute force."""
+"""Discs in rendered images: their position, size and shape against closed forms, OpenCV's rims and brute force."""
 
 import cv2
 import numpy as np
@@ -84,7 +84,7 @@ def light_moments(light, reach):
 
 @pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("radius_px", [2.5, 6.0, 12.0, 30.0])
-def test_place_area_and_shape_are_those_of_the_rim(model, radius_px):
+def test_position_area_and_shape_are_those_of_the_rim(model, radius_px):
     """Tilts to 75 degrees, sharp and far out of focus: the blur adds its variance and moves nothing."""
     cam, rng = camera(model), np.random.default_rng(4)
     for tilt in (0.0, 45.0, 60.0, 75.0):
@@ -100,9 +100,9 @@ def test_place_area_and_shape_are_those_of_the_rim(model, radius_px):
             np.testing.assert_allclose(centre, centre_true, atol=SHIFT_PX)
             for k, i, j in ((3, 0, 0), (4, 0, 1), (5, 1, 1)):
                 spread = seen[k] / seen[0] - centre[i] * centre[j]
-                wanted = true[k] / true[0] - centre_true[i] * centre_true[j] + (i == j) * (psf**2 + 1 / 12)
+                expected = true[k] / true[0] - centre_true[i] * centre_true[j] + (i == j) * (psf**2 + 1 / 12)
                 # A radius is twice the root of this: 0.01 of it is 0.002 px of a radius of 10 px.
-                assert spread == pytest.approx(wanted, abs=0.002 * radius_px + 0.004)
+                assert spread == pytest.approx(expected, abs=0.002 * radius_px + 0.004)
 
 
 @pytest.mark.parametrize(

@@ -55,12 +55,14 @@ def test_circles_lie_as_opencv_counts_them(asymmetric):
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(7, 5), (6, 4), (5, 8)])
-def test_charuco_is_the_board_opencv_draws(columns, rows):
+def test_charuco_is_the_board_of_opencv(columns, rows):
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    drawn = cv2.aruco.CharucoBoard((columns, rows), 0.08, 0.06, dictionary).generateImage((columns * 80, rows * 80))
+    raster_image = cv2.aruco.CharucoBoard((columns, rows), 0.08, 0.06, dictionary).generateImage(
+        (columns * 80, rows * 80)
+    )
     board = charuco(columns, rows, 0.08, 0.06, "DICT_4X4_50")
     ours = raster(board, -0.08, -0.08, 0.001, columns * 80, rows * 80) > 0.5
-    assert ((drawn > 127) != ours).mean() < 1e-3  # OpenCV rounds some cells by a pixel
+    assert ((raster_image > 127) != ours).mean() < 1e-3  # OpenCV rounds some cells by a pixel
 
 
 @pytest.mark.parametrize(("family", "dictionary"), [("4X4_50", "DICT_4X4_50"), ("DICT_5X5_100", "DICT_5X5_100")])
@@ -83,8 +85,8 @@ def test_apriltags_own_upright_is_opencvs_upside_down():
 def test_aprilgrid_counts_from_the_lower_left_and_puts_squares_between():
     grid = aprilgrid(3, 2, 0.05, 0.2)
     step, columns, rows = 0.0005, 420, 300
-    drawn = raster(grid, grid.x_edges[0], grid.y_edges[0], step, columns, rows)
-    image = (cv2.copyMakeBorder(drawn, 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=WHITE) * 255).astype(np.uint8)
+    raster_image = raster(grid, grid.x_edges[0], grid.y_edges[0], step, columns, rows)
+    image = (cv2.copyMakeBorder(raster_image, 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=WHITE) * 255).astype(np.uint8)
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = 2
     known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -110,6 +112,6 @@ def test_aprilgrid_counts_from_the_lower_left_and_puts_squares_between():
         lambda: Pattern(np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.array([[0.5, 0.5]])),
     ],
 )
-def test_impossible_patterns_are_refused(make):
+def test_impossible_patterns_are_rejected(make):
     with pytest.raises(InputError):
         make()

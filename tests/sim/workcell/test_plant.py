@@ -8,7 +8,7 @@ import pytest
 
 from armsight.robot.arm_file import open_arm
 from armsight.robot.models import MODELS
-from armsight.sim.workcell.arm import PRESETS, sample_arm, pot_travel
+from armsight.sim.workcell.arm import PRESETS, pot_travel, sample_arm
 from armsight.sim.workcell.board import gravity_duty
 from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, gravity_torque, row_frames, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant, mjcf
@@ -30,7 +30,7 @@ def run(arm: ArmPlant, duty, ticks: int, drives_on: bool = True) -> np.ndarray:
 
 
 def bare(model, *, friction: float = 0.0):
-    """A MuJoCo model of an arm, rigid, without play, with so much of its friction; and its solids and motors."""
+    """A MuJoCo model of an arm, rigid, without backlash, with so much of its friction; and its solids and motors."""
     parts, motors = solids(model), chosen(model, solids(model), friction)
     none = replace(motors, brake_nm=0.0 * motors.brake_nm, bearing_nm=friction * motors.bearing_nm)
     text = mjcf(model, parts, none, OFF, np.full(6, 1e4), OFF)
@@ -87,7 +87,7 @@ def test_an_arm_that_falls_freely_keeps_its_energy():
     assert fallen > 5.0  # J
 
 
-def test_a_motor_draws_what_its_winding_lets_through():
+def test_a_motor_takes_the_current_that_its_winding_lets_through():
     arm = plant()
     motors = arm.motors
     duty = gravity_duty(MODEL, arm.parts, motors, MODEL.home) + 0.01  # friction takes the rest: nothing moves
@@ -126,8 +126,8 @@ def test_brakes_hold_the_arm():
     assert np.abs(path[-1] - path[0]).max() < 2e-6
 
 
-def test_backlash_is_as_wide_as_it_was_drawn():
-    """Turned slowly to and fro, the shaft leads the link by half the play, and by the bearing's drag on the twist."""
+def test_backlash_is_as_wide_as_it_was_sampled():
+    """Rotated slowly to and fro, the shaft leads the link by half the backlash, and by the bearing's drag on the twist."""
     arm = plant("worn")
     motors = arm.motors
     push = 1.6 * (motors.coulomb_nm[0] + motors.bearing_nm[0]) / motors.stall_nm[0]
@@ -142,7 +142,7 @@ def test_backlash_is_as_wide_as_it_was_drawn():
     assert width == pytest.approx(true.backlash_rad[0] + drag, rel=0.02)
 
 
-def test_weight_pulls_the_links_through_play_and_twist():
+def test_gravity_pulls_the_links_through_backlash_and_twist():
     arm = plant("worn")
     shaft, link = arm.path[-1, :6], arm.path[-1, 6:]
     true = sample_arm(MODEL, PRESETS["worn"], 0)
@@ -176,7 +176,7 @@ def test_potentiometer_errors_are_as_large_as_asked():
     assert (largest > 0.5 * PRESETS["worn"].pot_linearity).all()
     shaft = MODEL.home
     readings = np.array([arm.pots.read(shaft) for _ in range(2000)], dtype=float)
-    # Of 64 conversions: their noise, and the twelfth of a step that rounding adds; 2000 readings tell it to 1.6 %.
+    # Of 64 conversions: their noise, and the twelfth of a step that rounding adds; 2000 readings determine it to 1.6 %.
     expected = 16 * np.sqrt((PRESETS["worn"].pot_noise_lsb ** 2 + 1 / 12) / 64 + 1 / (12 * 16**2))
     assert readings.std(axis=0) == pytest.approx(expected, rel=0.07)
 

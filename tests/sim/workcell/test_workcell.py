@@ -55,7 +55,7 @@ def test_the_arm_follows_and_comes_to_rest(workcell):
     off = readings - truth.shaft[rows] - workcell.plant.pots.error(truth.shaft[rows])
     speed = np.gradient(truth.shaft, 1e-3, axis=0)[rows]
     late = (speed * off).sum(axis=0) / (speed**2).sum(axis=0)
-    assert np.abs(late).max() < 1e-4  # s; the noise of some 1000 readings tells it to 2e-5 s
+    assert np.abs(late).max() < 1e-4  # s; the noise of some 1000 readings determines it to 2e-5 s
 
 
 def test_what_the_potentiometers_say_misleads_by_millimetres(workcell):
@@ -176,7 +176,7 @@ def _numbers(seed):
         return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.board_shots(1)).left
 
 
-def test_a_picture_of_the_cell(workcell):
+def test_a_picture_of_the_workcell(workcell):
     picture = workcell.picture((320, 180))
     assert picture.shape == (180, 320, 3)
     assert picture.std() > 20
@@ -189,19 +189,19 @@ def test_a_picture_of_the_cell(workcell):
     [
         ({"arm": "rusty"}, "nominal, used, worn"),
         ({"cameras": "8k"}, "1280x720@60"),
-        ({"machine": "tape"}, "unicorn"),
+        ({"emulator": "tape"}, "unicorn"),
         ({"rig": "one"}, "parallel, verging"),
         ({"seed": -1}, "seed"),
         ({"seed": 1.5}, "seed"),
     ],
 )
-def test_a_wrong_name_is_told_with_the_right_ones(given, said):
+def test_a_wrong_name_is_reported_with_the_right_ones(given, said):
     with pytest.raises(InputError, match=said):
-        Workcell.open(**{"machine": "host", "cameras": "320x240@60", **given})
+        Workcell.open(**{"emulator": "host", "cameras": "320x240@60", **given})
 
 
-def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(workcell):
-    off = replace(workcell.model, a=workcell.model.a + 0.002, name="believed")
+def test_what_the_arm_is_accepted_to_be_changes_nothing_of_what_it_is(workcell):
+    off = replace(workcell.model, a=workcell.model.a + 0.002, name="accepted")
     with Workcell.open(arm="worn", cameras=SMALL, seed=3, emulator="host", assumed=off) as other:
         assert other.model is off
         for name in ("T_base_rig", "T_tool_body"):
@@ -212,7 +212,7 @@ def test_what_the_arm_is_believed_to_be_changes_nothing_of_what_it_is(workcell):
         assert not np.array_equal(other.poses, workcell.poses)
 
 
-def test_a_cell_like_another_sees_the_same_room_at_another_rate():
+def test_a_workcell_like_another_sees_the_same_room_at_another_rate():
     with Workcell.open(seed=4, emulator="host", cameras=SMALL) as one:
         with Workcell.open(seed=4, emulator="host", cameras="640x360@120", like=one) as other:
             alone = Workcell.open(seed=4, emulator="host", cameras="640x360@120")

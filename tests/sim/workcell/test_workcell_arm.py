@@ -1,11 +1,11 @@
-"""What is wrong with an arm: presets, files, and how it is drawn."""
+"""What is wrong with an arm: presets, files, and how it is sampled."""
 
 import numpy as np
 import pytest
 
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
-from armsight.sim.workcell.arm import PRESETS, sample_arm, imperfections
+from armsight.sim.workcell.arm import PRESETS, imperfections, sample_arm
 from armsight.sim.workcell.board import configuration
 from armsight.sim.workcell.motors import chosen, solids
 
@@ -40,14 +40,14 @@ def test_a_worn_arm_is_off_by_what_the_preset_says(seed):
 
 
 def test_what_only_moves_base_and_tool_is_not_wrong():
-    """Errors in these places of the table leave every motion as it was, seen from a rig that was placed by motions."""
+    """Errors in these entries of the table leave every motion as it was, seen from a rig that was calibrated by motions."""
     true = sample_arm(MODEL, PRESETS["worn"], 0).arm
     assert (true.d[[0, 5]] == MODEL.d[[0, 5]]).all()
     assert (true.offset[[0, 5]] == MODEL.offset[[0, 5]]).all()
     assert (true.a[5], true.alpha[5]) == (MODEL.a[5], MODEL.alpha[5])
 
 
-def test_the_same_seed_draws_the_same_arm_and_another_another():
+def test_the_same_seed_gives_the_same_arm_and_another_another():
     first, again, other = (sample_arm(MODEL, PRESETS["worn"], seed) for seed in (1, 1, 2))
     assert (first.arm.table == again.arm.table).all()
     assert (first.pot_sines == again.pot_sines).all()
@@ -79,7 +79,7 @@ def test_a_file_changes_what_it_names(tmp_path):
         ("preset = [", "not TOML"),
     ],
 )
-def test_a_bad_file_is_told_by_name(tmp_path, text, said):
+def test_a_bad_file_is_reported_by_name(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said) as error:
@@ -99,7 +99,7 @@ def test_every_arm_gets_a_configuration_that_the_board_takes(name):
     model = open_arm(name)
     parts = solids(model)
     motors = chosen(model, parts)
-    config = configuration(model, parts, motors)  # refuses by itself what a board would refuse
+    config = configuration(model, parts, motors)  # rejects by itself what a board would reject
     assert (motors.no_load_rad_s > 1.5 * model.qd_max).all()
     assert (motors.stall_nm > 3 * motors.gravity_nm).all()
     assert (config["joint"]["gains"]["kp_per_rad"] > 0).all()

@@ -1,4 +1,4 @@
-"""When the cell's cameras look, what a user may ask of them, and where they stand."""
+"""When the workcell's cameras look, what a user may ask of them, and where they stand."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_shots_come_at_their_rate_and_are_stamped_when_they_came():
     late = np.array([t.stamp_s for t in times]) - left
     # Middle to end of the exposure, the delay, and a jitter that is cut at three sigma.
     assert np.abs(late - timing.exposure_s / 2 - timing.delay_s).max() <= 3 * timing.jitter_s + 1e-12
-    assert late.std() == pytest.approx(timing.jitter_s, rel=0.1)  # 400 draws tell it to 3.5 %
+    assert late.std() == pytest.approx(timing.jitter_s, rel=0.1)  # 400 samples determine it to 3.5 %
 
 
 @pytest.mark.parametrize("timing", [CameraTiming(), WEBCAMS])
@@ -57,7 +57,7 @@ def test_what_can_be_asked_for():
     "spec",
     ["", "1280x720", "1280@60", "1280x720@0", "1280x720@1000", "10x10@60", "9999x9999@60", "usb:1280x720@60", "webcam"],
 )
-def test_what_cannot_is_told(spec):
+def test_what_cannot_is_reported(spec):
     with pytest.raises(InputError, match="cameras"):
         open_timing(spec)
 

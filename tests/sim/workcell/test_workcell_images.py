@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from render_oracle import brute
 
 from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
@@ -14,7 +15,6 @@ from armsight.sim.workcell.cameras import open_rig, rig_pose
 from armsight.sim.workcell.images import LENS, ArmSeen, WorkcellCamera, moving
 from armsight.sim.workcell.motors import row_frames, solids
 from disc_rims import ellipse_through, rim
-from render_oracle import brute
 from views import pixels
 
 MODEL = open_arm("six_r")
@@ -53,7 +53,8 @@ def test_a_pattern_is_painted_as_rays_through_every_pixel_see_it(camera, exposur
 
         def light(ground, samples, window=window, face=face, T=T):
             seen = [
-                brute(camera.camera, [(face, T @ exp_se3(t_s * twist))], window, 0.7, ground, samples) for t_s in moments
+                brute(camera.camera, [(face, T @ exp_se3(t_s * twist))], window, 0.7, ground, samples)
+                for t_s in moments
             ]
             return np.mean(seen, axis=0)
 
@@ -72,9 +73,9 @@ def test_a_pattern_is_painted_as_the_renderer_paints_it(camera, shutter):
     rng = np.random.default_rng(1)
     twist = np.array([0.4, -0.2, 0.3, 0.5, -0.6, 0.7]) * (shutter.exposure_s > 0)
     for k in range(4):
-        placed = [PosedBody(body_patterns()[k : k + 1], somewhere(rng), twist)]
-        image = camera.image(None, placed, shutter, QUIET, 0)
-        light = radiance(camera.camera, placed, camera.still.light.copy(), psf_sigma_px=0.7, shutter=shutter)
+        posed = [PosedBody(body_patterns()[k : k + 1], somewhere(rng), twist)]
+        image = camera.image(None, posed, shutter, QUIET, 0)
+        light = radiance(camera.camera, posed, camera.still.light.copy(), psf_sigma_px=0.7, shutter=shutter)
         oracle = exposed(shaded(light, LENS), Sensor(read_noise=0.0), None)
         assert np.abs(image.astype(int) - oracle).max() <= 1
 
@@ -116,8 +117,8 @@ def test_an_arm_hides_what_is_behind_it_and_not_what_is_before(camera):
     u, v = camera.camera.project(T_camera_elbow[None, :3, 3])[0]
     inside[int(v) - 40 : int(v) + 40, int(u) - 40 : int(u) + 40] = True
     for shift, hidden in ((0.6, True), (-0.7, False)):  # beyond the whole arm; before all of it
-        placed = [PosedBody((sheet,), pose(facing, T_camera_elbow[:3, 3] + shift * away))]
-        image = camera.image(arm, placed, STILL, QUIET, 0)
+        posed = [PosedBody((sheet,), pose(facing, T_camera_elbow[:3, 3] + shift * away))]
+        image = camera.image(arm, posed, STILL, QUIET, 0)
         # Two pixels off an edge the lens mixes the two.
         kernel = np.lib.stride_tricks.sliding_window_view(np.pad(elbow, 4), (9, 9)).all(axis=(2, 3))
         same = np.abs(image.astype(int) - bare)[kernel & inside] <= 1
@@ -131,9 +132,9 @@ def test_a_disc_behind_a_link_is_not_found(camera):
     arm = ArmSeen(PARTS, row_frames(MODEL, MODEL.home))
     T_camera_wrist = inverse(camera.T_base_camera) @ row_frames(MODEL, MODEL.home)[5]
     behind = T_camera_wrist[:3, 3] * (1 + 0.15 / np.linalg.norm(T_camera_wrist[:3, 3]))
-    placed = [PosedBody(body_patterns(), pose(np.eye(3), behind))]
-    seen = discs.find(camera.image(None, placed, STILL, QUIET, 0))
-    covered = discs.find(camera.image(arm, placed, STILL, QUIET, 0))
+    posed = [PosedBody(body_patterns(), pose(np.eye(3), behind))]
+    seen = discs.find(camera.image(None, posed, STILL, QUIET, 0))
+    covered = discs.find(camera.image(arm, posed, STILL, QUIET, 0))
     uv = camera.camera.project(discs.body.points + behind)
     ids = camera.arm_ids(arm)
     hidden = np.array([ids[round(v), round(u)] > 0 for u, v in uv])
@@ -142,7 +143,7 @@ def test_a_disc_behind_a_link_is_not_found(camera):
     assert not left[hidden].any()
 
 
-def test_a_face_that_turns_away_during_the_exposure(camera):
+def test_a_face_that_rotates_away_during_the_exposure(camera):
     """It is in some parts of the exposure and not in others."""
     T = pose(exp_so3(np.array([0.0, np.pi / 2 - 1e-4, 0.0])), np.array([0.0, 0.0, 0.8]))
     twist = np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
@@ -159,7 +160,7 @@ def test_noise_is_as_strong_as_asked_and_another_in_every_image():
     images = [noisy.image(None, [], STILL, strip, noise_start(0, 0, k)).astype(float) for k in (0, 1, 0)]
     assert (images[0] == images[2]).all()
     difference = images[0] - images[1]
-    # Twice the noise's variance and twice that of rounding; 76800 differences tell a deviation to 0.3 %.
+    # Twice the noise's variance and twice that of rounding; 76800 differences determine a deviation to 0.3 %.
     assert difference.std() == pytest.approx(np.sqrt(2 * (4 + 1 / 12)), rel=0.02)
 
 
@@ -168,7 +169,7 @@ def test_nothing_in_view_is_what_stands_still(camera):
     assert (camera.image(None, [], STILL, QUIET, 0) == camera.image(None, away, STILL, QUIET, 0)).all()
 
 
-def test_a_ball_is_drawn_though_no_tile_has_a_corner_in_it():
+def test_a_ball_is_rendered_though_no_tile_has_a_corner_in_it():
     v, u = np.mgrid[:64, :64]
     rays = np.stack([(u - 31.5) / 100, (v - 31.5) / 100, np.ones((64, 64))])
     rays /= np.linalg.norm(rays, axis=0)

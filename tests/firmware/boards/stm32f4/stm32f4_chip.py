@@ -18,7 +18,7 @@ class Chip(ClockAndFlash):
         super().__init__()
         self.inputs: dict[str, int] = {}
         self.levels: dict[int, int] = {}  # the converter's reading of each channel
-        self.place = 0  # of the converter in its scan
+        self.position = 0  # of the converter in its scan
         self.pended = False
 
     # pins
@@ -167,7 +167,7 @@ class Chip(ClockAndFlash):
     def set_adc_cr2(self, name: str, value: int) -> None:
         """Without ADON a scan under way is given up."""
         if not value & 1:
-            self.place = 0
+            self.position = 0
         self[name] = value
 
     def scans(self, count: int) -> None:
@@ -187,8 +187,8 @@ class Chip(ClockAndFlash):
             self.wrong("DMA2 stream 0 does not serve the converter")
         sequence = self.sequence()
         for _ in range(count):
-            self.transfer(stream, 2, self.levels.get(sequence[self.place], 0))
-            self.place = (self.place + 1) % len(sequence)
+            self.transfer(stream, 2, self.levels.get(sequence[self.position], 0))
+            self.position = (self.position + 1) % len(sequence)
 
     # wire
 

@@ -42,7 +42,7 @@ class ClockAndFlash:
         return [value for register, value in self.writes if register == name]
 
     def first(self, name: str, mask: int = 0xFFFFFFFF) -> int:
-        """Return the place among all writes of the first one that set any bit of ``mask`` in a register."""
+        """Return the index among all writes of the first one that set any bit of ``mask`` in a register."""
         return next(i for i, (register, value) in enumerate(self.writes) if register == name and value & mask)
 
     # bus
@@ -60,7 +60,7 @@ class ClockAndFlash:
         return None
 
     def clocked(self, name: str) -> bool:
-        """Tell whether a register's peripheral has its clock."""
+        """Return whether a register's peripheral has its clock."""
         gate = PERIPHERALS[name.split(".")[0]][2]
         return gate is None or bool(self[f"RCC.{gate[0]}"] >> gate[1] & 1)
 

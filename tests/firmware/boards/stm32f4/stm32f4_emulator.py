@@ -51,8 +51,8 @@ class Emulator:
         self.chip.memory_write = self.uc.mem_write
         self.uc.hook_add(UC_HOOK_MEM_WRITE, self._program, None, FLASH, FLASH + FLASH_BYTES - 1)
         self._loop_poll = self.symbols.get("loop_poll", RETURN) & ~1
-        self.uc.hook_add(UC_HOOK_CODE, self._turn, None, self._loop_poll, self._loop_poll)
-        self._turns_left = 0
+        self.uc.hook_add(UC_HOOK_CODE, self._pass, None, self._loop_poll, self._loop_poll)
+        self._passes_left = 0
 
     def _read(self, _uc: Uc, offset: int, size: int, page: int) -> int:
         return self.chip.read(page + offset, size)
@@ -72,13 +72,13 @@ class Emulator:
 
     # running
 
-    def _turn(self, uc: Uc, *_: object) -> None:
-        if self._turns_left == 0:
+    def _pass(self, uc: Uc, *_: object) -> None:
+        if self._passes_left == 0:
             uc.emu_stop()
-        self._turns_left -= 1
+        self._passes_left -= 1
 
-    def _run(self, begin: int, until: int, turns: int = 1) -> None:
-        self._turns_left = turns
+    def _run(self, begin: int, until: int, passes: int = 1) -> None:
+        self._passes_left = passes
         self.uc.emu_start(begin | 1, RETURN, timeout=MOST_US)
         reached = self.uc.reg_read(UC_ARM_REG_PC)
         assert reached == until, f"stopped at {reached:#x} instead of {until:#x}"
@@ -101,22 +101,22 @@ class Emulator:
             self.call(step)
 
     def boot(self) -> None:
-        """Reset, and run until the main loop begins its first turn."""
+        """Reset, and run until the main loop begins its first pass."""
         self.uc.mem_write(RAM, STACK_FILL * RAM_BYTES)
         self.uc.reg_write(UC_ARM_REG_SP, self._vector(0))
-        self._run(self._vector(1), self._loop_poll, turns=0)
+        self._run(self._vector(1), self._loop_poll, passes=0)
 
     def interrupt(self, number: int) -> None:
         """Run an interrupt's handler and come back to where the main loop was."""
         assert not self.masked()
         before = self.uc.context_save()
-        # The processor puts 26 words (with the floating-point registers' place) and at most one for alignment on the stack.
+        # The processor puts 26 words (with the floating-point registers' space) and at most one for alignment on the stack.
         self.uc.reg_write(UC_ARM_REG_SP, (self.uc.reg_read(UC_ARM_REG_SP) - 4 * 27) & ~7)
         self.call(self._vector(number))
         self.uc.context_restore(before)
 
     def masked(self) -> bool:
-        """Tell whether interrupts wait."""
+        """Return whether interrupts wait."""
         return bool(self.uc.reg_read(UC_ARM_REG_PRIMASK))
 
     def run_into(self, number: int, instructions: int) -> None:
@@ -124,11 +124,11 @@ class Emulator:
         self.uc.emu_start(self._vector(number), RETURN, count=instructions)
 
     def main_loop(self) -> None:
-        """Run one turn of the main loop."""
+        """Run one pass of the main loop."""
         self._run(self._loop_poll, self._loop_poll)
 
     def millisecond(self) -> bytes:
-        """Let 1 ms pass: twenty PWM periods, a tick, a turn of the main loop; return what went out on the wire."""
+        """Let 1 ms pass: twenty PWM periods, a tick, a pass of the main loop; return what went out on the wire."""
         self.chip.scans(20)
         self.interrupt(15)
         assert self.chip.pended

@@ -143,7 +143,7 @@ def test_a_stop_shorter_than_a_tick_is_not_forgotten(emulator, pin):
     chip.set_input(pin, 1)
     chip.set_input(pin, 0)
     assert stopped(emulator)
-    assert not stopped(emulator)  # told once
+    assert not stopped(emulator)  # reported once
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)

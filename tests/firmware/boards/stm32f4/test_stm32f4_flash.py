@@ -81,7 +81,7 @@ def test_no_interrupt_is_taken_while_the_memory_cannot_be_read(emulator):
     assert not emulator.masked()
 
 
-def test_a_cell_that_cannot_be_written_is_told(emulator):
+def test_a_cell_that_cannot_be_written_is_reported(emulator):
     """The sector is worn: by the time it is locked a word stands as the erase left it."""
     chip, write = emulator.chip, emulator.chip.set_flash_cr
 

@@ -1,4 +1,4 @@
-"""The whole Nucleo: a host on the wire, potentiometers on the converter, PWM on the pins, against the core on this machine.
+"""The whole Nucleo: a host on the wire, potentiometers on the converter, PWM on the pins, against the core on this host.
 
 Every tick the same inputs go to the core's host build; what it asks for must stand in the timers' registers.
 """
@@ -69,37 +69,37 @@ class Nucleo:
             self.compare()
 
     def compare(self) -> None:
-        wanted = self.arm.outputs
-        duties = np.array(wanted.duty, np.float32)
+        expected = self.arm.outputs
+        duties = np.array(expected.duty, np.float32)
         steps = np.floor(np.abs(duties) * np.float32(4500) + np.float32(0.5)).astype(int)
-        assert self.chip.output("PC9") == float(wanted.drives_on)
+        assert self.chip.output("PC9") == float(expected.drives_on)
         assert [self.chip.output(pin) for pin in PWM_PINS] == [
-            step / 4500 * wanted.drives_on for step in steps.tolist()
+            step / 4500 * expected.drives_on for step in steps.tolist()
         ]
-        if wanted.drives_on:
+        if expected.drives_on:
             assert [self.chip.output(pin) for pin in DIRECTION_PINS] == (duties < 0.0).astype(float).tolist()
         assert self.chip.wrongs == []
 
-    def tell(self, message) -> None:
+    def send(self, message) -> None:
         """Send a message; what it asks for comes into force a tick after the next, as bytes take their time."""
         self.chip.receive(message.pack(self.host))
         self.run()
 
     def hello(self) -> None:
         version = dialect().ARMSIGHT_DIALECT_VERSION
-        self.tell(dialect().MAVLink_hello_message(version, 1, 77))
+        self.send(dialect().MAVLink_hello_message(version, 1, 77))
         self.run(2)
 
     def command(self, kind: int) -> None:
         self.sequence += 1
-        self.tell(dialect().MAVLink_order_message(self.sequence, kind))
+        self.send(dialect().MAVLink_command_message(self.sequence, kind))
         self.arm.inputs.command.kind, self.arm.inputs.command.sequence = kind, self.sequence
         self.run()
 
     def move(self, position_rad: float, ticks: int) -> None:
         self.sequence += 1
         positions = [position_rad * (-1) ** i for i in range(c.JOINTS)]
-        self.tell(dialect().MAVLink_move_message(self.sequence, ticks, positions, [0.0] * 6, [0.01] * 6))
+        self.send(dialect().MAVLink_move_message(self.sequence, ticks, positions, [0.0] * 6, [0.01] * 6))
         command = self.arm.inputs.command
         command.kind, command.sequence, command.move.duration_ticks = c.COMMAND_MOVE, self.sequence, ticks
         for i in range(c.JOINTS):
@@ -129,7 +129,7 @@ def moving(nucleo):
     return nucleo
 
 
-def test_it_tells_who_it_is(nucleo):
+def test_it_says_who_it_is(nucleo):
     nucleo.run(3)
     nucleo.hello()
     (welcome,) = nucleo.said["WELCOME"]
@@ -139,8 +139,8 @@ def test_it_tells_who_it_is(nucleo):
 
 def test_a_potentiometers_counts_become_compare_values(moving):
     """Through converter, DMA, core, wire and timers, for half a second there and back: ``run`` compares every tick."""
-    for turn in range(8):
-        moving.move((0.3, -0.2)[turn % 2], 50)
+    for swing in range(8):
+        moving.move((0.3, -0.2)[swing % 2], 50)
         moving.run(50)
     assert moving.arm.outputs.faults == 0
     last = moving.said["ANGLES"][-1]
@@ -150,26 +150,26 @@ def test_a_potentiometers_counts_become_compare_values(moving):
     assert (moving.status.crc_errors, moving.status.lost_bytes, moving.status.overrun_bytes) == (0, 0, 0)
 
 
-def test_the_angles_told_are_those_of_the_tick_they_name(moving):
+def test_the_angles_reported_are_those_of_the_tick_they_name(moving):
     moving.arm.history.clear()
     begin = moving.arm.inputs.tick
     moving.run(40)
-    told = {message.tick: message for message in moving.said["ANGLES"]}
+    reported = {message.tick: message for message in moving.said["ANGLES"]}
     compared = 0
     for offset, raw in enumerate(moving.arm.history, start=1):
-        if message := told.get(begin + offset):
+        if message := reported.get(begin + offset):
             assert list(message.angle_rad) == list(c.core_outputs.from_buffer_copy(raw).angle_rad)
             compared += 1
     assert compared > 20
 
 
 def test_a_silent_host_lets_the_arm_slow_down(moving):
-    """The silence limit passes, the arm stops by itself; again every tick as the core on this machine has it."""
+    """The silence limit passes, the arm stops by itself; again every tick as the core on this computer has it."""
     moving.run(moving.config.silence_ticks + 200)
     assert moving.status.first_fault == c.FAULT_HOST_SILENT
 
 
-def test_the_emergency_stop_acts_before_the_tick_and_is_told(moving):
+def test_the_emergency_stop_acts_before_the_tick_and_is_reported(moving):
     moving.chip.set_input("PA6", 1)
     moving.chip.set_input("PB12", 1)
     assert [moving.chip.output(pin) for pin in PWM_PINS] == [0.0] * 6
@@ -196,7 +196,7 @@ def test_a_dead_converter_releases_the_arm(moving):
     assert moving.chip.wrongs == []
 
 
-def test_a_tick_that_takes_too_long_is_told_and_its_millisecond_counted(moving):
+def test_a_tick_that_takes_too_long_is_reported_and_its_millisecond_counted(moving):
     """SysTick comes while the tick still runs."""
     running = moving.emulator.symbols["running"]
     moving.emulator.uc.mem_write(running, b"\1\0\0\0")
@@ -209,7 +209,7 @@ def test_a_tick_that_takes_too_long_is_told_and_its_millisecond_counted(moving):
     moving.run(200)
     assert moving.status.faults == 1 << c.FAULT_TICK_MISSED | 1 << c.FAULT_TICK_OVERRUN
     assert moving.status.state == c.STATE_HOLDING
-    moving.command(c.COMMAND_CLEAR_FAULTS)  # refused as long as a cause stands: told once, it does not
+    moving.command(c.COMMAND_CLEAR_FAULTS)  # rejected as long as a cause stands: reported once, it does not
     moving.run(10)
     assert (moving.status.state, moving.status.faults) == (c.STATE_ENABLED, 0)
 
@@ -247,9 +247,9 @@ def test_a_configuration_from_the_wire_is_stored_beside_the_newest(nucleo):
     for offset in range(0, len(raw), 200):
         part = raw[offset : offset + 200]
         padded = list(part.ljust(200, b"\0"))
-        nucleo.tell(dialect().MAVLink_config_part_message(offset, len(raw), len(part), padded))
+        nucleo.send(dialect().MAVLink_config_part_message(offset, len(raw), len(part), padded))
         nucleo.run(3)
-    nucleo.tell(dialect().MAVLink_config_store_message(1, zlib.crc32(raw)))
+    nucleo.send(dialect().MAVLink_config_store_message(1, zlib.crc32(raw)))
     nucleo.run(30)
     assert nucleo.status.config_stored == 1
     size = ctypes.sizeof(c.config_copy)

@@ -177,13 +177,13 @@ def test_no_other_pin_is_touched(booted):
 
 def test_the_wiring_picture_shows_the_same_pins():
     script = (ROOT / "docs" / "images" / "wiring.py").read_text(encoding="utf-8")
-    drawn = ast.literal_eval(re.search(r"^JOINTS = (\(.*?^\))", script, flags=re.DOTALL | re.MULTILINE)[1])
-    place = {what: (pin, connector) for what, pin, connector, _ in documented()}
-    for joint, *shown in drawn:
-        wanted = ("potentiometer {}", "PWM of joint {}", "direction of joint {}", "current of joint {}")
-        assert [tuple(pin.split()) for pin in shown] == [place[what.format(joint)] for what in wanted]
+    plotted = ast.literal_eval(re.search(r"^JOINTS = (\(.*?^\))", script, flags=re.DOTALL | re.MULTILINE)[1])
+    socket = {what: (pin, connector) for what, pin, connector, _ in documented()}
+    for joint, *shown in plotted:
+        expected = ("potentiometer {}", "PWM of joint {}", "direction of joint {}", "current of joint {}")
+        assert [tuple(pin.split()) for pin in shown] == [socket[what.format(joint)] for what in expected]
     for what, said in (("motor supply", "supply"), ("emergency stop", "stop"), ("enable of all bridges", "enable")):
-        assert f"{said}: {place[what][0]}  {place[what][1]}" in script
+        assert f"{said}: {socket[what][0]}  {socket[what][1]}" in script
 
 
 def test_the_currents_are_read_around_the_middle_of_the_pulses(booted):
@@ -245,7 +245,7 @@ def test_a_fault_switches_the_drives_off_and_lets_the_watchdog_run_out(booted, v
     assert chip.wrongs == []
 
 
-def test_a_restart_by_the_watchdog_is_told_once(emulator):
+def test_a_restart_by_the_watchdog_is_reported_once(emulator):
     emulator.chip["RCC.CSR"] = 1 << 29 | 1 << 26
     emulator.power_up("watchdog_was_here")
     assert emulator.call("watchdog_was_here") == 0

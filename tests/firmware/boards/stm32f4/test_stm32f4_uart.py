@@ -26,7 +26,7 @@ def emulator(request):
 
 
 def take(emulator, room: int = 128) -> tuple[bytes, int]:
-    """Take what came in, as a turn of the main loop does; return it and how many bytes were lost."""
+    """Take what came in, as a pass of the main loop does; return it and how many bytes were lost."""
     emulator.uc.mem_write(COUNT, bytes(4))
     length = emulator.call("uart_receive", BYTES, room, COUNT)
     return bytes(emulator.uc.mem_read(BYTES, length)), struct.unpack("<I", emulator.uc.mem_read(COUNT, 4))[0]
@@ -64,7 +64,7 @@ def test_what_comes_in_goes_out_in_order(compiler, pieces):
     assert emulator.chip.wrongs == []
 
 
-def test_a_ring_that_came_round_is_told_and_read_on_afresh(emulator):
+def test_a_ring_that_came_round_is_reported_and_read_on_afresh(emulator):
     emulator.chip.receive(b"a" * 700)
     assert take(emulator, 1000) == (b"a" * 700, 0)
     emulator.chip.receive(b"b" * (RING + 100))
@@ -73,14 +73,14 @@ def test_a_ring_that_came_round_is_told_and_read_on_afresh(emulator):
     assert take(emulator, 1000) == (b"next", 0)
 
 
-def test_a_ring_just_full_is_lost_as_it_cannot_be_told_from_an_empty_one(emulator):
+def test_a_ring_just_full_is_lost_as_it_cannot_be_reported_from_an_empty_one(emulator):
     emulator.chip.receive(bytes(RING))
     assert take(emulator, 2000) == (b"", RING)
 
 
-def test_a_wrap_between_two_turns_is_not_taken_for_a_loss(emulator):
-    for turn in range(40):
-        data = bytes([turn]) * 92
+def test_a_wrap_between_two_passes_is_not_taken_for_a_loss(emulator):
+    for k in range(40):
+        data = bytes([k]) * 92
         emulator.chip.receive(data)
         assert take(emulator) == (data, 0)
 

@@ -1,4 +1,4 @@
-"""The same trace, bit for bit, from every compiler on every machine; what the image needs, and its size."""
+"""The same trace, bit for bit, from every compiler on every emulator; what the image needs, and its size."""
 
 import json
 import shutil
@@ -15,24 +15,24 @@ from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.opening import open_emulator
 
-#: What a small Cortex-M4F has; the machine's linker script gives the image no more.
+#: What a small Cortex-M4F has; the board's linker script gives the image no more.
 FLASH_BYTES, RAM_BYTES = 64 * 1024, 32 * 1024
 IMAGES = ("gcc", "zig")
 
 
 class Recorder:
-    """A machine that keeps what goes in and out."""
+    """A emulator that keeps what goes in and out."""
 
-    def __init__(self, machine):
-        self.machine, self.frames = machine, []
+    def __init__(self, emulator):
+        self.emulator, self.frames = emulator, []
 
     def tick(self, request: bytes) -> bytes:
-        answer = self.machine.tick(request)
+        answer = self.emulator.tick(request)
         self.frames.append((bytes(request), answer))
         return answer
 
     def close(self) -> None:
-        self.machine.close()
+        self.emulator.close()
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,9 @@ def traces(library_files):
     """What the host build takes and gives in every scenario: those that drive the arm, each from power-up on."""
     found = {}
     for name, scenario in DRIVEN.items():
-        machine = Recorder(open_emulator("host", next(iter(library_files.values()))))
-        assert run_scenario(scenario, machine).problems == (), name
-        found[name] = machine.frames
+        emulator = Recorder(open_emulator("host", next(iter(library_files.values()))))
+        assert run_scenario(scenario, emulator).problems == (), name
+        found[name] = emulator.frames
     return found
 
 
@@ -60,19 +60,19 @@ def image_of(images, name):
     return images[name]
 
 
-def machine_of(name, image):
+def emulator_of(name, image):
     try:
         return open_emulator(name, image)
     except InputError as missing:
         pytest.skip(str(missing))
 
 
-@pytest.mark.parametrize("machine", ["unicorn", "qemu"])
+@pytest.mark.parametrize("emulator", ["unicorn", "qemu"])
 @pytest.mark.parametrize("compiler", IMAGES)
-def test_the_processor_gives_the_hosts_bits_in_every_scenario(traces, images, compiler, machine):
+def test_the_processor_gives_the_hosts_bits_in_every_scenario(traces, images, compiler, emulator):
     image = image_of(images, compiler)
     for name, frames in traces.items():
-        running = machine_of(machine, image)
+        running = emulator_of(emulator, image)
         for number, (request, answer) in enumerate(frames):
             assert running.tick(request) == answer, f"{name}, tick {number}"
         running.close()
@@ -98,7 +98,7 @@ def test_the_image_computes_in_hardware_and_is_small(images, compiler):
     assert elf.ram_bytes < RAM_BYTES
 
 
-def test_an_image_that_computes_in_software_is_refused(tmp_path):
+def test_an_image_that_computes_in_software_is_rejected(tmp_path):
     """Plain cortex_m4 has no floating-point unit: zig then calls helpers."""
     zig = build.compilers().get("zig")
     if zig is None:
@@ -124,38 +124,38 @@ def test_what_the_package_carries_is_built_from_these_sources():
 
 def test_a_board_whose_memory_is_overwritten_stops_and_is_restarted_by_its_watchdog(images, traces):
     """A word of the core's guard is changed from outside: drives off at once, then a start that says why."""
-    machine = machine_of("unicorn", next(iter(images.values())))
+    emulator = emulator_of("unicorn", next(iter(images.values())))
     elf = read_elf(next(iter(images.values())))
     frames = traces["nominal"]
     driven = next(k for k, (_, answer) in enumerate(frames) if outputs_of(answer).drives_on) + 50
     for request, answer in frames[:driven]:
-        assert machine.tick(request) == answer
+        assert emulator.tick(request) == answer
     assert outputs_of(answer).drives_on
     guard = elf.symbols["loop"] + 4  # the core follows a pointer
-    assert machine.uc.mem_read(guard, 4) == b"\x5a\x96\xc3\xa5"
-    machine.uc.mem_write(guard, b"\0\0\0\0")
-    after = [outputs_of(machine.tick(request)) for request, _ in frames[driven : driven + 20]]
+    assert emulator.uc.mem_read(guard, 4) == b"\x5a\x96\xc3\xa5"
+    emulator.uc.mem_write(guard, b"\0\0\0\0")
+    after = [outputs_of(emulator.tick(request)) for request, _ in frames[driven : driven + 20]]
     assert (after[0].drives_on, list(after[0].duty), after[0].feed_watchdog) == (0, [0.0] * 6, 0)
     fault = [outputs.first_fault for outputs in after].index(c.FAULT_WATCHDOG)
     assert fault == 10
     assert after[-1].state == c.STATE_FAULTED
-    machine.close()
+    emulator.close()
 
 
 def outputs_of(answer: bytes):
     return c.pil_answer.from_buffer_copy(answer).outputs
 
 
-def test_an_image_told_nonsense_says_so_on_every_machine(images, library_files):
+def test_an_image_reported_nonsense_says_so_on_every_emulator(images, library_files):
     """No tick is run on it, and the next frame is served."""
     good = c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION, supply_mv=12000)
     image = next(iter(images.values()))
     for name in ("host", "unicorn", "qemu"):
-        machine = machine_of(name, next(iter(library_files.values())) if name == "host" else image)
-        refused = c.pil_answer.from_buffer_copy(machine.tick(bytes(592)))
-        assert (refused.magic, refused.version) == (c.FRAME_REJECTED, c.FRAME_VERSION), name
-        assert c.pil_answer.from_buffer_copy(machine.tick(bytes(good))).magic == c.FRAME_ANSWER, name
-        machine.close()
+        emulator = emulator_of(name, next(iter(library_files.values())) if name == "host" else image)
+        rejected = c.pil_answer.from_buffer_copy(emulator.tick(bytes(592)))
+        assert (rejected.magic, rejected.version) == (c.FRAME_REJECTED, c.FRAME_VERSION), name
+        assert c.pil_answer.from_buffer_copy(emulator.tick(bytes(good))).magic == c.FRAME_ANSWER, name
+        emulator.close()
 
 
 @pytest.mark.parametrize("compiler", IMAGES)
@@ -171,7 +171,7 @@ def test_a_floating_point_register_lost_in_the_interrupt_ends_the_emulation(comp
     assert call in text
     startup.write_text(text.replace(call, call + '        __asm__ volatile("vmov s20, r0");\n'), encoding="utf-8")
     monkeypatch.setattr(build, "source_folder", lambda: sources)
-    machine = machine_of("qemu", build.build_board("pil", tmp_path / "pil.elf", found[compiler]))
+    emulator = emulator_of("qemu", build.build_board("pil", tmp_path / "pil.elf", found[compiler]))
     with pytest.raises(DeviceError, match="broke down"):
-        machine.tick(bytes(c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION)))
-    machine.close()
+        emulator.tick(bytes(c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION)))
+    emulator.close()

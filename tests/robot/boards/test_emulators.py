@@ -1,4 +1,4 @@
-"""The machines: the same bits from every compiler on every one of them, and what is said where one cannot run."""
+"""The emulators: the same bits from every compiler on every one of them, and what is said where one cannot run."""
 
 import hashlib
 import shutil
@@ -47,14 +47,14 @@ def test_every_scenario_passes(expected, scenario):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("machine", [UnicornEmulator, QemuEmulator])
-def test_every_machine_and_compiler_gives_the_same_bits(images, expected, machine, compiler):
+@pytest.mark.parametrize("emulator", [UnicornEmulator, QemuEmulator])
+def test_every_emulator_and_compiler_gives_the_same_bits(images, expected, emulator, compiler):
     if compiler not in images:
         pytest.skip(f"{compiler} is not installed")
-    if machine is QemuEmulator and not shutil.which(qemu.PROGRAM):
+    if emulator is QemuEmulator and not shutil.which(qemu.PROGRAM):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     for name, scenario in DRIVEN.items():
-        assert run_scenario(scenario, machine(images[compiler])) == expected[name], name
+        assert run_scenario(scenario, emulator(images[compiler])) == expected[name], name
 
 
 def test_one_bit_of_a_potentiometer_is_another_trace():
@@ -87,41 +87,41 @@ def test_two_host_boards_do_not_share_anything(library):
     assert second.answer["tick"] == 1
 
 
-def test_a_missing_qemu_is_told(monkeypatch, images):
+def test_a_missing_qemu_is_reported(monkeypatch, images):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match="qemu-system-arm is not installed: apt install qemu-system-arm, or use"):
         QemuEmulator.open(next(iter(images.values())))
 
 
-def test_an_emulation_that_ends_is_told_in_its_own_words(tmp_path):
+def test_an_emulation_that_ends_is_reported_with_its_own_text(tmp_path):
     if not shutil.which(qemu.PROGRAM):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     broken = tmp_path / "none.elf"
     broken.write_bytes(b"\x7fELF nothing more")
-    machine = QemuEmulator.open(broken)
+    emulator = QemuEmulator.open(broken)
     with pytest.raises(DeviceError, match="the emulated board broke down: qemu-system-arm ended"):
-        list(map(machine.tick, [bytes(REQUEST.itemsize)] * 3))
-    machine.close()
-    machine.close()
+        list(map(emulator.tick, [bytes(REQUEST.itemsize)] * 3))
+    emulator.close()
+    emulator.close()
 
 
 def test_a_request_that_is_none_runs_no_tick(images):
-    machine = UnicornEmulator.open(images[next(iter(images))])
-    answer = machine.tick(bytes(REQUEST.itemsize))
+    emulator = UnicornEmulator.open(images[next(iter(images))])
+    answer = emulator.tick(bytes(REQUEST.itemsize))
     assert len(answer) == ANSWER.itemsize
     assert answer[:4] == b"ASNO"
 
 
-def test_an_image_that_breaks_down_is_told(images):
-    machine = UnicornEmulator.open(images[next(iter(images))])
-    machine._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
+def test_an_image_that_breaks_down_is_reported(images):
+    emulator = UnicornEmulator.open(images[next(iter(images))])
+    emulator._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
     with pytest.raises(DeviceError, match="the emulated board broke down"):
-        machine.tick(bytes(REQUEST.itemsize))
+        emulator.tick(bytes(REQUEST.itemsize))
 
 
-@pytest.mark.parametrize("machine", [UnicornEmulator, HostEmulator])
-def test_a_file_that_is_no_firmware_is_named(machine, tmp_path):
+@pytest.mark.parametrize("emulator", [UnicornEmulator, HostEmulator])
+def test_a_file_that_is_no_firmware_is_named(emulator, tmp_path):
     wrong = tmp_path / "wrong.so"
     wrong.write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"wrong\.so"):
-        machine(wrong)
+        emulator(wrong)
