@@ -11,7 +11,7 @@
 float pot_angle(const pot_config *config, uint32_t counts);
 
 /* Take this tick's counts. A reading out of its band, or one further off than the joint can have moved, is not
- * believed: the angle stays. Returns the fault once that lasts confirm_ticks (1 or more), FAULT_NONE until then. */
+ * plausible: the angle stays. Returns the fault once that lasts confirm_ticks (1 or more), FAULT_NONE until then. */
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks);
 
 /* Return whether the present angle is a reading of this tick. */
