@@ -43,7 +43,7 @@ def main(seeds: int, quick: bool) -> None:
     for seed in range(seeds):
         began = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            s = run_demo(Demo(Path(folder), seed=seed, quick=quick))
+            s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).to_json()
         for name, (part, key, factor, _, _) in FIGURES.items():
             found[name].append(factor * s[part][key])
         c = s["closed_loop"]

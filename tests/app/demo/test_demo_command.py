@@ -41,8 +41,8 @@ def short(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "_AMOUNTS", {True: (10, 14, 0)})
         patch.setattr(demo, "_MOTIONS", {True: motion})
-        summary = run_demo(Demo(folder, machine="host", quick=True, seed=4))
-    return folder, summary
+        summary = run_demo(Demo(folder, emulator="host", quick=True, seed=4))
+    return folder, summary.to_json(), summary
 
 
 def rows(folder, name):
@@ -53,8 +53,8 @@ def rows(folder, name):
 
 
 @pytest.mark.parametrize("name", ["vision", "potentiometers", "fused", "live"])
-def test_anyone_can_recompute_the_figures_from_the_files(short, name):
-    folder, summary = short
+def test_anyone_can_recompute_the_metrics_from_the_files(short, name):
+    folder, summary, _ = short
     t, p, q, phase = rows(folder, name)
     t_true, p_true, q_true, _ = rows(folder, "truth")
     moving = phase == "open_loop"
@@ -63,16 +63,16 @@ def test_anyone_can_recompute_the_figures_from_the_files(short, name):
     assert np.sqrt((off**2).mean()) == pytest.approx(summary[name]["position_rms_m"], rel=1e-3)
     assert off.max() == pytest.approx(summary[name]["position_max_m"], rel=1e-2)
     nearest = np.clip(np.searchsorted(t_true, t), 0, len(t_true) - 1)
-    turns = [
+    angles = [
         np.linalg.norm(log_so3(from_quaternion_wxyz(q[k]).T @ from_quaternion_wxyz(q_true[nearest[k]])))
         for k in np.flatnonzero(moving)[::7]
     ]
-    # The nearest millisecond in place of interpolation: at 2 rad/s half a milliradian.
-    assert np.sqrt(np.square(turns).mean()) == pytest.approx(summary[name]["orientation_rms_rad"], abs=1e-3)
+    # The nearest millisecond instead of interpolation: at 2 rad/s half a milliradian.
+    assert np.sqrt(np.square(angles).mean()) == pytest.approx(summary[name]["orientation_rms_rad"], abs=1e-3)
 
 
-def test_vision_is_right_and_potentiometers_are_not(short):
-    _, summary = short
+def test_vision_is_accurate_and_potentiometers_are_not(short):
+    _, summary, _ = short
     assert summary["ended_by"] is None
     assert summary["vision"]["position_rms_m"] < 0.2e-3
     assert summary["vision"]["orientation_rms_rad"] < np.radians(0.15)
@@ -84,21 +84,22 @@ def test_vision_is_right_and_potentiometers_are_not(short):
 
 
 def test_the_record_is_there_for_every_reading(short):
-    folder, _ = short
+    folder, *_ = short
     np.testing.assert_allclose(rows(folder, "fused")[0], rows(folder, "potentiometers")[0], rtol=0, atol=1e-6)
 
 
-def test_closing_the_loop_pays(short):
-    _, summary = short
+def test_closing_the_loop_reduces_the_errors(short):
+    _, summary, _ = short
     c = summary["closed_loop"]
     assert c["rest_error_after_m"] < c["rest_error_before_m"] / 5
     assert c["path_error_after_m"] < c["path_error_before_m"] / 2
 
 
 def test_the_folder_holds_what_its_page_says(short):
-    folder, summary = short
+    folder, summary, _ = short
+    assert summary["version"] == 2
     assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary))
-    for name in ("truth", "vision", "potentiometers", "fused", "live", "wanted", "joints"):
+    for name in ("truth", "vision", "potentiometers", "fused", "live", "reference", "joints"):
         assert (folder / f"{name}.csv").stat().st_size > 1000
         assert (folder / f"{name}.parquet").stat().st_size > 1000
     for name in ("joints", "path", "errors", "loop", "latency", "pose", "workcell"):
@@ -118,17 +119,19 @@ def test_the_folder_holds_what_its_page_says(short):
 
 
 def broken(tmp_path, monkeypatch, mend):
-    """Run with a cell that ``mend`` has done something to; returns what was said."""
+    """Run with a workcell that ``mend`` has changed; returns the message."""
 
-    class Cell(Workcell):
-        def __init__(self, **options):
-            super().__init__(**options)
-            mend(self)
+    class Mended(Workcell):
+        @classmethod
+        def open(cls, **options):
+            workcell = super().open(**options)
+            mend(workcell)
+            return workcell
 
-    monkeypatch.setattr(demo, "Workcell", Cell)
+    monkeypatch.setattr(demo, "Workcell", Mended)
     monkeypatch.setattr(demo, "_AMOUNTS", {True: (6, 12, 0)})
     with pytest.raises(ArmsightError) as caught:
-        run_demo(Demo(tmp_path, machine="host", quick=True, seed=1))
+        run_demo(Demo(tmp_path, emulator="host", quick=True, seed=1))
     assert json.loads((tmp_path / "summary.json").read_text())["ended_by"] in str(caught.value)
     return str(caught.value)
 
@@ -162,7 +165,7 @@ def test_a_board_that_faults(tmp_path, monkeypatch):
         monkeypatch.setattr(workcell.plant, "step", stepped)
 
     said = broken(tmp_path, monkeypatch, fails)
-    assert "the board went over to FAULTED" in said
+    assert "the board changed to FAULTED" in said
     assert "supply too low" in said
 
 
@@ -177,7 +180,7 @@ def test_a_demo_where_a_file_stands(armsight, tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--rig", "round")],
+    [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--layout", "round")],
 )
 def test_options_typed_wrong(armsight, options):
     assert armsight("demo", *options).code == 2
@@ -200,28 +203,33 @@ def test_names_that_are_not_known(armsight, tmp_path, options, said):
 
 @pytest.mark.parametrize("cameras", ["webcams", "webcams:640x480@15", "1280x720@60"])
 def test_the_study_of_rates_takes_the_same_cameras(cameras):
-    told, at = open_timing(cameras), open_timing(demo.cameras_at(cameras, 4.0))
+    given, at = open_timing(cameras), open_timing(demo.cameras_at(cameras, 4.0))
     assert at.rate_hz == 4.0
-    assert replace(at, rate_hz=told.rate_hz) == told
+    assert replace(at, rate_hz=given.rate_hz) == given
 
 
 def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):
-    _, summary = short
+    folder, values, summary = short
     monkeypatch.setattr(command, "run_demo", lambda demo, **options: summary)
     said = armsight("demo", "-o", tmp_path)
     assert said.code == 0
-    assert f"{1e3 * summary['vision']['position_rms_m']:.3f} mm" in said.out
+    lines = said.out.splitlines()
+    vision = next(line for line in lines if line.startswith("vision"))
+    assert vision.split()[1] == f"{1e3 * values['vision']['position_rms_m']:.3f}"
+    assert "RMS, mm" in said.out
     assert "times smaller" in said.out
+    page = (folder / "report.html").read_text()  # the same numbers as in the terminal
+    assert all(f"<td>{cell}</td>" in page for cell in vision.split()[1:])
     again = armsight("demo", "-o", tmp_path, "--json")
     assert again.lines[0]["seed"] == 4
 
 
-def test_a_model_that_is_none_leaves_nothing_behind(armsight, tmp_path):
+def test_an_arm_model_that_cannot_be_read_leaves_nothing_behind(armsight, tmp_path):
     (tmp_path / "none.toml").write_text("identified = true\n")
-    for model, said in (
+    for name, said in (
         ("none.toml", "none.toml: six [[joint]] tables"),
         ("lost.toml", "lost.toml"),
         ("lost.urdf", "lost.urdf"),
     ):
-        refused(armsight("demo", "--model", tmp_path / model, "-o", tmp_path / "run"), said)
+        refused(armsight("demo", "--nominal-arm", tmp_path / name, "-o", tmp_path / "run"), said)
         assert not (tmp_path / "run").exists()

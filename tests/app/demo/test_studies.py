@@ -1,4 +1,4 @@
-"""The studies of vision: what is measured is what the covariance foretold, and it goes the way of the geometry."""
+"""The studies of vision: the measured errors agree with the predicted ones, which follow the geometry."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ SHOTS = 3
 @pytest.fixture(scope="module")
 def found():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studies, "_DRAWS", 1)
+        patch.setattr(studies, "_REPEATS", 1)
         said = []
         yield {study.name: study for study in vision_studies(seed=3, shots=SHOTS, progress=said.append)}, said
 
 
-def test_every_study_is_told_and_misses_nothing(found):
+def test_every_study_is_reported_and_misses_nothing(found):
     by_name, said = found
     assert list(by_name) == ["distance", "baseline", "image width", "pixel noise", "calibration size"]
     for study in by_name.values():
@@ -32,12 +32,12 @@ def test_every_study_is_told_and_misses_nothing(found):
     ("name", "way"),
     [("distance", 1), ("baseline", -1), ("image width", -1), ("pixel noise", 1), ("calibration size", -1)],
 )
-def test_what_is_foretold_goes_the_way_of_the_geometry(found, name, way):
+def test_predicted_errors_follow_the_geometry(found, name, way):
     assert (way * np.diff(found[0][name].predicted_m) > 0).all()
 
 
 @pytest.mark.parametrize("name", ["distance", "baseline", "image width", "pixel noise"])
-def test_what_is_measured_is_what_was_foretold(found, name):
+def test_measured_errors_agree_with_predicted_ones(found, name):
     study = found[0][name]
     # Most of the error is along the line of sight: so many shots are as many squares at least, 17 values in 1e4 runs.
     ratio = (study.position_rms_m / study.predicted_m) ** 2

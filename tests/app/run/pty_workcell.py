@@ -1,8 +1,8 @@
 """A workcell as devices are: its board behind a pseudo-terminal, its cameras stamped by another clock, time of its own.
 
-The board's clock goes on by itself, a millisecond at a time and not faster than real time; where the machine is loaded
+The board's clock goes on by itself, a millisecond at a time and not faster than real time; where the computer is loaded
 it goes slower. It does not wait for the host: what the host does not read in time is lost, and a host that is silent for
-SILENT_TICKS stops the arm. That is four times what boards usually allow, because on a loaded machine the host's thread
+SILENT_TICKS stops the arm. That is four times what boards usually allow, because on a loaded computer the host's thread
 may not run for a while; the calibrations take longer still. The host's clock is tied to the board's.
 """
 
@@ -26,7 +26,7 @@ OFFSET_S, DRIFT, JITTER_S = 12345.678, 50e-6, 2e-4
 SILENT_TICKS = 400
 
 
-class PtyCell:
+class PtyWorkcell:
     """A workcell on the other side of a cable."""
 
     def __init__(self, **options):
@@ -79,7 +79,7 @@ class PtyCell:
 
 
 class HostStamped:
-    """The cell's cameras, stamped by the host's clock."""
+    """The workcell's cameras, stamped by the host's clock."""
 
     def __init__(self, far, seed=0):
         self._far, self._rng = far, np.random.default_rng(seed)

@@ -32,9 +32,9 @@ def files(tmp_path_factory, host_firmware):
     return folder
 
 
-def arguments(files, out, *more, source="sim:640x360@12", board="emulated:host", rig="rig.json", target="body.toml"):
+def arguments(files, output, *more, source="sim:640x360@12", board="emulated:host", rig="rig.json", target="body.toml"):
     named = ("--rig", files / rig, "--target", files / target, "--motion", files / "motion.toml")
-    return ("run", "--source", source, "--board", board, *named, "-o", out, *more)
+    return ("run", "--source", source, "--board", board, *named, "-o", output, *more)
 
 
 def test_the_workcell_by_name_is_run_as_devices_are(armsight, files, tmp_path, monkeypatch):
@@ -61,7 +61,7 @@ def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, boar
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("given", "said"),
     [
         ({"rig": "none.json"}, ("none.json", "no such file")),
         ({"rig": "motion.toml"}, ("motion.toml",)),
@@ -72,8 +72,8 @@ def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, boar
         ({"source": "usb:0,1", "board": "can:0"}, ("can:0", "serial:PORT")),
     ],
 )
-def test_what_is_not_there_is_named(armsight, files, tmp_path, given, words):
-    refused(armsight(*arguments(files, tmp_path / "run", **given)), *words)
+def test_what_is_not_there_is_named(armsight, files, tmp_path, given, said):
+    refused(armsight(*arguments(files, tmp_path / "run", **given)), *said)
 
 
 def test_a_rig_that_was_never_calibrated(armsight, files, tmp_path):
@@ -86,36 +86,36 @@ def test_a_rig_that_was_never_calibrated(armsight, files, tmp_path):
 def test_another_arm_than_the_boards(armsight, files, tmp_path):
     (tmp_path / "far.toml").write_text("start_deg = [40, 0, 0, 0, -90, 0]\n" + MOTION)
     said = armsight(*arguments(files, tmp_path / "run", "--motion", tmp_path / "far.toml"))
-    refused(said, "joint 1 reads", "the motion starts at 40.0", "--model six_r")
+    refused(said, "joint 1 reads", "the motion starts at 40.0", "--arm six_r")
 
 
 def test_a_run_where_a_file_stands_and_one_over_a_strangers_shots(armsight, files, tmp_path):
     (tmp_path / "run").write_text("mine")
     refused(armsight(*arguments(files, tmp_path / "run")), tmp_path / "run")
     (tmp_path / "other" / "shots").mkdir(parents=True)
-    refused(armsight(*arguments(files, tmp_path / "other")), "holds shots that are of no earlier run")
+    refused(armsight(*arguments(files, tmp_path / "other")), "holds shots that are not of an earlier run")
 
 
-@pytest.mark.parametrize("stage", ["opening the devices", "making ready", "hand-eye: pose 1 "])
+@pytest.mark.parametrize("stage", ["opening the devices", "preparing to follow", "hand-eye: pose 1 "])
 def test_ctrl_c_before_and_in_motion(armsight, files, tmp_path, monkeypatch, stage):
     steps = command.steps
 
-    class Told:
+    class Interrupting:
         def __enter__(self):
             self.shown = steps()
             progress = self.shown.__enter__()
 
-            def told(line):
+            def interrupting(line):
                 progress(line)
                 if line.startswith(stage):
                     os.kill(os.getpid(), signal.SIGINT)
 
-            return told
+            return interrupting
 
         def __exit__(self, *ended):
             return self.shown.__exit__(*ended)
 
-    monkeypatch.setattr(command, "steps", Told)
+    monkeypatch.setattr(command, "steps", Interrupting)
     said = armsight(*arguments(files, tmp_path / "run"))
     assert said.code == 130
     assert said.err.splitlines()[-1] == "armsight: interrupted"

@@ -1,6 +1,6 @@
 """A run on devices: the real protocol over a pseudo-terminal, a board with a clock of its own, cameras on another one.
 
-What is asserted holds however slow the machine is: see :mod:`pty_workcell`.
+What is asserted holds however slow the computer is: see :mod:`pty_workcell`.
 """
 
 import csv
@@ -12,7 +12,7 @@ import threading
 
 import numpy as np
 import pytest
-from pty_workcell import SILENT_TICKS, HostStamped, PtyCell
+from pty_workcell import SILENT_TICKS, HostStamped, PtyWorkcell
 
 from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import command
@@ -46,8 +46,8 @@ rest_s = 0.6
 
 @pytest.fixture
 def far(tmp_path, monkeypatch):
-    """A cell at the end of a cable, its files, and the command line made to find it."""
-    there = PtyCell(arm="used", cameras=CAMERAS, seed=4)
+    """A workcell at the end of a cable, its files, and the command line connected to it."""
+    there = PtyWorkcell(arm="used", cameras=CAMERAS, seed=4)
     there.workcell.truth.rig.save(tmp_path / "rig.json")
     (tmp_path / "body.toml").write_text(there.workcell.body_text)
     (tmp_path / "motion.toml").write_text(MOTION)
@@ -101,8 +101,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["ended_by"] is None
     assert summary["handeye"]["poses"] == 12
-    # Half an exposure of 2 ms and 12 ms, less the shortest way of a reading to the host, which is the clocks' to take up:
-    # two ticks are not missed, and the least of thousands is not ten.
+    # Half an exposure of 2 ms and 12 ms, less the shortest transmission of a reading, which the clock offset includes.
     assert 3e-3 < summary["camera_delay_s"]["value"] < 14e-3
     assert summary["shots"]["measured"] > 100
     # The host was never silent between its first command and its last, whatever was computed meanwhile.
@@ -111,7 +110,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     assert np.diff(times).max() < 1e-3 * SILENT_TICKS
     silent(far)
     assert state(far) == (BoardState.HOLDING, Fault.HOST_SILENT)
-    for name in ("vision", "potentiometers", "fused", "live", "wanted", "joints"):
+    for name in ("vision", "potentiometers", "fused", "live", "reference", "joints"):
         assert (tmp_path / "run" / f"{name}.csv").stat().st_size > 1000
     assert (tmp_path / "run" / "report.html").exists()
     _agrees_with_the_truth(far, loop, tmp_path)
@@ -122,7 +121,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
 
 
 def _agrees_with_the_truth(far, loop, tmp_path):
-    """Vision, brought onto the board's clock, must see the tool where it was, in motion as well as at rest."""
+    """Vision's track, on the board's clock, must agree with the true one, in motion as well as at rest."""
     truth = far.workcell.truth
     mounting = loop.mounting
     T = mounting.T_base_rig @ inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
@@ -138,7 +137,7 @@ def _agrees_with_the_truth(far, loop, tmp_path):
 
     lags = np.arange(-0.02, 0.02, 2e-4)
     best = lags[np.argmin([off(lag) for lag in lags])]
-    # The delay's sigma, and jitter and drift: a clock that were not followed would be off by 1.5 ms after 30 s.
+    # The delay's sigma, jitter and drift: an uncorrected clock would be off by 1.5 ms after 30 s.
     assert abs(best) < 1.5e-3
     assert off(best) < 1e-3  # discs of 3 px seen from 0.8 m; twice what is measured
 
@@ -148,13 +147,13 @@ def meanwhile(monkeypatch, stage, happens):
     real, done = command.run_experiment, []
 
     def run_experiment(*arguments, progress, **options):
-        def told(line):
+        def watched(line):
             progress(line)
             if line.startswith(stage) and not done:
                 done.append(line)
                 happens()
 
-        return real(*arguments, progress=told, **options)
+        return real(*arguments, progress=watched, **options)
 
     monkeypatch.setattr(command, "run_experiment", run_experiment)
     return done
@@ -212,7 +211,7 @@ def test_a_camera_that_breaks_in_a_way_nobody_thought_of(armsight, far, tmp_path
     silent(far)
 
 
-def test_a_fault_that_an_earlier_run_left_is_told_before_anything_moves(armsight, far, tmp_path):
+def test_a_fault_that_an_earlier_run_left_is_reported_before_anything_moves(armsight, far, tmp_path):
     with open_board(f"serial:{far.port}") as earlier:
         earlier.stop()
         earlier.receive(0.1)

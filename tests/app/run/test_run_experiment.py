@@ -1,4 +1,4 @@
-"""A board as an earlier run left it, taken over or refused: the firmware itself, in lock-step."""
+"""A board as an earlier run left it, taken over or rejected: the firmware itself, in lock-step."""
 
 from types import SimpleNamespace
 
@@ -52,7 +52,7 @@ def left_silent(board, link):
     return Board.connect(link, name="the board")
 
 
-def test_an_arm_that_is_held_is_taken_over_without_letting_go_of_it(made):
+def test_an_arm_that_is_held_is_taken_over_without_releasing_it(made):
     board, link, plant = made()
     again = left_silent(board, link)
     assert again.status.state is BoardState.HOLDING
@@ -84,14 +84,14 @@ def test_an_arm_that_still_slows_down_is_waited_for(made):
     assert board.status.state is BoardState.ENABLED
 
 
-def test_other_faults_are_a_persons_to_look_at(made):
+def test_other_faults_are_left_to_a_person(made):
     board, link, plant = made()
     again = left_silent(board, link)
     plant.break_pot(2, PotFault.OPEN)
     again.receive(0.2)
-    with pytest.raises(DeviceError, match=r"the board is not ready: faulted.*joint 3: potentiometer open") as told:
+    with pytest.raises(DeviceError, match=r"the board is not ready: faulted.*joint 3: potentiometer open") as caught:
         enable(again)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     again.receive(0.05)
     assert again.status.state is BoardState.FAULTED  # nothing was cleared
     assert {each.fault for each in again.status.faults} >= {Fault.HOST_SILENT, Fault.POT_OPEN}
@@ -123,21 +123,21 @@ def stands(q):
         ([0, 0, 0, 0, 0, 0], 2.6, r"joint 6 is to go from .* to 149\.0 deg, the board allows -137\.5 to 137\.5"),
     ],
 )
-def test_an_arm_that_does_not_fit_the_board_is_refused(shift_deg, target, said):
+def test_an_arm_that_does_not_fit_the_board_is_rejected(shift_deg, target, said):
     q = ARM.home + np.radians(shift_deg)
     setup = SimpleNamespace(board=stands(q[None]), arm=ARM)
     targets = ARM.home[None] + np.array([[0, 0, 0, 0, 0, target]])
-    with pytest.raises(InputError, match=said) as told:
+    with pytest.raises(InputError, match=said) as caught:
         require_start(setup, read_motions(ARM, QUICK), targets)
-    assert "--model six_r" in str(told.value)
+    assert "--arm six_r" in str(caught.value)
 
 
-def test_a_board_that_tells_no_angles(made):
+def test_a_board_that_reports_no_angles(made):
     setup = SimpleNamespace(board=stands(np.zeros((0, 6))), arm=ARM)
-    with pytest.raises(DeviceError, match="tells no joint angles"):
+    with pytest.raises(DeviceError, match="reports no joint angles"):
         require_start(setup, read_motions(ARM, QUICK), ARM.home[None])
 
 
-def test_all_that_the_loop_runs_can_be_rehearsed():
+def test_all_that_the_loop_runs_can_be_warmed_up():
     warm_up(ARM)
     warm_up(open_arm("puma560"))

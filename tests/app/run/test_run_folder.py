@@ -28,12 +28,14 @@ def finished(readings=400, **said):
     outcome.log.poses.append(("000000", 0.1, Missed("nothing is seen")))
     for name, value in said.items():
         setattr(outcome, name, value)
-    facts = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
-    return Finished(SimpleNamespace(), None, outcome, SimpleNamespace(), None, facts, time.perf_counter(), [], None)
+    properties = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
+    return Finished(
+        SimpleNamespace(), None, outcome, SimpleNamespace(), None, properties, time.perf_counter(), [], None
+    )
 
 
 def test_what_is_not_known_is_null(tmp_path):
-    summary = write_run(finished(), tmp_path)
+    summary = write_run(finished(), tmp_path).to_json()
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail) == summary
     assert summary["sigma_m"] is None
@@ -41,7 +43,7 @@ def test_what_is_not_known_is_null(tmp_path):
     assert summary["count"] == 3
     assert summary["said"] is True
     assert summary["ended_by"] is None
-    assert list(summary) == ["arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
+    assert list(summary) == ["version", "arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
 
 
 def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
@@ -55,9 +57,9 @@ def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
 
 def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
     disk, gone = small_disk("96k"), DeviceError("left camera: gone")
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as caught:
         finish(finished(readings=4000, ended_by=gone), disk)
-    said = str(told.value)
+    said = str(caught.value)
     assert "\n" not in said
     assert said.startswith("left camera: gone; the arm was stopped, and not all could be written: ")
     assert f"{disk / 'joints.csv'}: cannot be written: No space left on device" in said
@@ -108,14 +110,16 @@ def test_an_interrupt_while_writing_waits_until_what_was_measured_is_there(tmp_p
     assert {"joints.csv", "joints.parquet", "poses.csv", "summary.json"} == {path.name for path in tmp_path.iterdir()}
 
 
-def test_what_ended_a_run_is_told_with_where_the_rest_is(tmp_path):
-    with pytest.raises(ArmsightError) as told:
+def test_the_message_about_what_ended_a_run_names_the_folder(tmp_path):
+    with pytest.raises(ArmsightError) as caught:
         finish(finished(ended_by=DeviceError("the board is gone")), tmp_path)
-    assert str(told.value) == f"the board is gone; the arm was stopped; what was measured until then is in {tmp_path}"
+    assert str(caught.value) == f"the board is gone; the arm was stopped; what was measured until then is in {tmp_path}"
 
 
 def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
-    for name in ("report.html", "vision.csv", "vision.parquet", "errors.png", "summary.json", "mine.txt", "rig.json"):
+    of_a_run = ("report.html", "vision.csv", "vision.parquet", "reference.csv", "workcell.png", "summary.json")
+    of_version_1 = ("wanted.csv", "wanted.parquet", "cell.png")
+    for name in (*of_a_run, *of_version_1, "mine.txt", "rig.json"):
         (tmp_path / name).write_text("x")
     (tmp_path / "shots").mkdir()
     (tmp_path / "shots" / "shots.csv").write_text("x")
@@ -124,7 +128,7 @@ def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
 
 
 def test_what_cannot_make_room_is_named(tmp_path):
-    (tmp_path / "run.log").mkdir()  # a folder in a file's place
+    (tmp_path / "run.log").mkdir()  # a folder instead of a file
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InputError, match=r"run\.log: an earlier run's file cannot be removed"):
         make_room(tmp_path)

@@ -1,4 +1,4 @@
-"""The loop of a run on a board and cameras that are made up: how it ends when something goes wrong."""
+"""The control loop with a fake board and fake cameras: how a run ends when something fails."""
 
 import gc
 import os
@@ -32,7 +32,7 @@ ARM = open_arm("six_r")
 
 
 class Standing:
-    """A board whose arm stands at home whatever it is told."""
+    """A board whose arm stands at home, whatever it is commanded."""
 
     def __init__(self):
         self.t_s, self.sent = 0.0, []
@@ -53,7 +53,7 @@ class Standing:
 
 
 class Blind:
-    """A follower that sees nothing."""
+    """A follower that never finds the body."""
 
     rig, way = None, "followed"
 
@@ -76,8 +76,15 @@ def setup(board, last_shot_s=np.inf, clock=None):
     return Setup(ARM, board, poll, target, lambda q: np.zeros(6), 60.0, 0.0, clock)
 
 
+def test_a_loop_receives_nothing_before_it_is_opened():
+    board = Standing()
+    loop = Loop(setup(board), Blind(), Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    assert board.t_s == 0.0
+    assert loop.log.joints == []
+
+
 def looped(board, **given):
-    loop = Loop(setup(board, **given), Blind(), Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    loop = Loop.open(setup(board, **given), Blind(), Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
     board.enable()
     return loop
 
@@ -97,7 +104,9 @@ def test_cameras_that_stall_end_a_run_and_a_body_that_is_hidden_does_not():
     assert loop.log.segments[-1].end_s == pytest.approx(board.t_s)
 
 
-@pytest.mark.parametrize("error", [InputError("a camera"), KeyboardInterrupt(), ZeroDivisionError("a mistake of ours")])
+@pytest.mark.parametrize(
+    "error", [InputError("a camera"), KeyboardInterrupt(), ZeroDivisionError("a programming error")]
+)
 def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
     board = Standing()
 
@@ -119,7 +128,7 @@ def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
     assert board.sent[-1].duration_s == pytest.approx(0.3)
 
 
-def test_between_the_passes_the_arm_goes_back_to_the_start_by_a_way_of_its_own():
+def test_between_the_passes_the_arm_moves_back_to_the_start_on_a_planned_trajectory():
     board = Standing()
     loop = looped(board)
     plan = read_motions(ARM, QUICK)
@@ -168,7 +177,7 @@ def test_in_lock_step_no_time_passes_while_something_is_computed():
     assert (board.t_s, len(board.sent)) == (t_s, sent)
 
 
-def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
+def test_a_board_that_faults_while_something_is_computed_is_reported_at_once():
     board = Standing()
     loop = looped(board, clock=Live())
     stand(loop, 0.1)
@@ -178,7 +187,7 @@ def test_a_board_that_faults_while_something_is_computed_is_told_at_once():
         board.status.state = BoardState.HOLDING
         ended.wait(10.0)
 
-    with pytest.raises(DeviceError, match="went over to HOLDING"):
+    with pytest.raises(DeviceError, match="changed to HOLDING"):
         loop.compute(work)
     ended.set()
 
@@ -194,7 +203,7 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
         return Missed("searched in vain")
 
     slow.measure = measure
-    loop = Loop(setup(board, clock=Live()), slow, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    loop = Loop.open(setup(board, clock=Live()), slow, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
     board.enable()
     stand(loop, 1.0)
     assert len(board.sent) >= 250
@@ -202,9 +211,7 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     names = [name for name, _, _ in loop.log.poses]
     still = point_to_point(ARM, ARM.home, ARM.home)
     planned = Planned(still, loop.t_s, lambda q: np.zeros(6))
-    loop.run_until_seen(
-        planned, 0.02, RunSegment("calibration", "", "", False)
-    )  # what was begun before is not taken for it
+    loop.run_until_seen(planned, 0.02, RunSegment("calibration", "", "", False))  # a shot begun before does not count
     (name,) = [name for name, _, _ in loop.log.poses[len(names) :]]
     assert int(name) >= 60
     assert board.t_s > 1.02
@@ -233,7 +240,7 @@ def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatc
     assert board.t_s > 0.4
 
 
-def test_where_time_passes_by_itself_the_stop_is_said_again_and_again():
+def test_where_time_passes_by_itself_the_stop_is_sent_repeatedly():
     board = Standing()
     loop = looped(board, clock=Live())
     stand(loop, 0.1)
@@ -249,9 +256,9 @@ def test_slow_cameras_are_given_a_longer_sweep(monkeypatch):
     loop.mounting = SimpleNamespace()
     slow = replace(loop.setup, rate_hz=4.0)
     monkeypatch.setattr(loop, "setup", slow)
-    with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as told:
+    with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as caught:
         run_calibrate.find_delay(loop, ARM, ARM.home, ARM.home, lambda q: np.zeros(6))
-    assert "slower than 4 Hz" in str(told.value)
+    assert "slower than 4 Hz" in str(caught.value)
 
 
 def test_an_interrupt_does_not_wait_for_what_is_being_computed():
@@ -267,7 +274,7 @@ def test_an_interrupt_does_not_wait_for_what_is_being_computed():
     ended.set()
 
 
-def test_what_makes_a_loop_wait_is_put_back_afterwards():
+def test_the_interpreter_settings_of_a_loop_are_restored_afterwards():
     before = sys.getswitchinterval()
     for in_time in (True, False):
         with steady(in_time=in_time):
@@ -277,10 +284,10 @@ def test_what_makes_a_loop_wait_is_put_back_afterwards():
         assert gc.isenabled()
 
 
-def test_interrupts_are_held_back_and_told():
+def test_interrupts_are_held_back_and_reported():
     with uninterrupted() as held:
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.001)  # a place where it would have come
+        time.sleep(0.001)  # here it would have been raised
     assert held == [signal.SIGINT]
     with pytest.raises(KeyboardInterrupt):
         raised()

@@ -1,4 +1,4 @@
-"""Tracks, their files and their figures, against slow obvious versions."""
+"""Tracks, their files and their metrics, against slow obvious versions."""
 
 import csv
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from armsight.app.run.metrics import path_distances, spread, track_metrics
+from armsight.app.run.metrics import Spread, path_distances, spread, track_metrics
 from armsight.app.run.record import ToolTrack, errors, write_track
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
@@ -32,11 +32,11 @@ def test_errors_are_the_tangents_from_the_estimate_to_the_truth():
     expected = [
         log_se3(inverse(T) @ T_true) for T, T_true in zip(estimate.Ts_base_tool, truth.Ts_base_tool, strict=True)
     ]
-    # The shift is taken straight, not along the screw: they differ by half the product of shift and turn.
+    # The shift is taken straight, not along the screw: they differ by half the product of shift and rotation.
     assert np.abs(errors(estimate, truth) - expected).max() < 0.5 * np.abs(xi).max() ** 2 * 6
 
 
-def test_between_its_rows_a_track_is_straight_and_turns_evenly():
+def test_between_its_rows_a_track_is_linear_and_rotates_evenly():
     truth = track(n=2001)
     rows = np.arange(0, 2001, 10)
     coarse = truth[rows]
@@ -45,7 +45,7 @@ def test_between_its_rows_a_track_is_straight_and_turns_evenly():
     assert np.abs(off).max() < 2 * 4 * 0.3 * 0.01**2 / 8
 
 
-def test_the_figures_of_noise_with_a_known_covariance():
+def test_the_metrics_of_noise_with_a_known_covariance():
     truth = track(n=4000)
     sigma = np.array([1e-4, 2e-4, 3e-4, 1e-3, 1e-3, 2e-3])
     xi = sigma * np.random.default_rng(2).standard_normal((4000, 6))
@@ -53,10 +53,10 @@ def test_the_figures_of_noise_with_a_known_covariance():
     found = track_metrics(
         ToolTrack(truth.t_s, truth.Ts_base_tool @ exp_se3(-xi), truth.phase, truth.motion, covs), truth
     )
-    assert found["position_rms_m"] == pytest.approx(np.linalg.norm(sigma[:3]), rel=0.03)
-    assert found["position_sigma_rms_m"] == pytest.approx(np.linalg.norm(sigma[:3]))
-    assert found["nees_mean"] == pytest.approx(6.0, abs=4 * np.sqrt(12 / 4000))
-    assert found["inside_95_share"] == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
+    assert found.position_rms_m == pytest.approx(np.linalg.norm(sigma[:3]), rel=0.03)
+    assert found.claimed.position_sigma_rms_m == pytest.approx(np.linalg.norm(sigma[:3]))
+    assert found.claimed.nees_mean == pytest.approx(6.0, abs=4 * np.sqrt(12 / 4000))
+    assert found.claimed.inside_95_share == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
 
 
 def test_the_files_hold_what_the_track_holds(tmp_path):
@@ -91,4 +91,4 @@ def test_distances_from_a_path_do_not_ask_when():
 
 def test_spread_is_numpys():
     values = np.random.default_rng(3).exponential(size=999)
-    assert spread(values) == {"p50": np.percentile(values, 50), "p99": np.percentile(values, 99), "max": values.max()}
+    assert spread(values) == Spread(np.percentile(values, 50), np.percentile(values, 99), values.max())

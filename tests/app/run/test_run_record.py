@@ -1,4 +1,4 @@
-"""A log as tables: what stamps that are off do to the poses of a tool that moves stands in their covariance."""
+"""A log as tracks: the covariance of a moving tool's poses includes the errors of the time stamps."""
 
 import numpy as np
 import pytest
@@ -12,17 +12,17 @@ from armsight.robot.arm_file import open_arm
 ARM = open_arm("six_r")
 RATE_HZ, SHOTS, DELAY_S = 60.0, 600, 0.02
 EXPOSED = 0.5 + np.arange(SHOTS) / RATE_HZ
-SIGMA = np.repeat([2e-5, 5e-5], 3)  # of one sighting, m and rad
+SIGMA = np.repeat([2e-5, 5e-5], 3)  # of one pose measurement, m and rad
 
 
 def swinging(t_s):
-    """Where the tool is at times (N,): up to 0.4 m/s and 1 rad/s, turning back every second."""
+    """Poses of the tool at times (N,): up to 0.4 m/s and 1 rad/s, reversing every second."""
     swing = np.sin(np.pi * t_s)[:, None] * np.array([0.1, 0.05, -0.06, 0.2, -0.15, 0.2])
     return exp_se3(swing)
 
 
 def assemble(rng, delay, jitter_s, off_s, exposed=EXPOSED):
-    """The vision track and the truth of a run whose stamps scatter, and whose delay is off by so much."""
+    """The vision track and the truth of a run whose stamps scatter, and whose delay is wrong by ``off_s``."""
     stamps = exposed + DELAY_S + off_s + jitter_s * rng.normal(size=len(exposed))
     Ts = swinging(exposed) @ exp_se3(SIGMA * rng.normal(size=(len(exposed), 6)))
     cov = np.diag(SIGMA**2)
@@ -54,11 +54,11 @@ def test_jitter_of_the_stamps_is_in_the_covariance():
 def test_what_is_not_known_of_the_delay_is_in_it_too():
     rng, sigma_s = np.random.default_rng(1), 2e-4
     found = [nees(*assemble(rng, Delay(DELAY_S, sigma_s), 0.0, sigma_s * rng.normal())).mean() for _ in range(20)]
-    # Common to all of a run: of its 20 draws the mean square is known to a third of one degree of freedom.
+    # Common to all of a run: from 20 samples the mean square is known to a third of one degree of freedom.
     assert np.mean(found) == pytest.approx(6.0, abs=1.0)
 
 
-def test_seldom_shots_and_such_beside_gaps_and_doubled_stamps():
+def test_sparse_shots_gaps_and_doubled_stamps():
     seldom = 0.5 + np.arange(100) / 5.0  # neighbours on both sides, 0.2 s away
     lonely = np.concatenate([0.75 + np.arange(40) * 0.5 + n / RATE_HZ for n in (0, 1)])  # pairs, half a second apart
     for exposed in (seldom, np.sort(lonely)):
@@ -72,9 +72,9 @@ def test_seldom_shots_and_such_beside_gaps_and_doubled_stamps():
     assert single.covs[0] == pytest.approx(np.diag(SIGMA**2))
 
 
-def test_a_tool_that_stands_has_no_more_than_its_own():
+def test_a_tool_at_rest_has_its_own_covariance_alone():
     vision, _ = assemble(np.random.default_rng(2), Delay(DELAY_S, 1e-3), 0.0, 0.0)
-    turning = np.argmin(np.abs(np.cos(np.pi * vision.t_s)))
-    # Within half a shot of the turn it is slower than pi^2 * 0.1 m * 1 / 120 s: 0.4 of its own sigma at 1 ms.
-    assert np.sqrt(np.diag(vision.covs[turning])) == pytest.approx(SIGMA, rel=0.15)
+    reversal = np.argmin(np.abs(np.cos(np.pi * vision.t_s)))
+    # Within half a shot of the reversal it is slower than pi^2 * 0.1 m * 1 / 120 s: 0.4 of its own sigma at 1 ms.
+    assert np.sqrt(np.diag(vision.covs[reversal])) == pytest.approx(SIGMA, rel=0.15)
     assert np.sqrt(vision.covs[:, 0, 0]).max() > 5 * SIGMA[0]

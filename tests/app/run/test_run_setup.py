@@ -1,4 +1,4 @@
-"""Two clocks brought together, and cameras that are read beside the loop."""
+"""Host times converted to the board's clock, and cameras that a thread reads."""
 
 import threading
 
@@ -23,9 +23,9 @@ class Clock:
 
 
 def heard(rng, drift, seconds, *, pause=None, way_s=1e-3):
-    """Readings heard every 4 ms, late by the shortest way and up to 3 ms more, now and then much more.
+    """Readings received every 4 ms, late by the shortest transmission and up to 3 ms more, sometimes much more.
 
-    Returns (board's time, host's true time then, host's time as brought over) of each, from 1 s on.
+    Returns (board's time, host's time converted to the board's clock) of each, from 1 s on.
     """
     now = Clock()
     clock, rows = HostClock(now), []
@@ -42,7 +42,7 @@ def heard(rng, drift, seconds, *, pause=None, way_s=1e-3):
 
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6, 1.5e-4, -1e-3])
-def test_stamps_are_brought_to_the_boards_clock_but_for_the_shortest_way(drift):
+def test_stamps_are_converted_to_the_boards_clock_up_to_the_shortest_transmission(drift):
     rows = heard(np.random.default_rng(0), drift, 60.0)
     off = rows[:, 1] - rows[:, 0]
     # Taken late by h above the least: h is so that 250 readings a second, uniform over 3 ms, bring it down as fast as it
@@ -52,7 +52,7 @@ def test_stamps_are_brought_to_the_boards_clock_but_for_the_shortest_way(drift):
     assert np.ptp(off) < 8 * h + abs(drift) * 0.1
 
 
-def test_a_host_that_is_busy_for_a_while_does_not_upset_the_clock():
+def test_a_host_that_is_busy_for_some_time_does_not_disturb_the_clock():
     rows = heard(np.random.default_rng(1), 50e-6, 12.0, pause=(5.0, 9.0))
     off = rows[:, 1] - rows[:, 0] + 1e-3
     assert np.abs(off).max() < 4.1 * DRIFT + 2e-4  # it rises meanwhile, no faster than clocks drift
@@ -63,7 +63,7 @@ def test_a_host_that_is_busy_for_a_while_does_not_upset_the_clock():
 @pytest.mark.parametrize(
     ("t_s", "said"), [(None, "has no time"), (3.0, "was taken 12343 s ago"), (1.7e9, "was taken -")]
 )
-def test_shots_of_a_recording_are_refused(t_s, said):
+def test_shots_of_a_recording_are_rejected(t_s, said):
     now = Clock()
     clock = HostClock(now)
     now.s = OFFSET_S
@@ -74,7 +74,7 @@ def test_shots_of_a_recording_are_refused(t_s, said):
 
 
 class Reads:
-    """A source that hands out shots, and then what it is told to."""
+    """A source of one shot, and then of a given end."""
 
     def __init__(self, end):
         self.end, self.left, self.closed = end, [Shot("1", None, None, 1.0)], False
@@ -100,15 +100,18 @@ def polled_until_it_raises(shots):
 @pytest.mark.parametrize(
     ("end", "said"),
     [
-        (None, "the source of images has come to its end"),
+        (None, "the source of images has ended"),
         (DeviceError("left camera: gone"), "left camera: gone"),
         (ZeroDivisionError("of ours"), "reading the cameras failed: ZeroDivisionError: of ours"),
         (MemoryError(), "reading the cameras failed: MemoryError"),
     ],
 )
-def test_whatever_ends_the_reading_is_told_where_shots_are_asked_for(end, said):
+def test_whatever_ends_the_reading_is_raised_by_poll(end, said):
     source = Reads(end)
     shots = LiveShots(source)
+    assert shots.poll() is None  # nothing is read before the start
+    assert source.left
+    shots.start()
     first = None
     while first is None:
         first = shots.poll()

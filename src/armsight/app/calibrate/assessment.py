@@ -1,11 +1,10 @@
-"""Is a calibration good? Its held-out figures judged one by one, and the verdict in plain words.
+"""Assessment of a calibration: its predicted uncertainty in space, and its held-out metrics with a grade each.
 
-The limits are orientation for a reader, no gate: nothing is refused because of them.
-
-How well a rig knows a point in the volume both cameras see: predicted sigmas over a slice and at the boards.
-
-A calibrated rig and the noise of a corner go in; depth and lateral sigma come out, the pixel noise and the calibration
-apart and together. Same functions as in a measurement, so the picture shows what a measurement will claim.
+In: a Calibration. Out, first: the predicted sigma of a triangulated point over the volume that both cameras see, split into
+the shares of pixel noise and of calibration (:func:`predicted_sigmas`, :func:`volume_slice`); they are computed as in a
+measurement, so they are what a measurement will claim. Second: metrics of the held-out errors with grades and advice
+(:func:`graded_metrics`, :func:`advice`), and the grade of the whole (:func:`assess`). The limits of the grades are a guide
+for the reader; nothing is rejected because of them.
 """
 
 from __future__ import annotations
@@ -24,25 +23,24 @@ from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
-#: What a predicted sigma is made of, in the order of the first axis of every array here.
+#: Shares of a predicted sigma, in the order of the first axis of the arrays.
 SHARES = ("pixel noise", "calibration", "both together")
-#: The slice goes this much nearer and farther than the boards were, and beyond them to both sides by this share of their
-#: extent, as far as both cameras see.
+#: The slice extends beyond the nearest and the farthest target by the first share of its distance, and to both sides by
+#: the second share of the targets' extent, as far as both cameras see.
 BEYOND, BESIDE = 0.15, 0.5
 _DEEP, _WIDE = 80, 120
-_WIDEST_TANGENT = 3.0  # of half the field of view: a fisheye's slice would else be infinitely wide
-_FINDS_BACK = (
-    1e-6  # relative to the distance: a point that triangulates elsewhere lies beyond what the lens model spans
-)
+_WIDEST_TANGENT = 3.0  # of half the field of view: the slice of a fisheye lens would be infinitely wide otherwise
+#: Relative to the distance: a point that triangulates elsewhere lies outside the valid range of the lens model.
+_ROUND_TRIP = 1e-6
 _LEAST_SIGMA_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Slice(Record):
-    """Predicted sigmas over a plane through the cameras and the places where the boards were.
+    """Predicted sigmas over a plane through the cameras and the positions of the targets.
 
     Attributes:
-        axis: 0 where the plane's sideways coordinate is X of the left camera, 1 where it is Y.
+        axis: 0 if the plane's sideways coordinate is X of the left camera, 1 if it is Y.
         sideways_m: (W,) coordinates along that axis, m.
         depth_m: (D,) Z of the left camera, m.
         seen: (D, W) whether both cameras see the point.
@@ -59,7 +57,7 @@ class Slice(Record):
 
 
 def corner_variance_px2(calibration: Calibration) -> Array:
-    """Return (2,) the variance of a typical corner in the left and the right image, px^2: the image's and the rig's."""
+    """Return (2,) the variance of a typical corner in the left and the right image, px^2: its own and the rig's share."""
     observations, base = calibration.observations, max(calibration.rig.sigma_px, _LEAST_SIGMA_PX) ** 2
     image = np.trace(observations.cov_uv, axis1=1, axis2=2) / 2
     sides = [image[observations.camera == side] for side in (0, 1)]
@@ -67,7 +65,7 @@ def corner_variance_px2(calibration: Calibration) -> Array:
 
 
 def predicted_sigmas(rig: StereoRig, p_left: Array, variance_px2: Array) -> tuple[Array, Array]:
-    """Predict how well points would be triangulated.
+    """Predict the uncertainty of triangulated points.
 
     Args:
         rig: the calibrated pair.
@@ -85,7 +83,7 @@ def predicted_sigmas(rig: StereoRig, p_left: Array, variance_px2: Array) -> tupl
     cov_uv = np.broadcast_to(variance_px2[:, None, None] * np.eye(2), (len(rows), 2, 2, 2))
     p, noise, by_rig = optimal_points(rig, uv[rows], cov_uv)
     with np.errstate(invalid="ignore"):
-        back = np.linalg.norm(p - p_left[rows], axis=1) < _FINDS_BACK * np.linalg.norm(p_left[rows], axis=1)
+        back = np.linalg.norm(p - p_left[rows], axis=1) < _ROUND_TRIP * np.linalg.norm(p_left[rows], axis=1)
     calibration = by_rig @ rig.cov @ by_rig.transpose(0, 2, 1)
     depth, lateral = np.full((2, len(SHARES), len(p_left)), np.nan)
     for k, cov in enumerate((noise, calibration, noise + calibration)):
@@ -108,25 +106,25 @@ def _along_and_across(rig: StereoRig, p_left: Array, cov: Array) -> tuple[Array,
     return np.sqrt(np.maximum(along, 0)), np.sqrt(np.maximum(across, 0))
 
 
-def board_points(calibration: Calibration) -> Array:
-    """Return (S, M, 3) the points of the board in every pair used, m, left camera's frame."""
+def target_points(calibration: Calibration) -> Array:
+    """Return (S, M, 3) the points of the target in every pair used, m, left camera's frame."""
     Ts = calibration.solution.state.Ts_left_body
     return np.asarray(transform(Ts[:, None], calibration.body.points))
 
 
 def volume_slice(calibration: Calibration) -> Slice:
-    """Predict the sigmas over the plane through the boards' middle, from nearer than the nearest to beyond the farthest.
+    """Predict the sigmas over the plane through the targets' middle, from before the nearest to beyond the farthest.
 
-    The plane holds the left camera's X axis, or its Y axis where the cameras stand one above the other.
+    The plane contains the left camera's X axis, or its Y axis if the cameras are mounted one above the other.
     """
-    rig, boards = calibration.rig, board_points(calibration)
+    rig, targets = calibration.rig, target_points(calibration)
     axis = int(np.argmax(np.abs(rig.T_left_right[:2, 3])))
-    z = boards[..., 2]
+    z = targets[..., 2]
     depth = np.linspace((1 - BEYOND) * max(z.min(), 1e-3 * z.max()), (1 + BEYOND) * z.max(), _DEEP)
-    middle = boards.mean(axis=1)
+    middle = targets.mean(axis=1)
     slope = float(np.median(middle[:, 1 - axis] / middle[:, 2]))
     low, high = _view(rig, axis)
-    across = boards[..., axis]
+    across = targets[..., axis]
     margin = BESIDE * float(np.ptp(across))
     sideways = np.linspace(
         max(depth[-1] * low, float(across.min()) - margin), min(depth[-1] * high, float(across.max()) + margin), _WIDE
@@ -140,7 +138,7 @@ def volume_slice(calibration: Calibration) -> Slice:
 
 
 def _view(rig: StereoRig, axis: int) -> tuple[float, float]:
-    """Return the least and the greatest tangent at which the left camera sees, along X (axis 0) or Y (axis 1)."""
+    """Return the limits of the left camera's field of view as tangents, along X (axis 0) or Y (axis 1)."""
     width, height = rig.left.image_size_px
     u, v = np.linspace(-0.5, width - 0.5, 33), np.linspace(-0.5, height - 0.5, 33)
     border = [np.stack([u, np.full(33, v[k])], 1) for k in (0, -1)] + [
@@ -154,31 +152,31 @@ def _view(rig: StereoRig, axis: int) -> tuple[float, float]:
 
 Grade = Literal["good", "fair", "poor"]
 
-#: Up to the first a figure is good, up to the second fair. Epipolar error: sharp corners of a still board give 0.05 to
-#: 0.3 px; beyond 1 px something is wrong with the images, not with the noise. In proportion where the image's longer
-#: side is more than that many pixels, for such images are rarely sharp to the pixel.
+#: A metric is good up to the first limit, and fair up to the second. Epipolar error: sharp corners of a still target give
+#: 0.05 to 0.3 px; beyond 1 px something is wrong with the images, not with the noise. The limits grow in proportion where
+#: the image's longer side has more than LARGE_PX pixels, as such images are rarely sharp to the pixel.
 EPIPOLAR_PX, LARGE_PX = (0.3, 1.0), 1280
-#: Held-out over fitted epipolar RMS: how much the fit has learned its own pairs by heart.
+#: Held-out over fitted epipolar RMS: the degree of overfitting.
 OVERFIT = (1.25, 2.0)
 #: Relative error of size, either sign.
 SCALE = (0.001, 0.005)
-#: Residual over predicted sigma, or its inverse: 1 is honest.
+#: Residual over predicted sigma, or its inverse: 1 means that the predicted sigma is right.
 HONESTY = (1.25, 2.0)
-#: A board or body that differs from its drawing by less was held to it, m.
+#: A target or body that differs from its drawing by less was not estimated, m.
 HELD_M = 1e-8
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One figure of the headline.
+class GradedMetric:
+    """One metric of a calibration.
 
     Attributes:
-        name: what it is called.
+        name: its name.
         heldout: its value on held-out pairs, with its unit.
         fit: its value in the fit, or a dash.
-        meaning: what it says, in words.
-        grade: how good it is; None where that depends on what the rig is for.
-        advice: what to do about it where it is not good; empty where there is nothing to do.
+        meaning: what it means, a sentence or two.
+        grade: how good it is; None where that depends on the use of the rig.
+        advice: what to do where it is not good; may be empty.
     """
 
     name: str
@@ -189,8 +187,17 @@ class Judged:
     advice: str = ""
 
 
-def board_drawing(calibration: Calibration) -> Array | None:
-    """Return (M, 3) the drawing of the calibration board, m; None where the calibration is from a body of markers."""
+@dataclass(frozen=True)
+class CalibrationAssessment:
+    """The grade of a calibration, its headline, and what that means for the user."""
+
+    grade: Grade
+    headline: str
+    meaning: str
+
+
+def target_drawing(calibration: Calibration) -> Array | None:
+    """Return (M, 3) the drawing of the calibration target, m; None where the calibration is from a body of markers."""
     try:
         points = open_board(calibration.body.name).body.points
     except InputError:
@@ -199,24 +206,24 @@ def board_drawing(calibration: Calibration) -> Array | None:
 
 
 def target(calibration: Calibration) -> str:
-    """Return what the cameras were shown, in a word."""
-    return "body" if board_drawing(calibration) is None else "board"
+    """Return what the cameras were shown: body or target."""
+    return "body" if target_drawing(calibration) is None else "target"
 
 
 def distance_m(calibration: Calibration) -> float:
-    """Return the median distance of the boards from the left camera, m."""
-    return float(np.median(np.linalg.norm(board_points(calibration).mean(axis=1), axis=1)))
+    """Return the median distance of the target from the left camera, m."""
+    return float(np.median(np.linalg.norm(target_points(calibration).mean(axis=1), axis=1)))
 
 
 def _grade(value: float, limits: tuple[float, float]) -> Grade:
-    """Grade a figure of which less is better; what is no number is poor."""
+    """Return the grade of a metric of which less is better; NaN is poor."""
     if not math.isfinite(value):
         return "poor"
     return "good" if value <= limits[0] else "fair" if value <= limits[1] else "poor"
 
 
-def judged(calibration: Calibration) -> tuple[Judged, ...]:
-    """Judge the held-out figures of a calibration, the most telling first."""
+def graded_metrics(calibration: Calibration) -> tuple[GradedMetric, ...]:
+    """Return the held-out metrics of a calibration with their grades, the most important first."""
     h, fit = calibration.heldout, calibration.epipolar_rms_px
     distance, what = distance_m(calibration), target(calibration)
     large = max(1.0, max(max(camera.image_size_px) for camera in calibration.rig.cameras) / LARGE_PX)
@@ -224,59 +231,59 @@ def judged(calibration: Calibration) -> tuple[Judged, ...]:
     overfit = h.epipolar_rms_px / fit if fit > 0 else 1.0
     honesty = max(h.normalised_rms, 1 / h.normalised_rms) if h.normalised_rms > 0 else math.inf
     rows = (
-        Judged(
+        GradedMetric(
             "rigid RMS",
             f"{1e3 * h.rigid_rms_m:.3g} mm",
             "–",
-            f"How far triangulated points lie from where the perfect {what} has them: the error of a measured "
-            f"shape, {100 * h.rigid_rms_m / distance:.2g}% of the distance of {1e3 * distance:.0f} mm. "
+            f"Distance of triangulated points from those of the exact {what}: the error of a measured shape, "
+            f"{100 * h.rigid_rms_m / distance:.2g}% of the distance of {1e3 * distance:.0f} mm. "
             f"{_print(calibration)}Compare it with what your task needs.",
         ),
-        Judged(
+        GradedMetric(
             "scale error",
             f"{100 * h.scale_error:+.3f} %",
             "–",
-            f"Whether lengths come out too long or too short; good within {100 * SCALE[0]:g}%. An error of the size you "
-            f"gave for the {what} itself does not show here.",
+            f"Relative error of measured lengths; good within {100 * SCALE[0]:g}%. An error of the size you gave for the "
+            f"{what} itself does not show here.",
             _grade(abs(h.scale_error), SCALE),
-            f"measured lengths are off: check the size given for the {what}, and show it tilted at several distances",
+            f"measured lengths are wrong: check the size given for the {what}, and show it tilted at several distances",
         ),
-        Judged(
+        GradedMetric(
             "epipolar RMS",
             f"{h.epipolar_rms_px:.3g} px",
             f"{fit:.3g} px",
-            f"Whether the two cameras agree on a point; good up to {epipolar[0]:.2g} px for images of this size.",
+            f"Disagreement of the two cameras on a point; good up to {epipolar[0]:.2g} px for images of this size.",
             _grade(h.epipolar_rms_px, epipolar),
             f"the two cameras disagree: hold the {what} still, take both images at the same moment, check that the pairs "
             "belong together and that both images are sharp",
         ),
-        Judged(
+        GradedMetric(
             "held-out over fit",
             f"{overfit:.2f}",
             "–",
-            f"Epipolar RMS of pairs left out over that of the fit; good up to {OVERFIT[0]:g}. Far above 1 the fit has "
-            "learned its pairs by heart.",
+            f"Epipolar RMS of held-out pairs over that of the fit; good up to {OVERFIT[0]:g}. Far above 1 means "
+            "overfitting: the fit describes its own pairs better than others.",
             _grade(overfit, OVERFIT),
-            "the fit knows its own pairs much better than others: take more pairs, and more different ones",
+            "the fit describes its own pairs much better than others: take more pairs, and more different ones",
         ),
-        Judged(
+        GradedMetric(
             "residual over predicted sigma",
             f"{h.normalised_rms:.2f}",
             "–",
-            f"Whether the predicted uncertainty is honest: 1 is, good from {1 / HONESTY[0]:.2g} to {HONESTY[0]:g}; "
-            f"below, it was too careful. {_rescaled(calibration)}",
+            f"1 means that the predicted uncertainty is right; good from {1 / HONESTY[0]:.2g} to {HONESTY[0]:g}. Below 1 "
+            f"it was too large. {_rescaled(calibration)}",
             _grade(honesty, HONESTY),
             ""
             if h.normalised_rms < 1
-            else "held-out errors are larger than the fit predicted: some pairs are worse than "
-            "the rest, or the noise is not random; look at the errors by pair and at the residual vectors",
+            else "held-out errors are larger than predicted: some pairs are worse than the rest, or the noise is not "
+            "random; look at the errors by pair and at the residual vectors",
         ),
     )
     return rows
 
 
 def _print(calibration: Calibration) -> str:
-    """Say how much of the rigid error is the board's own."""
+    """Return a sentence on the target's share of the rigid error; empty where it is negligible."""
     deviation_mm = 1e3 * calibration.deviation_m
     if deviation_mm < 0.01:
         return ""
@@ -284,19 +291,19 @@ def _print(calibration: Calibration) -> str:
 
 
 def _rescaled(calibration: Calibration) -> str:
-    """Say by how much the rig's sigmas were adjusted to the held-out errors."""
+    """Return a sentence on how the rig's sigmas were adjusted to the held-out errors; empty where they were not."""
     before = calibration.solution.sigma_px
     factor = calibration.rig.sigma_px / before if before > 0 else 1.0
     return f"All sigmas of this rig have been multiplied by {factor:.2f} to match." if abs(factor - 1) > 0.005 else ""
 
 
 def advice(calibration: Calibration) -> tuple[str, ...]:
-    """Return what is weak and what to do about it: the calibration's own words, then figures that are not good."""
+    """Return what is weak and what to do about it: the calibration's own list, then metrics that are not good."""
     return (
         *calibration.weaknesses,
         *(
             f"{row.name} {row.heldout}: {row.advice}"
-            for row in judged(calibration)
+            for row in graded_metrics(calibration)
             if row.grade in ("fair", "poor") and row.advice
         ),
     )
@@ -309,23 +316,27 @@ def _baseline_share(calibration: Calibration) -> float:
     return float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along)) / rig.baseline_m
 
 
-def verdict(calibration: Calibration) -> tuple[Grade, str, str]:
-    """Return the grade of a calibration, its headline, and what that means for the one who made it."""
+def assess(calibration: Calibration) -> CalibrationAssessment:
+    """Return the assessment of a calibration: poor if a metric is, fair if there is advice, else good."""
     h = calibration.heldout
-    grades = {row.grade for row in judged(calibration)}
+    grades = {row.grade for row in graded_metrics(calibration)}
     expect = (
-        f"On pairs it was not fitted on, measured points lie {1e3 * h.rigid_rms_m:.2g} mm (RMS) off their true shape, at "
-        f"a distance of about {1e3 * distance_m(calibration):.0f} mm, and lengths, compared with the "
-        f"{target(calibration)}'s, are right to {100 * max(abs(h.scale_error), _baseline_share(calibration)):.2g}%."
+        f"On held-out pairs, measured points deviate by {1e3 * h.rigid_rms_m:.2g} mm (RMS) from their true shape, at a "
+        f"distance of about {1e3 * distance_m(calibration):.0f} mm; lengths, compared with those of the "
+        f"{target(calibration)}, are right to {100 * max(abs(h.scale_error), _baseline_share(calibration)):.2g}%."
     )
     if "poor" in grades:
-        return "poor", "Do not rely on this calibration yet.", f"{expect} Do what is said below and calibrate again."
+        return CalibrationAssessment(
+            "poor", "Do not rely on this calibration yet.", f"{expect} Follow the advice below and calibrate again."
+        )
     count = len(advice(calibration))
     if count:
         points = "one weak point" if count == 1 else f"{count} weak points"
-        return "fair", f"Usable, with {points}.", f"{expect} What is weak, and what to do about it, is said below."
-    return (
+        return CalibrationAssessment(
+            "fair", f"Usable, with {points}.", f"{expect} What is weak, and what to do about it, is listed below."
+        )
+    return CalibrationAssessment(
         "good",
-        "Good. Nothing stands out as weak.",
+        "Good. No weak points found.",
         f"{expect} Leave mount, focus and zoom of both cameras as they are: the calibration holds for them alone.",
     )

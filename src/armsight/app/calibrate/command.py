@@ -1,4 +1,4 @@
-"""``armsight calibrate``: two cameras from pictures of a board, or from detections of a known body."""
+"""``armsight calibrate``: two cameras, from images of a calibration target or from detections of a known body."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any
 
 import click
 import cv2
-from rich.console import Console
-from rich.table import Table
 
-from armsight.app.calibrate.report import report_folder, write_report
+from armsight.app.calibrate.report import write_report
 from armsight.app.progress import bar, steps
+from armsight.app.report.page import PAGE, writable_folder
+from armsight.app.report.plotting import require_matplotlib
+from armsight.app.report.table import TextTable, print_table
 from armsight.data import SIDES, Detections
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -25,7 +26,7 @@ from armsight.vision.calibrate.result import Calibration
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey
-from armsight.vision.markers.board import Board, open_board
+from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.sources import PairsSource
 
@@ -35,11 +36,11 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
-@click.option("--board", metavar="SPEC", help="The board, such as chessboard:9x6:25mm (inner corners, square).")
-@click.option("--model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses.")
+@click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
 @click.option(
-    "--flat-board", is_flag=True, help="Trust the print: do not estimate how the board differs from its drawing."
+    "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
 )
+@click.option("--flat-target", is_flag=True, help="Do not estimate the target's deviation from its drawing.")
 @click.option(
     "--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections of a body, not images."
 )
@@ -52,45 +53,46 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
     "--folds", type=click.IntRange(min=2), default=FOLDS, show_default=True, help="Parts for the held-out errors."
 )
 @click.option(
-    "-o", "--out", required=True, metavar="RIG.json", type=click.Path(path_type=Path), help="The rig to write."
+    "-o", "--output", required=True, metavar="RIG.json", type=click.Path(path_type=Path), help="The rig to write."
 )
 @click.option("--report", metavar="DIR", type=click.Path(path_type=Path), help="Write an HTML report with figures.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 def command(
     left: str | None,
     right: str | None,
-    board: str | None,
-    model: str | None,
-    flat_board: bool,
+    target: str | None,
+    lens_model: str | None,
+    flat_target: bool,
     detections: Path | None,
     cameras: Path | None,
     body: Path | None,
     refine_body: Path | None,
     folds: int,
-    out: Path,
+    output: Path,
     report: Path | None,
     as_json: bool,
 ) -> None:
-    """Calibrate two cameras, and say on pairs left out of the fit how well they measure.
+    """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
-    From images: --left, --right and --board. From detections of a known body with known intrinsics: --detections,
+    From images: --left, --right and --target. From detections of a known body with known intrinsics: --detections,
     --cameras and --body.
     """
-    images, points = (left, right, board), (detections, cameras, body)
+    images, points = (left, right, target), (detections, cameras, body)
     if (None in images) == (None in points) or any(images) == any(points):
-        raise InputError("give --left, --right and --board, or --detections, --cameras and --body")
+        raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
-        raise InputError("--refine-body goes with --detections; a board in images is estimated by itself")
-    check_writable(out, apart_from=(refine_body, *points))
+        raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
+    check_writable(output, apart_from=(refine_body, *points))
     if refine_body is not None:
         check_writable(refine_body, apart_from=points)
     if report is not None:
-        report_folder(report)
+        require_matplotlib()
+        writable_folder(report, "no report")
     started = time.perf_counter()
-    if left is not None and right is not None and board is not None:
-        models = MODELS if model is None else (model,)
-        calibration = _from_images(left, right, open_board(board), models, flat_board, folds)
-        said: dict[str, Any] = {"left": left, "right": right, "board": board}
+    if left is not None and right is not None and target is not None:
+        models = MODELS if lens_model is None else (lens_model,)
+        calibration = _from_images(left, right, open_board(target), models, flat_target, folds)
+        given = {"left": left, "right": right, "target": target}
     elif detections is not None and cameras is not None and body is not None:
         known, pair = load_body_csv(body), read_cameras(cameras)
         with steps() as progress:
@@ -98,25 +100,27 @@ def command(
             calibration = calibrate_bodies(
                 known, shots, pair, refine_body=refine_body is not None, folds=folds, progress=progress
             )
-        said = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
-    calibration = replace(calibration, rig=replace(calibration.rig, provenance=_provenance(said, calibration)))
+        given = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
+    calibration = replace(calibration, rig=replace(calibration.rig, provenance=_provenance(given, calibration)))
     if refine_body is not None:
         save_body_csv(calibration.body, refine_body)
-    calibration.rig.save(out)
+    calibration.rig.save(output)
     if report is not None:
         write_report(calibration, report)
     if as_json:
-        click.echo(json.dumps(_summary(calibration, out, report, time.perf_counter() - started)))
+        click.echo(json.dumps(_summary(calibration, output, report, time.perf_counter() - started)))
     else:
-        _tell(calibration, out, report)
+        _print(calibration, output, report)
 
 
-def _from_images(left: str, right: str, board: Board, models: tuple[str, ...], flat: bool, folds: int) -> Calibration:
-    """Detect the board in every pair of images and calibrate."""
+def _from_images(
+    left: str, right: str, target: CalibrationBoard, models: tuple[str, ...], flat: bool, folds: int
+) -> Calibration:
+    """Detect the target in every pair of images and calibrate."""
     source = PairsSource(left, right)
     pairs: list[Pair] = []
     sizes: Sizes | None = None
-    with bar("looking for the board", len(source.pairs)) as advance:
+    with bar("detecting the target", len(source.pairs)) as advance:
         for stored in source.pairs:
             shot = stored.load()
             if shot.left is None or shot.right is None:
@@ -125,16 +129,16 @@ def _from_images(left: str, right: str, board: Board, models: tuple[str, ...], f
             else:
                 now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
                 sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
-                pairs.append(Pair(shot.name, board.detect(grey(shot.left)), board.detect(grey(shot.right))))
+                pairs.append(Pair(shot.name, target.detect(grey(shot.left)), target.detect(grey(shot.right))))
             advance()
     if sizes is None:
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
     with steps() as progress:
-        return calibrate_boards(board, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
+        return calibrate_boards(target, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
 
 
 def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None) -> Sizes:
-    """Hold every image to the size of the first one."""
+    """Return the sizes of the images; raise an InputError if they differ from those before."""
     for side, path in enumerate((left, right)):
         if sizes is not None and sizes[side] != now[side]:
             (w, h), (w0, h0) = now[side], sizes[side]
@@ -144,12 +148,12 @@ def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None
     return now
 
 
-def _provenance(said: dict[str, Any], calibration: Calibration) -> dict[str, Any]:
-    """Say where the rig comes from."""
+def _provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any]:
+    """Return how the rig was made, as its file records it."""
     h = calibration.heldout
     return {
         "made_by": f"armsight {importlib.metadata.version('armsight')} calibrate, OpenCV {cv2.__version__}",
-        **said,
+        **given,
         "pairs_used": len(calibration.pairs),
         "heldout_epipolar_rms_px": h.epipolar_rms_px,
         "heldout_rigid_rms_m": h.rigid_rms_m,
@@ -157,7 +161,7 @@ def _provenance(said: dict[str, Any], calibration: Calibration) -> dict[str, Any
     }
 
 
-def _summary(calibration: Calibration, out: Path, report: Path | None, seconds: float) -> dict[str, Any]:
+def _summary(calibration: Calibration, output: Path, report: Path | None, seconds: float) -> dict[str, Any]:
     """Return the object that ``--json`` prints."""
     c = calibration
     return {
@@ -174,38 +178,32 @@ def _summary(calibration: Calibration, out: Path, report: Path | None, seconds: 
         "distortion_model": c.rig.left.model,
         "sigma_px": c.rig.sigma_px,
         "body_deviation_rms_m": c.deviation_m,
-        "rig": str(out),
-        "report": str(report / "index.html") if report is not None else None,
+        "rig": str(output),
+        "report": str(report / PAGE) if report is not None else None,
         "seconds": seconds,
     }
 
 
-def _tell(calibration: Calibration, out: Path, report: Path | None) -> None:
-    """Print the held-out table first, then the fit, then what is weak."""
+def _print(calibration: Calibration, output: Path, report: Path | None) -> None:
+    """Print the held-out metrics first, then those of the fit, then what is weak."""
     c, h = calibration, calibration.heldout
-    console = Console(highlight=False, soft_wrap=True)
-    table = Table(title=f"Held-out errors: {h.folds} folds, fitted on the rest, measured on what was left out")
-    for column in ("epipolar RMS", "board against a perfect one, RMS", "scale error", "residual over its sigma"):
-        table.add_column(column, justify="right")
-    table.add_row(
-        f"{h.epipolar_rms_px:.3f} px",
-        f"{1e3 * h.rigid_rms_m:.3f} mm",
-        f"{100 * h.scale_error:+.3f} %",
-        f"{h.normalised_rms:.2f}",
+    rows = (
+        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
+        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
+        ("scale error", f"{100 * h.scale_error:+.3f} %"),
+        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
     )
-    console.print(table)
-    console.print(
+    print_table(
+        TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
+    )
+    lines = [
         f"fit: epipolar {c.epipolar_rms_px:.3f} px, reprojection {c.reprojection_rms_px:.3f} px RMS; {len(c.pairs)} of "
-        f"{c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px"
-    )
-    console.print(
+        f"{c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
-        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS"
-    )
-    for rejected in c.rejected:
-        console.print(f"rejected {rejected.pair}: {rejected.reason}", markup=False)
-    for note in c.notes:
-        console.print(f"note: {note}", markup=False)
-    for weakness in c.weaknesses:
-        console.print(f"weak: {weakness}", markup=False)
-    console.print(f"rig written to {out}" + (f", report to {report / 'index.html'}" if report is not None else ""))
+        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *(f"rejected {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
+        *(f"note: {note}" for note in c.notes),
+        *(f"weak: {weakness}" for weakness in c.weaknesses),
+        f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
+    ]
+    click.echo("\n".join(lines))

@@ -1,8 +1,6 @@
-"""The figures of a calibration's report about its images and pairs: coverage, residuals, held-out errors.
+"""The figures of a calibration's report: predicted sigma, shape of the target, coverage, residuals, errors by pair.
 
-Every function takes the calibration and returns a matplotlib Figure.
-
-Two maps of a calibration's report: predicted sigma over the volume, and the board against its drawing.
+In: a Calibration. Out: a matplotlib Figure each, or None where there is nothing to plot.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import griddata
 
-from armsight.app.calibrate.assessment import HELD_M, SHARES, Slice, board_drawing, board_points, volume_slice
+from armsight.app.calibrate.assessment import HELD_M, SHARES, Slice, target_drawing, target_points, volume_slice
 from armsight.app.report.plotting import BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain
 from armsight.data import SIDES, Array
 from armsight.vision.calibrate.result import Calibration
@@ -24,21 +22,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_DOTS = 4000
-#: The board's longer in-plane deviations are drawn as long as this share of its width.
+#: The target's longer in-plane deviations are plotted as long as this share of its width.
 _MAP_ARROW_SHARE = 0.06
 _LEAST_MM = 1e-4
 _FINE = 150
-#: Colours do not tell shares apart that are less than one part in this of the least sigma of all.
-_HARDLY = 20.0
+#: Sigmas below the least total sigma divided by this all have one colour.
+_NEGLIGIBLE = 20.0
 #: Over a greater range than this only the powers of ten are marked.
-_MANY = 500.0
+_WIDE_RANGE = 500.0
 
 
 def volume_figure(calibration: Calibration) -> Figure:
-    """Predicted depth and lateral sigma over a slice of the volume: pixel noise, calibration, both together."""
+    """Plot the predicted depth and lateral sigma over a slice of the volume: pixel noise, calibration, both together."""
     shown = volume_slice(calibration)
-    boards = board_points(calibration).reshape(-1, 3)
-    boards = boards[:: len(boards) // _MOST_DOTS + 1]
+    points = target_points(calibration).reshape(-1, 3)
+    points = points[:: len(points) // _MOST_DOTS + 1]
     left, right, near, far = _limits(calibration, shown)
     shape = (far - near) / (right - left)
     figure = new_figure(float(np.clip(0.56 * WIDTH_IN * shape, 2.0, 11.0)) + 1.3)
@@ -50,7 +48,7 @@ def volume_figure(calibration: Calibration) -> Figure:
         for column, share in enumerate(SHARES):
             axes = panels[row, column]
             filled = _contours(axes, shown, millimetres[column], low, high)
-            _scene(axes, calibration, shown, boards)
+            _positions(axes, calibration, shown, points)
             axes.set_title(f"{kind} sigma: {share}")
             if row == 1:
                 axes.set_xlabel(f"{'XY'[shown.axis]}, mm")
@@ -64,7 +62,7 @@ def volume_figure(calibration: Calibration) -> Figure:
 
 
 def _limits(calibration: Calibration, shown: Slice) -> list[float]:
-    """Return what the map must show, sideways and in depth, mm: all that both cameras see, and the cameras."""
+    """Return the limits of the map, sideways and in depth, mm: all that both cameras see, and the cameras."""
     centres = np.stack([np.zeros(3), calibration.rig.T_left_right[:3, 3]])
     sideways = np.r_[shown.sideways_m[shown.seen.any(axis=0)], centres[:, shown.axis]]
     depth = np.r_[shown.depth_m, centres[:, 2]]
@@ -74,12 +72,12 @@ def _limits(calibration: Calibration, shown: Slice) -> list[float]:
 
 
 def _range(millimetres: Array) -> tuple[float, float]:
-    """Return the colours' range for sigmas (3, D, W), mm: all of them, but for shares that hardly matter."""
+    """Return the range of the colours for sigmas (3, D, W), mm: all of them, except for negligible shares."""
     seen = millimetres[:, np.isfinite(millimetres[0])]
     if not seen.size:
         return 0.1, 1.0
     high = float(seen[-1].max())
-    return float(np.clip(seen.min(), seen[-1].min() / _HARDLY, 0.9 * high)), high
+    return float(np.clip(seen.min(), seen[-1].min() / _NEGLIGIBLE, 0.9 * high)), high
 
 
 def _contours(axes: Axes, shown: Slice, millimetres: Array, low: float, high: float) -> QuadMesh:
@@ -101,13 +99,13 @@ def _contours(axes: Axes, shown: Slice, millimetres: Array, low: float, high: fl
 def round_steps(low: float, high: float) -> list[float]:
     """Return the values 1, 2, 5 times a power of ten from ``low`` to ``high``; of many, the powers of ten alone."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    factors = (1, 2, 5) if high < _MANY * low else (1,)
+    factors = (1, 2, 5) if high < _WIDE_RANGE * low else (1,)
     return [m * 10.0**k for k in powers for m in factors if low <= m * 10.0**k <= high]
 
 
-def _scene(axes: Axes, calibration: Calibration, shown: Slice, boards: Array) -> None:
-    """Draw where the boards and the cameras were."""
-    axes.plot(1e3 * boards[:, shown.axis], 1e3 * boards[:, 2], ".", color=INK, markersize=0.8, alpha=0.35)
+def _positions(axes: Axes, calibration: Calibration, shown: Slice, points: Array) -> None:
+    """Plot the points (N, 3), m, of the targets, and the cameras."""
+    axes.plot(1e3 * points[:, shown.axis], 1e3 * points[:, 2], ".", color=INK, markersize=0.8, alpha=0.35)
     centre = 1e3 * calibration.rig.T_left_right[:3, 3]
     outward = 1 if centre[shown.axis] >= 0 else -1
     for name, x, z, side in (("left", 0.0, 0.0, -outward), ("right", centre[shown.axis], centre[2], outward)):
@@ -117,9 +115,12 @@ def _scene(axes: Axes, calibration: Calibration, shown: Slice, boards: Array) ->
     axes.set_aspect("equal")
 
 
-def board_figure(calibration: Calibration) -> Figure | None:
-    """How the board as estimated differs from its drawing: colour out of the plane, arrows within it, mm; None without."""
-    drawing = board_drawing(calibration)
+def target_figure(calibration: Calibration) -> Figure | None:
+    """Plot the target's estimated deviation from its drawing: colour out of the plane, arrows within it, mm.
+
+    None where it was not estimated.
+    """
+    drawing = target_drawing(calibration)
     if drawing is None or calibration.deviation_m < HELD_M:
         return None
     at, off = 1e3 * drawing[:, :2], 1e3 * (calibration.body.points - drawing)
@@ -138,20 +139,20 @@ def board_figure(calibration: Calibration) -> Figure | None:
     enlarged = nice(_MAP_ARROW_SHARE * float(extent[0]) / usual)
     arrows(axes, at, off[:, :2], enlarged, INK, 0.003, "mm", 0.03)
     axes.set_title(f"colour: out of the plane; arrows: within it, x{enlarged:g}")
-    bar = figure.colorbar(filled, ax=axes, label="z, mm (+ is into the board)", format="%.3g", aspect=25)
+    bar = figure.colorbar(filled, ax=axes, label="z, mm (+ is into the target)", format="%.3g", aspect=25)
     bar.set_ticks(list(np.linspace(-most, most, 5)))
     return figure
 
 
 #: Cells of the coverage map along the longer side of the image, and of the mean residuals.
 COVERAGE_CELLS, MEAN_CELLS = 16, 9
-#: A cell's mean residual is drawn from so many corners on, and stands out beyond so many of its standard errors.
+#: A cell's mean residual is plotted from this many corners on, and stands out beyond this many of its standard errors.
 _LEAST_IN_CELL, STANDS_OUT = 5, 4.0
-#: The typical longer residual is drawn as long as this share of the image's width.
+#: The typical longer residual is plotted as long as this share of the image's width.
 _ARROW_SHARE = 0.035
-#: More pairs than this are not drawn one by one: the worst are.
+#: Of more pairs than this only the worst are plotted.
 MOST_BARS = 60
-#: More residuals than this are not drawn one by one: a random choice is.
+#: Of more residuals than this a random choice is plotted.
 MOST_ARROWS = 3000
 _MOST_LETTERS = 50
 #: A pair whose error is this many times the median stands out.
@@ -159,13 +160,13 @@ OUTSTANDING = 2.5
 
 
 def corners(calibration: Calibration, side: int) -> tuple[Array, Array]:
-    """Return (N, 2) places of one camera's corners and (N, 2) their residuals, px."""
+    """Return the positions (N, 2) of one camera's corners and their residuals (N, 2), px."""
     rows = calibration.observations.camera == side
     return calibration.observations.uv[rows], calibration.solution.residuals_px[rows]
 
 
 def grid_counts(calibration: Calibration, side: int, cells: int = COVERAGE_CELLS) -> tuple[Array, Array, Array]:
-    """Count one camera's corners in square cells: (R, C) counts, (C + 1,) u and (R + 1,) v edges, px."""
+    """Count one camera's corners in square cells; return (R, C) counts, (C + 1,) u and (R + 1,) v edges, px."""
     size = np.array(calibration.rig.cameras[side].image_size_px)
     columns, rows = np.maximum(np.round(cells * size / size.max()).astype(int), 2)
     edges_u, edges_v = np.linspace(-0.5, size[0] - 0.5, columns + 1), np.linspace(-0.5, size[1] - 0.5, rows + 1)
@@ -175,7 +176,7 @@ def grid_counts(calibration: Calibration, side: int, cells: int = COVERAGE_CELLS
 
 
 def _image_axes(axes: Axes, calibration: Calibration, side: int, title: str) -> None:
-    """Make axes the frame of one camera's image."""
+    """Set the limits and labels of axes to those of one camera's image."""
     width, height = calibration.rig.cameras[side].image_size_px
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=title)
     axes.set_xlabel("u, px")
@@ -184,12 +185,12 @@ def _image_axes(axes: Axes, calibration: Calibration, side: int, title: str) -> 
 
 
 def _tall(calibration: Calibration) -> float:
-    """Height of two images side by side at the report's width, inches."""
+    """Return the height of two images side by side at the report's width, inches."""
     return 0.46 * WIDTH_IN * max(h / w for w, h in (camera.image_size_px for camera in calibration.rig.cameras))
 
 
 def coverage_figure(calibration: Calibration) -> Figure:
-    """Where the corners were in both images, coloured by count; empty cells stand out."""
+    """Plot the number of corners in each region of both images; empty cells stand out."""
     figure = new_figure(_tall(calibration) + 0.7)
     panels = figure.subplots(1, 2)
     grids = [grid_counts(calibration, side) for side in (0, 1)]
@@ -215,7 +216,7 @@ def mean_residuals(calibration: Calibration, side: int) -> tuple[Array, Array, A
     """Average one camera's residuals over cells.
 
     Returns:
-        (C, 2) mean places, px; (C, 2) mean residuals, px; (C,) their length over their standard error.
+        (C, 2) mean positions, px; (C, 2) mean residuals, px; (C,) their length over their standard error.
     """
     uv, residuals = corners(calibration, side)
     _, edges_u, edges_v = grid_counts(calibration, side, MEAN_CELLS)
@@ -229,7 +230,7 @@ def mean_residuals(calibration: Calibration, side: int) -> tuple[Array, Array, A
 
 
 def residuals_figure(calibration: Calibration) -> Figure:
-    """Residual vectors over both images: every corner above, the mean of every region below, both enlarged."""
+    """Plot residual vectors over both images: every corner above, the mean of every region below, both enlarged."""
     figure = new_figure(2 * _tall(calibration) + 1.6)
     panels = figure.subplots(2, 2)
     every = [corners(calibration, side) for side in (0, 1)]
@@ -254,14 +255,14 @@ def residuals_figure(calibration: Calibration) -> Figure:
 
 
 def _enlargement(calibration: Calibration, vectors: list[Array], share: float) -> float:
-    """Return the round factor under which the longer vectors, px, are drawn as long as a share of the left image."""
+    """Return a round factor that makes the longer vectors, px, as long as a share of the left image's width."""
     lengths = np.linalg.norm(np.concatenate(vectors), axis=1)
     usual = max(float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0, 1e-9)
     return nice(share * calibration.rig.left.image_size_px[0] / usual)
 
 
 def pairs_figure(calibration: Calibration) -> Figure:
-    """Held-out errors of every pair, one bar each; pairs that were not used are named with their reason."""
+    """Plot the held-out errors of every pair, one bar each; pairs that were not used are named with their reason."""
     errors = calibration.errors
     order = np.sort(np.argsort(-errors.rigid_m)[:MOST_BARS])
     names = [plain(calibration.pairs[int(errors.pair[k])], 28) for k in order]

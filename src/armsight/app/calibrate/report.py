@@ -1,23 +1,16 @@
-"""The report of a calibration: one HTML page that says whether it is good, and its figures as PNG files beside it.
+"""The report of a calibration: one HTML page with its assessment, and its figures as PNG files beside it.
 
-A Calibration goes in, a folder comes out. The page holds its figures itself, needs no network and runs no script. All is
-drawn in memory first; then every file is put in place whole, the page last.
+In: a Calibration. Out: a folder. The page holds its figures itself, needs no network and runs no script. Everything is
+rendered in memory first; then each file is written completely, the page last.
 
-The tables of a calibration's report as HTML; whatever comes from outside is escaped.
-
-The sections of a calibration's report, in the order a person needs them: verdict, images, pairs, volume, numbers.
-
-Each is a function of the calibration and of its figures (name -> HTML image); what it says beside a figure is what one
-should see there and what would be bad.
+In order: the tables; the sections of the page, from the assessment to the parameters; the page. A section is a function of
+the calibration and of its figures (name -> HTML image). Its caption explains what one should see, and what would be bad.
 """
 
 from __future__ import annotations
 
-import base64
-import html
 import json
-import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,30 +20,29 @@ from armsight.app.calibrate.assessment import (
     BEYOND,
     SHARES,
     advice,
-    board_points,
+    assess,
     corner_variance_px2,
-    judged,
+    graded_metrics,
     predicted_sigmas,
     target,
-    verdict,
+    target_points,
 )
 from armsight.app.calibrate.figures import (
     MOST_BARS,
     OUTSTANDING,
     STANDS_OUT,
-    board_figure,
     coverage_figure,
     pairs_figure,
     residuals_figure,
+    target_figure,
     volume_figure,
 )
-from armsight.app.report.page import html_page, put_files
-from armsight.app.report.plotting import drawing, plain, png, require_matplotlib
+from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table, text, writable_folder
+from armsight.app.report.plotting import drawing, png, require_matplotlib
 from armsight.data import Array
-from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
-from armsight.vision.calibrate.result import Calibration, HeldOut
+from armsight.vision.calibrate.result import Calibration, HeldOutErrors
 from armsight.vision.rig import StereoRig
 
 if TYPE_CHECKING:
@@ -60,28 +52,8 @@ _STEP_RAD = 1e-6
 _ROUNDING = 1e-12
 
 
-def text(value: object) -> str:
-    """Return a value as text that is safe anywhere in the page."""
-    return html.escape(plain(str(value), most=2000))
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return a table of cells that are HTML already; the first cell of a row names it."""
-    top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
-    body = "".join(
-        f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in rest) + "</tr>\n"
-        for first, *rest in rows
-    )
-    return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
-
-
-def bullets(lines: Iterable[str]) -> str:
-    """Return a list of plain lines, escaped."""
-    return "<ul>" + "".join(f"<li>{text(line)}</li>\n" for line in lines) + "</ul>\n"
-
-
 def headline_table(calibration: Calibration) -> str:
-    """Return the held-out figures beside those of the fit, each with what it means and how good it is."""
+    """Return the held-out metrics beside those of the fit, each with its meaning and its grade."""
     rows = [
         (
             text(row.name),
@@ -90,22 +62,22 @@ def headline_table(calibration: Calibration) -> str:
             f'<span class="grade {row.grade}">{row.grade}</span>' if row.grade else "your call",
             text(row.meaning),
         )
-        for row in judged(calibration)
+        for row in graded_metrics(calibration)
     ]
     fit = f"{calibration.reprojection_rms_px:.3g} px"
-    meaning = "How well the fitted model reproduces the points it was fitted to. It says nothing about millimetres."
+    meaning = "Error of the fitted model at the points it was fitted to. It does not predict errors in millimetres."
     rows.append(("reprojection RMS", "–", fit, "", meaning))
-    head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "what it tells")
+    head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "meaning")
     return table(head, rows, "headline")
 
 
 def models_table(calibration: Calibration) -> str:
     """Return the distortion models that were tried, with their held-out errors."""
 
-    def row(name: str, h: HeldOut) -> tuple[str, ...]:
+    def row(name: str, h: HeldOutErrors) -> tuple[str, ...]:
         chosen = "<b>chosen</b>" if name == calibration.rig.left.model else ""
-        figures = (f"{h.epipolar_rms_px:.4f}", f"{1e3 * h.rigid_rms_m:.4f}", f"{100 * h.scale_error:+.3f}")
-        return (text(name), *figures, f"{h.normalised_rms:.2f}", chosen)
+        values = (f"{h.epipolar_rms_px:.4f}", f"{1e3 * h.rigid_rms_m:.4f}", f"{100 * h.scale_error:+.3f}")
+        return (text(name), *values, f"{h.normalised_rms:.2f}", chosen)
 
     head = ("model", "epipolar RMS, px", "rigid RMS, mm", "scale error, %", "residual / sigma", "")
     return table(head, [row(name, h) for name, h in calibration.models.items()], "numbers")
@@ -134,7 +106,7 @@ def cameras_table(rig: StereoRig) -> str:
 
 
 def pose_table(rig: StereoRig) -> str:
-    """Return where the right camera stands in the left one's frame, mm and degrees, with sigmas."""
+    """Return the pose of the right camera in the left one's frame, mm and degrees, with sigmas."""
     cov, T = rig.cov[-6:, -6:], rig.T_left_right
     rotation, J = log_so3(T[:3, :3]), np.empty((3, 6))
     for k, axis in enumerate(np.eye(6)):
@@ -156,21 +128,21 @@ def pose_table(rig: StereoRig) -> str:
 
 
 def sigma_table(calibration: Calibration) -> str:
-    """Return the predicted sigmas at the nearest, the middle and the farthest board."""
-    middle = board_points(calibration).mean(axis=1)
+    """Return the predicted sigmas at the nearest, the middle and the farthest target."""
+    middle = target_points(calibration).mean(axis=1)
     order = np.argsort(middle[:, 2])
     chosen: Array = middle[order[[0, len(order) // 2, -1]]]
     depth, lateral = predicted_sigmas(calibration.rig, chosen, corner_variance_px2(calibration))
     rows, what = [], target(calibration)
     for k, name in enumerate(("nearest", "middle", "farthest")):
-        figures = [f"{1e3 * s[k]:.2g}" if np.isfinite(s[k]) else "not seen by both" for s in (*depth, *lateral)]
-        rows.append((f"{name} {what}, Z {1e3 * chosen[k, 2]:.0f} mm", *figures))
+        sigmas = [f"{1e3 * s[k]:.2g}" if np.isfinite(s[k]) else "not seen by both" for s in (*depth, *lateral)]
+        rows.append((f"{name} {what}, Z {1e3 * chosen[k, 2]:.0f} mm", *sigmas))
     head = ("sigma, mm", *(f"{kind}: {share}" for kind in ("depth", "lateral") for share in SHARES))
     return table(head, rows, "numbers")
 
 
 def provenance_table(provenance: Mapping[str, Any]) -> str:
-    """Return where a rig comes from, as its file will say."""
+    """Return how a rig was made, as its file records it."""
     rows = [
         (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
         for key, value in provenance.items()
@@ -189,41 +161,42 @@ def _figure(figures: Figures, name: str, see: str, bad: str, opening: str = "You
 
 
 def result(calibration: Calibration, figures: Figures) -> str:
-    """Return the verdict, the held-out figures, what is weak, what was rejected, what was mended."""
-    grade, headline, meaning = verdict(calibration)
-    parts = [f'<div class="verdict {grade}"><p class="headline">{text(headline)}</p><p>{text(meaning)}</p></div>\n']
+    """Return the assessment, the held-out metrics, what is weak, and which pairs were rejected or used in part."""
+    found = assess(calibration)
+    parts = [
+        f'<div class="assessment {found.grade}"><p class="headline">{text(found.headline)}</p>'
+        f"<p>{text(found.meaning)}</p></div>\n"
+    ]
     parts.append(headline_table(calibration))
     parts.append(
-        "<p>Believe the held-out column: a fit adapts to the very pairs it is made from, and the more so the fewer they "
-        "are; the held-out figures come from pairs that were kept from it, by the very steps of a later measurement.</p>\n"
+        "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
+        "held-out metrics come from pairs that were not fitted, measured as later measurements are.</p>\n"
     )
-    parts.append("<h3>What is weak, and what to do</h3>\n")
+    parts.append("<h3>Weak points, and what to do</h3>\n")
     weak = advice(calibration)
-    parts.append(bullets(weak) if weak else "<p>Nothing stands out.</p>\n")
-    used, found = len(calibration.pairs), calibration.pairs_found
+    parts.append(bullets(weak) if weak else "<p>None.</p>\n")
+    used, pairs_found = len(calibration.pairs), calibration.pairs_found
     parts.append("<h3>Pairs that were not used</h3>\n")
     if calibration.rejected:
         reasons: dict[str, list[str]] = {}
         for pair in calibration.rejected:
             reasons.setdefault(pair.reason, []).append(pair.pair)
         rows = [(", ".join(text(name) for name in names), text(reason)) for reason, names in reasons.items()]
-        parts.append(f"<p>{used} of {found} pairs were used.</p>\n" + table(("pair", "why not"), rows, "words"))
+        parts.append(f"<p>{used} of {pairs_found} pairs were used.</p>\n" + table(("pair", "reason"), rows, "prose"))
     else:
         parts.append(f"<p>None: all {used} pairs were used.</p>\n")
     if calibration.notes:
-        parts.append("<h3>Mended, or used in part</h3>\n" + bullets(calibration.notes))
+        parts.append("<h3>Corrected, or used in part</h3>\n" + bullets(calibration.notes))
     return "".join(parts)
 
 
 def coverage(calibration: Calibration, figures: Figures) -> str:
     """Return the coverage maps."""
     what = target(calibration)
-    see = (
-        f"points of the {what} (dots) in nearly all cells of both images, right into their corners. Colour counts them."
-    )
+    see = f"points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number."
     bad = (
-        "hatched cells where you want to measure: nothing was ever seen there, so the lens is only guessed at. Take more "
-        f"pairs with the {what} there. (The dark rim around the picture of a fisheye stays empty.)"
+        "hatched cells where you want to measure: no point was seen there, so the lens model is extrapolated. Take more "
+        f"pairs with the {what} there. (The dark rim around the image of a fisheye lens stays empty.)"
     )
     return _figure(figures, "coverage", see, bad)
 
@@ -232,14 +205,14 @@ def residuals(calibration: Calibration, figures: Figures) -> str:
     """Return the residual vectors."""
     sigma = np.sqrt(corner_variance_px2(calibration))
     see = (
-        "above, short arrows in all directions, alike in both images, as noise is: one sigma of a point along u or v is "
-        f"taken to be {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without order. Mind the scale "
+        "above, short arrows in all directions, alike in both images, as random noise is: one sigma of a point along u or "
+        f"v is {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without a pattern. Note the scale "
         "over each panel."
     )
     bad = (
-        "neighbours that point the same way, or a whirl or a star below: the lens differs from its model there, or the "
+        "neighbours that point the same way, or a vortex or a star below: the lens differs from its model there, or the "
         f"{target(calibration)} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
-        "Longer arrows in one image than in the other: that camera is out of focus, moves or is badly lit."
+        "Longer arrows in one image than in the other: that camera is out of focus, moves, or has too little light."
     )
     return _figure(figures, "residuals", see, bad)
 
@@ -263,9 +236,10 @@ def volume(calibration: Calibration, figures: Figures) -> str:
     """Return the predicted sigma over the volume, and where the board was."""
     what = target(calibration)
     see = (
-        f"one sigma of a triangulated point, in a slice through the middle of where the {what} was (dots): of 100 "
-        "measurements of a point, 95 are off by less than two sigma. Depth is along the line of sight, and its sigma grows "
-        "with the square of the distance; lateral is across it, in the worse direction. The axes are the left camera's."
+        f"one sigma of a triangulated point, in a slice through the middle of the {what}'s positions (dots): of 100 "
+        "measurements of a point, 95 have an error of less than two sigma. Depth is along the line of sight, and its sigma "
+        "grows with the square of the distance; lateral is across it, in the worse direction. The axes are the left "
+        "camera's."
     )
     bad = (
         "a calibration's share above that of the pixel noise where you measure: more and better pairs help there, while "
@@ -273,30 +247,30 @@ def volume(calibration: Calibration, figures: Figures) -> str:
         "is extrapolated."
     )
     known = (
-        "<p>The calibration's share is common to all points and all shots: averaging does not lessen it, but it largely "
-        "cancels between places close to each other. The noise is that of a typical point of these images. The slice "
-        f"reaches {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the size given for the {what} "
-        "comes on top.</p>\n"
+        "<p>The calibration's share is common to all points and all shots: averaging does not reduce it, but it largely "
+        "cancels between positions close to each other. The noise is that of a typical point of these images. The slice "
+        f"extends {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the size given for the {what} "
+        "adds to these errors.</p>\n"
     )
     if not calibration.rig.cov.any():
         known += "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
     return _figure(figures, "volume", see, bad, "It shows") + sigma_table(calibration) + known
 
 
-def board(calibration: Calibration, figures: Figures) -> str:
-    """Return how the estimated board differs from its drawing, where it was estimated."""
-    if "board" not in figures:
+def target_shape(calibration: Calibration, figures: Figures) -> str:
+    """Return the deviation of the target from its drawing, where it was estimated."""
+    if "target" not in figures:
         return ""
     see = (
-        f"how the board differs from its drawing, {1e3 * calibration.deviation_m:.2g} mm RMS: a few hundredths of a "
-        "millimetre for a board on glass or aluminium, tenths for paper on card. It was estimated with the cameras, so "
-        "that it does not spoil them."
+        f"the deviation of the target from its drawing, {1e3 * calibration.deviation_m:.2g} mm RMS: a few hundredths of a "
+        "millimetre for a target on glass or aluminium, tenths for paper on card. It was estimated together with the "
+        "cameras, so that it does not distort their parameters."
     )
     bad = (
         "a millimetre or more: a loose or bowed sheet, which also bends from pair to pair. Glue it to something stiff. "
-        "(The size of the whole board cannot be seen by the cameras; it is the one you gave.)"
+        "(The cameras cannot measure the size of the whole target; it is the one you gave.)"
     )
-    return _figure(figures, "board", see, bad, "It shows")
+    return _figure(figures, "target", see, bad, "It shows")
 
 
 def numbers(calibration: Calibration, figures: Figures) -> str:
@@ -306,67 +280,43 @@ def numbers(calibration: Calibration, figures: Figures) -> str:
         cameras_table(rig),
         pose_table(rig),
         "<p>± is one sigma. T_left_right is the pose of the right camera in the left camera's frame: X right, Y down, Z "
-        "forward. Parameters vary together, so a single sigma may look large while what is measured is well known; the "
-        f"rig file holds the whole covariance. Noise of a point beyond what the image tells: {rig.sigma_px:.3g} px.</p>\n",
+        "forward. Parameters are correlated, so a single sigma may be large while a measured point is well known; the "
+        f"rig file holds the whole covariance. Noise of a point beyond its detection's own: {rig.sigma_px:.3g} px.</p>\n",
     ]
     if calibration.models:
         parts.append("<h3>Distortion models tried</h3>\n" + models_table(calibration))
         parts.append(
-            "<p>Judged on held-out pairs alone; of models that are about as good, the simplest is chosen.</p>\n"
+            "<p>Evaluated on held-out pairs alone; of models that are about as good, the simplest is chosen.</p>\n"
         )
     return "".join(parts)
 
 
 def provenance(calibration: Calibration, figures: Figures) -> str:
-    """Return where the rig comes from."""
+    """Return how the rig was made."""
     return provenance_table(calibration.rig.provenance)
 
 
 #: Anchor -> title and text, in the page's order; a section without text is left out.
 SECTIONS: dict[str, tuple[str, Section]] = {
-    "result": ("Is it good?", result),
-    "coverage": ("What the cameras have seen", coverage),
+    "result": ("Assessment", result),
+    "coverage": ("Coverage of the images", coverage),
     "residuals": ("Residuals of the fit", residuals),
     "pairs": ("Held-out errors by pair", pairs),
-    "volume": ("What to expect of a measurement", volume),
-    "board": ("The board itself", board),
-    "parameters": ("The cameras in numbers", numbers),
-    "provenance": ("Where it comes from", provenance),
+    "volume": ("Predicted uncertainty of a measurement", volume),
+    "target": ("Shape of the target", target_shape),
+    "parameters": ("Parameters of the cameras", numbers),
+    "provenance": ("Provenance", provenance),
 }
 
 
-PAGE = "index.html"
-#: Name -> how it is drawn (None where there is nothing to draw) and what it shows, for who cannot see it.
+#: Name -> the function that plots it (None where there is nothing to plot), and its description for who cannot see it.
 FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
     "coverage": (coverage_figure, "Maps of both images: how many points were seen in which part"),
     "residuals": (residuals_figure, "Residual vectors over both images, every point and averaged by region"),
     "pairs": (pairs_figure, "Bars: held-out epipolar and rigid error of every pair"),
     "volume": (volume_figure, "Maps of the predicted depth and lateral sigma over a slice of the volume"),
-    "board": (board_figure, "Map of the board's deviation from its drawing"),
+    "target": (target_figure, "Map of the target's deviation from its drawing"),
 }
-
-
-def report_folder(directory: str | Path) -> Path:
-    """Make sure that a report can be written, before the work it reports on is begun.
-
-    Args:
-        directory: the folder of the report; made with its parents where it does not exist.
-
-    Returns:
-        The folder.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be made or written to.
-    """
-    require_matplotlib()
-    folder = Path(directory).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{folder}: no report can be written here: {error.strerror}") from None
-    return folder
 
 
 def write_report(calibration: Calibration, directory: str | Path) -> Path:
@@ -377,12 +327,13 @@ def write_report(calibration: Calibration, directory: str | Path) -> Path:
         directory: the folder; files of an earlier report in it are replaced, others stay.
 
     Returns:
-        The page, index.html in the folder; every figure is beside it as report-NAME.png.
+        The page, report.html in the folder; every figure is beside it as report-NAME.png.
 
     Raises:
         InputError: matplotlib is missing, or the folder cannot be written to; then none of the report's files is new.
     """
-    folder = report_folder(directory)
+    require_matplotlib()
+    folder = writable_folder(directory, "no report")
     images: dict[str, bytes] = {}
     with drawing():
         for name, (draw, _) in FIGURES.items():
@@ -398,7 +349,7 @@ def write_report(calibration: Calibration, directory: str | Path) -> Path:
 
 def page(calibration: Calibration, images: dict[str, bytes]) -> str:
     """Return the page; ``images`` maps the names of figures to PNG data."""
-    figures = {name: _embedded(name, data) for name, data in images.items()}
+    figures = {name: picture(data, FIGURES[name][1]) for name, data in images.items()}
     bodies = {anchor: make(calibration, figures) for anchor, (_, make) in SECTIONS.items()}
     shown = {anchor: SECTIONS[anchor][0] for anchor, body in bodies.items() if body}
     left, right = ("{} x {}".format(*camera.image_size_px) for camera in calibration.rig.cameras)
@@ -407,9 +358,3 @@ def page(calibration: Calibration, images: dict[str, bytes]) -> str:
     what = f"{calibration.body.name} · {used} · {size} · baseline {1e3 * calibration.rig.baseline_m:.1f} mm"
     sections = {anchor: (title, bodies[anchor]) for anchor, title in shown.items()}
     return html_page("armsight: calibration report", "Calibration of two cameras", what, sections)
-
-
-def _embedded(name: str, data: bytes) -> str:
-    """Return a figure as an HTML image that holds its own data."""
-    source = f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
-    return f'<img src="{source}" alt="{text(FIGURES[name][1])}">'

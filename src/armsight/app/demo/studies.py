@@ -1,17 +1,22 @@
-"""The chapter's summary, measured: how the error goes with distance, baseline, resolution, noise and calibration.
+"""Studies of the error: its dependence on distance, baseline, resolution, noise, calibration, and rate of vision.
 
-Each study renders the tool's body before a rig, one thing changed at a time, measures it with the same line as ever, and
-holds the error against the truth and against what the covariance foretold. The rate of vision in the loop is studied in
-the workcell (``experiment``).
-
-How the error goes with the rate of vision in the loop: the circle, closed on vision, in workcells of several rates.
+Out: a :class:`Study` each. :func:`vision_studies` changes one quantity at a time: it renders shots of the tool's body,
+measures them with the same functions as every other command, and compares the errors with the truth and with what the
+covariance predicts. :func:`rate_study` closes the loop on the circle of a run, in workcells with cameras of several rates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
 import numpy as np
+from scipy.special import chdtri
+
 from armsight.app.run.controllers import closed_on, drive
-from armsight.app.run.experiment import Outcome, PRIOR, Progress, timing
+from armsight.app.run.experiment import PRIOR, Progress, RunResult, timing
 from armsight.app.run.loop import Loop
 from armsight.app.run.metrics import track_metrics
 from armsight.app.run.motion_file import MotionPlan
@@ -22,7 +27,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import KalmanEstimator
 from armsight.loop.servo import PoseServo
-from armsight.sim.example_rig import example_rig, board_poses
+from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.background import plain
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.render import render_pair
@@ -34,31 +39,26 @@ from armsight.vision.follow.follower import Follower
 from armsight.vision.markers.board import open_board
 from armsight.vision.measure import measure
 from armsight.vision.rig import StereoRig
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import lru_cache
-from scipy.special import chdtri
 
 _BOARD = "chessboard:9x6:25mm"
 _TILT = np.radians(30.0)
 _SIZE, _FOCAL, _BASELINE, _DISTANCE, _NOISE = (1280, 720), 900.0, 0.2, 0.8, 2.0
-_DRAWS = 3  # calibrations of each size
+_REPEATS = 3  # calibrations of each size
 
 
 @dataclass(frozen=True, eq=False)
 class Study(Record):
-    """How the error goes with one thing.
+    """The error of the position as a function of one quantity.
 
     Attributes:
-        name: what is changed.
-        unit: of it.
-        values: (N,) what it was.
-        position_rms_m: (N,) measured error of the position.
-        low_m: (N,) lower end of its 95% interval, from the number of shots.
-        high_m: (N,) upper end.
-        predicted_m: (N,) what the covariance foretold.
-        missed: (N,) shots without a pose.
+        name: the quantity.
+        unit: its unit.
+        values: (N,) its values.
+        position_rms_m: (N,) measured RMS error of the position, m.
+        low_m: (N,) lower end of its 95% interval, from the number of shots, m.
+        high_m: (N,) upper end, m.
+        predicted_m: (N,) error predicted by the covariance, m.
+        missed: (N,) number of shots without a pose.
     """
 
     name: str
@@ -81,8 +81,8 @@ class _Errors(Record):
 
 
 @dataclass(frozen=True)
-class _Setup:
-    """What the body at rest is seen with, by an exactly known rig."""
+class _Conditions:
+    """How shots of the body at rest are rendered, with an exactly known rig."""
 
     distance_m: float = _DISTANCE
     baseline_m: float = _BASELINE
@@ -95,7 +95,7 @@ def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = l
 
     Args:
         seed: of poses and noise.
-        shots: rendered for each value.
+        shots: number of shots rendered for each value.
         progress: called with a line about what is being done.
     """
 
@@ -104,22 +104,22 @@ def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = l
         with ThreadPoolExecutor(2) as both:
             return _study(name, unit, values, list(both.map(errors, values)))
 
-    @lru_cache  # what is usual is a value of three studies
-    def seen(setup: _Setup) -> _Errors:
-        rig = _rig(setup.width, setup.baseline_m)
-        return _measured(rig, *_rendered(rig, seed, shots, setup.distance_m, setup.noise))
+    @lru_cache  # the default conditions are a value of three studies
+    def seen(given: _Conditions) -> _Errors:
+        rig = _rig(given.width, given.baseline_m)
+        return _measured(rig, *_rendered(rig, seed, shots, given.distance_m, given.noise))
 
     return [
-        changed("distance", "m", (0.5, 0.7, 0.9, 1.2, 1.6), lambda v: seen(_Setup(distance_m=v))),
-        changed("baseline", "m", (0.05, 0.1, 0.2, 0.4), lambda v: seen(_Setup(baseline_m=v))),
-        changed("image width", "px", (640, 960, 1280, 1920), lambda v: seen(_Setup(width=int(v)))),
-        changed("pixel noise", "grey levels", (1.0, 2.0, 5.0, 10.0), lambda v: seen(_Setup(noise=v))),
+        changed("distance", "m", (0.5, 0.7, 0.9, 1.2, 1.6), lambda v: seen(_Conditions(distance_m=v))),
+        changed("baseline", "m", (0.05, 0.1, 0.2, 0.4), lambda v: seen(_Conditions(baseline_m=v))),
+        changed("image width", "px", (640, 960, 1280, 1920), lambda v: seen(_Conditions(width=int(v)))),
+        changed("pixel noise", "grey levels", (1.0, 2.0, 5.0, 10.0), lambda v: seen(_Conditions(noise=v))),
         _calibration_study(seed, shots, progress),
     ]
 
 
 def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Errors]) -> Study:
-    """Bring the errors at each value together; the interval counts three coordinates of unequal size as two."""
+    """Return the study of the errors at each value; its interval counts three coordinates of unequal size as two."""
     squares = np.array([(e.error**2).sum(axis=1).mean() if len(e.error) else np.nan for e in found])
     freedom = np.array([max(2 * len(e.error), 1) for e in found])
     return Study(
@@ -135,32 +135,37 @@ def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Error
 
 
 @lru_cache
-def _usual(width: int) -> StereoRig:
-    """Return the true rig with images so wide; the same cameras each time, so that their rays are found once."""
+def _default_rig(width: int) -> StereoRig:
+    """Return the true rig for an image width, px; the same cameras each time, so that their rays are computed once."""
     size = (width, width * 9 // 16)
     return example_rig(size, focal_px=_FOCAL * width / _SIZE[0], baseline_m=_BASELINE, convergence_deg=0.0)
 
 
 def _rig(width: int = _SIZE[0], baseline_m: float = _BASELINE) -> StereoRig:
-    """Return the true rig."""
-    return replace(_usual(width), T_left_right=example_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right)
+    """Return the true rig for an image width, px, and a baseline, m."""
+    return replace(
+        _default_rig(width), T_left_right=example_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right
+    )
 
 
 def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: float) -> tuple[list[Shot], Array]:
-    """Render shots of the body near the middle of the view; the same seed gives the same tilts and places."""
+    """Render shots of the body near the middle of the view; return them, and the body's poses (N, 4, 4), left camera.
+
+    The same seed gives the same tilts and positions.
+    """
     rng = np.random.default_rng([seed, 7])
     across = rng.uniform(-1, 1, (shots, 3)) * (0.12, 0.06, 0.05)
-    turns = rng.uniform(-1, 1, (shots, 3)) * _TILT
+    rotations = rng.uniform(-1, 1, (shots, 3)) * _TILT
     middle = np.array([rig.baseline_m / 2, 0.0, distance_m])
-    Ts = np.array([pose(exp_so3(turn), middle + distance_m * shift) for turn, shift in zip(turns, across, strict=True)])
+    Ts = np.array([pose(exp_so3(w), middle + distance_m * shift) for w, shift in zip(rotations, across, strict=True)])
     behind = tuple(plain(camera.image_size_px, rng) for camera in rig.cameras)
     patterns = body_patterns()
 
     def shot(k: int) -> Shot:
         own = np.random.default_rng([seed, 8, k])
-        placed = [PosedBody(patterns, Ts[k])]
+        bodies = [PosedBody(patterns, Ts[k])]
         images = render_pair(
-            rig.cameras, rig.T_left_right, placed, (behind[0], behind[1]), sensor=Sensor(read_noise=noise), rng=own
+            rig.cameras, rig.T_left_right, bodies, (behind[0], behind[1]), sensor=Sensor(read_noise=noise), rng=own
         )
         return Shot(f"{k}", *images)
 
@@ -168,7 +173,7 @@ def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: f
 
 
 def _measured(rig: StereoRig, shots: Sequence[Shot], Ts_left_body: Array) -> _Errors:
-    """Measure shots and hold them against the truth."""
+    """Measure shots and compare the positions with the true poses (N, 4, 4)."""
     target = body_target()
     error, variance = [], []
     for shot, T in zip(shots, Ts_left_body, strict=True):
@@ -180,13 +185,13 @@ def _measured(rig: StereoRig, shots: Sequence[Shot], Ts_left_body: Array) -> _Er
 
 
 def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -> Study:
-    """Calibrate with more and more pairs of a board, several times each, and measure the same shots with each rig."""
+    """Calibrate with more and more pairs of a target, several times each, and measure the same shots with each rig."""
     sizes, true, board = (4, 8, 16, 32), _rig(), open_board(_BOARD)
     rng = np.random.default_rng([seed, 9])
     pattern = chessboard(9, 6, 0.025)
     Ts = board_poses(rng, true, pattern, max(sizes) * 2)
     grey = (0.4, 0.4)
-    progress("study: boards for calibrations of several sizes")
+    progress("study: images for calibrations of several sizes")
 
     def pair(k: int) -> Pair:
         images = render_pair(
@@ -201,18 +206,18 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
     with ThreadPoolExecutor(2) as both:
         pairs = list(both.map(pair, range(len(Ts))))
     rendered = _rendered(true, seed, max(4, shots // 2), _DISTANCE, _NOISE)
-    # Drawn beforehand: what is drawn is not to depend on which calibration is done first.
-    drawn = [[rng.choice(len(pairs), size, replace=False) for _ in range(_DRAWS)] for size in sizes]
+    # Sampled beforehand, so that the samples do not depend on which calibration is done first.
+    samples = [[rng.choice(len(pairs), size, replace=False) for _ in range(_REPEATS)] for size in sizes]
 
     def calibrated(chosen: Array) -> _Errors:
         rig = calibrate_boards(board, [pairs[k] for k in chosen], (_SIZE, _SIZE), models=("brown5",), flat=True).rig
         return _measured(rig, *rendered)
 
     found = []
-    for size, draws in zip(sizes, drawn, strict=True):
+    for size, chosen_pairs in zip(sizes, samples, strict=True):
         progress(f"study: calibrations of {size} pairs")
         with ThreadPoolExecutor(2) as both:
-            each = list(both.map(calibrated, draws))
+            each = list(both.map(calibrated, chosen_pairs))
         found.append(
             _Errors(
                 np.concatenate([e.error for e in each]),
@@ -220,9 +225,9 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
                 sum(e.missed for e in each),
             )
         )
-    study = _study("calibration size", "pairs of the board", sizes, found)
-    # The shots of one calibration err together: its draws are what is counted.
-    freedom = 3.0 * _DRAWS
+    study = _study("calibration size", "pairs of the target", sizes, found)
+    # The errors of the shots of one calibration are correlated: the number of calibrations counts.
+    freedom = 3.0 * _REPEATS
     wide = study.position_rms_m * np.sqrt(freedom / chdtri(freedom, [[0.025], [0.975]]))
     return Study(
         study.name, study.unit, study.values, study.position_rms_m, wide[0], wide[1], study.predicted_m, study.missed
@@ -236,30 +241,30 @@ def rate_study(
     open_workcell: Callable[[float], Workcell],
     setup_of: Callable[[Workcell], Setup],
     rig: StereoRig,
-    outcome: Outcome,
+    outcome: RunResult,
     plan: MotionPlan,
     progress: Progress,
 ) -> Study:
-    """Make the last motions of a plan, up to its circle, with the loop closed at several rates.
+    """Make the last motions of a plan, up to its circle, with the loop closed at several rates of the cameras.
 
     Args:
-        open_workcell: opens a workcell whose cameras have a rate; all else as in the run.
-        setup_of: makes a station of it.
+        open_workcell: opens a workcell with cameras of a rate, Hz; all else as in the run.
+        setup_of: makes a setup of it.
         rig: the calibrated cameras.
-        outcome: of the run, for where everything is.
+        outcome: of the run; its hand-eye calibration and delay are used.
         plan: the motions of the run.
         progress: called with a line about what is being done.
     """
 
     def at(rate: float) -> tuple[float, float, int]:
         progress(f"study: vision at {rate:g} Hz in the loop")
-        with open_workcell(rate) as cell:
-            return _figures(_circle(cell, setup_of(cell), rig, outcome, plan))
+        with open_workcell(rate) as workcell:
+            return _circle_errors(_circle(workcell, setup_of(workcell), rig, outcome, plan))
 
     with ThreadPoolExecutor(2) as both:  # the longest first
         rows = list(both.map(at, RATES_HZ[::-1]))[::-1]
     position, predicted, count = (np.array(column) for column in zip(*rows, strict=True))
-    # A circle's errors hang together: about one independent error every tenth of a second.
+    # The errors along a circle are correlated: about one independent error every tenth of a second.
     spread = 1.96 / np.sqrt(2 * 3 * np.maximum(count / 100.0, 1.0))
     return Study(
         "rate of vision in the loop",
@@ -273,12 +278,12 @@ def rate_study(
     )
 
 
-def _circle(cell: Workcell, setup: Setup, rig: StereoRig, outcome: Outcome, plan: MotionPlan) -> RunData:
-    """Drive to the circle and along it, without a rest."""
+def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult, plan: MotionPlan) -> RunData:
+    """Move to the circle and along it, without a rest; return the tracks."""
     assert outcome.handeye is not None
     setup.board.enable()
     log = Log()
-    loop = Loop(
+    loop = Loop.open(
         setup,
         Follower(rig, setup.target),
         log,
@@ -292,15 +297,16 @@ def _circle(cell: Workcell, setup: Setup, rig: StereoRig, outcome: Outcome, plan
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
     drive(loop, part, closed_on(servo, setup.gravity), closed=True, progress=lambda line: None)
     loop.close_record()
-    truth, mounting = cell.truth, outcome.handeye.mounting
+    truth, mounting = workcell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
     Ts = mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
     return assembled(log, setup.arm, mounting, outcome.delay, (truth.t_s, Ts))
 
 
-def _figures(run: RunData) -> tuple[float, float, int]:
-    """Return the fused estimate's error on the circle, RMS, m; what it claimed; how many readings."""
+def _circle_errors(run: RunData) -> tuple[float, float, int]:
+    """Return the RMS error of the fused estimate on the circle, m, the claimed one, m, and the number of readings."""
     assert run.truth is not None
     rows = (run.fused.motion == "circle") & (run.fused.phase == "closed_loop")
     found = track_metrics(run.fused[rows], run.truth)
-    return found["position_rms_m"], found["position_sigma_rms_m"], int(rows.sum())
+    assert found.claimed is not None
+    return found.position_rms_m, found.claimed.position_sigma_rms_m, int(rows.sum())

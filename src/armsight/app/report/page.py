@@ -1,13 +1,23 @@
-"""A page that holds everything it shows: style, sections, figures; needs no network."""
+"""Pages of reports: one HTML file that holds everything it shows and needs no network, and the folder it is written to.
+
+In: sections of HTML and the bytes of pictures. Out: the text of a page; files that are complete or not there at all.
+Whatever comes from outside passes :func:`text`, which escapes it.
+"""
 
 from __future__ import annotations
 
+import base64
 import html
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from armsight.app.report.plotting import plain
+from armsight.errors import InputError
 from armsight.files import replacing
 
+#: Name of the page in the folder of every report.
+PAGE = "report.html"
 STYLE = """
 :root { color-scheme: light; --ink: #1f2933; --muted: #616e7c; --line: #e4e7eb; --soft: #f5f7fa;
   --good: #2f7d4f; --fair: #b7791f; --poor: #b83232; }
@@ -21,10 +31,10 @@ p { margin: .5rem 0; max-width: 50rem; }
 ul { padding-left: 1.2rem; max-width: 50rem; } li { margin: .35rem 0; }
 .sub, nav { color: var(--muted); } nav { margin: .8rem 0 1.6rem; font-size: .92rem; }
 nav a { color: #2b6cb0; text-decoration: none; margin-right: 1.1rem; white-space: nowrap; }
-.verdict { border-left: .4rem solid; background: var(--soft); padding: .8rem 1.2rem; margin: 1.2rem 0 1.6rem; }
-.verdict p { margin: .25rem 0; } .headline { font-size: 1.25rem; font-weight: 650; }
-.verdict.good { border-color: var(--good); } .verdict.fair { border-color: var(--fair); }
-.verdict.poor { border-color: var(--poor); }
+.assessment { border-left: .4rem solid; background: var(--soft); padding: .8rem 1.2rem; margin: 1.2rem 0 1.6rem; }
+.assessment p { margin: .25rem 0; } .headline { font-size: 1.25rem; font-weight: 650; }
+.assessment.good { border-color: var(--good); } .assessment.fair { border-color: var(--fair); }
+.assessment.poor { border-color: var(--poor); }
 .grade { font-weight: 650; } .grade::before { content: "\\25CF\\00A0"; }
 .grade.good { color: var(--good); } .grade.fair { color: var(--fair); } .grade.poor { color: var(--poor); }
 table { border-collapse: collapse; margin: .8rem 0 1.2rem; font-size: .92rem; }
@@ -34,7 +44,7 @@ thead th { color: var(--muted); font-weight: 500; } tbody th { font-weight: 550;
 table.headline td:nth-child(-n+4), table.headline th { white-space: nowrap; }
 table.headline td { font-variant-numeric: tabular-nums; } table.headline td:last-child { color: var(--muted); }
 table.headline { font-weight: 400; font-size: .95rem; }
-table.words th { font-weight: 400; } table.words td { min-width: 18rem; }
+table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
 table.numbers tbody th { white-space: nowrap; } table.numbers td { font-variant-numeric: tabular-nums; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
@@ -42,6 +52,45 @@ figcaption p { margin: .3rem 0; }
 @media (max-width: 48rem) { table { display: block; overflow-x: auto; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } figure { break-inside: avoid; } }
 """
+
+
+def text(value: object) -> str:
+    """Return a value as text that is safe anywhere in a page."""
+    return html.escape(plain(str(value), most=2000))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """Return an HTML table.
+
+    Args:
+        head: titles of the columns, HTML.
+        rows: cells, HTML; the first of a row is its title.
+        kind: CSS class: headline, prose or numbers.
+    """
+    top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in rest) + "</tr>\n"
+        for first, *rest in rows
+    )
+    return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list of plain lines, escaped."""
+    return "<ul>" + "".join(f"<li>{text(line)}</li>\n" for line in lines) + "</ul>\n"
+
+
+def picture(data: bytes, description: str, *, kind: str = "png", attributes: str = "") -> str:
+    """Return an HTML image that holds its own data.
+
+    Args:
+        data: the file's bytes.
+        description: for who cannot see it; plain text.
+        kind: png or svg+xml.
+        attributes: further HTML attributes, such as a style.
+    """
+    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return f'<img src="{source}" alt="{text(description)}"{attributes and " " + attributes}>'
 
 
 def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[str, str]], script: str = "") -> str:
@@ -68,8 +117,32 @@ def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[s
     )
 
 
+def writable_folder(directory: str | Path, contents: str, advice: str = "") -> Path:
+    """Make a folder and check that files can be written to it, before long work begins.
+
+    Args:
+        directory: the folder; made with its parents where it does not exist.
+        contents: what is to be written, as the message names it: "no report".
+        advice: what to do, at the end of the message.
+
+    Returns:
+        The folder, ``~`` expanded.
+
+    Raises:
+        InputError: it cannot be made or written to.
+    """
+    folder = Path(directory).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: {contents} can be written here: {error.strerror}{advice}") from None
+    return folder
+
+
 def put_files(folder: Path, files: dict[str, bytes]) -> None:
-    """Put files in place, each whole; where one fails, those that were not there before are taken away again."""
+    """Write files, each complete or not at all; where one fails, those that are new are removed again."""
     made: list[Path] = []
     try:
         for name, data in files.items():

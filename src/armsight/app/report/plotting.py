@@ -1,4 +1,7 @@
-"""How the report's figures are drawn: style, canvas, arrows; matplotlib without a display, imported only when used."""
+"""Plots of reports: style, canvas, arrows; matplotlib without a display, imported only when something is plotted.
+
+Plot within :func:`drawing`, on a :func:`new_figure`; :func:`png` and :func:`svg` return the bytes of a file.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Draw in the report's own style, whatever the user's matplotlib settings, without a display.
+    """Plot within this block in the style of the reports, whatever the user's matplotlib settings, without a display.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -63,7 +66,7 @@ def drawing() -> Iterator[None]:
 
 
 def require_matplotlib() -> None:
-    """Raise an InputError that says what to install unless matplotlib can be imported."""
+    """Raise an InputError with what to install unless matplotlib can be imported."""
     try:
         importlib.import_module("matplotlib.figure")
     except ImportError:
@@ -84,7 +87,7 @@ def new_figure(height_in: float) -> Figure:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Give everything in a figure its place, once; matplotlib would draw it all for that, and again for every file."""
+    """Compute the layout of a figure once; matplotlib would render it all for that, and again for every file."""
     if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
@@ -137,22 +140,22 @@ def arrows(
     unit: str,
     above: float,
 ) -> None:
-    """Draw enlarged vectors in the units of the axes, and a scale arrow above their right end.
+    """Plot enlarged vectors in the units of the axes, and a scale arrow above their right end.
 
     Args:
-        axes: where; its x axis must have its limits.
-        at: (N, 2) feet.
-        vectors: (N, 2) what to show.
-        enlarged: how many times.
-        colours: one, or one each.
+        axes: the axes; the limits of x must be set.
+        at: (N, 2) feet of the vectors.
+        vectors: (N, 2) the vectors.
+        enlarged: factor of enlargement.
+        colours: one colour, or one for each vector.
         width: of a shaft, as a share of the width of the axes.
         unit: of the vectors, for the scale.
-        above: height of the scale above the axes, as a share of theirs.
+        above: height of the scale above the axes, as a share of their height.
     """
     low, high = axes.get_xlim()
     scale = nice(0.09 * abs(high - low) / enlarged)
     style: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / enlarged, "clip_on": False}
-    drawn = axes.quiver(*at.T, *vectors.T, color=colours, width=width, **style)
-    drawn.set_in_layout(False)
+    arrows_shown = axes.quiver(*at.T, *vectors.T, color=colours, width=width, **style)
+    arrows_shown.set_in_layout(False)
     key: Any = {"labelpos": "E", "color": INK, "labelcolor": INK, "coordinates": "axes"}
-    axes.quiverkey(drawn, 0.87, 1 + above, scale, f"{scale:g} {unit}", **key)
+    axes.quiverkey(arrows_shown, 0.87, 1 + above, scale, f"{scale:g} {unit}", **key)

@@ -1,22 +1,26 @@
-"""Controllers that follow what was planned, and nothing else: potentiometers alone, as the chapter has it.
+"""The controllers of a run: open loop (:class:`Planned`), closed on vision (:class:`Closed`); and what they follow.
 
-The motions of a run, once with potentiometers alone and once with vision in the loop.
+:class:`Planned` sends a trajectory as it is: the board then controls the joints by their potentiometers alone.
+:class:`Closed` corrects it by the tool pose that vision measures. :class:`Sweep` is the trajectory that the cameras'
+delay is measured with. :func:`drive` makes all motions of a plan with either controller.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-from armsight.app.run.loop import Controller, Loop, PERIOD_S
+
+from armsight.app.run.loop import PERIOD_S, Controller, Loop
 from armsight.app.run.motion_file import MotionPlan
-from armsight.app.run.record import Segment
+from armsight.app.run.record import RunSegment
 from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
 from armsight.loop.servo import Aim, PoseServo
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Tabled, Trajectory
-from collections.abc import Callable
 
-#: A joint that lifts the tool by so much, m per rad, carries weight.
+#: A joint that lifts the tool by more than this, m per rad, carries a gravity load.
 LOADED_M = 0.15
 
 
@@ -25,8 +29,8 @@ class Planned:
 
     Args:
         trajectory: joint angles over time.
-        start_s: when it begins, board's clock.
-        gravity: gives the duty that carries the arm at joint angles.
+        start_s: when it begins, board's clock, s.
+        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
     """
 
     def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
@@ -34,27 +38,27 @@ class Planned:
         self._next: JointCommand | None = None
 
     def prepare(self, t_s: float) -> None:
-        """Find where the joints are to be a period from now."""
+        """Compute the reference of the joints one period from now."""
         ahead = self._trajectory.at(t_s + PERIOD_S - self._start_s)
         self._next = JointCommand(ahead.q, ahead.qd, self._gravity(ahead.q), PERIOD_S)
 
     def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return where the joints are to be."""
+        """Return the reference, and "planned" as its basis."""
         assert self._next is not None
         return self._next, "planned"
 
 
 class Sweep:
-    """Joints to and fro with changing speed: the motion that tells how late the cameras are. A trajectory.
+    """A trajectory that moves the joints back and forth with varying speed, to measure the delay of the cameras.
 
-    Only joints that carry weight move: their backlash stays closed. One that carries none lags by its play whenever it is
-    turned round, which looks like a delay: 0.1 degree at 30 degrees a second are 3 ms.
+    Only joints with a gravity load move: the load keeps their backlash on one side. A joint without load lags by its
+    backlash after every reversal, which looks like a delay: 0.1 degree at 30 degrees a second are 3 ms.
 
     Args:
         arm: the nominal arm, its base upright.
-        q_middle: (6,) about which they move, rad; there it begins and ends.
-        reach_rad: how far.
-        duration_s: of the whole.
+        q_middle: (6,) joint angles about which they move, rad; the trajectory begins and ends there.
+        reach_rad: amplitude, rad.
+        duration_s: duration, s.
     """
 
     def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, *, duration_s: float) -> None:
@@ -64,7 +68,7 @@ class Sweep:
         self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0])
 
     def at(self, t_s: float | Array) -> Joints:
-        """Return the joints ``t_s`` seconds after the start."""
+        """Return angles, speeds and accelerations of the joints ``t_s`` seconds after the start."""
         t = np.clip(np.asarray(t_s, float), 0.0, self.duration_s)[..., None]
         x = np.pi * t / self.duration_s
         window, window_d = np.sin(x) ** 2, np.pi / self.duration_s * np.sin(2 * x)
@@ -77,13 +81,13 @@ class Sweep:
 
 
 class Closed:
-    """Sends a trajectory corrected by what vision sees.
+    """Sends a trajectory corrected by the tool pose that vision measures.
 
     Args:
-        servo: the outer loop; one for all motions, as it carries its correction over.
+        servo: the outer loop; one for all motions, as its correction continues from one to the next.
         trajectory: joint angles over time.
-        start_s: when it begins, board's clock.
-        gravity: gives the duty that carries the arm at joint angles.
+        start_s: when it begins, board's clock, s.
+        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
     """
 
     def __init__(
@@ -93,19 +97,19 @@ class Closed:
         self._aim: Aim | None = None
 
     def prepare(self, t_s: float) -> None:
-        """Find where the tool is to be a period from now."""
+        """Compute the reference of the tool one period from now."""
         self._aim = self._servo.aim(self._trajectory, t_s - self._start_s, self._gravity)
 
     def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return where the joints are to be for the tool to be right."""
+        """Return the corrected reference of the joints, and its basis: vision, bridged, planned."""
         assert self._aim is not None
         step = self._servo.step(self._aim, estimator)
         return step.command, step.mode.name.lower()
 
 
-#: Without a loop to settle the arm need not stand longer, s.
+#: Longest rest in open loop, s: there is no correction that has to settle.
 OPEN_REST_S = 0.5
-#: Makes a controller of a trajectory that begins at a time of the board's clock.
+#: Makes a controller from a trajectory and the time at which it begins, board's clock, s.
 Control = Callable[[Trajectory, float], Controller]
 
 
@@ -118,15 +122,15 @@ def drive(
     progress: Callable[[str], None],
     started: Callable[[str, str, float], None] = lambda motion, kind, duration_s: None,
 ) -> None:
-    """Drive all motions of a plan, with its rests.
+    """Make all motions of a plan, with its rests.
 
     Args:
-        loop: to run them in; the arm stands at the plan's start.
+        loop: runs them; the arm stands at the plan's start.
         plan: the motions.
-        control: what commands the joints.
+        control: makes the controller of each motion.
         closed: whether that closes the loop on vision.
         progress: called with a line about what is being done.
-        started: called with name, kind and duration of each motion as it begins.
+        started: called with name, kind and duration (s) of each motion as it begins.
 
     Raises:
         DeviceError: the board or a camera failed.
@@ -135,18 +139,18 @@ def drive(
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
         controller = control(Tabled(motion.trajectory), loop.t_s)
-        segment = Segment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        segment = RunSegment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)
-        rest = Segment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        rest = RunSegment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
         loop.run(controller, motion.rest_s if closed else min(motion.rest_s, OPEN_REST_S), rest)
 
 
 def planned(gravity: Callable[[Array], Array]) -> Control:
-    """Return what follows the plan with potentiometers alone."""
+    """Return the control that follows the plan with potentiometers alone."""
     return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
 
 
 def closed_on(servo: PoseServo, gravity: Callable[[Array], Array]) -> Control:
-    """Return what follows the plan with the loop closed on vision."""
+    """Return the control that follows the plan with the loop closed on vision."""
     return lambda trajectory, start_s: Closed(servo, trajectory, start_s, gravity)

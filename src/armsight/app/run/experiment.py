@@ -1,77 +1,80 @@
-"""The chapter's experiment: calibrate, find where everything is, drive the arm, see who is right, and close the loop.
+"""The experiment: hand-eye calibration, camera delay, the motions in open loop, the motions with the loop closed.
 
-One sequence for the workcell and for real devices (:class:`~armsight.app.run.setup.Setup`). What a device failure or
-an interrupt leaves is a :class:`Outcome` with everything measured until then; the arm is stopped first.
+In: a :class:`~armsight.app.run.setup.Setup` (the workcell or real devices), a calibrated rig and a motion plan. Out: a
+:class:`RunResult`. After a device failure or an interrupt it has everything measured until then; the arm is stopped first.
 
-What must be so before an arm moves: code compiled, the board free of faults, the joints where the motion starts.
+Before an arm moves, :func:`require_start` checks its joint angles and limits, :func:`warm_up` compiles all that the loop
+runs, and :func:`enable` switches the drives on.
 """
 
 from __future__ import annotations
 
 import contextlib
-import numpy as np
-from armsight.app.interrupts import uninterrupted
-from armsight.app.run.calibrate import HandEyeRun, find_delay, find_mounting
-from armsight.app.run.controllers import Planned, closed_on, drive, planned
-from armsight.app.run.loop import Loop, PERIOD_S, steady
-from armsight.app.run.motion_file import MotionPlan
-from armsight.app.run.record import Log, Segment
-from armsight.app.run.setup import Setup
-from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
-from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.loop.estimators import Delay, KalmanEstimator, Prior, PoseMeasurement
-from armsight.loop.servo import PoseServo, Timing
-from armsight.robot.arm import Arm
-from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import Fault, Command, STATE_TEXTS, State
-from armsight.robot.trajectories import Trajectory, point_to_point
-from armsight.vision.follow.follower import Follower
-from armsight.vision.rig import StereoRig
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-#: The joints must agree with where the motion is to start to so much before anything moves, rad.
+import numpy as np
+
+from armsight.app.interrupts import uninterrupted
+from armsight.app.run.calibrate import HandEyeRun, find_delay, find_mounting
+from armsight.app.run.controllers import Planned, closed_on, drive, planned
+from armsight.app.run.loop import PERIOD_S, Loop, steady
+from armsight.app.run.motion_file import MotionPlan
+from armsight.app.run.record import Log, RunSegment
+from armsight.app.run.setup import Setup
+from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement, Prior
+from armsight.loop.servo import PoseServo, LoopTiming
+from armsight.robot.arm import Arm
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
+from armsight.robot.trajectories import Trajectory, point_to_point
+from armsight.vision.follow.follower import Follower
+from armsight.vision.rig import StereoRig
+
+#: Largest difference of the joints from the start of the motion before anything moves, rad.
 START_RAD = float(np.radians(2.0))
-#: A board that slows its arm down is waited for so long, s.
+#: How long to wait for a board that is stopping its arm, s.
 _SLOWS_S = 3.0
 _STEP_S = 0.05
-_MOVE_RAD = 0.05  # of the joints, in what is rehearsed
-_REHEARSED = 400  # readings
-_LOOKED = 200  # places along a motion
+_MOVE_RAD = 0.05  # motion of the joints in warm_up
+_WARM_UP = 400  # readings
+_CHECKED = 200  # joint angles along a motion that are checked
 
 
 def enable(board: Board) -> None:
-    """Switch the drives on; an arm that is held since an earlier host fell silent is taken over as it stands.
+    """Switch the drives on; an arm that is held since an earlier host went silent is taken over in its position.
 
     Raises:
-        DeviceError: another fault stands: that is for a person to look at. Or the board refused.
+        DeviceError: another fault is latched, which a person must look into; or the board rejected the command.
     """
     waited_s = 0.0
-    while board.status.state is State.STOPPING and waited_s < _SLOWS_S:
+    while board.status.state is BoardState.STOPPING and waited_s < _SLOWS_S:
         board.receive(_STEP_S)
         waited_s += _STEP_S
     faults = board.status.faults
     if faults and all(each.fault is Fault.HOST_SILENT for each in faults):
         board.confirm(board.command(Command.CLEAR_FAULTS))
-    elif faults or board.status.state is State.STOPPED:
-        causes = "; ".join(str(fault) for fault in faults) or "the emergency stop was pressed"
+    elif faults or board.status.state is BoardState.STOPPED:
+        found = "; ".join(str(fault) for fault in faults) or "the emergency stop was pressed"
         raise DeviceError(
-            f"the board is not ready: {STATE_TEXTS[board.status.state]} ({causes}): see to the cause, and switch the board "
+            f"the board is not ready: {STATE_TEXTS[board.status.state]} ({found}): remove the cause, and switch the board "
             "off and on again"
         )
-    if board.status.state is not State.ENABLED:  # a held arm is taken over without letting go of it
+    if board.status.state is not BoardState.ENABLED:  # a held arm is taken over without releasing it
         board.enable()
 
 
 def warm_up(arm: Arm) -> None:
-    """Run once all that the loop runs in motion: nothing is compiled while an arm waits for its next command."""
+    """Run once all that the loop runs in motion, so that nothing is compiled while an arm waits for a command."""
     low, high = np.maximum(arm.home - _MOVE_RAD, arm.q_min), np.minimum(arm.home + _MOVE_RAD, arm.q_max)
     way = point_to_point(arm, low, high)
-    t_s = np.linspace(1e-3, 1e-3 * _REHEARSED, _REHEARSED)
+    t_s = np.linspace(1e-3, 1e-3 * _WARM_UP, _WARM_UP)
     q = way.at(t_s).q
-    servo = PoseServo(arm, Timing(PERIOD_S, 0.016, 0.02))
+    servo = PoseServo(arm, LoopTiming(PERIOD_S, 0.016, 0.02))
     estimator = KalmanEstimator(arm, delay=Delay(0.02, 0.02))
-    for first in range(0, _REHEARSED, 4):
+    for first in range(0, _WARM_UP, 4):
         rows = slice(first, first + 4)
         estimator.joints(JointStates(t_s[rows], q[rows]))
         estimator.estimate()
@@ -85,19 +88,19 @@ def warm_up(arm: Arm) -> None:
 
 
 def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
-    """Refuse to begin where the arm is not where the motion starts, or is no such arm at all.
+    """Check that the arm is where the motion starts, and that the board allows all joint angles of the run.
 
     Args:
-        station: the arm and its board.
+        setup: the arm and its board.
         plan: the motions.
-        targets: (N, 6) where else the joints will go, rad.
+        targets: (N, 6) further joint angles of the run, rad.
 
     Raises:
-        ArmsightError: which joint is where, and where it should be.
+        ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
     """
     states = setup.board.receive(0.2)
     if not len(states.q):
-        raise DeviceError("the board tells no joint angles: is its wire's baud rate right?")
+        raise DeviceError("the board reports no joint angles: is the baud rate of its serial port right?")
     q = states.q[-1]
     off = np.abs(q - plan.start)
     if off.max() > START_RAD:
@@ -105,18 +108,18 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
         raise InputError(
             f"joint {joint + 1} reads {np.degrees(q[joint]):.1f} deg, the motion starts at "
             f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
-            f"--model {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
+            f"--arm {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
     _require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 
 
 def passed(way: Trajectory) -> Array:
     """Return joint angles (N, 6) that a motion passes, rad."""
-    return way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
+    return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
 def _require_range(setup: Setup, q: Array) -> None:
-    """Refuse joint angles (N, 6) that the board's own limits do not allow: it would hold the joint back on the way."""
+    """Reject joint angles (N, 6), rad, beyond the board's own limits: it would stop the joint on the way."""
     config = setup.board.configuration()["joint"]
     low, high = config["soft_min_rad"].astype(float), config["soft_max_rad"].astype(float)
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
@@ -125,38 +128,39 @@ def _require_range(setup: Setup, q: Array) -> None:
         raise InputError(
             f"joint {joint + 1} is to go from {np.degrees(q[:, joint].min()):.1f} to {np.degrees(q[:, joint].max()):.1f} "
             f"deg, the board allows {np.degrees(low[joint]):.1f} to {np.degrees(high[joint]):.1f}: change the motion or "
-            f"the board's soft limits; or is --model {setup.arm.name} another arm than the board's?"
+            f"the board's soft limits; or is --arm {setup.arm.name} another arm than the board's?"
         )
 
 
 Progress = Callable[[str], None]
-#: Sigma of the delay before it is measured, s.
+#: Delay of the cameras and its sigma before it is measured, s.
 _UNKNOWN_DELAY = Delay(0.02, 0.02)
-#: So many shots are kept as images: a recording for whoever wants to try the stages on them.
+#: Number of shots that are kept as images: a recording to try the stages on.
 KEPT_SHOTS = 12
-#: Links of an arm that stands creep in their backlash, unseen by the potentiometers: half a gap of 0.2 degree in seconds.
+#: Links of an arm at rest creep within their backlash, which the potentiometers do not measure: by half of a gap of 0.2
+#: degree within seconds.
 PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
-#: From an image's arrival to its command: our own time, and the wait for the loop's next turn, s.
+#: Time from an image's arrival to its command, s: computing time, and the mean wait for the next iteration.
 _OWN_S = 0.002 + PERIOD_S / 2
 _STALE_S = 0.05
 
 
 @dataclass
-class Outcome:
-    """What a run has come to.
+class RunResult:
+    """What a run measured.
 
     Attributes:
-        body: that was looked for.
-        log: everything, as it came.
-        handeye: where cameras and body are; None before they were found.
-        delay: how late the cameras' stamps are.
-        open_s: when the pass with potentiometers alone began and ended, board's clock; None before.
-        closed_s: the same of the pass with the loop closed.
-        covered_s: when the body was hidden on purpose, from and to; None where it was not.
+        body: the body on the tool.
+        log: everything that was measured and commanded.
+        handeye: the hand-eye calibration; None before it was made.
+        delay: delay of the cameras' time stamps.
+        open_s: begin and end of the pass with potentiometers alone, board's clock, s; None before.
+        closed_s: begin and end of the pass with the loop closed.
+        covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
         kept: the first shots of the motions.
-        picture: the first image with the body found in motion, and the pose.
-        ended_by: what ended the run early; None where it ran to its end.
-        interrupted: whether that was the keyboard.
+        picture: the first shot in motion in which the body was found, and its pose.
+        ended_by: the error that ended the run early; None where there was none.
+        interrupted: whether the keyboard ended the run.
     """
 
     body: Body
@@ -177,8 +181,8 @@ class Outcome:
         return self.delay is not _UNKNOWN_DELAY
 
     @property
-    def said(self) -> str | None:
-        """What ended the run early, in words; None where it ran to its end."""
+    def ended_text(self) -> str | None:
+        """What ended the run early, as text; None where it ran to its end."""
         return "interrupted" if self.interrupted else None if self.ended_by is None else str(self.ended_by)
 
 
@@ -191,22 +195,22 @@ def run_experiment(
     progress: Progress,
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
-) -> Outcome:
+) -> RunResult:
     """Run the experiment.
 
     Args:
-        station: where.
-        rig: its calibrated cameras.
+        setup: the devices.
+        rig: the calibrated cameras.
         plan: the motions; the arm stands at their start.
-        targets: (N, 6) joint angles of the hand-eye poses.
+        targets: (N, 6) joint angles of the hand-eye poses, rad.
         progress: called with a line about what is being done.
-        cover: hides the body from one time to another; None where nobody can.
+        cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
 
     Returns:
-        All that was measured, also where something ended it early.
+        All that was measured, also where something ended the run early.
     """
-    outcome = Outcome(setup.target.body)
+    outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
         _run(setup, rig, plan, targets, outcome, progress, cover, close_loop)
     return outcome
@@ -217,20 +221,20 @@ def _run(
     rig: StereoRig,
     plan: MotionPlan,
     targets: Array,
-    outcome: Outcome,
+    outcome: RunResult,
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
 ) -> None:
-    """Run the experiment; what ends it early is told in the outcome, and the arm is stopped."""
+    """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
     try:
-        progress("making ready to follow the body")
+        progress("preparing to follow the body")
         follower = Follower(rig, setup.target)
         if setup.clock is not None:
             warm_up(setup.arm)
-            setup.board.receive(_STALE_S)  # what lay in the wire's buffer meanwhile
-        loop = Loop(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+            setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
+        loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
         enable(setup.board)
         _require_seen(loop, setup, plan)
         _prepare(loop, setup, plan, targets, outcome, progress)
@@ -238,28 +242,28 @@ def _run(
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
-    finally:  # whatever it was, a mistake of ours among it: the arm stops
+    finally:  # after any exception, a programming error too: the arm stops
         if loop is not None:
-            with uninterrupted() as again:  # who presses Ctrl-C twice wants the arm stopped no less
+            with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
                 _stopped(loop)
                 loop.close_record()
             outcome.interrupted = outcome.interrupted or bool(again)
 
 
 def _stopped(loop: Loop) -> None:
-    """Bring the arm to rest, whatever else does not answer any more."""
+    """Bring the arm to rest; an error is ignored, as the one that ended the run is reported."""
     try:
         loop.stop()
     except ArmsightError:
-        return  # told what it must, or gone: then its own silence reaction holds or releases the arm
+        return  # the board is gone: it reacts to the silence itself, and holds or releases the arm
 
 
 def _require_seen(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
-    """Raise where the body is not in view at the start: everything after would be for nothing."""
-    here = plan.start if setup.clock is None else loop.log.joints[-1].q[-1]  # a real arm stands about there
+    """Raise an ArmsightError if the body is not in view at the start."""
+    here = plan.start if setup.clock is None else loop.log.joints[-1].q[-1]  # a real arm is only near the start
     there = point_to_point(setup.arm, np.clip(here, setup.arm.q_min, setup.arm.q_max), plan.start)
     look_s = there.duration_s + max(0.3, 3.0 / setup.rate_hz)
-    loop.run_until_seen(Planned(there, loop.t_s, setup.gravity), look_s, Segment("calibration", "", "", False))
+    loop.run_until_seen(Planned(there, loop.t_s, setup.gravity), look_s, RunSegment("calibration", "", "", False))
     results = [result for _, _, result in loop.log.poses]
     if any(isinstance(result, PoseEstimate) for result in results):
         return
@@ -272,16 +276,18 @@ def _require_seen(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
     )
 
 
-def _prepare(loop: Loop, setup: Setup, plan: MotionPlan, targets: Array, outcome: Outcome, progress: Progress) -> None:
-    """Find where cameras and body are, and how late the images come; the arm ends at the plan's start."""
+def _prepare(
+    loop: Loop, setup: Setup, plan: MotionPlan, targets: Array, outcome: RunResult, progress: Progress
+) -> None:
+    """Calibrate hand and eye, and measure the delay of the images; the arm ends at the plan's start."""
     arm, gravity = setup.arm, setup.gravity
     outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
     loop.mounting = outcome.handeye.mounting
-    progress("how late the images come: a sweep of the joints")
+    progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
     back = point_to_point(arm, middle, plan.start)
-    there = Segment("calibration", "to the start", "joints", False, trajectory=back)
+    there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
     loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))
     loop.run(Planned(back, loop.t_s, gravity), back.duration_s + 0.5, there)
 
@@ -290,12 +296,12 @@ def _passes(
     loop: Loop,
     setup: Setup,
     plan: MotionPlan,
-    outcome: Outcome,
+    outcome: RunResult,
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
 ) -> None:
-    """Make the motions with potentiometers alone, and with the loop closed."""
+    """Make the motions with potentiometers alone, and then with the loop closed."""
 
     def started(motion: str, kind: str, duration_s: float) -> None:
         if cover is not None and kind == "circle" and outcome.covered_s is None:
@@ -329,16 +335,16 @@ def _passes(
 
 
 def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
-    """Take the arm from the end of the motions to their start: they need not end where they began."""
+    """Move the arm from the end of the motions to their start, if these differ."""
     last = plan.motions[-1].trajectory
     end = last.at(last.duration_s).q
     if np.allclose(end, plan.start, rtol=0.0, atol=1e-6):
         return
     back = point_to_point(setup.arm, end, plan.start)
-    there = Segment("calibration", "back to the start", "joints", False, trajectory=back)
+    there = RunSegment("calibration", "back to the start", "joints", False, trajectory=back)
     loop.run(Planned(back, loop.t_s + PERIOD_S, setup.gravity), back.duration_s + 0.5, there)
 
 
-def timing(setup: Setup, delay: Delay) -> Timing:
-    """Return the loop's timing as measured: its gain follows from it."""
-    return Timing(PERIOD_S, 1.0 / setup.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)
+def timing(setup: Setup, delay: Delay) -> LoopTiming:
+    """Return the timing of the loop with the measured delay; the servo's gain follows from it."""
+    return LoopTiming(PERIOD_S, 1.0 / setup.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)

@@ -1,48 +1,49 @@
-"""What a run keeps: its stretches, and all that was measured and commanded, as it came.
+"""The record of a run: the log of the loop, and the tracks (tool pose over time) that are made from it and written.
 
-Where the tool was, as files that anyone can compute with: one CSV and one Parquet a track.
+In order: :class:`ToolTrack`, and its CSV and Parquet files; :class:`Skew`, which adds the cameras' exposure skew to a
+covariance; :class:`Log` with its segments, which the loop appends to; :class:`RunData`, all tracks on the board's clock,
+which :func:`assembled` makes from a log.
 
-Columns: ``t_s, x_m, y_m, z_m, qw, qx, qy, qz`` of the tool in the base frame; where a track has a covariance,
-``sigma_x_m .. sigma_z_m`` along the base's axes and ``sigma_rx_rad .. sigma_rz_rad`` about them; ``phase`` and ``motion``.
-
-What cameras that do not expose at the same instant add to the covariance of a moving body's pose.
-
-A run as tables: its log brought onto one axis of time, beside what was wanted and, in the workcell, the truth.
+Columns of a track's file: ``t_s, x_m, y_m, z_m, qw, qx, qy, qz``, the pose of the tool in the base frame (quaternion
+wxyz); where the track has a covariance, ``sigma_x_m .. sigma_z_m`` along the base's axes and ``sigma_rx_rad ..
+sigma_rz_rad`` about them; ``phase`` and ``motion``.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.files import read_table, replacing
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.estimators import ArmEstimate, Delay, Mounting, PoseMeasurement, Verdict
+from armsight.loop.estimators import ArmEstimate, Delay, Mounting, PoseMeasurement, Outcome
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.rig import StereoRig
-from dataclasses import dataclass, field, replace
-from numpy.typing import NDArray
-from pathlib import Path
-from scipy.spatial.transform import Rotation
-from typing import Any
 
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-#: What a moment belongs to.
+#: Phases of a run.
 PHASES = ("calibration", "open_loop", "closed_loop", "rest")
-_DIGITS = 9  # decimals of m, s and rad that are written
+_DIGITS = 9  # decimals of m, s and rad in files
 
 
 @dataclass(frozen=True, eq=False)
 class ToolTrack(Record):
-    """Where the tool was at N times.
+    """Poses of the tool at N times.
 
     Attributes:
         t_s: (N,) times on the board's clock, s, rising.
-        Ts_base_tool: (N, 4, 4) poses.
+        Ts_base_tool: (N, 4, 4) poses of the tool in the base frame.
         phase: (N,) names out of PHASES.
         motion: (N,) names of the motions, "" between them.
-        covs: (N, 6, 6) covariances of the right tangents; None where there are none.
+        covs: (N, 6, 6) covariances of the right tangents [m; rad]; None where they are not known.
     """
 
     t_s: Array
@@ -61,23 +62,23 @@ class ToolTrack(Record):
         return ToolTrack(self.t_s[rows], self.Ts_base_tool[rows], self.phase[rows], self.motion[rows], covs)
 
     def at(self, t_s: Array) -> Array:
-        """Return the poses (N, 4, 4) at times within the track: straight and by slerp between its rows."""
+        """Return the poses (N, 4, 4) at times (N,) within the track: linear and slerp interpolation between its rows."""
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
         T0, T1, t0, t1 = (x[k] for x in (self.Ts_base_tool, self.t_s) for k in (after - 1, after))
         share = np.clip((t_s - t0) / np.maximum(t1 - t0, 1e-12), 0.0, 1.0)[:, None]
-        out = T0.copy()
-        out[:, :3, 3] += share * (T1 - T0)[:, :3, 3]
-        turn = Rotation.from_matrix(np.swapaxes(T0[:, :3, :3], 1, 2) @ T1[:, :3, :3]).as_rotvec()
-        out[:, :3, :3] @= Rotation.from_rotvec(share * turn).as_matrix()
-        return out
+        T = T0.copy()
+        T[:, :3, 3] += share * (T1 - T0)[:, :3, 3]
+        rotation = Rotation.from_matrix(np.swapaxes(T0[:, :3, :3], 1, 2) @ T1[:, :3, :3]).as_rotvec()
+        T[:, :3, :3] @= Rotation.from_rotvec(share * rotation).as_matrix()
+        return T
 
 
 def errors(track: ToolTrack, truth: ToolTrack) -> Array:
-    """Return (N, 6) right tangents from each pose of a track to the true one, [m; rad], the tool's axes."""
+    """Return (N, 6) right tangents from each pose of a track to the true one, [m; rad], along the tool's axes."""
     T, T_true = track.Ts_base_tool, truth.at(track.t_s)
-    turned = np.swapaxes(T[:, :3, :3], 1, 2)
-    shift = np.einsum("nij,nj->ni", turned, T_true[:, :3, 3] - T[:, :3, 3])
-    return np.hstack([shift, Rotation.from_matrix(turned @ T_true[:, :3, :3]).as_rotvec()])
+    R_tool_base = np.swapaxes(T[:, :3, :3], 1, 2)
+    shift = np.einsum("nij,nj->ni", R_tool_base, T_true[:, :3, 3] - T[:, :3, 3])
+    return np.hstack([shift, Rotation.from_matrix(R_tool_base @ T_true[:, :3, :3]).as_rotvec()])
 
 
 def columns(track: ToolTrack) -> dict[str, NDArray[Any]]:
@@ -100,7 +101,7 @@ def columns(track: ToolTrack) -> dict[str, NDArray[Any]]:
 
 
 def require_pyarrow() -> None:
-    """Raise an InputError that says what to install unless pyarrow can be imported."""
+    """Raise an InputError with what to install unless pyarrow can be imported."""
     try:
         import pyarrow  # noqa: F401 - only whether it is there
     except ImportError:
@@ -132,7 +133,7 @@ def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array
     """Read the CSV of a track, without its covariances.
 
     Args:
-        file: as :func:`write_track` writes it.
+        file: a CSV as :func:`write_track` writes it.
         more: names of further columns of numbers.
 
     Returns:
@@ -172,22 +173,22 @@ def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array
 
 
 def _whole(row: list[str], at: list[int]) -> bool:
-    """Say whether a line has all its cells, and numbers where they must be."""
+    """Return whether a line has all its cells, and numbers where they are needed."""
     try:
         return bool([float(row[k]) for k in (*at[:8], *at[10:])]) and len(row) > max(at)
     except (ValueError, IndexError):
         return False
 
 
-#: Two poses further apart than this, s, tell no speed.
+#: Two poses further apart than this, s, give no speed.
 APART_S = 0.5
 
 
 class Skew:
-    """Widens poses of a body by how fast it moves.
+    """Adds the effect of the cameras' exposure skew to the covariance of a moving body's pose.
 
-    Between the exposures it moves v dt along the baseline, which is taken for disparity: the depth is off by Z / B v dt
-    along the line of sight.
+    Between the two exposures of a shot the body moves by v dt along the baseline. Triangulation takes that for disparity:
+    the depth Z is wrong by Z / B v dt along the line of sight, with B the baseline.
 
     Args:
         rig: the calibrated pair.
@@ -199,31 +200,36 @@ class Skew:
         self._last: tuple[float, Array] | None = None
 
     def widened(self, pose: PoseEstimate, t_s: float) -> PoseEstimate:
-        """Return a pose with its covariance widened; poses come in order of time."""
+        """Return a pose with the skew in its covariance; the poses are given in order of time.
+
+        Args:
+            pose: of the body in the left camera's frame.
+            t_s: time of its shot, s.
+        """
         p = pose.T_left_body[:3, 3]
         last, self._last = self._last, (t_s, p)
         if last is None or not 0.0 < t_s - last[0] < APART_S:
             return pose
         baseline = self._rig.T_left_right[:3, 3]
         along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))
-        off = pose.T_left_body[:3, :3].T @ p * (self._sync_s * along / np.linalg.norm(baseline))
+        sigma = pose.T_left_body[:3, :3].T @ p * (self._sync_s * along / np.linalg.norm(baseline))
         extra = np.zeros((6, 6))
-        extra[:3, :3] = np.outer(off, off)
+        extra[:3, :3] = np.outer(sigma, sigma)
         return replace(pose, cov=pose.cov + extra, cov_noise=pose.cov_noise + extra)
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A stretch of a run.
+class RunSegment:
+    """An interval of a run: a motion, or the rest at its end.
 
     Attributes:
         phase: calibration, open_loop, closed_loop or rest.
-        motion: name of the motion, or of the one whose end the arm stands at; "" before the first.
-        kind: joints, home, line or circle, of that motion.
+        motion: name of the motion, or of the one at whose end the arm rests; "" before the first.
+        kind: joints, home, line or circle: the kind of that motion.
         closed: whether the loop was closed on vision.
-        begin_s: on the board's clock.
-        end_s: likewise.
-        trajectory: what the joints were to do from ``begin_s`` on; None where nothing was planned.
+        begin_s: begin, board's clock, s.
+        end_s: end, board's clock, s.
+        trajectory: reference of the joints from ``begin_s`` on; None where nothing was planned.
     """
 
     phase: str
@@ -237,50 +243,50 @@ class Segment:
 
 @dataclass
 class Log:
-    """All that a run measured, as it came.
+    """All that a run measured and commanded, in the order it came.
 
     Attributes:
-        joints: the potentiometers, batch by batch.
-        fused: where the estimator has the tool at each reading, RECORD_LAG_S later, batch by batch.
-        live: where it had the tool at the newest reading, turn by turn: what the loop goes by.
-        poses: each shot's name, stamp and pose (the cameras' skew in its covariance), or why there is none.
-        verdicts: what the estimator made of those it was given.
-        commands: when each was sent, and what.
-        modes: what each was based on.
-        latency_s: our time from an image to the command that knows it, image by image, s.
-        segments: what happened when.
+        joints: readings of the potentiometers, batch by batch.
+        fused: the estimated tool track, smoothed with measurements up to RECORD_LAG_S later, batch by batch.
+        live: the estimate at the newest reading, iteration by iteration: what the loop uses.
+        poses: name, time stamp and pose of each shot (the cameras' skew in its covariance), or why there is none.
+        outcomes: what the estimator did with each pose measurement: used, or rejected for which reason.
+        commands: time and content of each command.
+        modes: the basis of each command: planned, vision, bridged.
+        latency_s: computing time from an image to the command that depends on it, image by image, s.
+        segments: motions and rests with their times.
     """
 
     joints: list[JointStates] = field(default_factory=list)
     fused: list[ToolTrack] = field(default_factory=list)
     live: list[ArmEstimate] = field(default_factory=list)
     poses: list[tuple[str, float, PoseEstimate | Missed]] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
     commands: list[tuple[float, JointCommand]] = field(default_factory=list)
     modes: list[str] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
-    segments: list[Segment] = field(default_factory=list)
+    segments: list[RunSegment] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
 class RunData(Record):
-    """A run.
+    """The tracks and tables of a run, all on the board's clock.
 
     Attributes:
-        t_s: (N,) times of the potentiometers' readings, board's clock.
-        q: (N, 6) what they said, rad.
-        q_ref: (N, 6) what the planned motions wanted, rad; NaN where nothing was planned.
-        potentiometers: where the table of the arm has the tool with them.
-        vision: where each used shot saw it.
-        fused: where the estimator has it, a little later, with vision on both sides of each time.
-        live: where the estimator had it at once: what the loop goes by.
-        wanted: where it was to be, at the times something was planned.
-        truth: where it was; None for a real arm.
-        segments: what happened when.
-        latency_s: from each image to the command that knows it, our time, s.
-        modes: (M,) what each command was based on.
-        missed: shots that gave no pose.
-        outliers: sightings that the estimator did not believe.
+        t_s: (N,) times of the potentiometers' readings, s.
+        q: (N, 6) joint angles from the potentiometers, rad.
+        q_ref: (N, 6) reference joint angles, rad; NaN where nothing was planned.
+        potentiometers: tool track by the nominal arm's forward kinematics of ``q``.
+        vision: tool track measured by vision, one row a shot.
+        fused: estimated tool track, smoothed, with vision before and after each time.
+        live: estimated tool track as it was known at each time: what the loop used.
+        reference: reference tool track, at the times something was planned.
+        truth: true tool track; None for a real arm.
+        segments: motions and rests with their times.
+        latency_s: computing time from each image to the command that depends on it, s.
+        modes: (M,) basis of each command.
+        missed: number of shots that gave no pose.
+        rejected: number of pose measurements that the estimator rejected.
     """
 
     t_s: Array
@@ -290,30 +296,30 @@ class RunData(Record):
     vision: ToolTrack
     fused: ToolTrack
     live: ToolTrack
-    wanted: ToolTrack
+    reference: ToolTrack
     truth: ToolTrack | None
-    segments: tuple[Segment, ...]
+    segments: tuple[RunSegment, ...]
     latency_s: Array
     modes: NDArray[np.str_]
     missed: int
-    outliers: int
+    rejected: int
 
 
 def assembled(
     log: Log, arm: Arm, mounting: Mounting, delay: Delay, truth: tuple[Array, Array] | None = None
 ) -> RunData:
-    """Bring a log onto one axis of time.
+    """Make the tracks of a run from its log.
 
     Args:
         log: of the run.
         arm: the nominal arm.
-        mounting: where cameras and body are.
-        delay: how late the camera's stamps are: what is not known of that, too, spoils the pose of a tool that moves.
-        truth: times (N,) and poses (N, 4, 4) of the tool, where they are known.
+        mounting: poses of cameras and body on the arm.
+        delay: of the cameras' time stamps. Its uncertainty adds to the covariance of the pose of a moving tool.
+        truth: times (N,), s, and poses (N, 4, 4) of the tool in the base frame, where they are known.
     """
     t_s, q, q_ref = joints_of(log)
     planned = np.isfinite(q_ref).all(axis=1)
-    named = _Named(log.segments)
+    named = _SegmentNames(log.segments)
     seen = [mounting.pose_measurement(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(
@@ -342,29 +348,29 @@ def assembled(
         np.array(log.latency_s),
         np.array(log.modes),
         len(log.poses) - len(seen),
-        sum(verdict in (Verdict.OUTLIER, Verdict.TOO_LATE) for verdict in log.verdicts),
+        sum(outcome in (Outcome.OUTLIER, Outcome.TOO_LATE) for outcome in log.outcomes),
     )
 
 
 def _mistimed(seen: list[PoseMeasurement], delay: Delay) -> Array:
-    """Return what the stamps' errors add to the covariances (N, 6, 6) of poses of a moving tool."""
+    """Return what the errors of the time stamps add to the covariances (N, 6, 6) of poses of a moving tool."""
     if len(seen) < 2:
         return np.zeros((len(seen), 6, 6))
     t_s, Ts = np.array([s.t_s for s in seen]), np.array([s.T_base_tool for s in seen])
     apart_s = np.diff(t_s)
-    tells = ((apart_s > 0.0) & (apart_s < APART_S)).astype(float)
-    speeds = tells[:, None] * log_se3(inverse(Ts[:-1]) @ Ts[1:]) / np.maximum(apart_s, 1e-9)[:, None]
-    # The mean of the speeds before and after a pose, as far as there are such.
+    near = ((apart_s > 0.0) & (apart_s < APART_S)).astype(float)
+    speeds = near[:, None] * log_se3(inverse(Ts[:-1]) @ Ts[1:]) / np.maximum(apart_s, 1e-9)[:, None]
+    # The mean of the speeds before and after a pose, as far as they are known.
     v, count = np.zeros((len(seen), 6)), np.zeros((len(seen), 1))
     for rows in (slice(None, -1), slice(1, None)):
         v[rows] += speeds
-        count[rows] += tells[:, None]
+        count[rows] += near[:, None]
     v /= np.maximum(count, 1.0)
     return np.asarray((delay.sigma_s**2 + delay.jitter_s**2) * v[:, :, None] * v[:, None, :])
 
 
 def joints_of(log: Log) -> tuple[Array, Array, Array]:
-    """Return a log's times (N,) of readings, the joints (N, 6) then, and as planned, rad; NaN where nothing was."""
+    """Return the times (N,) of a log's readings, s, the joints (N, 6), and their reference, rad; NaN where none is."""
     t_s = np.concatenate([s.t_s for s in log.joints])
     q = np.concatenate([s.q for s in log.joints])
     q_ref = np.full_like(q, np.nan)
@@ -376,27 +382,27 @@ def joints_of(log: Log) -> tuple[Array, Array, Array]:
     return t_s, q, q_ref
 
 
-def _rests(segment: Segment) -> bool:
-    """Whether the arm stands at the end of its trajectory."""
+def _rests(segment: RunSegment) -> bool:
+    """Return whether the arm stands at the end of its trajectory."""
     return segment.phase == "rest"
 
 
-class _Named:
-    """Tells for any time which phase and motion it belongs to."""
+class _SegmentNames:
+    """Finds the phase and the motion that a time belongs to."""
 
-    def __init__(self, segments: list[Segment]) -> None:
+    def __init__(self, segments: list[RunSegment]) -> None:
         self._begins = np.array([s.begin_s for s in segments])
         self._phase = np.array([s.phase for s in segments] + ["calibration"])
         self._motion = np.array([s.motion for s in segments] + [""])
 
     def track(self, t_s: Array, Ts_base_tool: Array, covs: Array | None = None) -> ToolTrack:
-        """Return a track with its phases and motions; what lies before the first segment belongs to the calibration."""
+        """Return a track with its phases and motions; times before the first segment belong to the calibration."""
         at = np.searchsorted(self._begins, t_s, side="left") - 1
         return ToolTrack(t_s, Ts_base_tool, self._phase[at], self._motion[at], covs)
 
 
 def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
-    """Return what lies between two times of all tracks."""
+    """Return the rows of all tracks between two times, board's clock, s."""
 
     def within(track: ToolTrack) -> ToolTrack:
         return track[(track.t_s > begin_s) & (track.t_s <= end_s)]
@@ -411,6 +417,6 @@ def cut(run: RunData, begin_s: float, end_s: float) -> RunData:
         vision=within(run.vision),
         fused=within(run.fused),
         live=within(run.live),
-        wanted=within(run.wanted),
+        reference=within(run.reference),
         segments=tuple(s for s in run.segments if s.begin_s >= begin_s - 1e-9 and s.end_s <= end_s + 1e-9),
     )

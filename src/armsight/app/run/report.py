@@ -1,29 +1,28 @@
-"""The report of a run: one page that holds its figures, to be zoomed with the wheel, and each as a PNG beside it.
+"""The report of a run: one page that holds its figures, which the mouse wheel zooms, and each figure as a PNG beside it.
 
-The figures of a run: the chapter's 18.8 and 18.9, and what it left out: errors against the truth, with their bands.
-
-A run in one picture: what the camera sees, who is right over time, and what closing the loop gains.
-
-The studies in one picture: measured errors with their intervals, and the curve the uncertainty model foretells.
+In: a :class:`RunReport`. In order: the figures of the run (joint angles, the tool's path, errors against the truth, the
+loop, latency); the overview, one figure of all; the studies of vision; the page.
 """
 
 from __future__ import annotations
 
-import base64
-import cv2
-import numpy as np
-from armsight.app.calibrate.report import bullets, table, text
-from armsight.app.demo.studies import Study
-from armsight.app.report.page import html_page, put_files
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg
-from armsight.app.run.metrics import judge, path_errors, rest_errors
-from armsight.app.run.record import RunData, ToolTrack, errors
-from armsight.data import Array, Image
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
 from scipy.special import ndtri
-from typing import Any, TYPE_CHECKING
+
+from armsight.app.demo.studies import Study
+from armsight.app.report.page import PAGE, bullets, picture, html_page, put_files
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg
+from armsight.app.report.table import html_table
+from armsight.app.run.metrics import evaluated_track, path_errors, rest_errors
+from armsight.app.run.record import RunData, ToolTrack, errors
+from armsight.app.run.summary import RunSummary, loop_table, track_table
+from armsight.data import Array, Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +35,7 @@ _POINTS = 4000  # of a line in a figure: more cannot be seen
 
 
 def joints_figure(run: RunData) -> Figure:
-    """Draw figure 18.8: the six joint angles over time, what the potentiometers say and what was wanted."""
+    """Plot the six joint angles over time: potentiometers and reference."""
     figure = new_figure(6.2)
     rows = _thinned(len(run.t_s))
     for joint, plot in enumerate(figure.subplots(3, 2, sharex=True).T.flat):
@@ -51,19 +50,19 @@ def joints_figure(run: RunData) -> Figure:
 
 
 def path_figure(run: RunData) -> Figure:
-    """Draw figure 18.9: the tool's path in space from potentiometers, vision, both fused, and as it was."""
+    """Plot the tool's path in space: from potentiometers, vision, both fused, and the truth."""
     figure = new_figure(6.4)
     axes = figure.add_subplot(projection="3d")
-    drawn: list[tuple[ToolTrack | None, str, str, float, str]] = [
+    shown: list[tuple[ToolTrack | None, str, str, float, str]] = [
         (run.truth, "truth", INK, 2.6, "-"),
         (run.potentiometers, "potentiometers", ORANGE, 1.0, "-"),
         (run.fused, "fused", GREEN, 1.0, "-"),
         (run.vision, "vision", BLUE, 0.0, "."),
     ]
-    for track, name, colour, width, marker in drawn:
+    for track, name, colour, width, marker in shown:
         if track is None or not len(track):
             continue
-        if track is run.truth and len(run.fused):  # not where it was before
+        if track is run.truth and len(run.fused):  # from the first estimate on
             track = track[track.t_s >= run.fused.t_s[0]]
         p = _MM * track.Ts_base_tool[_thinned(len(track)), :3, 3]
         if marker == ".":
@@ -79,7 +78,7 @@ def path_figure(run: RunData) -> Figure:
 
 
 def errors_figure(run: RunData) -> Figure | None:
-    """Draw how far each track is from the truth over time, position and orientation, with the 95% bands claimed."""
+    """Plot the error of each track against the truth over time, position and orientation, with the claimed 95% bands."""
     if run.truth is None:
         return None
     figure = new_figure(6.8)
@@ -88,19 +87,19 @@ def errors_figure(run: RunData) -> Figure | None:
     off = errors(alone, run.truth)
     for plot, part, factor, name in ((plots[0], slice(0, 3), _MM, "mm"), (plots[2], slice(3, 6), _DEG, "deg")):
         plot.plot(alone.t_s, factor * np.linalg.norm(off[:, part], axis=1), color=ORANGE, lw=1.0)
-        plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
-        plot.set_title("potentiometers through the arm's table", fontsize=9)
+        plot.set_ylabel(f"{'position' if name == 'mm' else 'orientation'}, {name}")
+        plot.set_title("potentiometers and the nominal arm's forward kinematics", fontsize=9)
         plot.set_ylim(bottom=0)
     shown = {"vision": (run.vision, BLUE), "fused": (run.fused, GREEN)}
     thin = {name: (track[_thinned(len(track))], colour) for name, (track, colour) in shown.items() if len(track)}
     seen = [(name, colour, track, errors(track, run.truth)) for name, (track, colour) in thin.items()]
     for plot, part, factor, name in ((plots[1], slice(0, 3), _MM, "mm"), (plots[3], slice(3, 6), _DEG, "deg")):
         _own(plot, seen, part, factor)
-        plot.set_ylabel(f"{'position' if name == 'mm' else 'turn'}, {name}")
+        plot.set_ylabel(f"{'position' if name == 'mm' else 'orientation'}, {name}")
     for plot in plots:
         _shade(plot, run, named=plot is plots[0])
     plots[1].set_title(
-        "vision and fused; shaded: at least 95% of the fused estimate's errors are to lie below", fontsize=9
+        "vision and fused; shaded: at least 95% of the fused estimate's errors should lie below", fontsize=9
     )
     plots[1].legend(fontsize=7, ncols=3, loc="upper right")
     plots[3].set_xlabel("time, s")
@@ -108,7 +107,7 @@ def errors_figure(run: RunData) -> Figure | None:
 
 
 def _own(plot: Axes, seen: list[tuple[str, str, ToolTrack, Array]], part: slice, factor: float) -> None:
-    """Draw the sizes of tracks' errors, and the band that the fused one claims: names, colours, tracks, errors."""
+    """Plot the norms of tracks' errors, and the 95% band that the fused one claims: (name, colour, track, errors) each."""
     for name, colour, track, error in seen:
         size = factor * np.linalg.norm(error[:, part], axis=1)
         style = {"marker": ".", "ms": 2.0, "lw": 0.0} if name == "vision" else {"lw": 0.9}
@@ -122,8 +121,8 @@ def _own(plot: Axes, seen: list[tuple[str, str, ToolTrack, Array]], part: slice,
 
 
 def loop_figure(before: RunData, after: RunData) -> Figure | None:
-    """Draw how far the tool was from where it was to be, with potentiometers alone and with the loop closed."""
-    truth_before, truth_after = judge(before), judge(after)
+    """Plot the distance of the tool from its reference, with potentiometers alone and with the loop closed."""
+    truth_before, truth_after = evaluated_track(before), evaluated_track(after)
     figure = new_figure(4.6)
     rests, paths = figure.subplots(1, 2)
     for shift, run, truth, name, colour in (
@@ -132,9 +131,9 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
     ):
         found = rest_errors(run, truth)
         rests.bar(np.arange(len(found)) + shift, _MM * np.array(list(found.values())), 0.38, color=colour, label=name)
-        for number, (motion, (along_s, away_m)) in enumerate(path_errors(run, truth).items()):
+        for number, (motion, (since_s, distance_m)) in enumerate(path_errors(run, truth).items()):
             style = "--" if number else "-"
-            paths.plot(along_s, _MM * away_m, style, color=colour, lw=1.0, label=f"{motion}, {name}")
+            paths.plot(since_s, _MM * distance_m, style, color=colour, lw=1.0, label=f"{motion}, {name}")
     rests.set_xticks(range(len(found)), list(found), rotation=30, ha="right", fontsize=7)
     for plot, title in ((rests, "error at rest, mm"), (paths, "distance from the path, mm")):
         plot.set_yscale("log")
@@ -151,7 +150,7 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
 
 
 def latency_figure(run: RunData) -> Figure | None:
-    """Draw the histogram of our time from an image to its command."""
+    """Plot the histogram of the computing time from an image to its command."""
     if not len(run.latency_s):
         return None
     figure = new_figure(2.8)
@@ -176,7 +175,7 @@ def latency_figure(run: RunData) -> Figure | None:
 
 
 def _shade(plot: Axes, run: RunData, *, named: bool) -> None:
-    """Shade the rests, and mark where the loop is closed; say so above the plot where that is wanted."""
+    """Shade the rests, and mark where the loop is closed; ``named`` adds a label above the plot."""
     for segment in run.segments:
         if segment.phase == "rest":
             plot.axvspan(segment.begin_s, segment.end_s, color="#f0f2f5", lw=0, zorder=0)
@@ -197,30 +196,18 @@ def _shade(plot: Axes, run: RunData, *, named: bool) -> None:
 
 
 def _thinned(count: int) -> Array:
-    """Return the rows to draw."""
+    """Return the rows to plot, (M,)."""
     return np.unique(np.linspace(0, count - 1, min(count, _POINTS)).astype(int))
 
 
-#: Name -> how it is drawn and what it shows.
-FIGURES: dict[str, tuple[Callable[[RunData], Figure | None], str]] = {
-    "joints": (
-        joints_figure,
-        "Figure 18.8: the six joint angles over time, potentiometers and reference; rests shaded",
-    ),
-    "path": (path_figure, "Figure 18.9: the tool's path from potentiometers, vision, both fused, and as it was"),
-    "errors": (errors_figure, "Error of each against the truth over time, with the 95% band the estimate claims"),
-    "latency": (latency_figure, "Our time from image to command"),
-}
-
-
-_EVERY = 12  # of the readings are drawn
+_EVERY = 12  # one reading of this many is plotted
 
 
 def overview_figure(picture: Image, before: RunData, after: RunData) -> Figure | None:
-    """Draw it; None without a truth.
+    """Plot the run in one figure: a camera image, errors over time, errors at rest; None without a truth.
 
     Args:
-        picture: (H, W, 3) BGR, with the measured pose drawn in.
+        picture: (H, W, 3) BGR, with the measured pose overlaid.
         before: the motions with potentiometers alone.
         after: the same with the loop closed.
     """
@@ -231,14 +218,14 @@ def overview_figure(picture: Image, before: RunData, after: RunData) -> Figure |
     image = figure.add_subplot(grid[:, 0])
     image.imshow(picture[..., ::-1])
     image.set_axis_off()
-    image.set_title("the left camera's image, the measured pose drawn in")
+    image.set_title("the left camera's image with the measured pose")
     _over_time(figure.add_subplot(grid[0, 1]), before)
     _at_rest(figure.add_subplot(grid[1, 1]), before, after)
     return figure
 
 
 def _over_time(plot: Axes, run: RunData) -> None:
-    """Draw the errors of potentiometers, vision and both over time."""
+    """Plot the errors of potentiometers, vision and both fused over time."""
     assert run.truth is not None
     start = run.t_s[0]
     for track, name, colour, every in (
@@ -248,7 +235,7 @@ def _over_time(plot: Axes, run: RunData) -> None:
     ):
         shown = track[np.arange(0, len(track), every)]
         off = _MM * np.linalg.norm(errors(shown, run.truth)[:, :3], axis=1)
-        off[1:][np.diff(shown.t_s) > 0.2] = np.nan  # no line where nothing was seen
+        off[1:][np.diff(shown.t_s) > 0.2] = np.nan  # no line over a gap in time
         plot.plot(shown.t_s - start, off, color=colour, lw=0.8, label=name)
     plot.set_yscale("log")
     plot.set_ylim(bottom=5e-3)
@@ -259,19 +246,19 @@ def _over_time(plot: Axes, run: RunData) -> None:
 
 
 def _at_rest(plot: Axes, before: RunData, after: RunData) -> None:
-    """Draw the errors at rest, before and after."""
+    """Plot the errors at rest, with potentiometers alone and with the loop closed."""
     for shift, run, name, colour in (
         (-0.2, before, "potentiometers alone", ORANGE),
         (0.2, after, "loop closed on vision", GREEN),
     ):
-        found = rest_errors(run, judge(run))
+        found = rest_errors(run, evaluated_track(run))
         plot.bar(np.arange(len(found)) + shift, _MM * np.array(list(found.values())), 0.38, color=colour, label=name)
     plot.set_xticks(range(len(found)), list(found), rotation=30, ha="right", fontsize=6)
     plot.set_yscale("log")
     plain_log(plot.yaxis)
     low, high = plot.get_ylim()
     plot.set_ylim(low, 3 * high)  # room for the legend
-    plot.set_title("distance of the arm at rest from where it was sent, mm")
+    plot.set_title("distance of the tool at rest from its reference, mm")
     plot.legend(fontsize=6.5, loc="upper right", ncols=2)
 
 
@@ -279,13 +266,13 @@ _ACROSS = 3
 
 
 def studies_figure(studies: Sequence[Study]) -> Figure:
-    """Draw one panel a study, both axes logarithmic."""
+    """Plot one panel a study, both axes logarithmic: measured errors with their 95% intervals, and the predicted curve."""
     down = -(-len(studies) // _ACROSS)
     figure = new_figure(2.9 * down)
     for number, study in enumerate(studies, start=1):
         plot = figure.add_subplot(down, _ACROSS, number)
         reach = _MM * np.abs(np.array([study.low_m, study.high_m]) - study.position_rms_m)
-        plot.plot(study.values, _MM * study.predicted_m, color=MUTED, lw=1.4, label="foretold")
+        plot.plot(study.values, _MM * study.predicted_m, color=MUTED, lw=1.4, label="predicted")
         plot.errorbar(
             study.values,
             _MM * study.position_rms_m,
@@ -320,7 +307,6 @@ def _decades(values: np.ndarray) -> list[float]:
     return [tick for tick in ticks if 0.8 * good.min() <= tick <= 1.25 * good.max()]
 
 
-PAGE = "report.html"
 #: Names of the figures; each is a PNG beside the page.
 NAMES = ("joints", "path", "errors", "loop", "latency", "studies", "overview")
 #: Wheel zooms about the pointer, dragging moves, a double click shows the whole again.
@@ -339,45 +325,45 @@ for (const box of document.querySelectorAll(".zoom")) {
   box.addEventListener("dblclick", () => { k = 1; x = y = 0; show(); });
 }
 """
-_NAMES = {"fused": "fused, smoothed (0.6 s later)", "live": "fused, live"}
 _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{}</div>'
-_IMG = '<img src="data:image/{};base64,{}" alt="{}" style="transform-origin:0 0" draggable="false">'
+_ZOOMED = 'style="transform-origin:0 0" draggable="false"'
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a report is made of.
+    """The contents of a report.
 
     Attributes:
-        summary: the run's figures (summary.json).
-        run: all of it.
+        summary: the run in numbers.
+        run: all tracks of the motions.
         before: the motions with potentiometers alone; None where they were not made.
         after: the same with the loop closed; None likewise.
-        studies: error against one thing after the other.
-        picture: (H, W, 3) BGR, the left image with the measured pose drawn in; None without.
-        cell: (H, W, 3) BGR, the workcell seen from aside; None on a real arm.
-        notes: what was used, what was thrown away and why, a line each.
+        picture: (H, W, 3) BGR, the left image with the measured pose overlaid; None without.
+        workcell: (H, W, 3) BGR, the workcell from aside; None on a real arm.
+        notes: what was used, and what was left out and why, a line each.
     """
 
-    summary: Mapping[str, Any]
+    summary: RunSummary
     run: RunData
     before: RunData | None
     after: RunData | None
-    studies: Sequence[Study]
     picture: Image | None
-    cell: Image | None
+    workcell: Image | None
     notes: Sequence[str]
 
 
 def write_run_report(report: RunReport, folder: Path) -> Path:
     """Write the page and its PNGs.
 
+    Returns:
+        The page, report.html.
+
     Raises:
         InputError: matplotlib is missing, or a file cannot be written; then none of them is new.
     """
     files: dict[str, bytes] = {}
     embedded: dict[str, str] = {}
-    for name, image in (("pose", report.picture), ("cell", report.cell)):
+    for name, image in (("pose", report.picture), ("workcell", report.workcell)):
         if image is not None:
             files[f"{name}.png"] = cv2.imencode(".png", image)[1].tobytes()
             embedded[name] = _box("png", files[f"{name}.png"], name)
@@ -391,7 +377,7 @@ def write_run_report(report: RunReport, folder: Path) -> Path:
 
 
 def _figures(report: RunReport) -> dict[str, Figure | None]:
-    """Draw everything there is to draw."""
+    """Return the figures by name; None where the run has nothing to plot."""
     both = report.before is not None and report.after is not None
     return {
         "joints": joints_figure(report.run),
@@ -399,7 +385,7 @@ def _figures(report: RunReport) -> dict[str, Figure | None]:
         "errors": errors_figure(report.run),
         "loop": loop_figure(report.before, report.after) if both else None,  # type: ignore[arg-type]
         "latency": latency_figure(report.run),
-        "studies": studies_figure(report.studies) if report.studies else None,
+        "studies": studies_figure(report.summary.studies) if report.summary.studies else None,
         "overview": overview_figure(report.picture, report.before, report.after)
         if report.picture is not None and report.before is not None and report.after is not None
         else None,
@@ -408,110 +394,53 @@ def _figures(report: RunReport) -> dict[str, Figure | None]:
 
 def _box(kind: str, data: bytes, name: str) -> str:
     """Return a figure as HTML that holds its own data and can be zoomed."""
-    return _BOX.format(_IMG.format(kind, base64.b64encode(data).decode("ascii"), text(name)))
+    return _BOX.format(picture(data, name, kind=kind, attributes=_ZOOMED))
 
 
 def _page(report: RunReport, figures: Mapping[str, str]) -> str:
-    """Return the page."""
+    """Return the page; ``figures`` maps names to HTML images."""
     s = report.summary
 
     def shown(name: str, caption: str) -> str:
         return f"<figure>{figures[name]}<figcaption><p>{caption}</p></figcaption></figure>" if name in figures else ""
 
+    tables = [html_table(each) for each in (track_table(s), loop_table(s)) if each is not None]
     sections = {
-        "result": ("Result", _tracks(s) + _loop(s) + bullets(report.notes)),
-        "seen": (
-            "What was seen",
-            shown("pose", "The left camera's image with the measured pose drawn in.")
-            + shown("cell", "The cell from aside."),
+        "result": ("Result", "".join(tables) + bullets(report.notes)),
+        "images": (
+            "Images",
+            shown("pose", "The left camera's image with the measured pose.")
+            + shown("workcell", "The workcell from aside."),
         ),
         "motion": (
-            "The chapter's figures",
-            shown(
-                "joints",
-                "Figure 18.8: the six joint angles, potentiometers and reference; the arm rests where it is shaded.",
-            )
-            + shown("path", "Figure 18.9: the tool's path from potentiometers, from vision, from both, and as it was."),
+            "Joint angles and tool path",
+            shown("joints", "The six joint angles over time, potentiometers and reference; shaded: the arm rests.")
+            + shown("path", "The tool's path: from potentiometers, from vision, from both fused, and the truth."),
         ),
         "errors": (
-            "What the chapter left out",
-            shown(
-                "errors",
-                "Errors against the truth, and the band that the fused estimate claims for its own.",
-            ),
+            "Errors against the truth",
+            shown("errors", "The error of each track over time, and the 95% band that the fused estimate claims."),
         ),
         "loop": (
-            "The loop closed",
+            "Open loop and closed loop",
             shown("loop", "The same motions with potentiometers alone and with vision in the loop."),
         ),
         "latency": (
-            "From image to command",
-            shown("latency", "Our time; decoding and the camera's own delay come on top."),
+            "Latency",
+            shown(
+                "latency",
+                "Computing time from a decoded image to its command; decoding and the camera's own delay are not in it.",
+            ),
         ),
         "studies": (
             "What the error depends on",
             shown(
                 "studies",
-                "Measured, with the interval that the number of shots allows, and what the covariance foretold.",
+                "Measured errors with their 95% intervals (from the number of shots), and those the covariance predicts.",
             ),
         ),
     }
     kept = {anchor: section for anchor, section in sections.items() if section[1]}
-    sub = f"{s['arm']} · {s['cameras']} · seed {s['seed']}" if "seed" in s else str(s.get("arm", ""))
-    return html_page("armsight: run", "What the arm really did", sub, kept, _ZOOM)
-
-
-def _tracks(s: Mapping[str, Any]) -> str:
-    """Return the table of the three tracks."""
-    rows = []
-    for name in ("potentiometers", "vision", "fused", "live"):
-        t = s.get(name)
-        if t is None or "position_rms_m" not in t:
-            continue
-        sigma = (
-            f"{1e3 * t['position_sigma_rms_m']:.3f} mm, {_DEG * t['orientation_sigma_rms_rad']:.3f} deg"
-            if "position_sigma_rms_m" in t
-            else "–"
-        )
-        inside = f"{100 * t['inside_95_share']:.0f}%" if "inside_95_share" in t else "–"
-        rows.append(
-            (
-                _NAMES.get(name, name),
-                f"<b>{1e3 * t['position_rms_m']:.3f}</b>",
-                f"{1e3 * t['position_max_m']:.3f}",
-                f"<b>{_DEG * t['orientation_rms_rad']:.3f}</b>",
-                f"{_DEG * t['orientation_max_rad']:.3f}",
-                sigma,
-                inside,
-            )
-        )
-    head = (
-        "against the truth, in motion",
-        "RMS, mm",
-        "max, mm",
-        "RMS, deg",
-        "max, deg",
-        "sigma claimed",
-        "truth inside 95%",
-    )
-    return table(head, rows, "numbers") if rows else ""
-
-
-def _loop(s: Mapping[str, Any]) -> str:
-    """Return the table of what closing the loop gained."""
-    c = s.get("closed_loop")
-    if not c:
-        return ""
-    rows = [
-        (
-            what,
-            f"{1e3 * c[f'{key}_error_before_m']:.3f}",
-            f"<b>{1e3 * c[f'{key}_error_after_m']:.3f}</b>",
-            f"{c[f'{key}_error_before_m'] / c[f'{key}_error_after_m']:.1f}",
-        )
-        for what, key in (("at rest", "rest"), ("along the path", "path"))
-        if f"{key}_error_after_m" in c
-    ]
-    return table(
-        ("error of the tool, RMS", "potentiometers alone, mm", "loop closed, mm", "times smaller"), rows, "numbers"
-    )
+    p = s.properties
+    sub = f"{p['arm']} · {p['cameras']} · seed {p['seed']}" if "seed" in p else str(p.get("arm", ""))
+    return html_page("armsight: run", "A run of the arm, measured", sub, kept, _ZOOM)

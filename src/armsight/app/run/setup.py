@@ -1,4 +1,9 @@
-"""What a run happens at: an arm with its board, two cameras that look at the body on its tool. Real, or the workcell."""
+"""The setup of a run: an arm with its board, and two cameras that see the body on its tool; real devices or the workcell.
+
+:class:`Setup` is the record that the loop is given. Two helpers are for real devices, whose time passes by itself:
+:class:`HostClock` converts image times from the computer's clock to the board's, and :class:`LiveShots` reads the cameras
+in a thread.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +20,20 @@ from armsight.vision.markers.targets import Composite
 from armsight.vision.sources.source import Source
 
 _JOIN_S = 2.0
-#: Crystals of host and board drift apart by less: 50 ppm each, and what the host's clock is slewed by.
+#: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
-#: A live image's stamp lies no further from now, s.
+#: A live image's time stamp differs from the present time by at most this, s.
 _LIVE_S = 10.0
 
 
 class HostClock:
-    """Brings times of the host's clock, which stamps images, to the board's, which stamps readings.
+    """Converts times of the host's clock, which stamps images, to the board's clock, which stamps readings.
 
-    A reading that is heard at h of the host's clock and stamped b by the board gives h - b: the offset of the clocks and
-    the time it was under way. The least of these is the offset and the shortest way; that is the same for all of a run, and
-    is taken up by the cameras' delay, which is measured afterwards. Between two such the least may rise as fast as clocks
-    drift: so it follows them, and one reading that came quickly is enough to bring it back.
+    A reading received at time h of the host's clock with the board's stamp b gives h - b: the offset of the clocks plus
+    the transmission time. The estimate is the minimum of these differences: the offset plus the shortest transmission
+    time. The latter is constant over a run; it becomes part of the cameras' delay, which is measured afterwards. Between
+    two readings the minimum is allowed to rise at the rate at which the clocks can drift (``DRIFT``): so it follows the
+    drift, and one reading that arrives quickly restores it.
 
     Args:
         now: the host's clock, s; the one that stamps the images.
@@ -39,7 +45,7 @@ class HostClock:
         self._heard_s = 0.0
 
     def heard(self, board_s: float) -> None:
-        """Take the board's time of the newest reading, which has come just now."""
+        """Update the offset with the board's time stamp of a reading received just now, s."""
         now = self._now()
         offset = now - board_s
         if self._least_s is not None:
@@ -56,29 +62,30 @@ class HostClock:
         if shot.t_s is None and shot.problem is not None:
             return shot
         if shot.t_s is None or abs(self._now() - shot.t_s) > _LIVE_S:
-            said = (
+            problem = (
                 "has no time" if shot.t_s is None else f"was taken {self._now() - shot.t_s:.0f} s ago by its own time"
             )
             raise DeviceError(
-                f"shot {shot.name} {said}: is it of a recording? A run needs live cameras (usb:..., url:...)"
+                f"shot {shot.name} {problem}: is it of a recording? A run needs live cameras (usb:..., url:...)"
             )
         return replace(shot, t_s=shot.t_s - self._least_s)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Where a run happens.
+    """The devices of a run, and what is known of them.
 
     Attributes:
         arm: the nominal arm.
-        board: its joints' board, drives off.
-        poll: returns the newest shot not handed out yet, or None.
+        board: the controller board of its joints, drives off.
+        poll: returns the newest shot not returned yet, or None.
         target: the body on the tool.
-        gravity: gives the duty (6,) that carries the arm's weight at joint angles (6,); zeros where nobody knows.
-        rate_hz: of the cameras.
+        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad; zeros where it is
+            unknown.
+        rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
-        clock: of the computer that stamps the shots, and on which time passes by itself; None in lock-step, where shots are
-            on the board's clock and its time passes only in ``receive``.
+        clock: converts times of the computer, which stamps the shots, to the board's; None in lock-step simulation, where
+            shots are on the board's clock and time passes only in ``board.receive``.
     """
 
     arm: Arm
@@ -92,10 +99,12 @@ class Setup:
 
 
 class LiveShots:
-    """Reads a source in a thread of its own and keeps the newest shot: a loop must not wait for a camera.
+    """Reads a source in a thread and keeps the newest shot, so that the control loop never waits for a camera.
+
+    Nothing is read before :meth:`start`.
 
     Args:
-        source: the cameras; closed with this.
+        source: the cameras; :meth:`close` closes them.
     """
 
     def __init__(self, source: Source) -> None:
@@ -104,6 +113,10 @@ class LiveShots:
         self._newest: Shot | None = None
         self._failure: ArmsightError | None = None
         self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start reading."""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -114,20 +127,20 @@ class LiveShots:
             except ArmsightError as error:
                 self._failure = error
                 return
-            except Exception as error:  # noqa: BLE001 - whatever it is, it is told by poll: nobody watches this thread
+            except Exception as error:  # noqa: BLE001 - poll raises it: nobody else watches this thread
                 self._failure = DeviceError(f"reading the cameras failed: {type(error).__name__}: {error}")
                 return
             if shot is None:
-                self._failure = DeviceError("the source of images has come to its end")
+                self._failure = DeviceError("the source of images has ended")
                 return
             with self._lock:
                 self._newest = shot
 
     def poll(self) -> Shot | None:
-        """Return the newest shot not handed out yet, or None.
+        """Return the newest shot not returned yet, or None.
 
         Raises:
-            DeviceError: a camera is gone, or the source has ended.
+            DeviceError: a camera was disconnected, or the source has ended.
         """
         with self._lock:
             shot, self._newest = self._newest, None
@@ -136,7 +149,8 @@ class LiveShots:
         return shot
 
     def close(self) -> None:
-        """Stop reading and let go of the cameras."""
+        """Stop reading and close the cameras."""
         self._ended.set()
-        self._thread.join(_JOIN_S)
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
         self._source.close()
