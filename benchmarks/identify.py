@@ -19,10 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "loop"
 
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model_file import open_model
+from armsight.robot.arm_file import open_arm
 from armsight.loop.identify.read import read_poses
 from armsight.loop.identify.validate import validate
-from armsight.robot.models import open_arm
 from identify_handeye import eth_pairs, kuka2
 from identify_worn import worn_arms
 
@@ -83,7 +82,7 @@ def robots() -> None:
     )
     path = Path("/tmp") / f"rokae-{os.getpid()}.toml"
     path.write_text(ROKAE)
-    arm, few = open_model(str(path)), read["rokae"]
+    arm, few = open_arm(str(path)), read["rokae"]
     path.unlink()
     done = [held_out(arm, few.rows(np.delete(np.arange(30), k)), few.rows(np.array([k]))) for k in range(30)]
     ratio = float(np.sqrt(np.mean(np.square(done), axis=0)[1]))

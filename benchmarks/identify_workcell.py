@@ -17,7 +17,7 @@ import numpy as np
 
 from armsight.data import JointCommand
 from armsight.geometry.pose import exp_se3, inverse
-from armsight.loop.identify.backlash import plays
+from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
@@ -26,7 +26,7 @@ from armsight.loop.identify.plan import plan_poses
 from armsight.robot.arm import Arm
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import drawn, imperfections
 from armsight.sim.workcell.board import configuration, gravity_duty
@@ -132,7 +132,7 @@ def one(seed: int, goals: list, told) -> tuple[float, ...]:
             if found.value(f"{key}{i + 1}")[1] > 0 and f"{key}{i + 1}" not in found.reasons
         ]
         told(f"  furthest of {len(off)} parameters", max(off), 3.0, "sigma")
-        for play in plays(found, m.rows(np.arange(POSES))):
+        for play in joint_backlashes(found, m.rows(np.arange(POSES))):
             if np.isfinite(play.value_rad):
                 wrong = abs(np.degrees(play.value_rad - true.backlash_rad[play.joint]))
                 told(f"  play of joint {play.joint + 1}", wrong, 0.02, "deg", f" ({play.how})")

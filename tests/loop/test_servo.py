@@ -7,7 +7,7 @@ from arm_rig import ARM, MIDDLE, TICK_S, Cell, distance_mm, mounts, rms, worn
 from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.estimators import ESTIMATORS, Delay, Mounting
-from armsight.loop.servo import MOST_RAD, RATE_SHARE, Mode, PoseServo, Timing
+from armsight.loop.servo import MOST_RAD, RATE_SHARE, Mode, PoseServo, LoopTiming
 from armsight.robot.trajectories import point_to_point
 
 PERIOD_S = 0.016
@@ -16,7 +16,7 @@ GOAL = MIDDLE + np.radians([15, -10, 12, -14, 10, 20])
 
 
 def timing(rate_hz, response_s=0.05):
-    return Timing(PERIOD_S, 1 / rate_hz, 0.045 + PERIOD_S, response_s)
+    return LoopTiming(PERIOD_S, 1 / rate_hz, 0.045 + PERIOD_S, response_s)
 
 
 def cell_of(seed, rate_hz, kind="kalman", **more):
@@ -84,7 +84,7 @@ def test_on_bare_vision_it_does_not_swing_either(rate_hz, loose):
 def test_the_gain_rule_is_the_edge_of_overshoot_and_far_from_that_of_stability(rate_hz):
     t = timing(rate_hz)
     delay = round((t.latency_s + t.vision_period_s + t.response_s) / t.period_s)
-    exact = Timing(t.period_s, delay * t.period_s / 2, delay * t.period_s / 4, delay * t.period_s / 4).gain
+    exact = LoopTiming(t.period_s, delay * t.period_s / 2, delay * t.period_s / 4, delay * t.period_s / 4).gain
 
     def response(gain):
         c = [1.0] * (delay + 1)
@@ -183,4 +183,4 @@ def test_singular_places_do_not_make_it_wild(q):
 
 def test_times_must_be_positive():
     with pytest.raises(InputError, match=r"latency_s is -0\.1; it must be a positive number of seconds"):
-        Timing(0.016, 0.016, -0.1)
+        LoopTiming(0.016, 0.016, -0.1)

@@ -1,7 +1,7 @@
 """A worn arm whose truth is known, and what a stereo rig would see of it: an oracle apart from the code it tests.
 
 Its kinematics are the Arm's own forward kinematics with a true table; joints read by potentiometers that are off by a zero,
-a scale and a wave, and that see neither the gears' play nor their sag under point weights at the links' ends.
+a scale and a wave, and that see neither the gears' backlash nor their compliance under point masses at the links' ends.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ import numpy as np
 from armsight.geometry.pose import exp_se3
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 MASS_KG, GRAVITY = np.array([1.0, 0.6, 0.4, 0.3, 0.2, 0.3]), 9.81
 
@@ -37,7 +37,7 @@ class Worn:
         return said - 0.5 * self.backlash * approach + self.compliance * self.torque(said)
 
     def torque(self, q):
-        """Weight's torque about every joint, N m, in the sense of its angle."""
+        """Gravity torque about every joint, N m, in the sense of its angle."""
         out = np.zeros_like(q)
         for n, angles in enumerate(q):
             T = self.nominal.links(angles)
@@ -78,8 +78,8 @@ def worn(seed, nominal=None, *, waves=2, backlash=True, compliance=True):
         alpha=nominal.alpha + rng.normal(0, np.deg2rad(0.3), 6) * free,
         offset=nominal.offset + rng.normal(0, np.deg2rad(0.5), 6) * inner,
     )
-    order = np.arange(1, waves + 1)
-    size = np.deg2rad(0.05) / order[None, :, None]
+    harmonic = np.arange(1, waves + 1)
+    size = np.deg2rad(0.05) / harmonic[None, :, None]
     T_rig_base = exp_se3(np.array([0.1, 0.4, 0.9, 0, 0, 0])) @ exp_se3(np.array([0, 0, 0, *rng.normal(0, 1, 3)]))
     return Worn(
         nominal,

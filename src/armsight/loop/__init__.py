@@ -1,1 +1,13 @@
-"""Where vision and robot meet: hand-eye, identification of the arm, what a robot is judged by. Never imports sim."""
+"""The closed loop: what needs both vision and robot.
+
+In: poses that vision measured, joints that the robot read. Out: joint commands, and what is known of the arm.
+
+- ``servo``: the outer loop, from a motion and an estimate to the next joint command.
+- ``estimators``: the tool's pose at 1 kHz, from potentiometers and vision.
+- ``delay``: how late the camera's stamps are.
+- ``handeye``: where cameras and markers are to the arm.
+- ``identify``: kinematic identification of the arm, and the poses to measure next.
+- ``iso9283``: performance metrics of the arm.
+
+Imports vision, robot and geometry, never sim.
+"""

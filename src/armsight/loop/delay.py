@@ -1,10 +1,10 @@
 """How late the camera's stamps are on the joints' clock, from a sweep of the arm that both watched.
 
-In: potentiometer readings and sightings of a few seconds of motion with changing speed. Out: :class:`Delay` with its sigma.
-First the lag at which the turns between successive sightings are those the joints made (turns do not depend on where the
-cameras are); then the filter that also runs the loop, with the delay in its state beside all that makes an arm's
-potentiometers wrong. That matters: backlash at constant speed looks like a delay (0.2 deg at 30 deg/s like 7 ms), and is
-told from one only by the speed changing.
+In: potentiometer readings and pose measurements of a few seconds of motion with changing speed. Out: :class:`Delay`
+with its sigma. First the lag at which the rotations between successive measurements are those of the joints (rotation
+angles do not depend on where the cameras are); then the filter that also runs the loop, with the delay in its state
+beside all that makes an arm's potentiometers wrong. That matters: backlash at constant speed looks like a delay (0.2
+deg at 30 deg/s like 7 ms), and only a changing speed distinguishes the two.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from armsight.data import Array, JointStates
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
-from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement, Prior, Verdict
+from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, PoseMeasurement, Prior
 from armsight.robot.arm import Arm
 
-#: Lags that are looked at, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
+#: Lags that are tried, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
 LAGS_S = np.arange(-0.1, 0.6, 2e-3)
-#: Fewest sightings.
+#: Fewest measurements.
 LEAST = 20
 #: How far the first step may be off, s, and how often the filter is run from its own answer.
 FIRST_SIGMA_S, PASSES = 5e-3, 2
@@ -30,11 +30,11 @@ FIRST_SIGMA_S, PASSES = 5e-3, 2
 MOST_SIGMA_S = 2e-3
 #: What the sides of the backlash, which the filter sees change a little late, leave of error; found on simulated sweeps, s.
 SYSTEMATIC_S = 1.5e-4
-#: The median of what a normal's draws are off, in sigma.
+#: The median deviation of normal samples, in sigma.
 _MEDIAN_OF_NORMAL = 0.6745
 #: A stamp that is further off than this, in sigma, is no jitter but a hiccup.
-_STRAY = 4.0
-#: Readings given to the filter ahead of a sighting, s.
+_OUTLIER = 4.0
+#: Readings given to the filter ahead of a measurement, s.
 _AHEAD_S = 0.1
 
 
@@ -50,23 +50,23 @@ def estimate_delay(
 
     Args:
         arm: the arm, as its table says it is.
-        states: readings from before the first sighting to after the last.
-        sightings: what vision saw meanwhile, in order of time; 20 or more, while the joints moved to and fro.
+        states: readings from before the first measurement to after the last.
+        measurements: of the tool's pose meanwhile, in order of time; 20 or more, while the joints moved to and fro.
         prior: how far the arm may be off.
         sync_s: standard deviation of the time between a shot's two exposures, s.
 
     Raises:
-        InputError: too few sightings, or readings that do not cover them.
+        InputError: too few measurements, or readings that do not cover them.
         CalibrationError: the motion does not determine the delay.
     """
     t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), 6), "states.q")
     stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
     if len(stamps) < LEAST or not (np.diff(stamps) > 0).all():
-        raise InputError(f"a delay needs {LEAST} or more sightings in order of time, got {len(stamps)}")
+        raise InputError(f"a delay needs {LEAST} or more pose measurements in order of time, got {len(stamps)}")
     inside = LAGS_S[(stamps[0] - LAGS_S >= t[0]) & (stamps[-1] - LAGS_S <= t[-1])] if len(t) else LAGS_S[:0]
     if len(inside) < 3:
         raise InputError(
-            "the potentiometer readings do not cover the sightings; log them from a second before to a second after"
+            "the potentiometer readings do not cover the pose measurements; log them from a second before to a second after"
         )
     jitter_s = float(np.hypot(_jitter(stamps), 0.5 * sync_s))  # of the middle between the two exposures
     delay = Delay(_coarse(arm, t, q, measurements, inside), FIRST_SIGMA_S, jitter_s)
@@ -88,25 +88,25 @@ def _jitter(stamps: Array) -> float:
     apart = np.diff(stamps)
     periods = np.maximum(np.round(apart / np.median(apart)), 1.0)
     off = np.abs(apart - periods * (apart.sum() / periods.sum()))
-    usual = off[off <= _STRAY * np.median(off) / _MEDIAN_OF_NORMAL]
+    usual = off[off <= _OUTLIER * np.median(off) / _MEDIAN_OF_NORMAL]
     return float(np.sqrt(np.mean(usual**2) / 2))
 
 
 def _coarse(arm: Arm, t: Array, q: Array, measurements: Sequence[PoseMeasurement], lags: Array) -> float:
-    """Return the lag at which the joints turned the tool as the sightings did, by least squares on the turns' angles."""
+    """Return the lag, s, at which the tool's rotation angles by the joints fit the measured ones best (least squares)."""
     stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
-    seen = _turns(np.array([pose_measurement.T_base_tool for pose_measurement in measurements]))
+    seen = _rotation_angles(np.array([pose_measurement.T_base_tool for pose_measurement in measurements]))
     cost = np.empty(len(lags))
     for n, lag in enumerate(lags):
         at = np.stack([np.interp(stamps - lag, t, q[:, i]) for i in range(6)], axis=1)
-        cost[n] = np.square(_turns(arm.forward(at)) - seen).sum()
+        cost[n] = np.square(_rotation_angles(arm.forward(at)) - seen).sum()
     best = int(np.clip(np.argmin(cost), 1, len(lags) - 2))
     before, here, after = cost[best - 1 : best + 2]
     bend = before - 2 * here + after
     return float(lags[best] + (0.5 * (before - after) / bend * (lags[1] - lags[0]) if bend > 0 else 0.0))
 
 
-def _turns(Ts: Array) -> Array:
+def _rotation_angles(Ts: Array) -> Array:
     """Return the angles (N - 1,) between successive poses (N, 4, 4), rad."""
     R = Ts[:, :3, :3]
     return np.asarray(np.linalg.norm(log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:]), axis=1))
@@ -123,10 +123,10 @@ def _filtered(
         if upto > given:
             estimator.joints(JointStates(states.t_s[given:upto], states.q[given:upto]))
             given = upto
-        used += estimator.vision(pose_measurement) is Verdict.USED
+        used += estimator.vision(pose_measurement) is Outcome.USED
     if used < len(measurements) / 2:
         raise CalibrationError(
-            f"vision and potentiometers do not describe the same motion: {used} of {len(measurements)} sightings fit; is the "
-            "hand-eye calibration this arm's, and are both stamped by one clock?"
+            f"vision and potentiometers do not describe the same motion: {used} of {len(measurements)} measurements "
+            "fit; is the hand-eye calibration this arm's, and are both stamped by one clock?"
         )
     return estimator.learned().delay

@@ -1,10 +1,10 @@
-"""The outer loop: corrects what the joints are told until the tool, as vision sees it, is where it is wanted.
+"""The outer loop: corrects the joints' commands until the tool, as vision measures it, follows its reference.
 
 In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
 The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
-is what the estimator says the potentiometers must be off for the tool to be right at the place to be reached next; at rest,
-c integrates the tool's error itself. Tool errors become joint errors through the Jacobian, but for directions in which the
-arm is singular. Gain, its margin, and what happens when vision is lost: docs/loop.md.
+is the joint error, by the estimator's model, that must be made up for at the next pose to be reached; at rest, c integrates
+the tool's error itself. Tool errors become joint errors through the Jacobian, except in directions in which the arm is near
+a singularity. Gain, its margin, and what happens when vision is lost: docs/loop.md.
 """
 
 from __future__ import annotations
@@ -38,29 +38,30 @@ CROSS_S, CROSS_M = 0.3, 3e-5
 #: that is no feedback, as it hardly depends on the correction, but backlash that changes sides with every twitch would
 #: keep it twitching.
 FOLLOW_S = 0.08
-#: Singular values (linear rows over the arm's size) from which on a direction is corrected, and fully corrected.
-SINGULAR, EASY = 0.02, 0.04
+#: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), and fully
+#: from that.
+UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
 MOST_RAD = np.deg2rad(5.0)
-#: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and wanted slower than that, rad/s.
+#: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
 
 class Mode(Enum):
-    """What the loop is closed on."""
+    """What closes the loop."""
 
     VISION = "vision"
-    BRIDGED = "bridged: no sighting lately, the potentiometers carry on with what was learned"
+    BRIDGED = "bridged: no measurement lately, the potentiometers carry on with what was learned"
     POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
 
 
 @dataclass(frozen=True)
-class Timing:
+class LoopTiming:
     """How long everything in the loop takes.
 
     Attributes:
         period_s: between two commands, s.
-        vision_period_s: between two sightings, s.
+        vision_period_s: between two pose measurements, s.
         latency_s: from the middle of an exposure to the command that knows of it, s, as measured.
         response_s: from a command to the joints being there, s: the time constant of their own loop.
     """
@@ -87,7 +88,7 @@ class Timing:
 
         c[k+1] = c[k] - g e[k-d] comes to rest without overshoot up to g = d^d / (d+1)^(d+1), where the roots of
         z^(d+1) - z^d + g meet on the real axis; it is stable up to 2 sin(pi / (4d + 2)) (Levin and May, 1976): 2 times as
-        much at d = 0, 4 at 1, pi e / 2 = 4.27 in the limit. The age of what is held between sightings counts as delay.
+        much at d = 0, 4 at 1, pi e / 2 = 4.27 in the limit. The age of what is held between measurements counts as delay.
         """
         d = (self.latency_s + self.vision_period_s + self.response_s) / self.period_s
         return float(d**d / (d + 1) ** (d + 1))
@@ -95,13 +96,13 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class Aim(Record):
-    """What the next command is to do, as far as no sighting changes it: made ready while an image is on its way.
+    """The reference of the next command, as far as no measurement changes it: computed while an image is on its way.
 
     Attributes:
         goal: the joints now, as the motion has them.
         ahead: those a period from now.
         Ts_base_tool: (2, 4, 4) where they put the tool.
-        duty: (6,) what carries the arm's weight ahead.
+        duty: (6,) that holds the arm against gravity ahead.
         jacobian: (6, 6) at the goal.
         U: (6, 6) of its singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
         s: (6,).
@@ -126,7 +127,7 @@ class ServoStep(Record):
         command: what the board is to be sent.
         mode: what the loop is closed on.
         correction: (6,) what is added to the motion's joints, rad.
-        error: (6,) from the tool as estimated to the tool as wanted now, [m; rad] in base axes.
+        error: (6,) from the estimated tool to its reference now, [m; rad] in base axes.
         limited: what kept a joint from being corrected further, one text each.
     """
 
@@ -145,7 +146,7 @@ class PoseServo:
         timing: of the loop.
     """
 
-    def __init__(self, arm: Arm, timing: Timing) -> None:
+    def __init__(self, arm: Arm, timing: LoopTiming) -> None:
         self.timing = timing
         self._arm, self._scale = arm, np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])
         self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
@@ -154,12 +155,12 @@ class PoseServo:
         self._rest_s, self._lasting = 0.0, np.zeros(6)
 
     def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
-        """Say what the next command is to do.
+        """Return the reference of the next command.
 
         Args:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
-            gravity: gives the duty (6,) that carries the arm's weight at joint angles (6,), passed on.
+            gravity: returns the duty (6,) that holds the arm against gravity at joint angles (6,), passed on.
         """
         ahead = motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
@@ -172,7 +173,7 @@ class PoseServo:
         """Make the next command.
 
         Args:
-            aim: what it is to do, of this turn.
+            aim: its reference, of this period.
             estimator: where the tool is.
         """
         estimate = estimator.estimate()
@@ -191,13 +192,13 @@ class PoseServo:
         return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate) -> Mode:
-        """Say what the loop may be closed on."""
+        """Return what may close the loop."""
         cov = estimate.cov_own[:3, :3]
         # The greatest variance is not above the sum of three; only where that is too much is it worth looking for.
         sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
         if sigma_m > MOST_SIGMA_M:
             sigma_m = math.sqrt(np.linalg.eigvalsh(cov)[-1])
-        usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one sighting may be missed
+        usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one measurement may be missed
         if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MOST_SIGMA_M:
             return Mode.POTENTIOMETERS
         return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
@@ -212,22 +213,22 @@ class PoseServo:
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
         """
-        able = _within(0.0, (aim.s - SINGULAR) / (EASY - SINGULAR), 1.0)
-        return np.asarray((able / np.maximum(aim.s, SINGULAR) * ((error / self._scale) @ aim.U)) @ aim.Vt)
+        able = _within(0.0, (aim.s - UNCORRECTED_BELOW) / (CORRECTED_ABOVE - UNCORRECTED_BELOW), 1.0)
+        return np.asarray((able / np.maximum(aim.s, UNCORRECTED_BELOW) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
         """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
         self._lasting += self.timing.gain * (error - self._lasting)
-        wanted = self._joints(aim, self._lasting)
-        worth = np.abs(wanted) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
-        sides = np.stack([np.zeros(6), np.where(worth, np.sign(wanted), 0.0)])
+        requested = self._joints(aim, self._lasting)
+        worth = np.abs(requested) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
+        sides = np.stack([np.zeros(6), np.where(worth, np.sign(requested), 0.0)])
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
     def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:
-        """Say whether the arm has been at rest for as long as the newest sighting is old."""
-        wanted = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
-        still = bool(wanted < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
+        """Return whether the arm has been at rest for as long as the newest measurement is old."""
+        requested = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
+        still = bool(requested < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
             self._lasting = np.zeros(6)

@@ -20,7 +20,7 @@ from armsight.loop.estimators.armerror import (
     SIZE,
     Prior,
 )
-from armsight.loop.estimators.errormodel import ErrorModel, State, chi_square
+from armsight.loop.estimators.errormodel import ErrorModel, ErrorState, chi_square
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.models import MODELS
 from asserts import numeric_jacobian
@@ -146,7 +146,7 @@ def test_covariances_are_those_of_the_matrices():
         rng.uniform(0, 1, (n, 6)),
         rng.uniform(0, 1, (n, 2, 6)),
     )
-    state = State(0.0, np.zeros(SIZE), root @ root.T, Smoothed(*(part[:1] for part in joints)), None)
+    state = ErrorState(0.0, np.zeros(SIZE), root @ root.T, Smoothed(*(part[:1] for part in joints)), None)
     step = model.moved(state, joints, np.arange(n) * 1e-3)
     _, Hs = model.poses(state.x, joints.q, joints.unseen)
     for n, own in enumerate(model.covariances(state, step, Hs)):

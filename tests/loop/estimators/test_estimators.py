@@ -9,7 +9,7 @@ from arm_rig import ARM, MIDDLE, MOUNT, SHOT, TICK_S, mounts, off, seen, small, 
 
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse
-from armsight.loop.estimators import ESTIMATORS, Delay, Mounting, PoseMeasurement, Verdict
+from armsight.loop.estimators import ESTIMATORS, Delay, Mounting, PoseMeasurement, Outcome
 
 EXACT = Delay(0.0, 1e-6)
 
@@ -49,7 +49,7 @@ def test_without_vision_the_potentiometers_stand_alone_and_know_how_little(estim
 
 def test_a_sighting_brings_it_there_and_its_age_is_told(estimator):
     t = still(estimator, 0.5)
-    assert estimator.vision(plain(0.4, shift_m=3e-3)) is Verdict.USED
+    assert estimator.vision(plain(0.4, shift_m=3e-3)) is Outcome.USED
     estimate = estimator.estimate()
     assert off(estimate.T_base_tool, plain(0.4, shift_m=3e-3).T_base_tool)[:3] == pytest.approx(0, abs=SHOT[0])
     assert estimate.vision_age_s == pytest.approx(t[-1] - 0.4, abs=1e-5)

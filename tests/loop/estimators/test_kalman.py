@@ -24,7 +24,7 @@ from arm_rig import (
 )
 from scipy.stats import chi2
 
-from armsight.loop.estimators import Delay, KalmanEstimator, Mounting, Prior, PoseMeasurement, Verdict
+from armsight.loop.estimators import Delay, KalmanEstimator, Mounting, PoseMeasurement, Prior, Outcome
 
 #: Chance with which a consistent filter fails a test of consistency here.
 CHANCE = 1e-4
@@ -127,10 +127,10 @@ def test_order_of_arrival_does_not_matter():
     shaft, seen_all, _ = measurements(np.random.default_rng(3))
     straight, crossed = fed(shaft), fed(shaft)
     for pose_measurement in seen_all:
-        assert straight.vision(pose_measurement) is Verdict.USED
+        assert straight.vision(pose_measurement) is Outcome.USED
     for k in range(0, len(seen_all), 5):
         for pose_measurement in seen_all[k : k + 5][::-1]:
-            assert crossed.vision(pose_measurement) is Verdict.USED
+            assert crossed.vision(pose_measurement) is Outcome.USED
     a, b = straight.estimate(), crossed.estimate()
     assert np.allclose(a.T_base_tool, b.T_base_tool, atol=1e-9)
     assert np.allclose(a.cov, b.cov, rtol=1e-6, atol=1e-14)
@@ -141,7 +141,7 @@ def test_readings_far_apart_and_sightings_of_one_time_leave_numbers(period_s):
     estimator, T = kalman(), ARM.forward(MIDDLE)
     estimator.joints(states(np.arange(12) * period_s, np.tile(MIDDLE, (12, 1))))
     pose_measurement = PoseMeasurement(10 * period_s, T, 1e-8 * np.eye(6), np.zeros((6, 6)))
-    assert [estimator.vision(pose_measurement) for _ in range(3)] == [Verdict.USED] * 3
+    assert [estimator.vision(pose_measurement) for _ in range(3)] == [Outcome.USED] * 3
     for estimate in (estimator.estimate(), estimator.estimate(10 * period_s)):
         assert np.isfinite(estimate.T_base_tool).all()
         assert np.isfinite(estimate.cov).all()
@@ -158,47 +158,47 @@ def test_a_sighting_older_than_what_is_kept_comes_too_late_and_one_from_the_futu
     now = [pose_measurement for pose_measurement in rest if pose_measurement.t_s <= t[half - 1]]
     for pose_measurement in now:
         estimator.vision(pose_measurement)
-    assert estimator.vision(rest[len(now) + 2]) is Verdict.WAITING
+    assert estimator.vision(rest[len(now) + 2]) is Outcome.WAITING
     age = estimator.estimate().vision_age_s
     estimator.joints(states(t[half:], shaft[half:]))
     assert estimator.estimate(float(t[half - 1])).vision_age_s < age  # the one that waited is in
     for pose_measurement in rest[len(now) :]:
         estimator.vision(pose_measurement)
-    assert estimator.vision(late) is Verdict.TOO_LATE
+    assert estimator.vision(late) is Outcome.TOO_LATE
 
 
 def test_mistaken_poses_are_left_out_and_do_no_harm():
     rng = np.random.default_rng(5)
     shaft, seen_all, Ts = measurements(rng)
-    estimator, verdicts = fed(shaft), []
+    estimator, outcomes = fed(shaft), []
     for k, pose_measurement in enumerate(seen_all):
         if k % 7 == 3:  # flipped, shifted, or the reflection of another marker: never the same way twice
             wrong = pose_measurement.T_base_tool @ small(rng.normal(size=6) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
             pose_measurement = type(pose_measurement)(
                 pose_measurement.t_s, wrong, pose_measurement.cov_noise, pose_measurement.cov_common
             )
-        verdicts.append(estimator.vision(pose_measurement))
+        outcomes.append(estimator.vision(pose_measurement))
     wrongs = np.arange(len(seen_all)) % 7 == 3
-    assert all((v is Verdict.OUTLIER) == w for v, w in zip(verdicts, wrongs, strict=True))
+    assert all((v is Outcome.OUTLIER) == w for v, w in zip(outcomes, wrongs, strict=True))
     assert distance_mm(estimator.estimate().T_base_tool, Ts[-1]) < 1.0
 
 
 def test_when_vision_insists_it_believes_again():
     shaft, seen_all, Ts = measurements(np.random.default_rng(6))
     estimator, bump = fed(shaft), small([0.006, -0.004, 0.005, 0.01, 0.005, -0.008])
-    verdicts = []
+    outcomes = []
     for k, pose_measurement in enumerate(seen_all):
         moved = (
             bump @ pose_measurement.T_base_tool if k >= 40 else pose_measurement.T_base_tool
         )  # something knocked the arm's foot
-        verdicts.append(
+        outcomes.append(
             estimator.vision(
                 type(pose_measurement)(
                     pose_measurement.t_s, moved, pose_measurement.cov_noise, pose_measurement.cov_common
                 )
             )
         )
-    assert Verdict.REOPENED in verdicts[40:50]
+    assert Outcome.REOPENED in outcomes[40:50]
     assert distance_mm(estimator.estimate().T_base_tool, bump @ Ts[-1]) < 1.0
 
 
@@ -211,7 +211,7 @@ def test_long_rest_leaves_a_covariance_that_is_one():
         t = second + np.arange(1000) * TICK_S
         estimator.joints(states(t, MIDDLE + rng.normal(size=(1000, 6)) * 3.5e-4))
         for t_s in second + np.arange(0.01, 0.99, 1 / 30):
-            assert estimator.vision(mounting.pose_measurement(seen(rng, T, true), t_s)) is Verdict.USED
+            assert estimator.vision(mounting.pose_measurement(seen(rng, T, true), t_s)) is Outcome.USED
     estimate = estimator.estimate()
     assert np.linalg.eigvalsh(estimate.cov_own).min() > 0
     assert off(estimate.T_base_tool, T) @ np.linalg.solve(estimate.cov, off(estimate.T_base_tool, T)) < chi2.isf(
@@ -234,10 +234,10 @@ def test_for_the_record_the_sightings_that_follow_are_heard_too():
     for a, b in pairwise(seen_all):
         t_s = np.arange(round(a.t_s / TICK_S) + 1, round(b.t_s / TICK_S)) * TICK_S
         now.append(estimator.track(t_s))
-        noted += estimator.stretches(t_s[:3])  # as no sighting came after them yet
+        noted += estimator.intervals(t_s[:3])  # as no sighting came after them yet
         estimator.vision(b)
         later.append(estimator.smoothed(t_s))
-        noted += estimator.stretches(t_s[3:])
+        noted += estimator.intervals(t_s[3:])
     # Reckoned later, all at once: the same, whatever was heard since.
     late, parts = estimator.blended(noted), (slice(3), slice(3, None))
     for field in ("t_s", "Ts_base_tool", "covs", "covs_own", "q", "qd", "vision_age_s"):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 SIGMA_FLANGE_M, SIGMA_FLANGE_RAD = 0.5e-3, 1e-3
 

@@ -8,21 +8,20 @@ from worn_arm import distance_m, poses, worn
 
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.identify.backlash import plays
+from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.fit import fit, prior_sigma
 from armsight.loop.identify.identify import contributions, identify
 from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.model_file import open_model
 from armsight.loop.identify.observable import observed
-from armsight.loop.identify.placement import placed
+from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.plan import free_of_collision, plan_poses
-from armsight.loop.identify.selection import PLACEMENT, _Folds, _pays
+from armsight.loop.identify.selection import PLACEMENT, _Folds, _improves
 from armsight.loop.identify.toml_write import table_text
 from armsight.loop.identify.validate import validate
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 
 def points_of(measured, w, body_points):
@@ -60,17 +59,17 @@ def test_a_worn_arm_is_found_out(scene):
     q, approach = poses(w.nominal, 200, rng)
     truth = w.T_rig_body(q, approach)
     before, after = (distance_m(found.model, x, truth, q, approach).mean() for x in (found.nominal, found.solution.x))
-    assert after < before / 8  # the figure asked for
+    assert after < before / 8  # the metric asked for
     assert after < 0.25e-3
     for i in range(6):
         assert found.value(f"backlash{i + 1}")[0] == pytest.approx(w.backlash[i], abs=np.deg2rad(0.02))
 
 
-def test_what_is_told_alone_is_within_its_sigma(scene):
+def test_what_is_observable_alone_is_within_its_sigma(scene):
     w, _, found, _ = scene
-    told = {name: true for name, true in truth_of(w).items() if name not in found.reasons and found.value(name)[1] > 0}
-    assert len(told) > 15
-    off = np.array([(found.value(name)[0] - true) / found.value(name)[1] for name, true in told.items()])
+    seen = {name: true for name, true in truth_of(w).items() if name not in found.reasons and found.value(name)[1] > 0}
+    assert len(seen) > 15
+    off = np.array([(found.value(name)[0] - true) / found.value(name)[1] for name, true in seen.items()])
     assert np.abs(off).max() < 4  # of 20 numbers: 0.1 % by chance
     assert np.sqrt(np.mean(off**2)) < 1.5
 
@@ -81,20 +80,20 @@ def test_hayatis_angle_stands_where_axes_are_parallel_and_nowhere_else(scene):
     assert "not needed" in found.reasons["beta4"]
     assert "not needed" not in found.reasons.get("beta2", "")
     assert "not needed" not in found.reasons.get("beta3", "")
-    for name in ("d3", "d4"):  # axes 2, 3 and 4 are parallel: only the sum of their offsets is told
-        assert found.reasons[name] == "kept at its nominal value: no pose can tell it from d2"
+    for name in ("d3", "d4"):  # axes 2, 3 and 4 are parallel: only the sum of their offsets is observable
+        assert found.reasons[name] == "kept at its nominal value: no pose can distinguish it from d2"
     assert found.reasons["d2"] == "tied: its value also holds what is off in d3, d4"
 
 
-def test_the_gauge_is_told():
+def test_the_gauge_is_observable():
     arm, rng = open_arm("puma560"), np.random.default_rng(0)
     q = rng.uniform(-1, 1, (60, 6))
     measured = Measured(q, (arm.forward(q) @ [0.05, 0.03, 0.1, 1.0])[:, None, :3])
-    model, x = placed(Model.of(arm, measured, backlash=False), measured)
+    model, x = with_placement(Model.of(arm, measured, backlash=False), measured)
     seen = observed(model, x, measured, prior_sigma(model), (1e-5, 0.0))
     table = [p.name for p, f in zip(model.parameters, seen.free, strict=True) if f and p.kind not in PLACEMENT]
     geometric = [name for name in table if name.rstrip("123456") in ("a", "d", "alpha", "offset", "beta")]
-    # A complete model of six turning joints and one point has 4 x 6 + 6 - 3 numbers, nine of them base and tool.
+    # A complete model of six revolute joints and one point has 4 x 6 + 6 - 3 numbers, nine of them base and tool.
     assert len(geometric) == 4 * 6 + 6 - 3 - 9
     assert "base_z" in seen.reasons["d1"]
     assert "base_rz" in seen.reasons["offset1"]
@@ -105,18 +104,18 @@ def test_the_fit_is_least_squares(scene):
 
     w, _, _, rng = scene
     measured = replace(w.seen(*poses(w.nominal, 40, rng), rng), cov=None)
-    model, x = placed(Model.of(w.nominal, measured, backlash=False).with_features(()), measured)
+    model, x = with_placement(Model.of(w.nominal, measured, backlash=False).with_features(()), measured)
     prior = prior_sigma(model)
     free = np.array([p.kind in PLACEMENT or p.name in ("a2", "a3", "offset2", "alpha3") for p in model.parameters])
     s = fit(model, x, measured, free, prior, used=np.ones(len(measured), bool))
     phi, nominal = model.feature_values(measured.q, None), model.nominal()
-    weight = np.repeat([1 / s.noise[0], 1 / s.noise[1]], 3)
+    scale = np.repeat([1 / s.noise[0], 1 / s.noise[1]], 3)
 
     def cost(v):
         y = s.x.copy()
         y[free] = v
         pull = ((y - nominal) / prior)[free & np.isfinite(prior)]
-        return np.concatenate([(model.residuals(y, measured, phi) * weight).ravel(), pull])
+        return np.concatenate([(model.residuals(y, measured, phi) * scale).ravel(), pull])
 
     best = least_squares(cost, s.x[free], x_scale=np.diag(s.cov)[free] ** 0.5, xtol=1e-12, ftol=1e-12)
     assert np.abs((best.x - s.x[free]) / np.sqrt(np.diag(s.cov)[free])).max() < 0.01
@@ -150,7 +149,7 @@ def test_several_points_do_as_poses_do(scene):
     assert 0.7 < v.residual_over_predicted < 1.5
 
 
-def test_another_set_up_is_placed_anew(scene):
+def test_base_and_tool_are_refitted_for_another_set_up(scene):
     w, _, found, rng = scene
     q, approach = poses(w.nominal, 40, rng)
     moved = replace(w, T_rig_base=w.T_rig_base @ inverse(w.T_flange_body))
@@ -167,7 +166,7 @@ def test_a_perfect_arm_is_left_as_it_is():
     found = identify(arm, measured)
     kept = [n for n, f in zip(found.model.names, found.solution.free, strict=True) if f]
     beyond = [n for n in kept if not n.startswith(("base", "tool"))]
-    assert len(beyond) <= 12  # what pays by chance
+    assert len(beyond) <= 12  # what chance selects
     assert sum(contributions(found, measured).values()) < 2e-4
     q, approach = poses(arm, 100, rng)
     assert distance_m(found.model, found.solution.x, w.T_rig_body(q, approach), q, approach).mean() < 1e-4
@@ -192,13 +191,13 @@ def test_what_is_written_is_read_as_the_same_arm(scene, tmp_path):
     (tmp_path / "corrected.urdf").write_text(Corrected.of(found).urdf())
     x[found.model.sources_at :] = 0.0
     for name in ("corrected.toml", "corrected.urdf"):
-        arm = open_model(str(tmp_path / name))
+        arm = open_arm(str(tmp_path / name))
         np.testing.assert_allclose(arm.forward(q), found.model.tool_in_base(x, q, None), atol=1e-9)
         assert arm.inverse(arm.forward(arm.home + 0.1), near=arm.home).best is not None
 
 
 def test_a_sensors_curve_with_fast_swings_is_followed():
-    """Ten swings a turn, three over the range looked at; what is left is less than half of what it moves the tool by."""
+    """Ten oscillations a revolution, three over the range measured; less than half of its effect on the tool is left."""
     w, rng = worn(4, backlash=False, compliance=False), np.random.default_rng(8)
     q, approach = poses(w.nominal, 260, rng)
 
@@ -227,21 +226,21 @@ def test_with_plenty_of_numbers_the_fastest_harmonics_are_left_out():
     ]
 
 
-def test_one_pose_that_nothing_explains_does_not_rule_which_causes_pay():
+def test_one_pose_that_nothing_explains_does_not_rule_which_sources_are_selected():
     folds = _Folds(*(np.zeros(0) for _ in range(3)), np.full(20, 18.0), *(np.zeros(0) for _ in range(2)))
     without, with_it = np.full(20, 4.0), np.ones(20)
     with_it[3] = 100.0  # by the mean of squares it would cost more than it brings
     assert with_it.mean() > without.mean()
-    assert _pays(without, with_it, folds)
-    assert not _pays(without, without * (1 + 1e-12), folds)
+    assert _improves(without, with_it, folds)
+    assert not _improves(without, without * (1 + 1e-12), folds)
 
 
-def test_near_the_balance_of_weight_and_friction_the_side_is_uncertain():
+def test_near_the_balance_of_gravity_and_friction_the_side_is_uncertain():
     w, n = worn(1), 2000
     q, approach = poses(w.nominal, n, np.random.default_rng(6))
     m = Measured(q, np.zeros((n, 1, 3)), np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 6, 6)), approach)
     model = Model.of(w.nominal, m, backlash=True)
-    x, column = model.nominal(), model.names.index("slack5")
+    x, column = model.nominal(), model.names.index("gravity_backlash5")
     x[column] = 4e-3
     mean = 0.5 * 4e-3 * 2 * model.feature_values(q, m.approach)[:, column - model.sources_at]
     _, J = model.linearised(x, m, model.feature_values(q, m.approach))
@@ -253,14 +252,14 @@ def test_near_the_balance_of_weight_and_friction_the_side_is_uncertain():
     assert np.median(along) < 1e-6 * 2e-3**2
 
 
-def test_the_play_of_each_joint_is_told_or_why_it_is_not(scene):
+def test_the_backlash_of_each_joint_is_reported_or_why_it_is_not(scene):
     w, measured, found, _ = scene
-    for play in plays(found, measured):  # here friction holds every joint on the side it came from
-        assert play.value_rad == pytest.approx(w.backlash[play.joint], abs=np.deg2rad(0.02))
-        assert abs(play.value_rad - w.backlash[play.joint]) < 4 * play.sigma_rad
+    for backlash in joint_backlashes(found, measured):  # here friction holds every joint on the side it came from
+        assert backlash.value_rad == pytest.approx(w.backlash[backlash.joint], abs=np.deg2rad(0.02))
+        assert abs(backlash.value_rad - w.backlash[backlash.joint]) < 4 * backlash.sigma_rad
 
 
-def test_a_joint_that_lies_anywhere_in_its_play_spoils_only_its_own_direction():
+def test_a_joint_that_lies_anywhere_in_its_backlash_spoils_only_its_own_direction():
     w, rng = worn(2), np.random.default_rng(7)
     q, approach = poses(w.nominal, 60, rng)
     w = replace(w, backlash=w.backlash * [0, 1, 1, 1, 1, 1])
@@ -269,19 +268,19 @@ def test_a_joint_that_lies_anywhere_in_its_play_spoils_only_its_own_direction():
     seen = w.seen(q + stood[:, None] * np.eye(6)[0], approach, rng)
     measured = replace(seen, q=q)
     found = identify(w.nominal, measured)
-    assert found.joint_sigma_rad[0] == pytest.approx(stood.std(), rel=0.3)  # of 60 draws: 10 %
+    assert found.joint_sigma_rad[0] == pytest.approx(stood.std(), rel=0.3)  # of 60 samples: 10 %
     assert found.joint_sigma_rad[1:].max() < 0.3 * stood.std()
-    play = plays(found, measured)[0]
-    assert abs(play.value_rad - 2 * half) < 4 * play.sigma_rad < np.deg2rad(0.2)
-    assert "how far apart" in play.how
+    backlash = joint_backlashes(found, measured)[0]
+    assert abs(backlash.value_rad - 2 * half) < 4 * backlash.sigma_rad < np.deg2rad(0.2)
+    assert "how far apart" in backlash.how
     q, approach = poses(w.nominal, 200, rng)
     assert distance_m(found.model, found.solution.x, w.T_rig_body(q, approach), q, approach).mean() < 0.2e-3
 
 
-def test_planned_poses_tell_more_than_random_ones(scene):
+def test_planned_poses_inform_more_than_random_ones(scene):
     w, measured, _, _ = scene
     few = measured.rows(np.arange(15))
-    model, x = placed(Model.of(w.nominal, few, backlash=True), few)
+    model, x = with_placement(Model.of(w.nominal, few, backlash=True), few)
     plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), 12, done=few)
     assert (np.diff(plan.sigma_m) < 0).all()
     assert plan.sigma_m[12] < plan.random_sigma_m[12]
@@ -290,14 +289,14 @@ def test_planned_poses_tell_more_than_random_ones(scene):
     assert free_of_collision(model, plan.q).all()
 
 
-def test_poses_all_alike_are_refused(scene):
+def test_poses_all_alike_are_rejected(scene):
     w, _, _, rng = scene
     q = np.repeat(w.nominal.home[None], 30, axis=0)
     with pytest.raises(CalibrationError, match="too alike"):
         identify(w.nominal, w.seen(q, np.ones((30, 6)), rng))
 
 
-def test_too_few_poses_are_refused_and_few_are_enough_for_little(scene):
+def test_too_few_poses_are_rejected_and_few_are_enough_for_little(scene):
     w, measured, _, _ = scene
     with pytest.raises(InputError, match="fewer than 6"):
         identify(w.nominal, measured.rows(np.arange(3)))
@@ -318,25 +317,25 @@ def test_too_few_poses_are_refused_and_few_are_enough_for_little(scene):
         (lambda m: replace(m, p_rig=m.p_rig * 1e3), "are they in mm, not m"),
         (lambda m: replace(m, q=np.degrees(m.q) / 10), "not of this arm|fit"),
         (lambda m: replace(m, q=np.radians(m.q)), "radians; name the columns q1_rad"),
-        (lambda m: replace(m, q=m.q * [1, -1, 1, 1, 1, 1]), "sign is turned of joint 2"),
-        (lambda m: replace(m, q=m.q * [1, 1, -1, 1, -1, 1]), "sign is turned of joint 3, 5"),
+        (lambda m: replace(m, q=m.q * [1, -1, 1, 1, 1, 1]), "sign is wrong of joint 2"),
+        (lambda m: replace(m, q=m.q * [1, 1, -1, 1, -1, 1]), "sign is wrong of joint 3, 5"),
         (lambda m: replace(m, q=m.q[:, [0, 2, 1, 3, 4, 5]]), "order is q1, q3, q2, q4, q5, q6"),
         (lambda m: replace(m, q=m.q[:, ::-1]), "order is q6, q5, q4, q3, q2, q1"),
     ],
 )
-def test_wrong_units_order_and_signs_are_told(scene, change, said):
+def test_wrong_units_order_and_signs_are_reported(scene, change, said):
     w, measured, _, _ = scene
     with pytest.raises(InputError, match=said):
         identify(w.nominal, change(replace(measured, cov=None)))
 
 
-def test_another_arm_is_told(scene):
+def test_another_arm_is_reported(scene):
     _, measured, _, _ = scene
     with pytest.raises(InputError, match="not of this arm"):
         identify(open_arm("ur10"), measured)
 
 
-def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_refused(scene):
+def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_rejected(scene):
     w, measured, _, _ = scene
     found = identify(w.nominal, measured, priors={"a2": 0.0, "wave": 0.0})
     assert found.value("a2")[0] == w.nominal.a[1]

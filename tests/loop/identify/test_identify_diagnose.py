@@ -10,17 +10,17 @@ from worn_arm import poses, worn
 from armsight.errors import InputError
 from armsight.loop.identify.diagnose import check_plausible, misfit, without_tool
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.read import TURNS, read_poses
-from armsight.robot.models import open_arm
+from armsight.loop.identify.read import ROTATIONS, read_poses
+from armsight.robot.arm_file import open_arm
 
 #: One whose axes lie in a plane but for its shoulder, one with a round wrist, and two with none.
 ARMS = ("six_r", "ur5", "ur10", "puma560")
 SEEDS = (1, 2)
-FRAME = "two of the instrument's axes are swapped"
+FRAME = "two of the instrument's axes are exchanged"
 
 
 def made(name, seed, n=40):
-    """A worn arm and full poses of it, as a file of an instrument that tells no covariance holds them."""
+    """A worn arm and full poses of it, as a file of an instrument that gives no covariance holds them."""
     w, rng = worn(seed, open_arm(name)), np.random.default_rng(100 + seed)
     return w, replace(w.seen(*poses(w.nominal, n, rng), rng), cov=None, approach=None)
 
@@ -42,7 +42,7 @@ def said(w, measured):
 
 
 def proposed(text):
-    """What is proposed first, apart from what the data cannot tell."""
+    """What is proposed first, apart from what the data do not show."""
     return text.split("(off by")[0]
 
 
@@ -57,11 +57,11 @@ def test_right_data_pass(name, seed):
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("mirror", [np.eye(3)[[1, 0, 2]], np.eye(3)[[0, 2, 1]], np.diag([1.0, 1, -1])])
-def test_a_left_handed_frame_is_told(name, seed, mirror):
+def test_a_left_handed_frame_is_reported(name, seed, mirror):
     w, measured = made(name, seed)
     text = said(w, points(measured, p=seen_at(measured) @ mirror))
     assert FRAME in proposed(text)
-    assert "sign is turned of joint" not in proposed(text)
+    assert "sign is wrong of joint" not in proposed(text)
     assert "order" not in proposed(text)
 
 
@@ -77,37 +77,37 @@ def test_the_handedness_is_that_of_the_frame(name):
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("joint", [1, 2, 3, 4, 5])
-def test_one_turned_sign_is_told_as_one(name, seed, joint):
+def test_one_wrong_sign_is_reported_as_one(name, seed, joint):
     w, measured = made(name, seed)
     text = said(w, points(measured, q=measured.q * np.where(np.arange(1, 7) == joint, -1, 1)))
-    assert proposed(text) == f"the data fit this arm if the sign is turned of joint {joint} "
+    assert proposed(text) == f"the data fit this arm if the sign is wrong of joint {joint} "
 
 
-def test_a_sign_that_hardly_moves_the_tool_is_not_turned_by_chance():
+def test_a_sign_that_hardly_moves_the_tool_is_not_changed_by_chance():
     """A point 1 mm off joint 6's axis of an arm off by some mm: its sign takes up a part of that in one seed of two."""
     for seed in range(6):
         w, measured = made("puma560", seed)
         near_axis = np.linalg.inv(w.T_flange_body) @ np.array([0.001, 0, 0.06, 1])
         p = seen_at(measured, near_axis[:3])
         text = said(w, points(measured, p=p, q=measured.q * [1, 1, -1, 1, 1, 1]))
-        assert proposed(text) == "the data fit this arm if the sign is turned of joint 3 "
-        assert "whether the sign of joint 6 is right they cannot tell" in text
+        assert proposed(text) == "the data fit this arm if the sign is wrong of joint 3 "
+        assert "they do not show whether the sign of joint 6 is right" in text
 
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("order", [(1, 0, 2, 3, 4, 5), (0, 2, 1, 3, 4, 5), (0, 1, 2, 4, 3, 5), (5, 4, 3, 2, 1, 0)])
-def test_an_order_is_told_with_no_sign(name, seed, order):
+def test_an_order_is_reported_with_no_sign(name, seed, order):
     w, measured = made(name, seed)
     text = said(w, points(measured, q=measured.q[:, order]))
     back = ", ".join(f"q{i + 1}" for i in np.argsort(order))
     assert proposed(text) == f"the data fit this arm if the joints' order is {back} "
 
 
-def test_a_sign_and_a_unit_are_told_together():
+def test_a_sign_and_a_unit_are_reported_together():
     w, measured = made("ur5", 1)
     text = said(w, points(measured, p=1e3 * seen_at(measured), q=measured.q * [1, 1, -1, 1, 1, 1]))
-    assert "the sign is turned of joint 3 and the points are in mm, not m" in text
+    assert "the sign is wrong of joint 3 and the points are in mm, not m" in text
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -118,18 +118,18 @@ def test_nothing_is_proposed_for_another_arm(name, other, seed):
     assert "not of this arm" in said(w, points(measured))
 
 
-def test_nothing_is_proposed_where_places_have_nothing_to_do_with_angles():
+def test_nothing_is_proposed_where_positions_have_nothing_to_do_with_angles():
     w, measured = made("ur5", 1)
     assert "not of this arm" in said(w, points(measured, p=np.random.default_rng(0).permutation(seen_at(measured))))
 
 
-def with_angles(path, measured, turns):
-    """Write a file whose angles are meant as ``turns``."""
+def with_angles(path, measured, rotation):
+    """Write a file whose angles follow ``rotation``."""
     R = Rotation.from_matrix(measured.R_rig_body)
-    if turns == "rotvec":
+    if rotation == "rotvec":
         angles = np.degrees(R.as_rotvec())
     else:
-        angles = R.as_euler(turns, degrees=True)[:, np.argsort([*turns.lower()])]
+        angles = R.as_euler(rotation, degrees=True)[:, np.argsort([*rotation.lower()])]
     names = [f"q{i}_rad" for i in range(1, 7)] + [f"p1_{a}_mm" for a in "xyz"] + [f"r{a}_deg" for a in "xyz"]
     rows = np.column_stack([measured.q, 1e3 * measured.p_rig[:, 0], angles])
     path.write_text("\n".join([",".join(names), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n")
@@ -137,35 +137,35 @@ def with_angles(path, measured, turns):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("turns", ["rotvec", "xyz", "yzx", "XYZ"])
-def test_another_reading_of_angles_is_refused_and_the_right_one_named(tmp_path, seed, turns):
+@pytest.mark.parametrize("rotation", ["rotvec", "xyz", "yzx", "XYZ"])
+def test_another_convention_of_angles_is_rejected_and_the_right_one_named(tmp_path, seed, rotation):
     w, measured = made("six_r", seed)
-    path = with_angles(tmp_path / "poses.csv", measured, turns)
-    arm, right = without_tool(w.nominal), names_of(turns)
-    for given in set(TURNS) - set(right):
-        text = said(w, read_poses(path, turns=given).measured)
+    path = with_angles(tmp_path / "poses.csv", measured, rotation)
+    arm, right = without_tool(w.nominal), names_of(rotation)
+    for given in set(ROTATIONS) - set(right):
+        text = said(w, read_poses(path, rotation=given).measured)
         assert f"meant as {' or '.join(right)}, not as {given} " in text
-        assert text.endswith(f"give --turns {right[0]}")
+        assert text.endswith(f"give --rotation {right[0]}")
     for given in right:
-        check_plausible(arm, read_poses(path, turns=given).measured)
+        check_plausible(arm, read_poses(path, rotation=given).measured)
 
 
-def names_of(turns):
-    """Turns about fixed axes are those about turned axes in the other order: two names of one reading."""
-    same = {turns, turns if turns == "rotvec" else turns[::-1].swapcase()}
-    return [name for name in TURNS if name in same]
+def names_of(rotation):
+    """Rotations about fixed axes are those about rotated axes in the other order: two names of one convention."""
+    same = {rotation, rotation if rotation == "rotvec" else rotation[::-1].swapcase()}
+    return [name for name in ROTATIONS if name in same]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_sign_that_only_turns_tell_is_told(tmp_path, seed):
+def test_a_sign_that_only_rotations_show_is_reported(tmp_path, seed):
     w, measured = made("ur5", seed)
-    turned = replace(measured, q=measured.q * [1, 1, 1, 1, 1, -1])
-    assert "fit this arm if the sign is turned of joint 6 (" in said(w, turned)
-    path = with_angles(tmp_path / "poses.csv", turned, "xyz")
-    assert "fit this arm if the sign is turned of joint 6 (" in said(w, read_poses(path, turns="xyz").measured)
+    flipped = replace(measured, q=measured.q * [1, 1, 1, 1, 1, -1])
+    assert "fit this arm if the sign is wrong of joint 6 (" in said(w, flipped)
+    path = with_angles(tmp_path / "poses.csv", flipped, "xyz")
+    assert "fit this arm if the sign is wrong of joint 6 (" in said(w, read_poses(path, rotation="xyz").measured)
 
 
-def test_turns_of_something_else_are_refused():
+def test_rotations_of_something_else_are_rejected():
     w, measured = made("ur5", 1)
     other = Rotation.random(len(measured), rng=0).as_matrix()
-    assert "turns are not of this arm" in said(w, replace(measured, R_rig_body=other))
+    assert "rotations are not of this arm" in said(w, replace(measured, R_rig_body=other))

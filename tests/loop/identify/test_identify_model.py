@@ -9,7 +9,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 from asserts import assert_jacobian
 
 
@@ -24,8 +24,8 @@ def case(name, modified, full, points=1, seed=0):
     model = Model.of(arm, measured, backlash=True)
     x = model.nominal() + rng.normal(0, 0.03, len(model.names))
     if full:
-        turn = model.motion(x, q, model.feature_values(q, approach)).R @ model.T_6_body(x)[:3, :3]
-        measured = replace(measured, R_rig_body=turn @ exp_so3(rng.normal(0, 1e-4, (12, 3))))
+        R = model.motion(x, q, model.feature_values(q, approach)).R @ model.T_6_body(x)[:3, :3]
+        measured = replace(measured, R_rig_body=R @ exp_so3(rng.normal(0, 1e-4, (12, 3))))
     return model, x, measured
 
 
@@ -65,7 +65,7 @@ def test_the_derivative_is_the_derivative(modified, full, points):
     assert_jacobian(J, lambda y: model.residuals(y, measured, phi), x, 1e-3, rtol=1e-7)
 
 
-def test_sag_is_the_weights_torque():
+def test_compliance_follows_the_gravity_torque():
     model, _, measured = case("six_r", False, full=False)
     phi = model.feature_values(measured.q, None)
     names = [f.name for f in model.features]
@@ -75,4 +75,4 @@ def test_sag_is_the_weights_torque():
             for j in range(i, 6):
                 L = T[j + 1, :3, 3] - T[j, :3, 3]
                 torque = T[i, :3, 2] @ np.cross(L, [0, 0, -1.0])
-                assert phi[n, names.index(f"sag{i + 1}_{j + 1}")] == pytest.approx(torque, abs=1e-12)
+                assert phi[n, names.index(f"compliance{i + 1}_{j + 1}")] == pytest.approx(torque, abs=1e-12)

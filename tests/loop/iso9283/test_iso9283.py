@@ -7,7 +7,7 @@ from armsight.geometry.pose import exp_se3, pose
 from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.plan import CLEAR_RAD, CUBES_M, plan_check
-from armsight.robot.models import open_arm
+from armsight.robot.arm_file import open_arm
 
 ARM_M = np.array([2e-4, 1e-4, 0.5e-4])
 

@@ -1,11 +1,20 @@
-"""Where the tool is, from potentiometers and vision: estimators (estimator.py) and what they are given."""
+"""Estimators: the pose of the tool at 1 kHz, from potentiometers and vision.
+
+In: :class:`~armsight.data.JointStates` and :class:`PoseMeasurement` (``mounting`` makes them from what a rig measured).
+Out: :class:`ArmEstimate` and :class:`Track`, poses with covariances.
+
+``estimator`` is the contract of the family; its members are ``kalman`` (fuses both) and ``latest`` (vision alone). The
+Kalman filter's model is in ``armerror`` (what makes potentiometers wrong, as one vector) and ``errormodel`` (how motion
+changes it); ``readings`` and ``parabola`` smooth the potentiometers, ``backlash_dynamics`` follows links inside their
+backlash, and ``smoothing`` computes a track in retrospect. Equations: docs/loop.md.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, PoseMeasurement, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.estimators.latest import LatestEstimator
 from armsight.loop.estimators.mounting import Mounting
@@ -19,10 +28,10 @@ __all__ = [
     "LatestEstimator",
     "Learned",
     "Mounting",
+    "Outcome",
     "PoseMeasurement",
     "Prior",
     "Track",
-    "Verdict",
 ]
 
 #: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.

@@ -5,14 +5,14 @@ The true pose is modelled as
     T_base_tool = T_base_0 E_0 A_1(q_1 + d_1) E_1 ... A_6(q_6 + d_6) E_6 T_6_tool exp(x)
 
 with E_i = exp(e_i) a small motion of every link's frame (lengths, twists and zeros that differ from the table, and how the
-arm stands and holds its tool), d_i what its potentiometer does not say
+arm stands and holds its tool), d_i the error of its potentiometer
 
     d_i = c_i . b(q_i) - s_i w_i / 2 - f_i v_i / 2 + k_i (g_i(q) + h_i) + r_i + n_i
 
 (b: linearity, a line and harmonics; w_i: backlash, s_i its side if friction decides on that; v_i and f_i: the same if
-weight and inertia do; k_i: compliance, g_i the gravity torque of a unit load, h_i that of its inertia; r_i: the rest, that
-forgets itself as the joint moves; n_i: noise that smoothing left in its readings), and x what no joint explains, forgetting
-itself likewise. The derivatives are by the
+gravity and inertia do; k_i: compliance, g_i the gravity torque of a unit load, h_i that of its inertia; r_i: the rest,
+which is forgotten as the joint moves; n_i: noise that smoothing left in its readings), and x what no joint explains,
+forgotten likewise. The derivatives are by the
 right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_tool_frame) e (Sola, "A micro Lie theory",
 2018, eq. 31).
 """
@@ -28,49 +28,49 @@ import numpy as np
 from armsight.data import Array
 from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, sincos
 
-#: Harmonics of a potentiometer's linearity: an eccentric wiper has one turn's, its bow another.
+#: Harmonics of a potentiometer's linearity: an eccentric wiper makes the first, its bow the second.
 HARMONICS = 3
 #: Functions of one joint's linearity.
 BASIS = 1 + 2 * HARMONICS
-#: Where the parts stand in the vector: the seven frames' tangents, linearity, backlash (two widths), compliance, rest,
+#: Where each part begins in the vector: the seven frames' tangents, linearity, backlash (two widths), compliance, rest,
 #: readings' noise, x, delay.
 LINKS, LINEARITY = 0, 42
 BACKLASH = LINEARITY + 6 * BASIS
 FLOAT, COMPLIANCE, REST, READING, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 7))
 SIZE = DELAY + 1
-#: Zeros of the joints: the turn about z of the frame before each.
+#: Zeros of the joints: the rotation about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
-#: The trace of a turn of 3 rad.
-_HALF_TURN = 1.0 + 2.0 * math.cos(3.0)
+#: The trace of a rotation by 3 rad.
+_LEAST_TRACE = 1.0 + 2.0 * math.cos(3.0)
 
 _kernel = numba.njit(cache=True, error_model="numpy")
 
 
 @dataclass(frozen=True)
 class Prior:
-    """How far an arm may be off before anything is seen: standard deviations.
+    """How far an arm may be off before anything is measured: standard deviations.
 
-    The defaults are of a table-top arm with plastic-film potentiometers; a filter that is told less than the truth trusts
-    the potentiometers too much, one that is told more needs vision a little longer to learn.
+    The defaults are of a table-top arm with plastic-film potentiometers. With priors below the truth a filter trusts the
+    potentiometers too much; with priors above it the filter needs vision a little longer to learn.
 
     Attributes:
-        link_m: shift of a link's frame along each axis, m.
-        link_rad: turn about each, rad.
-        stand_m: shift of the base and of the tool in the hand, beyond that, m.
-        stand_rad: turn of them, rad.
+        link_m: translation of a link's frame along each axis, m.
+        link_rad: rotation about each, rad.
+        stand_m: translation of the base and of the tool in the hand, beyond that, m.
+        stand_rad: rotation of them, rad.
         zero_rad: zero of a potentiometer, rad.
         gain: its scale, relative.
         harmonic_rad: amplitude of the first harmonic of its linearity; the k-th has it over k^1.5, rad.
         backlash_rad: width of the backlash between potentiometer and link, rad, as far as friction decides on its side.
-        float_rad: the same as far as weight and inertia do.
-        compliance: sag per gravity torque of a unit load, rad/m.
+        float_rad: the same as far as gravity and inertia do.
+        compliance: angle per gravity torque of a unit load, rad/m.
         rest_rad: what else a joint is off, rad.
         rest_travel_rad: travel in which it forgets that, rad.
         creep_rad: how far a link creeps in its backlash in a second while its potentiometer stands, rad.
         flip_rad: how uncertain a joint is after a change of side by friction, beyond the width, rad.
-        flip_float_rad: the same of a change by weight and inertia, rad.
+        flip_float_rad: the same of a change by gravity and inertia, rad.
         pose_m: what no joint explains, m.
-        pose_rad: the same of the turn, rad.
+        pose_rad: the same of the rotation, rad.
         pose_travel_rad: travel of all joints together in which that is forgotten, rad.
         reading_rad: noise of one reading of a potentiometer, rad.
     """
@@ -173,14 +173,17 @@ def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
 
 @_kernel
 def _adjoint(F: Frame, G: Frame, out: Array) -> None:
-    """Write Ad(F^-1 G), (6, 6): what a small motion of the inner frame G is in the axes of F."""
+    """Write Ad(F^-1 G), (6, 6), which maps small motions in the axes of G to those in the axes of F.
+
+    This is ``geometry.pose.adjoint`` compiled, on frames as tuples.
+    """
     px, py, pz = G[9] - F[9], G[10] - F[10], G[11] - F[11]
     for row in range(3):
         fx, fy, fz = F[3 * row], F[3 * row + 1], F[3 * row + 2]
         for col in range(3):
             gx, gy, gz = G[3 * col], G[3 * col + 1], G[3 * col + 2]
-            turned = fx * gx + fy * gy + fz * gz
-            out[row, col] = out[3 + row, 3 + col] = turned
+            entry = fx * gx + fy * gy + fz * gz
+            out[row, col] = out[3 + row, 3 + col] = entry
             out[3 + row, col] = 0.0
             out[row, 3 + col] = fx * (py * gz - pz * gy) + fy * (pz * gx - px * gz) + fz * (px * gy - py * gx)
 
@@ -189,7 +192,7 @@ def _adjoint(F: Frame, G: Frame, out: Array) -> None:
 def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Array, H: Array) -> None:
     """Write the tool's pose (4, 4) at readings q (6,), unseen (3, 6), and its derivative (6, SIZE) by the vector x.
 
-    The column of the delay is left zero: it stands in no pose, only in when it was seen.
+    The column of the delay stays zero: the delay changes no pose, only its time.
     """
     motions, B = np.empty(84), np.empty((6, SIZE))
     _small_motions(x, motions)
@@ -240,11 +243,11 @@ def _store_moved(F: Frame, x: Array, T: Array) -> None:
 
 @_kernel
 def tangent(T: Array, T_to: Array, xi: Array) -> None:
-    """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for turns of less than 3 rad, to xi.
+    """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for rotations of less than 3 rad, to xi.
 
-    The turn's vector comes by its quaternion, the shift by the closed inverse of V (Sola, 2018, eq. 145, 174). This is
-    ``geometry.pose.log_se3`` compiled, for the loop. Beyond 3 rad the axis hardly shows: told is half a turn about x, which
-    nothing in the filter believes.
+    The rotation vector comes from its quaternion, the translation from the closed inverse of V (Sola, 2018, eq. 145, 174).
+    This is ``geometry.pose.log_se3`` compiled, for the loop. Beyond 3 rad the axis is hardly defined: the result is a
+    rotation by pi about x, which the filter rejects.
     """
     R, d = np.empty((3, 3)), np.empty(3)
     for row in range(3):
@@ -253,7 +256,7 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
             d[row] += T[k, row] * (T_to[k, 3] - T[k, 3])
         for col in range(3):
             R[row, col] = T[0, row] * T_to[0, col] + T[1, row] * T_to[1, col] + T[2, row] * T_to[2, col]
-    if R[0, 0] + R[1, 1] + R[2, 2] < _HALF_TURN:
+    if R[0, 0] + R[1, 1] + R[2, 2] < _LEAST_TRACE:
         xi[0], xi[1], xi[2], xi[3], xi[4], xi[5] = d[0], d[1], d[2], math.pi, 0.0, 0.0
         return
     w = 0.5 * math.sqrt(1.0 + R[0, 0] + R[1, 1] + R[2, 2])

@@ -1,16 +1,16 @@
-"""Links that float in their backlash: where weight and inertia press them, step by step.
+"""Dynamics of links inside their backlash: where gravity and inertia press them, step by step.
 
-In: angles, speeds and accelerations of the gears' shafts. Out: where each link stands in its play. A joint's gear can only
-push: where weight and acceleration press its link the one way, the link stands at that end of the play; where they change
+In: angles, speeds and accelerations of the gears' shafts. Out: where each link is in its backlash. A joint's gear can only
+push: where gravity and acceleration press its link one way, the link is at that end of the backlash; where they change
 sign it leaves, coasts, and comes to the other end some time later. Potentiometers on the shafts see none of it. Of a link's
 angle beyond its shaft's e, a small one, the links' own equation of motion leaves
 
     M(q) e'' = contact - tau(q, q', q'') - friction,    |e_i| <= w_i / 2,
 
-tau the torque that the links would need to follow their shafts, contact what the ends of the play push. It is stepped at
-the level of speeds, the contacts solved row by row (Moreau's scheme; Acary and Brogliato, "Numerical methods for nonsmooth
-dynamical systems", 2008, chapter 10). Masses are not known: links are rods of one weight per length along the table's d and
-a. That does, as only ratios count: of one torque to another, and to the friction of the links' bearings.
+tau the torque that the links would need to follow their shafts, contact the push of the ends of the backlash. It is
+stepped at the level of speeds, the contacts solved row by row (Moreau's scheme; Acary and Brogliato, "Numerical methods
+for nonsmooth dynamical systems", 2008, ch. 10). Masses are not known: links are rods of one mass per length along the
+table's d and a. That does, as only ratios count: of one torque to another, and to the friction of the links' bearings.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
 
 GRAVITY_M_S2 = 9.81
-#: Friction of a link's bearing, of the greatest torque that its weight and acceleration need: rolling bearings' order.
+#: Friction of a link's bearing over the greatest torque that gravity and acceleration need: typical of rolling bearings.
 BEARING = 0.01
-#: A rod is as thick as this share of the arm's length: what turns about its own axis has inertia, too.
+#: A rod is as thick as this share of the arm's length: what rotates about its own axis has inertia, too.
 _THICK = 0.03
-#: Poses at which the arm is looked at for the greatest torque.
+#: Random poses of which the greatest torque is taken.
 _POSES = 64
 #: Friction grows up to this speed of the link, rad/s; a step that would jump over standstill does not.
 _SLOW_RAD_S = 0.01
@@ -42,7 +42,7 @@ _kernel = numba.njit(cache=True, error_model="numpy")
 
 
 def rods(arm: Arm) -> Array:
-    """Return points with mass (K, 5) that stand for an arm's links: link, mass, place in the frame after the joint's turn.
+    """Return points with mass (K, 5) that stand for an arm's links: link, mass, position in the frame after the joint.
 
     Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m. A last link without length is
     a disc as long as it is thick.
@@ -65,18 +65,18 @@ def rods(arm: Arm) -> Array:
 def masses(arm: Arm) -> tuple[Array, Array]:
     """Return the points (K, 5) that stand for an arm's links, and what each joint has beside them (3, 6).
 
-    That is the inertia of what turns about its own axis, kg m^2, its bearing's friction, N m, both of rods of 1 kg/m, and
+    That is the inertia of what rotates about its own axis, kg m^2, its bearing's friction, N m, both of rods of 1 kg/m, and
     by what a torque of theirs is to be multiplied to become the lever of a unit load, 1/N.
     """
     points = rods(arm)
     beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)])
     own = beyond * 0.5 * _thickness(arm) ** 2
-    M, tau, weight, inertia = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6), np.zeros(6)
+    M, tau, gravity, inertia = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6), np.zeros(6)
     rng, still = np.random.default_rng(0), np.zeros(6)
     for q in rng.uniform(arm.q_min, arm.q_max, (_POSES, 6)):
         _dynamics(arm.table, points, own, q, still, still, M, tau)
-        weight, inertia = np.maximum(weight, np.abs(tau[0])), np.maximum(inertia, np.diag(M))
-    return points, np.stack([own, BEARING * (weight + inertia * arm.qdd_max), 1 / (beyond * GRAVITY_M_S2)])
+        gravity, inertia = np.maximum(gravity, np.abs(tau[0])), np.maximum(inertia, np.diag(M))
+    return points, np.stack([own, BEARING * (gravity + inertia * arm.qdd_max), 1 / (beyond * GRAVITY_M_S2)])
 
 
 def _thickness(arm: Arm) -> float:
@@ -86,13 +86,15 @@ def _thickness(arm: Arm) -> float:
 
 @_kernel
 def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd: Array, M: Array, tau: Array) -> None:
-    """Write the inertia (6, 6) of the links, and what torques they need to bear their weight and to move so, (2, 6).
+    """Write the inertia (6, 6) of the links, and the torques that they need against gravity and to move so, (2, 6).
 
     Speeds and accelerations go out from the base, link by link (Siciliano et al., "Robotics", 2009, section 7.5.2).
     """
     axes, J = np.empty((6, 6)), np.empty((6, 3))
     M[:], tau[:] = 0.0, 0.0
-    wx = wy = wz = bx = by = bz = ax = ay = az = 0.0  # turning speed, its rate, and the acceleration of the axis' point
+    wx = wy = wz = bx = by = bz = ax = ay = az = (
+        0.0  # angular velocity, its rate, and the acceleration of the axis' point
+    )
     F, n = first_frame(table), 0
     for i in range(6):
         way = table[6 * i + 5]
@@ -135,7 +137,7 @@ def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd:
 def _beyond(
     wx: float, wy: float, wz: float, bx: float, by: float, bz: float, rx: float, ry: float, rz: float
 ) -> tuple[float, float, float]:
-    """Return the acceleration of a point at r of a body beyond that of its origin, for turning speed w and its rate b."""
+    """Return the acceleration of a point at r of a body beyond that of its origin, for angular velocity w, its rate b."""
     vx, vy, vz = wy * rz - wz * ry, wz * rx - wx * rz, wx * ry - wy * rx
     return (
         by * rz - bz * ry + wy * vz - wz * vy,
@@ -152,11 +154,11 @@ def _step(
     motion: Array,
     dt: float,
     half: Array,
-    place: Array,
+    position: Array,
     speed: Array,
     lever: Array,
 ) -> None:
-    """Move links on in half their plays by a time dt: place and speed (6,) beyond their shafts, rad, rad/s; write levers.
+    """Step links in half their backlash by a time dt: position and speed (6,) off their shafts, rad, rad/s; write levers.
 
     The shafts' motion (3, 6) is angles, speeds and accelerations.
     """
@@ -174,14 +176,14 @@ def _step(
             for j in range(6):
                 if j != i:
                     x -= M[i, j] * speed[j]
-            speed[i] = min(max(x / M[i, i], (-half[i] - place[i]) / dt), (half[i] - place[i]) / dt)
+            speed[i] = min(max(x / M[i, i], (-half[i] - position[i]) / dt), (half[i] - position[i]) / dt)
     for i in range(6):
-        place[i] += dt * speed[i]
+        position[i] += dt * speed[i]
 
 
 @_kernel
 def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> None:
-    """Write 1 where the bearing of a link holds it against its weight at angles q (6,), else 0, out (6,)."""
+    """Write 1 where the bearing of a link holds it against gravity at angles q (6,), else 0, to out (6,)."""
     M, tau, none = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6)
     _dynamics(table, points, beside[0], q, none, none, M, tau)
     for i in range(6):
@@ -202,13 +204,13 @@ def float_on(
     still: float,
     gap: Array,
 ) -> None:
-    """Let links float from row to row of readings.
+    """Step links inside their backlash from row to row of readings.
 
     Args:
         t: (N,) times of the readings, s.
         q: (N, 6) readings, rad.
-        memory: (N, 4, 6) to be written: place and speed in half gaps, how far the links have come in that, and lever of the
-            torque of inertia, m.
+        memory: (N, 4, 6) to be written: position and speed in half gaps, how far the links have come in that, and lever
+            of the torque of inertia, m.
         first: first row there is.
         begin: first row to be written.
         end: the row after the last.
@@ -217,9 +219,9 @@ def float_on(
         beside: what each joint has beside them (3, 6).
         still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
             it is while its shaft creeps.
-        gap: (6,) the play, rad.
+        gap: (6,) the backlash, rad.
     """
-    motion, place, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
+    motion, position, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
     free, stood, was = np.empty(6), False, np.empty(6)
     begin = max(begin, first + 1)
     for k in range(begin - 1, end):
@@ -227,19 +229,19 @@ def float_on(
         low, high = window(t, first, end - first, t[k], span(t[k], t[end - 1]))
         fit(t, q, low, high, t[k], motion)
         stands = np.abs(motion[1]).max() <= still
-        if stands and not stood:  # as long as it stands its weight presses the same links
+        if stands and not stood:  # as long as it stands gravity presses the same links
             loose(table, points, beside, motion[0], free)
             was[:] = motion[0]
         stood = stands
         if k < begin:
             continue
         before, now = memory[k - 1], memory[k]
-        place[:], speed[:] = before[0] * half, before[1] * half
+        position[:], speed[:] = before[0] * half, before[1] * half
         if stands:
             for i in range(6):
-                place[i] = min(max(place[i] - free[i] * (motion[0, i] - was[i]), -half[i]), half[i])
+                position[i] = min(max(position[i] - free[i] * (motion[0, i] - was[i]), -half[i]), half[i])
             speed[:], now[3] = 0.0, 0.0
         else:
-            _step(table, points, beside, motion, min(t[k] - t[k - 1], _LONGEST_STEP_S), half, place, speed, now[3])
-        now[0], now[1] = place / half, speed / half
+            _step(table, points, beside, motion, min(t[k] - t[k - 1], _LONGEST_STEP_S), half, position, speed, now[3])
+        now[0], now[1] = position / half, speed / half
         now[2] = before[2] + np.abs(now[0] - before[0])

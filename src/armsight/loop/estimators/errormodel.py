@@ -1,4 +1,4 @@
-"""The filter's model at work: the tool's poses by a state, and what motion makes the state forget.
+"""The filter's process and measurement model: the tool's poses by a state, and what motion makes the state forget.
 
 In: the vector of ``armerror`` with its covariance, and the joints as ``readings`` has them. Out: poses with derivatives,
 and what first-order Gauss-Markov processes in travel keep and add. Equations: docs/loop.md.
@@ -21,19 +21,19 @@ from armsight.robot.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.
 LONGEST_CREEP_S = 4.0
-#: So many times as uncertain a joint is after a change of side to those who learn from it. What comes some hundredths of a
-#: second early or late would be taken for a narrower backlash else.
+#: A joint counts as so many times as uncertain after a change of side while the filter learns from it. Without this, a
+#: change some hundredths of a second early or late would be taken for a narrower backlash.
 LEARNING = 6.0
 
-#: What is thrown open when vision insists, as after a bump: how the arm stands and holds its tool, and the joints' zeros.
+#: Sigmas added when vision contradicts the state again and again, as after a bump: to base and tool, and the joints' zeros.
 OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 #: Of the vector the noise that smoothing left in the readings (6,).
 NOISE = slice(READING, POSE)
 _LEAST = 1e-9  # of a share
 
 
-class State(NamedTuple):
-    """The filter right after a pose_measurement, or before the first.
+class ErrorState(NamedTuple):
+    """The filter right after a pose measurement, or before the first.
 
     ``x`` (SIZE,) and ``P`` (SIZE, SIZE): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
     readings smoothed them then, N = 1; ``pose_measurement``: what went in last.
@@ -46,15 +46,15 @@ class State(NamedTuple):
     pose_measurement: PoseMeasurement | None
 
 
-class Step(NamedTuple):
-    """What motion does to the state: factors (SIZE,) by which it is remembered, and variances (SIZE,) that are added."""
+class Propagation(NamedTuple):
+    """Propagation of the state by motion: factors (SIZE,) that multiply it, and variances (SIZE,) that are added."""
 
     kept: Array
     added: Array
 
 
 def _opened() -> Array:
-    """Return the variances (SIZE,) that are added where all is thrown open."""
+    """Return the variances (SIZE,) that are added when the filter reopens."""
     sigmas = np.zeros(SIZE)
     sigmas[:6] = sigmas[36:42] = np.repeat([OPEN_M, OPEN_RAD], 3)
     sigmas[ZEROS] = OPEN_RAD
@@ -64,10 +64,10 @@ def _opened() -> Array:
 OPENED = _opened()
 
 
-def smoothed_anew(state: State, then: Smoothed) -> State:
-    """Return a state as it is when the readings about its time are smoothed anew: where the joints were has not changed.
+def smoothed_anew(state: ErrorState, then: Smoothed) -> ErrorState:
+    """Return a state after the readings about its time have been smoothed again: the joints' true angles stay the same.
 
-    What is smoothed otherwise had another noise; links that were elsewhere in their play were off by another rest.
+    Other smoothing leaves other noise; a link elsewhere in its backlash is off by another rest.
     """
     x = state.x.copy()
     x[NOISE] += state.joints.q[0] - then.q[0]
@@ -77,11 +77,12 @@ def smoothed_anew(state: State, then: Smoothed) -> State:
     return state._replace(x=x, joints=then)
 
 
-def bridged(before: Array, after: Array, ahead: Step, back: Step) -> tuple[Array, Array]:
+def bridged(before: Array, after: Array, ahead: Propagation, back: Propagation) -> tuple[Array, Array]:
     """Return the readings' noise (N, 6) between the states before and after (N, SIZE), and what is added to variances.
 
-    The noise is held by both ends, as a Gauss-Markov process is: its mean there, and what is left of its variance. The
-    rest is known from the nearer end alone: what shakes faster than the cameras look is not held by both ends.
+    The noise is bounded by both ends, as a Gauss-Markov process is: its mean between them, and what is left of its
+    variance. The rest is known from the nearer end alone: vibration faster than the cameras' rate is not bounded by
+    both ends.
     """
     near, far = ahead.kept[:, NOISE] ** 2, back.kept[:, NOISE] ** 2
     whole = np.maximum(1.0 - near * far, _LEAST)
@@ -92,7 +93,7 @@ def bridged(before: Array, after: Array, ahead: Step, back: Step) -> tuple[Array
 
 
 class ErrorModel:
-    """An arm and what makes its potentiometers wrong.
+    """An arm and the error model of its potentiometers.
 
     Args:
         arm: the arm, as its table says it is.
@@ -100,7 +101,7 @@ class ErrorModel:
         sigma_delay_s: how far the camera's delay may be.
 
     Attributes:
-        sigmas: (SIZE,) standard deviations of the vector before anything is seen.
+        sigmas: (SIZE,) standard deviations of the vector before anything is measured.
     """
 
     def __init__(self, arm: Arm, prior: Prior, sigma_delay_s: float) -> None:
@@ -116,7 +117,7 @@ class ErrorModel:
         armerror.poses_and_derivatives(self._table, xs, q, unseen, Ts, Hs)
         return Ts, Hs
 
-    def moved(self, state: State, joints: Smoothed, t_s: Array, *, learning: float = 1.0) -> Step:
+    def moved(self, state: ErrorState, joints: Smoothed, t_s: Array, *, learning: float = 1.0) -> Propagation:
         """Return what motion and time (N,) since a state, or before it, do to it: factors and variances (N, SIZE).
 
         Changes of side leave the joints ``learning`` times as uncertain as they are.
@@ -127,7 +128,7 @@ class ErrorModel:
 
     def carried(
         self, time_s: Array, travel: Array, flips: Array, was: Array, joints: Smoothed, *, learning: float = 1.0
-    ) -> Step:
+    ) -> Propagation:
         """Return the same for times (N,), and how far joints (N, 6) and sides (N, 2, 6) have come.
 
         Args:
@@ -141,10 +142,10 @@ class ErrorModel:
         kept, added = np.ones((len(time_s), SIZE)), np.zeros((len(time_s), SIZE))
         noise = joints.variance, joints.lasts_s, was
         _forget(time_s, travel, flips, *noise, self.sigmas, self._forgets, learning, kept, added)
-        return Step(kept, added)
+        return Propagation(kept, added)
 
-    def covariances(self, state: State, step: Step, Hs: Array) -> Array:
-        """Return the covariances (N, 6, 6) of poses that a state tells, a step on, without what all sightings share."""
+    def covariances(self, state: ErrorState, step: Propagation, Hs: Array) -> Array:
+        """Return the covariances (N, 6, 6) of poses by a propagated state, without what all measurements share."""
         own = np.empty((len(Hs), 6, 6))
         _covariances(Hs, step.kept, step.added, state.P, own)
         return own
@@ -218,7 +219,7 @@ def _covariances(Hs: Array, kept: Array, added: Array, P: Array, own: Array) -> 
 
 @numba.njit(cache=True, error_model="numpy")
 def symmetric(P: Array) -> None:
-    """Put the mean of a covariance (N, N) and its transpose in its place."""
+    """Overwrite a covariance (N, N) with the mean of it and its transpose."""
     for i in range(len(P)):
         for j in range(i):
             P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
@@ -243,9 +244,9 @@ def chi_square(S: Array, z: Array) -> float:
 
 
 def shared(pose_measurement: PoseMeasurement | None, Ts: Array) -> Array:
-    """Return what all sightings share, (N, 6, 6), seen in the axes of poses (N, 4, 4)."""
+    """Return the covariance (N, 6, 6) that all measurements share, in the axes of poses (N, 4, 4)."""
     if pose_measurement is None:
         return np.zeros((len(Ts), 6, 6))
-    turn = np.zeros((len(Ts), 6, 6))
-    turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ pose_measurement.T_base_tool[:3, :3]
-    return np.asarray(turn @ pose_measurement.cov_common @ np.swapaxes(turn, 1, 2))
+    rotation = np.zeros((len(Ts), 6, 6))
+    rotation[:, :3, :3] = rotation[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ pose_measurement.T_base_tool[:3, :3]
+    return np.asarray(rotation @ pose_measurement.cov_common @ np.swapaxes(rotation, 1, 2))

@@ -1,10 +1,10 @@
-"""The contract of an estimator: potentiometer readings and sightings go in, where the tool is comes out.
+"""The contract of an estimator: potentiometer readings and pose measurements go in, the tool's pose comes out.
 
-A member of this family takes the joints' readings as they come and what vision saw, late and out of order as it may be,
-and answers at any time within the last second or two. To write a new one: a class with the five methods of
-:class:`Estimator`; :class:`~armsight.loop.estimators.readings.Readings` keeps and smooths the joints for you; add it to the
-registry in ``__init__``. All times are on one clock, the board's (``JointStates.t_s``). Poses are ``T_base_tool``,
-covariances of their right tangent [translation m; rotation rad].
+A member of this family takes the joints' readings as they come and vision's pose measurements, which may be late and out of
+order, and returns an estimate for any time within the last second or two. To write a new one: a class with the five
+methods of :class:`Estimator`; :class:`~armsight.loop.estimators.readings.Readings` keeps and smooths the joints for
+you; add it to the registry in ``__init__``. All times are on one clock, the board's (``JointStates.t_s``). Poses are
+``T_base_tool``, covariances of their right tangent [translation m; rotation rad].
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from armsight.data import Array, JointStates, Record
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurement(Record):
-    """Where vision saw the tool.
+    """A pose of the tool measured by vision.
 
     Attributes:
         t_s: the middle of the exposure as the camera stamps it, s; the camera's delay is still in it.
@@ -33,19 +33,19 @@ class PoseMeasurement(Record):
     cov_common: Array
 
 
-class Verdict(Enum):
-    """What became of a sighting."""
+class Outcome(Enum):
+    """The outcome of a pose measurement given to an estimator."""
 
     USED = "used"
     WAITING = "waiting: newer than the newest potentiometer reading, used when that comes"
     OUTLIER = "outlier: too far from where the arm can be"
-    REOPENED = "used: several agree against what was learned, so that was thrown open"
+    REOPENED = "used: several agree against what was learned, so its uncertainty was reset"
     TOO_LATE = "too late: older than what is kept"
 
 
 @dataclass(frozen=True)
 class Delay:
-    """How late a camera's stamps are on the board's clock: seen at ``t_s - delay_s``.
+    """How late a camera's stamps are on the board's clock: the exposure was at ``t_s - delay_s``.
 
     Attributes:
         delay_s: the delay, s.
@@ -60,16 +60,16 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class Track(Record):
-    """Where the tool is at N times.
+    """Poses of the tool at N times.
 
     Attributes:
         t_s: (N,) times, s.
         Ts_base_tool: (N, 4, 4) poses of the tool, m.
-        covs: (N, 6, 6) their covariance, all in.
-        covs_own: (N, 6, 6) the same without what all sightings share (``PoseMeasurement.cov_common``).
+        covs: (N, 6, 6) their covariance, everything included.
+        covs_own: (N, 6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
         q: (N, 6) potentiometers, smoothed, rad.
         qd: (N, 6) their speeds, rad/s.
-        vision_age_s: (N,) time since the newest sighting used, s; infinite before the first.
+        vision_age_s: (N,) time since the newest measurement used, s; infinite before the first.
     """
 
     t_s: Array
@@ -99,16 +99,16 @@ class Track(Record):
 
 @dataclass(frozen=True, eq=False)
 class ArmEstimate(Record):
-    """Where the tool is.
+    """The pose of the tool at one time.
 
     Attributes:
         t_s: when, s.
         T_base_tool: (4, 4) pose of the tool, m.
-        cov: (6, 6) its covariance, all in.
-        cov_own: (6, 6) the same without what all sightings share (``PoseMeasurement.cov_common``).
+        cov: (6, 6) its covariance, everything included.
+        cov_own: (6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
         q: (6,) potentiometers, smoothed, rad.
         qd: (6,) their speeds, rad/s.
-        vision_age_s: time since the newest sighting used, s; infinite before the first.
+        vision_age_s: time since the newest measurement used, s; infinite before the first.
     """
 
     t_s: float
@@ -125,7 +125,7 @@ class Learned(Record):
     """What a filter has learned about an arm.
 
     Attributes:
-        joint_offset: (6,) what the joints are beyond their readings where they stand now, rad.
+        joint_offset: (6,) true joint angles minus readings where the joints are now, rad.
         sigma_joint_offset: (6,) standard deviations; wide where two joints' errors look alike to vision.
         backlash: (6,) widths between potentiometer and link, rad.
         sigma_backlash: (6,) standard deviations.
@@ -142,18 +142,18 @@ class Learned(Record):
 
 
 class Estimator(Protocol):
-    """Says where the tool is, from potentiometers and vision."""
+    """Estimates the pose of the tool from potentiometers and vision."""
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
         ...
 
-    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
-        """Take what vision saw, in any order; returns what became of it."""
+    def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
+        """Take a pose measurement, in any order of time; return what became of it."""
         ...
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
-        """Return where the tool is at a time, by default that of the newest reading.
+        """Return the pose of the tool at a time, by default that of the newest reading.
 
         Raises:
             InputError: no reading has come yet, or ``t_s`` is not within those kept.
@@ -167,6 +167,7 @@ class Estimator(Protocol):
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
         """Return T_base_tool (N, 4, 4) if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now.
 
-        With ``pressed`` joints that move have moved so far that their gears push also links that no weight presses.
+        With ``pressed``, joints that move have moved far enough for their gears to push also links that gravity does
+        not load.
         """
         ...

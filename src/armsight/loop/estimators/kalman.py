@@ -1,11 +1,12 @@
-"""An error-state Kalman filter: potentiometers carry the movement, vision says how far they are off.
+"""An error-state Kalman filter: potentiometers give the motion, vision corrects their errors.
 
-In: readings at 1 kHz, sightings at camera rate, late and out of order. Out: the tool's pose at 1 kHz with covariance. The
-state is not where the arm is but what makes its potentiometers wrong (``armerror``); it stands still but for what joint
-motion makes it forget, so between sightings there is nothing to integrate: the pose at any time is the model at that
-time's readings, and a late sighting goes in by taking up the state kept before it and the sightings after it again.
-What all sightings share (calibration) is no noise and is not averaged: the state is learned as vision sees it, and the
-shared covariance is added to what comes out (Schmidt, 1966: considered, not estimated). Equations: docs/loop.md.
+In: readings at 1 kHz, pose measurements at camera rate, late and out of order. Out: the tool's pose at 1 kHz with
+covariance. The state is not the arm's pose but the errors of its potentiometers (``armerror``); it is constant except for
+what joint motion makes it forget, so between measurements there is nothing to integrate: the pose at any time is the model
+at that time's readings. For a late measurement the filter returns to the state kept before it, and applies it and those
+after it again. What all measurements share (calibration) is no noise and is not averaged: the state is learned as vision
+measures it, and the shared covariance is added to the output (Schmidt, 1966: considered, not estimated). Equations:
+docs/loop.md.
 """
 
 from __future__ import annotations
@@ -18,21 +19,30 @@ from scipy.special import chdtri
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
-from armsight.loop.estimators.errormodel import LEARNING, NOISE, OPENED, ErrorModel, State, Step, chi_square, symmetric
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, PoseMeasurement, Track, Verdict
+from armsight.loop.estimators.errormodel import (
+    LEARNING,
+    NOISE,
+    OPENED,
+    ErrorModel,
+    ErrorState,
+    Propagation,
+    chi_square,
+    symmetric,
+)
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
-from armsight.loop.estimators.smoothing import Stretch, anew, blended, by_state, stretches
+from armsight.loop.estimators.smoothing import Interval, anew, blended, by_state, intervals
 from armsight.robot.arm import Arm
 
-#: A sighting less likely than this is an outlier.
+#: A measurement less likely than this is an outlier.
 CHANCE = 1e-6
-#: Outliers in a row that agree with each other and are then believed: no marker is mistaken the same way so often.
+#: So many outliers in a row that agree with each other are then used: no marker is mistaken the same way so often.
 STUBBORN = 6
-#: States kept for late sightings, s.
+#: States kept for late measurements, s.
 HISTORY_S = 1.0
-#: Sightings newer than the readings that are kept waiting.
+#: Most measurements newer than the readings that are kept waiting.
 MOST_WAITING = 16
-#: Linearisations per sighting at most, and the change (m, rad) that ends them: it leaves about its square.
+#: Linearisations per measurement at most, and the change (m, rad) that ends them: it leaves about its square.
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
@@ -51,8 +61,8 @@ class KalmanEstimator:
         arm: the arm, as its table says it is.
         prior: how far it may be off.
         delay: how late the camera's stamps are.
-        learns_delay: whether the delay is corrected, as far as its sigma allows, or left as it is and its sigma reckoned
-            with: then what is not modelled of the play cannot be taken for it.
+        learns_delay: whether the delay is corrected, as far as its sigma allows. If not, only its sigma is used, and what
+            the model misses of the backlash cannot be taken for delay.
     """
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
@@ -61,24 +71,24 @@ class KalmanEstimator:
         self._model = ErrorModel(arm, self._prior, delay.sigma_s)
         none, ones = np.zeros((1, 6)), np.ones((1, 6))
         nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, 6)), none, np.zeros((1, 2, 6)))
-        self._states = [State(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
+        self._states = [ErrorState(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
         self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
-        self._told = True  # whether the readings know how wide the backlash is, as far as that is known
+        self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
-        self._here: tuple[State, Smoothed, Step] | None = None
+        self._here: tuple[ErrorState, Smoothed, Propagation] | None = None
         self._newest: ArmEstimate | None = None
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The oldest and the newest time for which it can be asked, s."""
+        """The oldest and the newest time that can be estimated, s."""
         return self._readings.span_s
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
         self._newest = self._here = None
-        if not self._told:  # not when it was seen: a command waits for that
-            self._told = True
+        if not self._backlash_set:  # not when it was measured: a command waits for that
+            self._backlash_set = True
             self._readings.set_backlash(self._backlash())
         self._readings.add(states)
         if self._waiting:
@@ -86,42 +96,42 @@ class KalmanEstimator:
             for pose_measurement in waiting:
                 self.vision(pose_measurement)
 
-    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
-        """Take what vision saw, in any order; returns what became of it."""
+    def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
+        """Take a pose measurement, in any order of time; return what became of it."""
         self._newest = self._here = None
         oldest, newest = self.span_s
-        place = len(self._states)
-        while place > 1 and self._after(self._states[place - 1], pose_measurement):
-            place -= 1
-        before = self._states[place - 1]
+        row = len(self._states)
+        while row > 1 and self._after(self._states[row - 1], pose_measurement):
+            row -= 1
+        before = self._states[row - 1]
         seen_s = self._seen_s(pose_measurement, before)
         if seen_s > newest:
             self._waiting = [*self._waiting, pose_measurement][-MOST_WAITING:]
-            return Verdict.WAITING
+            return Outcome.WAITING
         if seen_s < oldest or (
-            place == 1 and before.pose_measurement is not None and self._after(before, pose_measurement)
+            row == 1 and before.pose_measurement is not None and self._after(before, pose_measurement)
         ):
-            return Verdict.TOO_LATE
-        later = self._states[place:]
-        after, verdict = self._take(before, pose_measurement)
+            return Outcome.TOO_LATE
+        later = self._states[row:]
+        after, outcome = self._take(before, pose_measurement)
         if after is None:
-            return verdict
-        self._states[place:] = [after]
+            return outcome
+        self._states[row:] = [after]
         for state in later:
             again, _ = (
                 self._take(self._states[-1], state.pose_measurement)
                 if state.pose_measurement is not None
-                else (None, verdict)
+                else (None, outcome)
             )
             if again is not None:
                 self._states.append(again)
-        self._told = False
+        self._backlash_set = False
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
-        return verdict
+        return outcome
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
-        """Return where the tool is at a time, by default that of the newest reading."""
+        """Return the pose of the tool at a time, by default that of the newest reading."""
         if t_s is not None:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
@@ -129,35 +139,35 @@ class KalmanEstimator:
             self._newest = by_state(self._model, state, np.array([self.span_s[1]]), joints, step)[0]
         return self._newest
 
-    def _now(self) -> tuple[State, Smoothed, Step]:
-        """Return the state after the newest sighting, the joints at the newest reading, and what moved meanwhile."""
+    def _now(self) -> tuple[ErrorState, Smoothed, Propagation]:
+        """Return the state after the newest measurement, the joints at the newest reading, and the propagation to it."""
         if self._here is None:
             self._here = self._since(np.array([self.span_s[1]]))
         return self._here
 
-    def _since(self, t_s: Array) -> tuple[State, Smoothed, Step]:
+    def _since(self, t_s: Array) -> tuple[ErrorState, Smoothed, Propagation]:
         """Return the same at (N,) times."""
         joints, (state,) = self._readings.at(t_s), anew(self._readings, self._states[-1:])
         return state, joints, self._model.moved(state, joints, t_s)
 
     def track(self, t_s: Array) -> Track:
-        """Return where the tool is at (N,) times."""
+        """Return the poses of the tool at (N,) times."""
         state, joints, step = self._since(np.asarray(t_s, dtype=float))
         return by_state(self._model, state, t_s, joints, step)
 
     def smoothed(self, t_s: Array) -> Track:
-        """Return where the tool was at (N,) times, rising, with the sightings after them heard, too: for the record.
+        """Return the poses of the tool at (N,) times, rising, with the measurements after them used, too: for the record.
 
-        Times newer than the newest sighting are as in :meth:`track`.
+        Times newer than the newest measurement are as in :meth:`track`.
         """
-        return self.blended(self.stretches(t_s))
+        return self.blended(self.intervals(t_s))
 
-    def stretches(self, t_s: Array) -> list[Stretch]:
-        """Return times (N,), rising, with what was heard around them up to now: for :meth:`blended`, soon after."""
-        return stretches(self._states, t_s)
+    def intervals(self, t_s: Array) -> list[Interval]:
+        """Return times (N,), rising, grouped by the measurements around them so far: for :meth:`blended`, soon after."""
+        return intervals(self._states, t_s)
 
-    def blended(self, parts: list[Stretch]) -> Track:
-        """Return where the tool was at the times of stretches as :meth:`smoothed` does; many cost little more than one."""
+    def blended(self, parts: list[Interval]) -> Track:
+        """Return the poses of the tool at the times of intervals as :meth:`smoothed` does; many cost little extra."""
         return blended(self._model, self._readings, parts)
 
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
@@ -191,22 +201,22 @@ class KalmanEstimator:
         )
 
     def _backlash(self) -> Array:
-        """Return the widths (6,) to reckon with: what is learned, as far as it is, else the middle of what gears have."""
+        """Return the backlash (6,) to use, rad: learned and typical (GAP_RAD), weighted by how well it is known."""
         state = self._states[-1]
         known = 1 - np.diag(WIDTHS @ state.P @ WIDTHS.T) / (WIDTHS @ self._model.sigmas**2)
         return np.asarray(known * (WIDTHS @ state.x) + (1 - known) * GAP_RAD)
 
     @staticmethod
-    def _after(state: State, pose_measurement: PoseMeasurement) -> bool:
-        """Say whether a state has seen what is newer than a sighting."""
+    def _after(state: ErrorState, pose_measurement: PoseMeasurement) -> bool:
+        """Return whether a state has used a measurement newer than this one."""
         return state.pose_measurement is not None and state.pose_measurement.t_s > pose_measurement.t_s
 
-    def _seen_s(self, pose_measurement: PoseMeasurement, state: State) -> float:
-        """Return when a sighting was, by the delay as a state knows it, s."""
+    def _seen_s(self, pose_measurement: PoseMeasurement, state: ErrorState) -> float:
+        """Return the time of a measurement, s, by a state's estimate of the delay."""
         return pose_measurement.t_s - self._delay.delay_s - float(state.x[DELAY])
 
-    def _take(self, before: State, pose_measurement: PoseMeasurement) -> tuple[State | None, Verdict]:
-        """Return the state after a sighting, None where it is an outlier."""
+    def _take(self, before: ErrorState, pose_measurement: PoseMeasurement) -> tuple[ErrorState | None, Outcome]:
+        """Return the state after a measurement, None where it is an outlier."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
@@ -216,21 +226,21 @@ class KalmanEstimator:
         P[DIAGONAL] += step.added[0]
         z, H, R = first = self._innovation(x, joints, pose_measurement)
         PHt = P @ H.T
-        verdict = self._judge(z, H @ PHt + R + pose_measurement.cov_common)
-        if verdict is Verdict.OUTLIER:
-            return None, verdict
-        if verdict is Verdict.REOPENED:
+        outcome = self._gate(z, H @ PHt + R + pose_measurement.cov_common)
+        if outcome is Outcome.OUTLIER:
+            return None, outcome
+        if outcome is Outcome.REOPENED:
             P[DIAGONAL] += OPENED
             PHt = P @ H.T
         x, P = self._update(x, P, joints, pose_measurement, first, PHt)
-        return State(t_s, x, P, joints, pose_measurement), verdict
+        return ErrorState(t_s, x, P, joints, pose_measurement), outcome
 
     def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
-        """Return how far a sighting is from the model (6,), its derivative (6, SIZE) by x, and the noise (6, 6)."""
+        """Return the innovation (6,) of a measurement, the model's derivative (6, SIZE) by x, and the noise (6, 6)."""
         Ts, Hs = self._model.poses(x[None], joints.q, joints.unseen)
         H = Hs[0]
         velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
-        H[:, DELAY] = -velocity  # seen earlier by so much, the tool was not yet as far
+        H[:, DELAY] = -velocity  # measured earlier by so much, the tool had not moved as far
         R = pose_measurement.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
         z = np.empty(6)
         armerror.tangent(Ts[0], pose_measurement.T_base_tool, z)
@@ -245,13 +255,13 @@ class KalmanEstimator:
         first: tuple[Array, Array, Array],
         PHt: Array,
     ) -> tuple[Array, Array]:
-        """Return state and covariance after a sighting: the iterated update (Bell and Cathey, 1993), from a first look.
+        """Return state and covariance after a measurement: the iterated update (Bell and Cathey, 1993), from a first look.
 
         Args:
             x: the state.
-            P: its covariance, which is taken for the result.
-            joints: at the sighting.
-            sighting: what was seen.
+            P: its covariance, which is overwritten by the result.
+            joints: at the measurement.
+            pose_measurement: the measurement.
             first: innovation, derivative and noise at x.
             PHt: the product of P and the derivative's transpose.
         """
@@ -273,17 +283,17 @@ class KalmanEstimator:
         symmetric(P)
         return x + change, P
 
-    def _judge(self, z: Array, S: Array) -> Verdict:
-        """Say whether an innovation is to be believed."""
+    def _gate(self, z: Array, S: Array) -> Outcome:
+        """Return whether an innovation (6,) with covariance (6, 6) is used, an outlier, or one too many to ignore."""
         if chi_square(S, z) < _GATE:
             self._outliers = []
-            return Verdict.USED
+            return Outcome.USED
         if self._outliers:
             apart = z - self._outliers[-1]
             if chi_square(S, apart) > _GATE:
                 self._outliers = []
         self._outliers.append(z)
         if len(self._outliers) < STUBBORN:
-            return Verdict.OUTLIER
+            return Outcome.OUTLIER
         self._outliers = []
-        return Verdict.REOPENED
+        return Outcome.REOPENED

@@ -1,4 +1,4 @@
-"""The newest vision pose as it is: no filter, no joints in between; what a loop on bare vision has to work with."""
+"""The newest pose measured by vision as it is: no filter, no joints in between, as a loop on vision alone would have it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import numpy as np
 from armsight.data import Array, JointStates
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, PoseMeasurement, Track, Verdict
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.robot.arm import Arm
 
 
 class LatestEstimator:
-    """Holds the newest sighting until the next; potentiometers alone before the first.
+    """Holds the newest measurement until the next; potentiometers alone before the first.
 
     Args:
         arm: the arm, as its table says it is.
-        prior: how far the arm may be off, for the covariance before the first sighting.
+        prior: how far the arm may be off, for the covariance before the first measurement.
         delay: how late the camera's stamps are.
     """
 
@@ -31,22 +31,22 @@ class LatestEstimator:
         """Take readings of the potentiometers, in order of time."""
         self._alone.joints(states)
 
-    def vision(self, pose_measurement: PoseMeasurement) -> Verdict:
-        """Take what vision saw; older than the newest, it is not used."""
+    def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
+        """Take a pose measurement; one older than the newest is not used."""
         if self._newest is not None and pose_measurement.t_s <= self._newest.t_s:
-            return Verdict.TOO_LATE
+            return Outcome.TOO_LATE
         seen_s = float(np.clip(pose_measurement.t_s - self._delay.delay_s, *self._alone.span_s))
         at = self._alone.estimate(seen_s)
         self._newest = pose_measurement
         self._offset = inverse(self._arm.forward(at.q)) @ pose_measurement.T_base_tool
-        return Verdict.USED
+        return Outcome.USED
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
-        """Return the newest sighting, whatever has moved since."""
+        """Return the newest measurement, whatever has moved since."""
         return self.track(np.array([self._alone.span_s[1] if t_s is None else t_s]))[0]
 
     def track(self, t_s: Array) -> Track:
-        """Return the newest sighting, N times."""
+        """Return the newest measurement at (N,) times."""
         alone = self._alone.track(t_s)
         if self._newest is None:
             return alone
@@ -58,5 +58,5 @@ class LatestEstimator:
         return Track(alone.t_s, Ts, covs, covs_own, alone.q, alone.qd, age)
 
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
-        """Return T_base_tool if the potentiometers were to read q (N, 6): the table's, moved as the newest sighting was."""
+        """Return T_base_tool if the potentiometers read q (N, 6): the table's, moved as the newest measurement was."""
         return np.asarray(self._arm.forward(q) @ self._offset)

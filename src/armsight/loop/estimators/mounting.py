@@ -1,4 +1,4 @@
-"""How cameras and marker body are mounted: what turns a measured pose of the body into a sighting of the tool."""
+"""How cameras and marker body are mounted: converts measured poses of the body into pose measurements of the tool."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from armsight.data import Array, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import inverse
+from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.estimators.estimator import PoseMeasurement
-from armsight.loop.handeye.handeye import HandEye, adjoint
+from armsight.loop.handeye.handeye import HandEye
 from armsight.robot.arm import Arm
 
 
@@ -61,7 +61,7 @@ class Mounting(Record):
             InputError: ``t_s`` is no number.
         """
         if not np.isfinite(t_s):
-            raise InputError(f"t_s is {t_s}; a sighting needs the time of its exposure, s")
+            raise InputError(f"t_s is {t_s}; a measurement needs the time of its exposure, s")
         T_rig_body, to_tool = checked(pose.T_left_body, (4, 4), "T_left_body"), self._to_tool
         common = _positive(pose.cov - pose.cov_noise)
         if self.cov.any():

@@ -14,7 +14,7 @@ from armsight.data import Array
 #: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
 SPAN_S = 0.049
 #: Where as many follow as went before it is up to this, s: a centred parabola is not led astray by jerk. Of accelerations
-#: that leaves a sixth of the noise, and of what passes between two sightings, which hold the rest, a third.
+#: that leaves a sixth of the noise, and of what passes between two measurements, which hold the rest, a third.
 LONG_SPAN_S = 2 * SPAN_S
 #: Fewest readings for a parabola; fewer are averaged.
 PARABOLA = 5
@@ -24,7 +24,7 @@ _kernel = numba.njit(cache=True, error_model="numpy")
 
 @_kernel
 def span(at: float, newest: float) -> float:
-    """Return the time, s, within which readings tell of a time when the newest is of another, s."""
+    """Return the span of readings, s, that are smoothed for a time when the newest reading is of another, s."""
     return min(max(2 * (newest - at), SPAN_S), LONG_SPAN_S)
 
 

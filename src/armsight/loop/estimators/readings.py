@@ -3,8 +3,8 @@
 In: JointStates. Out: joint angles and speeds at any time kept, and what smoothing leaves of a reading's noise. At a time t
 a parabola is laid through the readings around it, or before it where it is the newest (``parabola``). Beside each reading
 stands how far every joint has travelled and on which side of its backlash it should be, twice: if friction decides on it,
-the play operator (Krasnosel'skii and Pokrovskii, "Systems with hysteresis", 1989), behind a dead zone that the readings'
-noise does not cross; if weight and inertia do, where its link floats (``floating``).
+the backlash operator (Krasnosel'skii and Pokrovskii, "Systems with hysteresis", 1989), behind a dead zone that
+the readings' noise does not cross; if gravity and inertia do, where its link floats (``backlash_dynamics``).
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ KEPT_S = 2.0
 #: Dead zone before a joint counts as moved, in standard deviations of a smoothed newest reading. Less, and noise changes
 #: the sides of narrow gaps; more, and the sides change late.
 _DEAD = 5.0
-#: Within the dead zone a joint's place settles to its readings with this time constant, s: slow corrections count as moves.
+#: Within the dead zone a joint's position settles to its readings with this time constant, s: slow corrections count as
+#: moves.
 _SETTLE_S = 0.3
 #: Travel over which a joint changes the side of its backlash until that is known, rad: the middle of what gears have.
 GAP_RAD = np.deg2rad(0.2)
@@ -60,8 +61,8 @@ class Smoothed(NamedTuple):
         qd: (N, 6) speeds, rad/s.
         variance: (N, 6) what is left of a reading's variance.
         lasts_s: (N, 6) how long what is left of the noise lasts, s: the time constant of its correlation.
-        unseen: (N, 3, 6) on what hangs where the links are beyond their shafts. First the side of the backlash if friction
-            decides on it, -1 to 1: 1 when the joint came up from below; then if weight and inertia do; then the lever of
+        unseen: (N, 3, 6) what the links' angles beyond their shafts depend on. First the side of the backlash if friction
+            decides on it, -1 to 1: 1 when the joint came up from below; then if gravity and inertia do; then the lever of
             what inertia does to a unit load, m.
         travel: (N, 6) how far the joint has moved in all, rad.
         flips: (N, 2, 6) how far the two sides have moved in all.
@@ -78,7 +79,7 @@ class Smoothed(NamedTuple):
 
 @_kernel
 def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
-    """Write travel, flips, side, and the place behind the dead zone, of rows begin to end into memory (N, 8, 6)."""
+    """Write travel, flips, side, and the position behind the dead zone, of rows begin to end into memory (N, 8, 6)."""
     motion = np.empty((3, 6))
     angles = motion[0]
     for k in range(begin, end):
@@ -102,9 +103,9 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 def _rest(
     t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array
 ) -> None:
-    """Put the means of rows low to high in the place of fitted angles (6,) of joints that stand still meanwhile.
+    """Replace fitted angles (6,) by the means of rows low to high for joints that stand still meanwhile.
 
-    Of joints that drift a little, too, as far as the rows lie around the time: there drift does not move the mean.
+    Also for joints that drift a little, as far as the rows lie around the time: there drift does not move the mean.
     """
     half, n = (high - low + 1) // 2, high - low + 1
     aside = abs(2 * at - t[low] - t[high]) / (t[high] - t[low])
@@ -176,15 +177,15 @@ def _take_on(
     beside: Array,
     still: float,
 ) -> int:
-    """Reckon on over new rows begin to end, the floating from row ``settled`` on; return where it may still change."""
+    """Update the memory by new rows begin to end, links from row ``settled`` on; return the first unsettled row."""
     _take(t, q, memory, first, begin, end, dead, gap)
     float_on(t, q, memory[:, 4:], first, settled, end, table, points, beside, still, gap)
     return max(int(np.searchsorted(t[:end], t[end - 1] - 0.5 * LONG_SPAN_S)), settled)
 
 
 @_kernel
-def _in_order(t: Array, q: Array, begin: int, end: int, before: float) -> bool:
-    """Say whether rows begin to end are numbers and their times rise from the one before."""
+def _rising(t: Array, q: Array, begin: int, end: int, before: float) -> bool:
+    """Return whether rows begin to end are numbers and their times rise from the one before."""
     for k in range(begin, end):
         if not before < t[k] < np.inf:
             return False
@@ -207,7 +208,7 @@ class Readings:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
         self._gap, self._sigma = np.full(6, GAP_RAD), sigma_rad
-        # Beside each reading: travel, flips, side, place behind the dead zone; then what ``floating`` writes.
+        # Beside each reading: travel, flips, side, position behind the dead zone; then what ``backlash_dynamics`` writes.
         self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 8, 6))
         self._first = self._count = self._settled = 0
         self._gone_s = -np.inf
@@ -227,13 +228,13 @@ class Readings:
         return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
 
     def loose(self, q: Array) -> NDArray[np.bool_]:
-        """Return which links (6,) stay where they are in their play, for no weight presses them, at angles (6,), rad."""
+        """Return which links (6,) stay where they are in their backlash, unloaded by gravity, at angles (6,), rad."""
         out = np.empty(6)
         loose(self._table, self._points, self._beside, q, out)
         return out > 0.0
 
     def set_backlash(self, width_rad: Array) -> None:
-        """Say how wide the backlash of each joint is (6,), rad, for the readings from here on."""
+        """Set the width of each joint's backlash (6,), rad, for the readings from here on."""
         self._gap = np.maximum(width_rad, LEAST_GAP_RAD)
 
     def add(self, states: JointStates) -> None:
@@ -260,7 +261,7 @@ class Readings:
             self._first, self._count, end, self._settled = 0, end - keep, end - keep, max(self._settled - keep, 0)
         begin, end = end, end + len(t)
         self._t[begin:end], self._q[begin:end] = t, q
-        if not _in_order(self._t, self._q, begin, end, before):
+        if not _rising(self._t, self._q, begin, end, before):
             checked(t, (None,), "JointStates.t_s")
             checked(q, (len(t), 6), "JointStates.q")
             raise InputError("potentiometer readings must come in order of time; the times given do not rise")

@@ -1,8 +1,8 @@
-"""Where the tool was, with the sightings after a time heard, too: for the record.
+"""Smoothed poses of the tool: those at a time in the past, with the measurements after it used, too.
 
-In: states of the filter right after sightings, the readings. Out: poses with covariances. Between two sightings the model
-after each is carried to the time in between; the two are blended by how far the joints had come. Many stretches between
-sightings are reckoned at once: that costs little more than one.
+In: states of the filter right after measurements, the readings. Out: poses with covariances. Between two measurements the
+model after each is propagated to the time in between; the two are blended by how far the joints had moved. Many intervals
+between measurements are computed at once: that costs little more than one.
 """
 
 from __future__ import annotations
@@ -15,50 +15,59 @@ import numpy as np
 from armsight.data import Array, Ids
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators.armerror import SIZE
-from armsight.loop.estimators.errormodel import NOISE, ErrorModel, State, Step, bridged, shared, smoothed_anew
+from armsight.loop.estimators.errormodel import (
+    NOISE,
+    ErrorModel,
+    ErrorState,
+    Propagation,
+    bridged,
+    shared,
+    smoothed_anew,
+)
 from armsight.loop.estimators.estimator import Track
 from armsight.loop.estimators.readings import Readings, Smoothed
 
-#: Joints that came no further than this between two sightings stood still, rad.
+#: Joints that moved no further than this between two measurements stood still, rad.
 STILL_RAD = 1e-5
 
 
-class Stretch(NamedTuple):
-    """Times between two sightings.
+class Interval(NamedTuple):
+    """Times between two measurements.
 
     Attributes:
         t_s: (N,) the times, rising, s.
-        before: the filter after the sighting before them; its newest state where there is none after them, or none before.
-        after: the filter after the sighting after them; None where there is none, or none before.
+        before: the filter after the measurement before them; its newest state where there is none after them, or none
+            before.
+        after: the filter after the measurement after them; None where there is none, or none before.
     """
 
     t_s: Array
-    before: State
-    after: State | None
+    before: ErrorState
+    after: ErrorState | None
 
 
-def stretches(states: list[State], t_s: Array) -> list[Stretch]:
-    """Return times (N,), rising, by the sightings around them.
+def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
+    """Return times (N,), rising, grouped by the measurements around them.
 
     Args:
         states: the filter's, oldest first.
         t_s: the times, s.
     """
     ends = [state for state in states if state.pose_measurement is not None]
-    at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Stretch]()
+    at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Interval]()
     for k in np.unique(at).tolist():
         inner = 0 < k < len(ends)
-        found.append(Stretch(t_s[at == k], ends[k - 1] if inner else states[-1], ends[k] if inner else None))
+        found.append(Interval(t_s[at == k], ends[k - 1] if inner else states[-1], ends[k] if inner else None))
     return found
 
 
-def blended(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Track:
-    """Return where the tool was at the times of stretches, in their order.
+def blended(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Track:
+    """Return the poses of the tool at the times of intervals, in their order.
 
     Args:
         model: the arm's.
         readings: the potentiometers', which must still be kept.
-        parts: the stretches, one at least.
+        parts: the intervals, one at least.
     """
     tracks: list[Track] = []
     for inner, some in groupby(_merged(parts), lambda part: part.after is not None):
@@ -71,17 +80,17 @@ def blended(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Trac
     return Track(*(np.concatenate(column) for column in zip(*map(_columns, tracks), strict=True)))
 
 
-def _merged(parts: list[Stretch]) -> list[Stretch]:
-    """Return stretches that follow each other between the same sightings as one."""
-    merged: list[Stretch] = []
+def _merged(parts: list[Interval]) -> list[Interval]:
+    """Return intervals that follow each other between the same measurements as one."""
+    merged: list[Interval] = []
     for _, some in groupby(parts, lambda part: (id(part.before), id(part.after))):
         same = list(some)
         merged.append(same[0]._replace(t_s=np.concatenate([part.t_s for part in same])))
     return merged
 
 
-def anew(readings: Readings, states: list[State]) -> list[State]:
-    """Return states as they are by the readings that have come since, as far as those about their times are kept."""
+def anew(readings: Readings, states: list[ErrorState]) -> list[ErrorState]:
+    """Return states updated by the readings that have come since, as far as those about their times are kept."""
     oldest, _ = readings.span_s
     kept = [state.t_s >= oldest for state in states]
     if not any(kept):
@@ -91,14 +100,14 @@ def anew(readings: Readings, states: list[State]) -> list[State]:
     return [smoothed_anew(state, next(rows)) if there else state for state, there in zip(states, kept, strict=True)]
 
 
-def by_state(model: ErrorModel, state: State, t_s: Array, joints: Smoothed, step: Step) -> Track:
-    """Return where the tool is at times (N,), s, by one state, a step on."""
+def by_state(model: ErrorModel, state: ErrorState, t_s: Array, joints: Smoothed, step: Propagation) -> Track:
+    """Return the poses of the tool at times (N,), s, by one state, propagated."""
     Ts, Hs = model.poses(state.x * step.kept, joints.q, joints.unseen)
     own, age = model.covariances(state, step, Hs), t_s - state.t_s
     return Track(t_s, Ts, own + shared(state.pose_measurement, Ts), own, joints.q, joints.qd, age)
 
 
-def _alone(model: ErrorModel, readings: Readings, part: Stretch) -> Track:
+def _alone(model: ErrorModel, readings: Readings, part: Interval) -> Track:
     joints, (before,) = readings.at(part.t_s), anew(readings, [part.before])
     return by_state(model, before, part.t_s, joints, model.moved(before, joints, part.t_s))
 
@@ -109,8 +118,8 @@ def _columns(track: Track) -> tuple[Array, ...]:
     return (track.t_s, track.Ts_base_tool, *own, track.q, track.qd, track.vision_age_s)
 
 
-def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Track:
-    """Return where the tool was in stretches with a sighting before and after each."""
+def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Track:
+    """Return the poses of the tool in intervals with a measurement before and after each."""
     t_s = np.concatenate([part.t_s for part in parts])
     rows = np.repeat(np.arange(len(parts)), [len(part.t_s) for part in parts])
     joints = readings.at(t_s)
@@ -126,20 +135,20 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Stretch]) -> Tra
     Ts_after, _ = model.poses(x_after, joints.q, joints.unseen)
     share = _share(t_s, joints, before, after, rows)
     Ts = Ts @ exp_se3(share[:, None] * log_se3(inverse(Ts) @ Ts_after))
-    own, common, turned = np.empty((len(t_s), 6, 6)), np.empty((len(t_s), 6, 6)), np.swapaxes(Hs, 1, 2)
+    own, common, transposed = np.empty((len(t_s), 6, 6)), np.empty((len(t_s), 6, 6)), np.swapaxes(Hs, 1, 2)
     edges = np.searchsorted(rows, np.arange(len(parts) + 1)).tolist()
     for k, part in enumerate(parts):
         some = slice(edges[k], edges[k + 1])
         H = Hs[some].reshape(-1, SIZE)
         first, last = ((H @ P).reshape(-1, 6, SIZE) for P in (before.P[k], after.P[k]))
-        own[some] = (first + share[some, None, None] * (last - first)) @ turned[some]
+        own[some] = (first + share[some, None, None] * (last - first)) @ transposed[some]
         common[some] = shared(None if part.after is None else part.after.pose_measurement, Ts[some])
-    own += (Hs * bridge[:, None, :]) @ turned
+    own += (Hs * bridge[:, None, :]) @ transposed
     return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - before.t_s[rows])
 
 
 class _Ends(NamedTuple):
-    """The ends of K stretches: times (K,), states (K, SIZE), covariances, travel, flips (K, 2, 6), variances (K, 6)."""
+    """The ends of K intervals: times (K,), states (K, SIZE), covariances, travel, flips (K, 2, 6), variances (K, 6)."""
 
     t_s: Array
     x: Array
@@ -149,7 +158,7 @@ class _Ends(NamedTuple):
     variance: Array
 
 
-def _ends(states: list[State]) -> _Ends:
+def _ends(states: list[ErrorState]) -> _Ends:
     return _Ends(
         np.array([state.t_s for state in states]),
         np.array([state.x for state in states]),
@@ -168,7 +177,7 @@ def _come(ends: _Ends, joints: Smoothed, rows: Ids) -> tuple[Array, Array]:
 
 
 def _share(t_s: Array, joints: Smoothed, before: _Ends, after: _Ends, rows: Ids) -> Array:
-    """Return how far (N,) the joints had come on their way between two sightings; in time, where they stood."""
+    """Return the share (N,) of their travel between two measurements that joints had moved; of time where they stood."""
     come = np.abs(joints.travel - before.travel[rows]).sum(axis=1)
     whole = np.abs(after.travel - before.travel).sum(axis=1)[rows]
     times = (t_s - before.t_s[rows]) / np.maximum(after.t_s - before.t_s, 1e-9)[rows]

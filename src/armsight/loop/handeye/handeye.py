@@ -37,8 +37,8 @@ from scipy.special import chdtri
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, pose, transform
-from armsight.geometry.rotation import skew
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, small_adjoint, transform
+from armsight.geometry.rotation import nearest_rotation, skew
 
 #: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
 CHANCE = 1e-5
@@ -57,15 +57,6 @@ Share = Literal["flange", "seen", "places"]
 SHARES: tuple[Share, ...] = ("flange", "seen", "places")
 #: Sigma of turns that are hardly believed, rad: enough to determine what places leave open.
 HARDLY = 0.005
-
-
-def adjoint(T: Array) -> Array:
-    """Return the adjoints (..., 6, 6) of transforms (..., 4, 4): T exp(xi) T^-1 = exp(Ad xi)."""
-    R = T[..., :3, :3]
-    out = np.zeros((*T.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = R
-    out[..., :3, 3:] = skew(T[..., :3, 3]) @ R
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,16 +125,8 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
     # A change of Z comes in from the left of what follows it.
     by_z = -adjoint(inverse(E) if poses.in_hand else inverse(poses.A @ M) @ Z)
     e = log_se3(E)
-    bend = np.eye(6) + 0.5 * _small_adjoint(e)  # the right Jacobian's inverse, to first order
+    bend = np.eye(6) + 0.5 * small_adjoint(e)  # the right Jacobian's inverse, to first order
     return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
-
-
-def _small_adjoint(xi: Array) -> Array:
-    """Return ad(xi) (..., 6, 6) of tangents (..., 6)."""
-    out = np.zeros((*xi.shape[:-1], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = skew(xi[..., 3:])
-    out[..., :3, 3:] = skew(xi[..., :3])
-    return out
 
 
 def covariances(poses: Poses, carry: Array, sigma: Sigmas) -> Array:
@@ -302,8 +285,7 @@ def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
 
 def _rotation(M: Array) -> Array:
     """Return the rotation nearest to a multiple, of either sign, of a rotation (3, 3)."""
-    U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M)))
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return nearest_rotation(M * np.sign(np.linalg.det(M)))
 
 
 def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:

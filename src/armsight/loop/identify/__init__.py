@@ -1,6 +1,11 @@
-"""What an arm really is, from joint angles and where its tool was seen.
+"""Kinematic identification: what each number of an arm is, from joint angles and where its tool was measured.
 
-    measured -> place -> observable -> fit -> growth -> identify -> corrected
+In: the nominal :class:`~armsight.robot.arm.Arm` and :class:`Measured` poses (``read`` has them from a CSV file). Out:
+:class:`Identified`, every parameter with its sigma, and :class:`Corrected`, the arm in use.
 
-``identify.identify`` runs the line; ``plan`` says where to look next. Equations and formats: docs/identify.md.
+    measured -> diagnose -> placement -> observable -> fit -> selection -> identify -> corrected, toml_write
+
+``identify.identify`` runs the line on the parameters of ``model``. ``joint_noise`` and ``backlash`` estimate what scatters
+from pose to pose, ``validate`` evaluates the result on other poses, ``plan`` chooses the next poses to measure. Equations
+and formats: docs/identify.md.
 """

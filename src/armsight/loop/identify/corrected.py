@@ -1,25 +1,22 @@
-"""An identified arm as it is used: where its tool is at given readings, and which readings bring it somewhere.
+"""An identified arm in use: the pose of its tool at given joint readings, and the readings that reach a given pose.
 
-Also what is written for others: the corrected table with its causes (TOML), a URDF with Hayati's angles in its origins,
-and what the board has to add to its readings.
+Also the arm for other programs: an :class:`Arm` with the corrected table, and a URDF with Hayati's angles in its origins.
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
-from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import Model
 from armsight.robot.arm import Arm
-from armsight.robot.urdf_write import urdf_text
+from armsight.robot.arm_file import tilted_urdf
 
 #: Newton steps to a reading, and what counts as there, m and rad.
 STEPS, THERE = 30, 1e-9
@@ -72,8 +69,8 @@ class Corrected(Record):
         return np.asarray(log_se3(inverse(T) @ self.forward(many, sides)).T / h)
 
     def arm(self) -> Arm:
-        """Return the corrected table without Hayati's angles and without causes, which :class:`Arm` does not know."""
-        table = self.model.table(self.x)
+        """Return the corrected table without Hayati's angles and error sources, for which :class:`Arm` has no room."""
+        table, T_6_body = self.model.table(self.x), self.model.T_6_body(self.x)
         return replace(
             self.model.arm,
             name=f"{self.model.arm.name}_identified",
@@ -81,36 +78,10 @@ class Corrected(Record):
             d=table[:, chain.D],
             a=table[:, chain.A],
             alpha=table[:, chain.ALPHA],
-            T_flange_tool=_square(self.model.T_6_body(self.x)),
+            T_flange_tool=pose(nearest_rotation(T_6_body[:3, :3]), T_6_body[:3, 3]),
             source=f"identified from measurements; nominal: {self.model.arm.source}",
         )
 
     def urdf(self) -> str:
         """Return URDF text with everything that a URDF can hold: the table with Hayati's angles, base and tool."""
         return tilted_urdf(self.arm(), self.model.table(self.x)[:, chain.BETA])
-
-
-def tilted_urdf(arm: Arm, beta: Array) -> str:
-    """Return an arm with Hayati's angles (6,), rad, after its rows as URDF text, exactly."""
-    robot = ET.fromstring(urdf_text(arm))
-    modified = arm.convention == "modified"
-    for i in range(6):
-        place = i if modified else i + 1  # the origin that holds row i's angles
-        if beta[i] == 0.0:
-            continue
-        origin = robot.findall("joint")[place].find("origin")
-        if origin is None:
-            raise InputError(f"{arm.name}: a URDF joint has no origin")
-        before = Rotation.from_euler("xyz", [float(word) for word in origin.get("rpy", "").split()])
-        turned = (before * Rotation.from_euler("y", beta[i])).as_euler("xyz")
-        origin.set("rpy", " ".join(repr(float(angle)) for angle in turned))
-    ET.indent(robot)
-    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
-
-
-def _square(T: Array) -> Array:
-    """Return a transform whose rotation is orthonormal to the last digit."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = T.copy()
-    out[:3, :3] = U @ Vt
-    return out

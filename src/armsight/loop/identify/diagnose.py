@@ -1,9 +1,12 @@
-"""What is wrong with data that fit an arm far too badly, and what to do.
+"""Diagnosis of data that fit an arm far too badly: the likely mistake in the data, and what to do.
 
-Units, order or signs of the joints, a left-handed frame of the instrument, angles read in another way.
-The linear placement (``place``) needs no start and gives a scale and a handedness for free; it is tried for every order
+In: an arm and poses. Out: nothing, or an InputError that names the mistake: units, order or signs of the joints, a
+left-handed frame of the instrument, angles of another convention.
+
+The linear placement (``placement``) needs no start and yields a scale and a handedness as well; it is tried for every order
 and sign of the joints on a few poses. A cheap arm is off by 10 to 15 mm; data that are off by a tenth of the space they
-span are of another arm, or another order. Of the explanations that fit alike the one with the fewest mistakes is told.
+span are of another arm, or in another order. Of the explanations that fit equally well the one with the fewest mistakes is
+reported.
 """
 
 from __future__ import annotations
@@ -17,11 +20,12 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.handeye.handeye import kronecker
 from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.placement import linear_placement, turn_between
-from armsight.loop.identify.read import TURNS, AnglesMeasured, turned
+from armsight.loop.identify.placement import angle_between, linear_placement
+from armsight.loop.identify.read import ROTATIONS, AnglesMeasured, rotations_of
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain
 
@@ -29,15 +33,15 @@ from armsight.robot.kinematics import chain
 BAD_SHARE, BAD_M = 0.08, 0.015
 #: A proposal must be this many times better than what was given.
 BETTER = 4.0
-#: Only what fits this many times better is told from something simpler. A wrong sign that hardly moves the tool can take
+#: Only what fits this many times better is preferred to something simpler. A wrong sign that hardly moves the tool can take
 #: up a part of the arm's own errors by chance; to halve them it must lie along them to a cosine of 0.87, which, as these
 #: errors have some 15 independent directions (zeros, lengths and angles), is 3.4 sigma.
 CLEAR = 2.0
-#: Fits better than this, m and rad, are alike: files are rounded, instruments tell hundredths of a degree.
+#: Fits better than this, m and rad, are alike: files are rounded, instruments resolve hundredths of a degree.
 ALIKE_M, ALIKE_RAD = 1e-6, np.deg2rad(0.01)
 #: A scale off by more than this is a unit.
 SCALE_OFF = 0.2
-#: Turns off by more than this, rad, are not of this arm: twice what is known of zeros and twists, all six joints together.
+#: Rotations off by more than this, rad, are not of this arm: twice the prior of zeros and twists of all six joints.
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, and those that every order and sign is tried on.
 POSES, FEW = 80, 24
@@ -47,7 +51,7 @@ _ANGLES = (
     (180 / np.pi, "radians; name the columns q1_rad .. q6_rad"),
 )
 #: Orders whose signs are tried, best first.
-ORDERS = 40
+MOST_JOINT_ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
 _GIVEN = tuple(range(6))
 
@@ -61,9 +65,16 @@ class Off(NamedTuple):
 
 
 class Mistakes(NamedTuple):
-    """The column each joint stands in, each joint's sign, whether the frame is left-handed; and how far off that is, m."""
+    """A guess at the mistakes in the data, and how well it fits.
 
-    order: tuple[int, ...]
+    Attributes:
+        joint_order: the column of the data that each joint is in.
+        signs: of each joint.
+        left: whether the instrument's frame is left-handed.
+        off: RMS distance of the points from the arm under this guess, m.
+    """
+
+    joint_order: tuple[int, ...]
     signs: tuple[int, ...]
     left: bool
     off: float
@@ -71,32 +82,32 @@ class Mistakes(NamedTuple):
     @property
     def number(self) -> int:
         """How many mistakes these are: signs, a frame, and exchanges of two columns that make the order."""
-        cycles = {frozenset(_cycle(self.order, i)) for i in _GIVEN}
+        cycles = {frozenset(_cycle(self.joint_order, i)) for i in _GIVEN}
         return self.signs.count(-1) + self.left + 6 - len(cycles)
 
     @property
-    def told(self) -> str:
-        """The mistakes in words."""
-        told = [
-            "two of the instrument's axes are swapped, or one's sign is turned (its frame is left-handed)"
+    def text(self) -> str:
+        """The mistakes as text."""
+        texts = [
+            "two of the instrument's axes are exchanged, or one has the wrong sign (its frame is left-handed)"
         ] * self.left
-        if self.order != _GIVEN:
-            told.append("the joints' order is " + ", ".join(f"q{i + 1}" for i in self.order))
+        if self.joint_order != _GIVEN:
+            texts.append("the joints' order is " + ", ".join(f"q{i + 1}" for i in self.joint_order))
         if -1 in self.signs:
-            told.append("the sign is turned of joint " + ", ".join(str(i + 1) for i in _GIVEN if self.signs[i] < 0))
-        return " and ".join(told)
+            texts.append("the sign is wrong of joint " + ", ".join(str(i + 1) for i in _GIVEN if self.signs[i] < 0))
+        return " and ".join(texts)
 
 
-def _cycle(order: tuple[int, ...], start: int) -> list[int]:
-    """Return the columns that change places with one another, from one of them on."""
+def _cycle(joint_order: tuple[int, ...], start: int) -> list[int]:
+    """Return the columns of one cycle of a permutation, from one of them on."""
     out = [start]
-    while order[out[-1]] != start:
-        out.append(order[out[-1]])
+    while joint_order[out[-1]] != start:
+        out.append(joint_order[out[-1]])
     return out
 
 
 def check_plausible(arm: Arm, measured: Measured) -> None:
-    """Refuse data that cannot be of this arm, with what would make them fit.
+    """Reject data that cannot be of this arm, and say what would make them fit.
 
     Raises:
         InputError: with the unit, the order, the signs, the frame or the reading of angles that fit, or that none does.
@@ -104,7 +115,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     if np.abs(measured.q).max() > chain.MOST_RADIANS:
         row, joint = divmod(int(np.argmax(np.abs(measured.q))), 6)
         raise InputError(
-            f"joint {joint + 1} of row {row + 1} is at {measured.q[row, joint]:g} rad, further than any joint turns: are "
+            f"joint {joint + 1} of row {row + 1} is at {measured.q[row, joint]:g} rad, further than any joint rotates: are "
             "the angles in degrees? name the columns q1_deg .. q6_deg"
         )
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
@@ -113,28 +124,27 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     scaled = abs(np.log(scale)) > np.log1p(SCALE_OFF)
     good = off < max(BAD_SHARE * _span(p), BAD_M * (scale if scaled else 1.0))
     if good and not scaled:
-        _check_turns(arm, measured, rows)
+        _check_rotations(arm, measured, rows)
         return
-    told = _angles(arm, q, p, off)
-    if told is None:
-        told = _unit(scale) if good else _proposal(arm, q, p, off)
-    raise InputError(told or _no_arm(off))
+    explanation = _angles(arm, q, p, off)
+    if explanation is None:
+        explanation = _unit(scale) if good else _proposal(arm, q, p, off)
+    raise InputError(explanation or _no_arm(off))
 
 
 def misfit(arm: Arm, q: Array, p_rig: Array) -> Off:
-    """Return how far points (N, K, 3) are off an arm placed freely at q (N, 6), in frames of either hand."""
+    """Return how far points (N, K, 3) are off an arm at q (N, 6), with base and tool free, in frames of either hand."""
     T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
     R, o = T[:, :3, :3], T[:, :3, 3]
     M, _, t = linear_placement(R, o, p_rig)
     scale = float(np.cbrt(abs(np.linalg.det(M))))
     if not scale > 1e-12:
         return Off(np.inf, np.inf, 1.0)
-    U, _, Vt = np.linalg.svd(M)
     there = o[:, None] + (R @ t.T).swapaxes(1, 2)
     offs = []
-    for hand in (1.0, -1.0):
-        turn = U @ np.diag([1.0, 1.0, hand * np.linalg.det(U @ Vt)]) @ Vt * scale
-        e = p_rig @ turn.T - there
+    for mirrored in (False, True):
+        R_scaled = nearest_rotation(M, mirrored=mirrored) * scale
+        e = p_rig @ R_scaled.T - there
         e -= e.mean(axis=(0, 1))
         offs.append(float(np.sqrt(np.mean(np.sum(e**2, axis=2)))) / scale)
     return Off(offs[0], offs[1], 1 / scale)
@@ -169,16 +179,16 @@ def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str | None:
     if not alike:
         return None
     best = alike[0]
-    told = (
-        f"the data fit this arm if {best.told}{'' if unit == 1.0 else f' and the points are in {_SCALES[unit]}'} (off by "
+    text = (
+        f"the data fit this arm if {best.text}{'' if unit == 1.0 else f' and the points are in {_SCALES[unit]}'} (off by "
         f"{1e3 * off:.0f} mm as they are, {1e3 * best.off:.1f} mm so): put the columns right"
     )
     other = next((m for m in alike if m.left != best.left and m.number <= best.number + 1), None)
     if other is not None:
-        told += f"; as well, these data cannot tell which, if {other.told}"
+        text += f"; these data fit as well, and do not show which is true, if {other.text}"
     flipped = [tuple(-s if i == j else s for i, s in enumerate(best.signs)) for j in _GIVEN]
-    either = [str(j + 1) for j in _GIVEN if any(m[:3] == (best.order, flipped[j], best.left) for m in alike)]
-    return told + (f"; whether the sign of joint {', '.join(either)} is right they cannot tell" if either else "")
+    either = [str(j + 1) for j in _GIVEN if any(m[:3] == (best.joint_order, flipped[j], best.left) for m in alike)]
+    return text + (f"; they do not show whether the sign of joint {', '.join(either)} is right" if either else "")
 
 
 def _span(p: Array) -> float:
@@ -194,12 +204,12 @@ def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
     few = np.linspace(0, len(q) - 1, min(FEW, len(q))).astype(int)
     signs = list(itertools.product((1, -1), repeat=6))
     tried = _tried(arm, q[few], p[few], ((_GIVEN, s) for s in signs))
-    orders = sorted(
+    joint_orders = sorted(
         _tried(arm, q[few], p[few], ((o, signs[0]) for o in itertools.permutations(_GIVEN))), key=lambda m: m.off
     )
-    found = _fitting(arm, q, p, [*tried, *orders], limit)
+    found = _fitting(arm, q, p, [*tried, *joint_orders], limit)
     if not found:
-        best = list(dict.fromkeys(m.order for m in orders))[:ORDERS]
+        best = list(dict.fromkeys(m.joint_order for m in joint_orders))[:MOST_JOINT_ORDERS]
         found = _fitting(arm, q, p, _tried(arm, q[few], p[few], itertools.product(best, signs)), limit)
     return found
 
@@ -207,10 +217,10 @@ def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
 def _tried(arm: Arm, q: Array, p: Array, ways: Iterable[tuple[tuple[int, ...], tuple[int, ...]]]) -> list[Mistakes]:
     """Return how far off the points are in each order and with each signs, in frames of either hand."""
     out = []
-    for order, signs in ways:
-        at = misfit(arm, q[:, order] * signs, p)
+    for joint_order, signs in ways:
+        at = misfit(arm, q[:, joint_order] * signs, p)
         if abs(np.log(at.scale)) < np.log1p(SCALE_OFF):
-            out += [Mistakes(order, signs, False, at.right), Mistakes(order, signs, True, at.left)]
+            out += [Mistakes(joint_order, signs, False, at.right), Mistakes(joint_order, signs, True, at.left)]
     return out
 
 
@@ -219,8 +229,8 @@ def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) 
     near = CLEAR * max(min((m.off for m in tried), default=np.inf), ALIKE_M)
     every = [
         again
-        for order, signs in dict.fromkeys(m[:2] for m in tried if m.off < min(CLEAR * near, CLEAR * limit))
-        for again in _tried(arm, q, p, [(order, signs)])
+        for joint_order, signs in dict.fromkeys(m[:2] for m in tried if m.off < min(CLEAR * near, CLEAR * limit))
+        for again in _tried(arm, q, p, [(joint_order, signs)])
     ]
     best = max(min((m.off for m in every), default=np.inf), ALIKE_M)
     if best > limit:
@@ -228,70 +238,70 @@ def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) 
     return sorted((m for m in every if m.off < CLEAR * best), key=lambda m: (m.number, m.off))
 
 
-def _check_turns(arm: Arm, measured: Measured, rows: Array) -> None:
-    """Refuse turns of the body that are not those of the arm, where its places are."""
+def _check_rotations(arm: Arm, measured: Measured, rows: Array) -> None:
+    """Reject rotations of the body that are not those of the arm, where its positions fit."""
     if measured.R_rig_body is None:
         return
     q, p, R = measured.q[rows], measured.p_rig[rows], measured.R_rig_body[rows]
-    off = turn_misfit(arm, q, R)
-    told = None
+    off = rotation_misfit(arm, q, R)
+    explanation = None
     if off > ALIKE_RAD:
         if isinstance(measured, AnglesMeasured):
-            told = _reading(arm, q, measured.angles_deg[rows], off, measured.turns)
-        told = told or _turned_signs(arm, q, p, R, off)
-    if told is None and off > BAD_RAD:
-        told = (
-            f"these turns are not of this arm, whose places fit: they are off by {np.degrees(off):.0f} deg, and no reading "
-            "of them and no sign of a joint mends it; leave them out, or put them right"
+            explanation = _reading(arm, q, measured.angles_deg[rows], off, measured.rotation)
+        explanation = explanation or _signs_by_rotations(arm, q, p, R, off)
+    if explanation is None and off > BAD_RAD:
+        explanation = (
+            f"these rotations are not of this arm, whose positions fit: they are off by {np.degrees(off):.0f} deg, and no "
+            "convention and no sign of a joint corrects it; leave them out, or put them right"
         )
-    if told is not None:
-        raise InputError(told)
+    if explanation is not None:
+        raise InputError(explanation)
 
 
-def turn_misfit(arm: Arm, q: Array, R_rig_body: Array) -> float:
-    """Return how far turns (N, 3, 3) are off an arm placed freely at q (N, 6): the median angle, rad."""
+def rotation_misfit(arm: Arm, q: Array, R_rig_body: Array) -> float:
+    """Return how far rotations (N, 3, 3) are off an arm at q (N, 6), with base and tool free: the median angle, rad."""
     A = arm.forward(q)
     B = np.tile(np.eye(4), (len(q), 1, 1))
     B[:, :3, :3] = R_rig_body
     X, Z = kronecker(A, B)
-    return float(np.median(turn_between(A[:, :3, :3] @ X[:3, :3], Z[:3, :3] @ R_rig_body)))
+    return float(np.median(angle_between(A[:, :3, :3] @ X[:3, :3], Z[:3, :3] @ R_rig_body)))
 
 
 def _reading(arm: Arm, q: Array, angles_deg: Array, off: float, given: str) -> str | None:
-    """Return the reading of the angles that clearly fits better, or None."""
-    offs = {name: turn_misfit(arm, q, turned(angles_deg, name)) for name in TURNS}
+    """Return the convention of the angles that clearly fits better, or None."""
+    offs = {name: rotation_misfit(arm, q, rotations_of(angles_deg, name)) for name in ROTATIONS}
     best = min(offs, key=lambda name: offs[name])
     if max(offs[best], ALIKE_RAD) > min(off / CLEAR, BAD_RAD):
         return None
-    same = [name for name in TURNS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one
+    same = [name for name in ROTATIONS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one
     return (
-        f"the turns fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as {given} (off by "
-        f"{np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): give --turns {same[0]}"
+        f"the rotations fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as {given} (off by "
+        f"{np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): give --rotation {same[0]}"
     )
 
 
-def _turned_signs(arm: Arm, q: Array, p: Array, R: Array, off: float) -> str | None:
-    """Return the fewest signs that make the turns fit where the places, which hardly tell them, fit as well, or None."""
+def _signs_by_rotations(arm: Arm, q: Array, p: Array, R: Array, off: float) -> str | None:
+    """Return the fewest signs that make the rotations fit where the positions fit with either sign, or None."""
     near = CLEAR * max(misfit(arm, q, p).right, ALIKE_M)
     ways = _tried(arm, q, p, ((_GIVEN, s) for s in itertools.product((1, -1), repeat=6)))
-    fits = {m: turn_misfit(arm, q * m.signs, R) for m in ways if not m.left and m.off < near}
+    fits = {m: rotation_misfit(arm, q * m.signs, R) for m in ways if not m.left and m.off < near}
     best = max(min(fits.values(), default=np.inf), ALIKE_RAD)
     if best > min(off / BETTER, BAD_RAD):
         return None
-    told = min((m for m, at in fits.items() if at < CLEAR * best), key=lambda m: (m.number, fits[m]))
+    simplest = min((m for m, at in fits.items() if at < CLEAR * best), key=lambda m: (m.number, fits[m]))
     return (
-        f"the turns fit this arm if {told.told} (off by {np.degrees(off):.1f} deg as they are, "
-        f"{np.degrees(fits[told]):.2f} deg so): put the columns right"
+        f"the rotations fit this arm if {simplest.text} (off by {np.degrees(off):.1f} deg as they are, "
+        f"{np.degrees(fits[simplest]):.2f} deg so): put the columns right"
     )
 
 
 def _no_arm(off: float) -> str:
     return (
-        f"these data are not of this arm: placed as well as can be it is off by {1e3 * off:.0f} mm; no unit, frame, order "
-        "or sign of the joints mends it. Is it the right model, with the table's right convention?"
+        f"these data are not of this arm: with base and tool fitted it is off by {1e3 * off:.0f} mm; no unit, frame, order "
+        "or sign of the joints corrects it. Is it the right model, with the table's right convention?"
     )
 
 
 def without_tool(arm: Arm) -> Arm:
-    """Return the arm with its tool at the flange: where it is on the flange is found from the data."""
+    """Return the arm with its tool at the flange: the tool's pose on the flange is estimated from the data."""
     return replace(arm, T_flange_tool=np.eye(4))

@@ -1,16 +1,15 @@
-"""Least squares of an arm's parameters to what was seen of it, with priors, gross errors left out, and sigmas.
+"""Least-squares fit of an arm's parameters to measured poses, with priors, outlier rejection and sigmas.
 
-Gauss-Newton on whitened residuals with the priors as further measurements. Where the instrument's covariance is given, what
-the residuals show beyond it (the arm's repeatability, what the model does not know) is estimated and added: one sigma of
-place, one of turn. A pose further from the model than chance allows is left out; the scale for that is the median's.
+Gauss-Newton on whitened residuals, with the priors as further measurements. Where the instrument's covariance is given,
+what the residuals show beyond it (the arm's repeatability, what the model does not know) is estimated and added: one
+sigma of position, one of rotation. A pose further from the model than chance allows is left out; the median sets the
+scale for that.
 
-How far each number can plausibly be off before anything is measured: one sigma, in its own unit.
-
-The table's: what cheap arms are made to and published identifications of them find (some mm, a degree). The causes': a
-conductive-plastic potentiometer's data sheet (linearity 0.5 to 1 %, of which a part is scale), gears of hobby servos
-(backlash up to a degree), and compliance that lets a
-joint droop half a degree under the weight of a link of 0.25 m. A prior
-pulls at most as strongly as one measurement of that sigma; with tens of poses the data override it.
+The prior sigmas say how far each number can plausibly be off before anything is measured, in its own unit. Those of the
+table: what cheap arms are made to and published identifications of them find (some mm, a degree). Those of the error
+sources: a conductive-plastic potentiometer's data sheet (linearity 0.5 to 1 %, of which a part is scale), gears of hobby
+servos (backlash up to a degree), and compliance that lets a joint droop half a degree under the gravity load of a link of
+0.25 m. A prior pulls at most as strongly as one measurement of that sigma; with tens of poses the data override it.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from armsight.errors import InputError
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
-#: Kind of parameter -> sigma of what it is off; base and tool are not known at all.
+#: Kind of parameter -> prior sigma of its deviation from nominal, m, rad or its own unit; base and tool have no prior.
 SIGMA: dict[str, float] = {
     "base": np.inf,
     "tool": np.inf,
@@ -42,8 +41,8 @@ SIGMA: dict[str, float] = {
     "wave": np.deg2rad(0.5),
     "ripple": np.deg2rad(0.1),
     "backlash": np.deg2rad(1.0),
-    "slack": np.deg2rad(1.0),
-    "sag": np.deg2rad(0.5) / 0.25,
+    "gravity_backlash": np.deg2rad(1.0),
+    "compliance": np.deg2rad(0.5) / 0.25,
 }
 
 
@@ -76,9 +75,9 @@ CHANCE = 1e-7
 STEPS, SMALL_STEP = 25, 1e-3
 #: Rounds of leaving out gross errors and estimating the noise.
 ROUNDS = 6
-#: Residuals whose freedom a fit has taken but for this part of their number do not tell their noise.
+#: Where a fit has left less than this part of the residuals' degrees of freedom, they do not determine their noise.
 LEAST_FREEDOM = 0.1
-#: Added to a normal matrix of unit diagonal, so that rounding leaves it positive: far below what the data can tell.
+#: Added to a normal matrix of unit diagonal, so that rounding leaves it positive: far below what the data determine.
 ROUNDING = 1e-12
 #: Noise below this, m or rad, is none: what rounding of a printed file leaves.
 LEAST_NOISE = 1e-9
@@ -92,7 +91,8 @@ class Solution(Record):
         x: (P,) the vector.
         free: (P,) which of its numbers were fitted.
         cov: (P, P) their covariance; zero where not fitted.
-        noise: sigma, beyond the covariance given, of the place along one axis, m, and of the turn about one, rad.
+        noise: sigma, beyond the covariance given, of the position along one axis, m, and of the rotation about
+            one, rad.
         used: (N,) whether a pose was used.
         history: RMS of the weighted residuals after every step.
     """
@@ -140,10 +140,10 @@ def fit(
     Args:
         model: the arm.
         x: (P,) start.
-        measured: what was seen.
+        measured: the poses.
         free: (P,) what to fit; the rest stays as in ``x``.
         prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
-        used: (N,) poses to use; None: gross errors are found.
+        used: (N,) poses to use; None: outliers are found and left out.
         noise: to start from; None: from the residuals at the start.
     """
     phi = model.feature_values(measured.q, measured.approach)
@@ -199,7 +199,7 @@ def _free(
 
 
 def _pull(prior: Array, free: Mask) -> Array:
-    """Return the information that the priors of the free parameters bring."""
+    """Return the information (F,) that the priors of the free parameters add."""
     return np.asarray(np.where(np.isfinite(prior) & (prior > 0), prior, np.inf)[free] ** -2.0)
 
 
@@ -243,9 +243,9 @@ def _taken(H: Array, free: Mask, prior: Array) -> float:
 def _robust_noise(e: Array) -> tuple[float, float]:
     """Return sigmas along one axis from median residuals."""
     middle = np.sqrt(chdtri(3, 0.5))
-    places = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
-    turn = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0
-    return max(float(np.median(np.linalg.norm(places, axis=1)) / middle), LEAST_NOISE), max(turn, LEAST_NOISE)
+    positions = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
+    angle = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0
+    return max(float(np.median(np.linalg.norm(positions, axis=1)) / middle), LEAST_NOISE), max(angle, LEAST_NOISE)
 
 
 def _noise(measured: Measured, e: Array, taken: float) -> tuple[float, float]:
@@ -279,7 +279,7 @@ def squares(measured: Measured, e: Array, noise: tuple[float, float]) -> Array:
 
 
 def _sane(measured: Measured, e: Array, noise: tuple[float, float]) -> Mask:
-    """Say which poses are no mistakes, by the scale of the median."""
+    """Return which poses (N,) are no outliers, by the scale of the median."""
     far = squares(measured, e, noise)
     scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
     return np.asarray(far / scale < chdtri(measured.size, CHANCE))

@@ -1,7 +1,8 @@
-"""Identify an arm: what each number of it is, with sigma, and how much better it then says where its tool is.
+"""Identify an arm: every parameter of it with its sigma.
 
-In: the nominal arm and :class:`Measured`. Out: :class:`Identified`. Order: is this the arm at all; where base and tool are;
-what the poses can tell; a fit of the table; growth by the error on poses left out; the final fit.
+In: the nominal arm and :class:`Measured`. Out: :class:`Identified`. The steps: check that the poses are of this arm;
+estimate base and tool; find which parameters are observable; fit the table; select the error sources by the error on
+poses left out (forward selection); run the final fit.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from armsight.loop.identify.joint_noise import NO_CHANCE, JointNoise, joint_nois
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import PLENTY, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
-from armsight.loop.identify.placement import placed
-from armsight.loop.identify.selection import PLACEMENT, TOGETHER, Step, forward_selection, scaled_prior
+from armsight.loop.identify.placement import with_placement
+from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
 from armsight.robot.arm import Arm
 
-#: Fewest poses: what places base and tool, with some to spare.
+#: Fewest poses: what base and tool need, with some to spare.
 LEAST = 6
 #: Joints that move less than this, rad, do not move.
 ALIKE = 0.02
-#: Poses that tell which causes there are; the final fit is to all of them.
+#: Most poses that the error sources are selected on; the final fit is to all of them.
 MOST = 4000
-#: Turns of fitting everything and laying what is left to the joints.
-TURNS = 3
-#: Correlations larger than this are told.
+#: Rounds of fitting everything and attributing what is left to the joints.
+ROUNDS = 3
+#: Correlations larger than this are reported.
 CORRELATED = 0.9
 _TABLE = ("offset", "d", "a", "alpha", "beta")
 
@@ -46,21 +47,21 @@ class Identified(Record):
         nominal: (P,) base and tool fitted, the rest nominal.
         solution: the fit.
         reasons: name -> why a parameter is not fitted, or what its value shares.
-        steps: how the model grew.
-        singular_values: of the Jacobian of what the poses can tell, in units of prior sigmas.
-        prior: (P,) prior sigmas, those of the causes as large as the data show them to be.
-        joint_sigma_rad: (6,) how far each joint is off by chance, from pose to pose; zero where the instrument's covariance
-            is not known, as nothing tells then what is the joints' and what the instrument's.
-        cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma holds what the causes that
-            did not pay, or hardly show, could still be, and what leaving them out has moved it. ``solution.cov`` is that
-            of the fitted ones, the rest taken for nominal.
+        steps: of the forward selection.
+        singular_values: of the Jacobian of the observable parameters, in units of prior sigmas.
+        prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
+        joint_sigma_rad: (6,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not
+            known, because the joints' and the instrument's share cannot be separated then.
+        cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
+            sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
+            ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
     """
 
     model: Model
     nominal: Array
     solution: Solution
     reasons: Mapping[str, str]
-    steps: tuple[Step, ...]
+    steps: tuple[SelectionStep, ...]
     singular_values: Array
     prior: Array
     cov: Array
@@ -94,17 +95,17 @@ def identify(
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identified:
-    """Find what an arm really is.
+    """Identify an arm from poses.
 
     Args:
         arm: the nominal arm; where base and tool are is found from the data.
-        measured: joint angles, and where the tool was seen.
-        priors: sigma by name of a parameter or a kind, instead of ``priors.SIGMA``; 0 keeps one at its nominal value.
-        progress: is told what is being done.
+        measured: joint angles, and where the tool was measured.
+        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
+        progress: called with the name of each step as it begins.
 
     Raises:
         InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
-        CalibrationError: poses so alike that not even base and tool can be told.
+        CalibrationError: poses so alike that not even base and tool are observable.
     """
     model, x, prior = begun(arm, measured, priors=priors, progress=progress)
     progress("base and tool")
@@ -120,79 +121,79 @@ def begun(
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[Model, Array, Array]:
-    """Return the model, the vector (P,) of the nominal arm where base and tool are, and prior sigmas (P,).
+    """Return the model, the vector (P,) of the nominal arm with base and tool estimated, and prior sigmas (P,).
 
-    What every identification, and the choice of its next poses, starts from; poses that cannot carry either are refused.
+    Every identification, and the choice of its next poses, starts from this; poses that are not enough for it are rejected.
 
     Args:
         arm: the nominal arm.
-        measured: joint angles, and where the tool was seen.
+        measured: joint angles, and where the tool was measured.
         priors: as in :func:`identify`.
-        progress: is told what is being done.
+        progress: called with the name of each step as it begins.
 
     Raises:
         InputError: too few poses, or data that cannot be of this arm.
-        CalibrationError: poses so alike that not even base and tool can be told.
+        CalibrationError: poses so alike that not even base and tool are observable.
     """
     _require_enough(measured)
     arm = without_tool(arm)
     progress("is this the arm")
     check_plausible(arm, measured)
-    model, x = placed(Model.of(arm, measured, backlash=approaches(measured)), measured)
+    model, x = with_placement(Model.of(arm, measured, backlash=approaches(measured)), measured)
     prior = prior_sigma(model, priors)
     at = _first(model, x, measured, prior)
-    _require_placed(model, at.x, measured, prior, at.noise, _of(model, PLACEMENT))
+    _require_placement(model, at.x, measured, prior, at.noise, _of(model, PLACEMENT))
     return model, at.x, prior
 
 
 def _identified(
     model: Model, start: Solution, measured: Measured, prior: Array, placement: Mask, progress: Callable[[str], None]
 ) -> Identified:
-    """Go from base and tool to the whole."""
+    """Identify everything, from base and tool fitted."""
     rows = np.linspace(0, len(measured) - 1, min(MOST, len(measured))).astype(np.int64)
     part = measured.rows(rows)
     progress("lengths, angles and zeros")
     table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
     geometric = fit(model, start.x, part, table, prior)
-    progress("every cause at once")
-    whole, prior, tellable, chance = _everything(model, start, geometric, part, prior)
-    part, measured = (with_joint_noise(model, whole.x, m, chance.sigma_rad) for m in (part, measured))
-    progress("which causes pay")
-    # A curve's harmonics and a joint's loads stand together: each alone these poses may hardly show.
-    candidates = tellable.free | (tellable.possible & _of(model, TOGETHER))
+    progress("every error source at once")
+    whole, prior, observable, scatter = _everything(model, start, geometric, part, prior)
+    part, measured = (with_joint_noise(model, whole.x, m, scatter.sigma_rad) for m in (part, measured))
+    progress("which error sources lower the held-out error")
+    # A curve's harmonics and a joint's loads are selected together: each alone may hardly show at these poses.
+    candidates = observable.free | (observable.possible & _of(model, TOGETHER))
     few = len(part) * part.size < PLENTY * len(model.parameters)
     together = _of(model, TOGETHER) & few
-    growth = forward_selection(model, whole, part, candidates if few else tellable.free, prior, together, progress)
-    x = np.where(growth.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
+    selection = forward_selection(model, whole, part, candidates if few else observable.free, prior, together, progress)
+    x = np.where(selection.free, whole.x, np.where(np.isfinite(prior), model.nominal(), whole.x))
     progress("the fit")
-    solution = fit(model, x, measured, growth.free, prior, noise=whole.noise)
+    solution = fit(model, x, measured, selection.free, prior, noise=whole.noise)
     nominal = fit(model, start.x, measured, placement, prior, used=solution.used)
-    kept_together = {model.names[k] for k in np.flatnonzero(growth.free & ~tellable.free)}
-    reasons = {**{n: told for n, told in tellable.reasons.items() if n not in kept_together}, **growth.reasons}
-    cov = _whole(model, solution, measured, tellable.possible, prior)
-    between = np.where(growth.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
-    cov = np.where(growth.free[:, None] & growth.free, cov + np.diag(between**2), 0.0)
+    kept_together = {model.names[k] for k in np.flatnonzero(selection.free & ~observable.free)}
+    reasons = {**{n: why for n, why in observable.reasons.items() if n not in kept_together}, **selection.reasons}
+    cov = _whole(model, solution, measured, observable.possible, prior)
+    between = np.where(selection.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
+    cov = np.where(selection.free[:, None] & selection.free, cov + np.diag(between**2), 0.0)
     return Identified(
-        model, nominal.x, solution, reasons, growth.steps, tellable.singular_values, prior, cov, chance.sigma_rad
+        model, nominal.x, solution, reasons, selection.steps, observable.singular_values, prior, cov, scatter.sigma_rad
     )
 
 
 def _everything(
     model: Model, start: Solution, geometric: Solution, measured: Measured, prior: Array
 ) -> tuple[Solution, Array, Observed, JointNoise]:
-    """Fit all that may be off, in turns: a fit's noise tells how large the causes are, and what the joints do by chance."""
+    """Fit all that may be off, in rounds: each fit's noise gives the size of the error sources and the joints' scatter."""
     noise = geometric.noise
     whole = geometric
     scaled = prior
-    weighed, chance = measured, NO_CHANCE
-    for _ in range(TURNS if measured.cov is not None else 2):
-        seen = observed(model, start.x, weighed, prior, noise)
-        whole = fit(model, whole.x, weighed, seen.possible, scaled, noise=noise)
+    weighted, scatter = measured, NO_CHANCE
+    for _ in range(ROUNDS if measured.cov is not None else 2):
+        seen = observed(model, start.x, weighted, prior, noise)
+        whole = fit(model, whole.x, weighted, seen.possible, scaled, noise=noise)
         if measured.cov is not None:
-            chance = joint_noise(model, whole, weighed, measured)
-            weighed = with_joint_noise(model, whole.x, measured, chance.sigma_rad)
-        noise, scaled = whole.noise, scaled_prior(model, whole, weighed, seen.possible, prior)
-    return whole, scaled, observed(model, start.x, weighed, scaled, noise), chance
+            scatter = joint_noise(model, whole, weighted, measured)
+            weighted = with_joint_noise(model, whole.x, measured, scatter.sigma_rad)
+        noise, scaled = whole.noise, scaled_prior(model, whole, weighted, seen.possible, prior)
+    return whole, scaled, observed(model, start.x, weighted, scaled, noise), scatter
 
 
 def _of(model: Model, kinds: tuple[str, ...]) -> Mask:
@@ -200,7 +201,7 @@ def _of(model: Model, kinds: tuple[str, ...]) -> Mask:
 
 
 def _whole(model: Model, solution: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
-    """Return the covariance (P, P) of all that the poses can tell, at the solution and with its noise."""
+    """Return the covariance (P, P) of the free parameters at the solution, with its noise."""
     part = measured.rows(solution.used)
     return covariance(model, solution.x, part, model.feature_values(part.q, part.approach), free, prior, solution.noise)
 
@@ -221,23 +222,23 @@ def _require_enough(measured: Measured) -> None:
         raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
 
 
-def _require_placed(
+def _require_placement(
     model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], placement: Mask
 ) -> None:
-    """Refuse poses that do not even tell where base and tool are."""
-    told = observed(model, x, measured, np.where(placement, prior, 0.0), noise)
-    lost = [model.names[k] for k in np.flatnonzero(placement & ~told.free)]
+    """Reject poses that do not even determine base and tool."""
+    found = observed(model, x, measured, np.where(placement, prior, 0.0), noise)
+    lost = [model.names[k] for k in np.flatnonzero(placement & ~found.free)]
     if lost:
         raise CalibrationError(
-            f"the poses are too alike: {', '.join(lost)} cannot be told from the others; move every joint between poses, "
-            "by 20 degrees and more"
+            f"the poses are too alike: {', '.join(lost)} cannot be distinguished from the others; move every joint between "
+            "poses, by 20 degrees and more"
         )
 
 
 def contributions(found: Identified, measured: Measured) -> dict[str, float]:
-    """Return what each cause moves the tool by, RMS over the poses, m.
+    """Return by how much each error source moves the tool, RMS over the poses, m.
 
-    Causes are taken in the order in which the model grew, each beyond what base and tool and the causes before it take up,
+    The sources are taken in the order of their selection, each beyond what base and tool and the sources before it explain,
     so that what two could explain is counted once; the squares add up.
 
     Args:
@@ -252,7 +253,7 @@ def contributions(found: Identified, measured: Measured) -> dict[str, float]:
     Q = np.zeros((len(J), 0))
     for step in found.steps:
         names = [name for name in step.names if s.free[model.names.index(name)]]
-        if step.cause.startswith("-") or not names:
+        if step.source.startswith("-") or not names:
             continue
         columns = J[:, [model.names.index(name) for name in names]]
         for _ in range(2):  # twice is enough against rounding
@@ -261,7 +262,7 @@ def contributions(found: Identified, measured: Measured) -> dict[str, float]:
         taken = new @ (new.T @ left)
         left, Q = left - taken, np.column_stack([Q, new])
         if set(names) - set(_named_kinds(model, PLACEMENT)):
-            out[step.cause] = float(np.sqrt(np.sum(taken**2) / (len(measured) * measured.points)))
+            out[step.source] = float(np.sqrt(np.sum(taken**2) / (len(measured) * measured.points)))
     return out
 
 

@@ -1,7 +1,10 @@
-"""How far each joint is off its reading by chance, from pose to pose: play that nothing holds on one side, jitter.
+"""Scatter of each joint about its reading, from pose to pose: backlash that nothing holds on one side, jitter.
 
-Where the instrument's covariance is known, what residuals show beyond it is laid to the joints: each moves the body along
-its own column of the Jacobian, and a joint that lies anywhere in its play then spoils nothing but its own direction. The
+In: a fit, and poses with the instrument's covariance. Out: one sigma per joint, and how far each joint was off at each
+pose.
+
+What the residuals show beyond the instrument's covariance is attributed to the joints: each moves the body along its own
+column of the Jacobian, so that a joint that lies anywhere in its backlash affects nothing but its own direction. The
 variances are those of the greatest likelihood, found by expectation and maximisation (Dempster, Laird and Rubin, Journal of
 the Royal Statistical Society B 39, 1977).
 """
@@ -19,7 +22,7 @@ from armsight.loop.identify.fit import Solution, noise_cov
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
-#: Steps; the variances have settled to some per cent by then, which is better than so few poses tell them.
+#: Steps; the variances have settled to some per cent by then, which is better than so few poses determine them.
 STEPS = 60
 #: Where a step starts, rad and m: what is not there shrinks from it.
 START_RAD, START_M = 1e-3, 1e-4
@@ -30,7 +33,7 @@ class JointNoise(NamedTuple):
 
     Attributes:
         sigma_rad: (6,) of each joint.
-        off_rad: (N, 6) by how much each joint was off at each pose, as far as it can be told.
+        off_rad: (N, 6) by how much each joint was off at each pose, as far as the residuals show it.
         sigma_off_rad: (N, 6) their sigmas.
     """
 
@@ -39,47 +42,48 @@ class JointNoise(NamedTuple):
     sigma_off_rad: Array
 
 
-#: Where nothing tells.
+#: Where the instrument's covariance is unknown.
 NO_CHANCE = JointNoise(np.zeros(6), np.zeros((0, 6)), np.zeros((0, 6)))
 
 
-def joint_noise(model: Model, solution: Solution, weighed: Measured, measured: Measured) -> JointNoise:
-    """Lay residuals beyond the instrument's covariance to the joints.
+def joint_noise(model: Model, solution: Solution, weighted: Measured, measured: Measured) -> JointNoise:
+    """Attribute residuals beyond the instrument's covariance to the joints.
 
     Args:
         model: the arm.
         solution: a fit of it.
-        weighed: the poses as they were weighed in it.
+        weighted: the poses with the covariance that the fit used.
         measured: the poses, with the instrument's covariance alone.
     """
     phi = model.feature_values(measured.q, measured.approach)
     e, J = model.linearised(solution.x, measured, phi)
     free = J[:, :, solution.free]
-    taken = float(np.einsum("nif,fg,njg,nji->", free, _part(solution), free, _inverse_noise(weighed, solution)))
-    share = float(np.clip(1 - taken / e.size, 0.2, 1.0))  # what fitting has taken off the residuals
+    taken = float(np.einsum("nif,fg,njg,nji->", free, _part(solution), free, _inverse_noise(weighted, solution)))
+    share = float(np.clip(1 - taken / e.size, 0.2, 1.0))  # what the fit has left of the residuals' variance
     B = np.concatenate(
         [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2
     )
     measured = with_joint_noise(model, solution.x, measured, np.zeros(6))
-    place = np.arange(e.shape[1]) // 3  # the residual noise of place and of turn, one variance each
+    axes = np.arange(e.shape[1]) // 3  # the residual noise of position (0) and of rotation (1): one variance each
     if not model.full:
-        place[:] = 0
-    variance = np.concatenate([np.full(6, START_RAD**2), np.where(place == 0, START_M, START_RAD) ** 2])
+        axes[:] = 0
+    variance = np.concatenate([np.full(6, START_RAD**2), np.where(axes == 0, START_M, START_RAD) ** 2])
     used = solution.used
     for _ in range(STEPS):
         mean, spread = _expected(e, B, variance, measured)
         second = (mean**2 / share + spread)[used].mean(axis=0)
         variance = second
-        for k in np.unique(place):
-            variance[6:][place == k] = second[6:][place == k].mean()
+        for k in np.unique(axes):
+            variance[6:][axes == k] = second[6:][axes == k].mean()
     mean, spread = _expected(e, B, variance, measured)
     return JointNoise(np.sqrt(variance[:6]), mean[:, :6], np.sqrt(spread[:, :6]))
 
 
 def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
-    """Return the poses with what the joints are off by chance in their covariance.
+    """Return the poses with the joints' scatter added to their covariance.
 
-    So is on which side of its play a joint lies where weight and friction are about as strong.
+    Added, too, is the uncertainty on which side of its backlash a joint lies where gravity and friction are about as
+    strong.
     """
     if measured.cov is None:
         return measured
@@ -93,23 +97,23 @@ def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Arra
 
 
 def _of_sides(model: Model, x: Array, phi: Array) -> Array:
-    """Return the variance (N, 6), rad^2, of where joints lie in play that weight closes: 1 - mean^2 of a side of +-1."""
+    """Return the variance (N, 6), rad^2, of joints in backlash that gravity closes: 1 - mean^2 of a side of +-1."""
     out = np.zeros((len(phi), 6))
     for k, f in enumerate(model.features):
-        if f.kind == "slack":
+        if f.kind == "gravity_backlash":
             half = 0.5 * x[model.sources_at + k]
             out[:, f.joint] = half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
     return out
 
 
 def by_joints(model: Model, J: Array) -> Array:
-    """Return the derivative (N, M, 6) by the joints' angles, out of that by all parameters."""
+    """Return the derivative (N, M, 6) by the joints' angles, from that by all parameters (N, M, P)."""
     return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.sources_at : len(chain.COLUMNS)])
 
 
 def _expected(e: Array, B: Array, variance: Array, measured: Measured) -> tuple[Array, Array]:
     """Return mean (N, K) and variance (N, K) of every source at every pose, given the residuals."""
-    assert measured.cov is not None  # for the type checker: nothing is laid to the joints without
+    assert measured.cov is not None  # for the type checker: without it nothing is attributed to the joints
     S = measured.cov + (B * variance) @ B.swapaxes(1, 2)
     gain = variance[:, None] * np.linalg.solve(S, B).swapaxes(1, 2)
     mean = (gain @ e[..., None])[..., 0]

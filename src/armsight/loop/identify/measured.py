@@ -1,4 +1,4 @@
-"""What an identification is made from: joint angles, and where an instrument saw the tool.
+"""The input of an identification: joint angles, and where an instrument measured the tool.
 
 The instrument's frame is called rig whatever it is (a stereo rig, a laser tracker). Either K points of the tool were
 tracked, or one body's full pose.
@@ -20,12 +20,12 @@ Rows = NDArray[np.bool_] | NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Measured(Record):
-    """Joint angles, and where the tool was seen at them.
+    """Joint angles, and where the tool was measured at them.
 
     Attributes:
         q: (N, 6) joint angles as the joints' sensors read them, rad.
         p_rig: (N, K, 3) tracked points, m; K is 1 with full poses (the body's origin).
-        R_rig_body: (N, 3, 3) turn of the body, with full poses; None with points only.
+        R_rig_body: (N, 3, 3) rotation of the body in the rig, with full poses; None with points only.
         cov: (N, M, M) covariance of what was seen; None where not known. Points: M = 3 K, along the rig's axes, m^2. Poses:
             M = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
         approach: (N, 6) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;

@@ -1,23 +1,26 @@
-"""Everything that can be off about an arm, as one vector of named parameters, and what it predicts.
+"""The model that identification fits: an arm with everything that can be off about it, as one vector of parameters.
 
-Order of the vector: where the base is in the rig (shift along the rig's axes; turn about them, from a start), where the
-tool's points or the body are on frame 6, the table's numbers, and the coefficients of the causes in ``features``.
+The vector x (P,) holds, in this order: the base in the rig (translation along the rig's axes; rotation about them, from a
+start), the tool's points or the body in frame 6, the 30 numbers of the table, and one coefficient per error source beyond
+the table.
 
-Forward kinematics of an arm that is not what its table says, and the derivative by everything that can be off.
+The file in order: forward kinematics of an arm that deviates from its table, with derivatives (:class:`TableMotion`); the
+error sources of single joints (:class:`Feature`); the vector and its predictions (:class:`Model`).
 
 A row of the table is Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta), modified Rx(alpha) Tx(a) Ry(beta) Rz(theta) Tz(d). Beta is
 Hayati's angle ("Robot arm geometric link parameter estimation", CDC 1983): between neighbouring axes that are parallel, d
-says nothing and only beta can tilt the second axis about the common normal's perpendicular. The derivative of a point by an
-elementary turn about axis u through o is u x (p - o), by a shift u.
+has no effect and only beta can tilt the second axis about the common normal's perpendicular. The derivative of a point p by
+an elementary rotation about axis u through o is u x (p - o), by a translation along u it is u.
 
-What a joint's true angle may differ by from what its sensor reads: linear in the unknown coefficients.
+The error sources say by how much a joint's true angle differs from its sensor's reading, linear in the coefficients:
 
-gain: the sensor's scale. wave, ripple: linearity error of a sensor, sin and cos of its angle and of multiples of it.
-backlash: half of it to either side, by the direction of approach: play that friction holds where the joint left it. slack:
-the same for play that the weight beyond the joint closes, whichever way it came, save where the lever is so small that
-friction is stronger. sag: a compliant gear under the links'
-weight; the torque about joint i is the sum over links j >= i of (mass and lever, unknown) times z_i . (L_j x g), with L_j
-link j's own vector.
+- gain: scale of the sensor.
+- wave, ripple: linearity error of the sensor, sine and cosine of its angle and of multiples of it.
+- backlash: half of it to either side, by the direction of approach: friction holds the joint on the side it came from.
+- gravity_backlash: backlash that the gravity load of the links beyond the joint closes, whichever way the joint came,
+  except where the lever is so small that friction is stronger.
+- compliance: the gear yields under the gravity torque of the links. The torque about joint i is the sum over links j >=
+  i of (mass and lever, unknown) times z_i . (L_j x g), where L_j is the vector of link j.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.geometry.pose import exp_se3, inverse
+from armsight.geometry.pose import inverse, left_jacobian
 from armsight.geometry.rotation import exp_so3, log_so3, skew
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
@@ -39,19 +42,19 @@ COLUMNS = ("offset", "d", "a", "alpha", "beta")
 OFFSET, D, A, ALPHA, BETA = range(5)
 _STANDARD = (OFFSET, D, A, ALPHA, BETA)
 _MODIFIED = (ALPHA, A, BETA, OFFSET, D)
-#: Column -> the axis it turns about or shifts along.
+#: Column -> the axis it rotates about or translates along.
 _AXIS = {OFFSET: 2, D: 2, A: 0, ALPHA: 0, BETA: 1}
 _SHIFTS = (D, A)
 
 
-class Motion(NamedTuple):
-    """Where an arm's last frame is, and how it moves with each number of the table.
+class TableMotion(NamedTuple):
+    """Pose of an arm's last frame, and the axes along or about which each number of the table moves it.
 
     Attributes:
-        R: (N, 3, 3) turn of frame 6 in the rig.
-        o: (N, 3) its origin.
-        axis: (6, 5, N, 3) the axes that each number turns about or shifts along.
-        through: (6, 5, N, 3) points on those axes.
+        R: (N, 3, 3) rotation of frame 6 in the rig.
+        o: (N, 3) origin of frame 6 in the rig, m.
+        axis: (6, 5, N, 3) unit axes that each number rotates about or translates along, rig.
+        through: (6, 5, N, 3) points on those axes, rig, m.
     """
 
     R: Array
@@ -65,15 +68,15 @@ def nominal_table(arm: Arm) -> Array:
     return np.stack([arm.offset, arm.d, arm.a, arm.alpha, np.zeros(6)], axis=1)
 
 
-def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> Motion:
-    """Carry a frame along the chain.
+def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
+    """Move a frame along the chain, and note the axis of every number of the table.
 
     Args:
         table: (6, 5) by COLUMNS, m and rad.
-        theta: (N, 6) what each joint turns beside its offset, rad.
+        theta: (N, 6) rotation of each joint without its offset, rad.
         modified: whether the table follows the modified convention.
-        R_rig_0: (3, 3) turn of frame 0 in the rig.
-        o_rig_0: (3,) its origin.
+        R_rig_0: (3, 3) rotation of frame 0 in the rig.
+        o_rig_0: (3,) origin of frame 0 in the rig, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
@@ -86,61 +89,57 @@ def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: 
             if column in _SHIFTS:
                 o += value * R[:, :, k]
             elif column == OFFSET:
-                _turn(R, k, value + theta[:, i])
+                _rotate(R, k, value + theta[:, i])
             elif value != 0.0:
-                _turn(R, k, np.full(n, value))
-    return Motion(R, o, axis, through)
+                _rotate(R, k, np.full(n, value))
+    return TableMotion(R, o, axis, through)
 
 
-def _turn(R: Array, k: int, angle: Array) -> None:
-    """Turn frames (N, 3, 3) in place about their own axis ``k``."""
+def _rotate(R: Array, k: int, angle: Array) -> None:
+    """Rotate frames (N, 3, 3) in-place about their own axis ``k`` by angles (N,), rad."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     u, v = R[:, :, (k + 1) % 3].copy(), R[:, :, (k + 2) % 3].copy()
     R[:, :, (k + 1) % 3] = c * u + s * v
     R[:, :, (k + 2) % 3] = c * v - s * u
 
 
-def point_derivative(m: Motion, p: Array) -> Array:
+def point_derivative(m: TableMotion, p: Array) -> Array:
     """Return the derivative (6, 5, N, 3) of points p (N, 3), rig, by every number of the table."""
     out = np.cross(m.axis, p - m.through)
     out[:, _SHIFTS] = m.axis[:, _SHIFTS]
     return out
 
 
-def turn_derivative(m: Motion) -> Array:
-    """Return the derivative (6, 5, N, 3) of the turn of frame 6, as a rotation vector in the rig's axes."""
+def rotation_derivative(m: TableMotion) -> Array:
+    """Return the derivative (6, 5, N, 3) of frame 6's rotation, as a rotation vector in the rig's axes."""
     out = m.axis.copy()
     out[:, _SHIFTS] = 0.0
     return out
 
 
-def turned(start: Array, by: Array) -> Array:
-    """Return exp(by) @ start for a rotation vector (3,)."""
-    return np.asarray(exp_so3(by) @ start)
-
-
-#: Harmonics of one turn of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and the
-#: fastest: the workcell's potentiometers swing up to nine times over their travel, which may be three quarters of a turn.
+#: Harmonics of one revolution of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and
+#: the fastest: the workcell's potentiometers oscillate up to nine times over their travel of about 270 degrees.
 WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
-#: Fewer numbers measured than this are not given ripples at all: their one prior would be told by chance.
+#: With fewer measured numbers than this the model has no ripples: chance alone would determine their one prior.
 ENOUGH = 100
-#: With so many measured numbers to a parameter each harmonic and load stands for itself, whatever is known before. The
-#: fastest are then left out: chosen one by one, no prior holds them where the arm was not looked at.
+#: With so many measured numbers per parameter each harmonic and load is selected by itself, whatever its prior. The
+#: fastest are then left out: selected one by one, no prior would bound them where the arm was not measured.
 PLENTY = 10
-#: A bearing's friction holds a link in its play against weight with up to about this lever, m: some per cent of what the
-#: links of such arms have, as bearings' friction is of the load. Over half of it the play closes.
+#: A bearing's friction holds a link inside its backlash against gravity with up to about this lever, m: some per cent of
+#: the lever of such arms' links, as a bearing's friction is some per cent of its load. Over half of it the backlash closes.
 FRICTION_M = 2e-3
 
 
 class Feature(NamedTuple):
-    """A cause that moves one joint.
+    """An error source that moves one joint.
 
     Attributes:
         name: of the coefficient.
-        kind: "gain", "wave", "ripple", "backlash", "slack" or "sag".
+        kind: "gain", "wave", "ripple", "backlash", "gravity_backlash" or "compliance".
         joint: 0 to 5.
         unit: of the coefficient.
-        detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose weight sags; (0, 0) elsewhere.
+        detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose gravity loads the gear; (0, 0)
+            elsewhere.
     """
 
     name: str
@@ -151,7 +150,12 @@ class Feature(NamedTuple):
 
 
 def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
-    """Return every cause there is; ``backlash`` where directions of approach are known; the ripples' harmonics."""
+    """Return every error source.
+
+    Args:
+        backlash: include backlash that friction holds, which needs known directions of approach.
+        ripples: harmonics beyond WAVES.
+    """
     found = []
     for i in range(6):
         found.append(Feature(f"gain{i + 1}", "gain", i, "rad/rad"))
@@ -160,8 +164,8 @@ def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...
             found += [Feature(f"{kind}{i + 1}_{w}{n}", kind, i, "rad", (n, k)) for k, w in enumerate(("sin", "cos"))]
         if backlash:
             found.append(Feature(f"backlash{i + 1}", "backlash", i, "rad"))
-        found.append(Feature(f"slack{i + 1}", "slack", i, "rad"))
-        found += [Feature(f"sag{i + 1}_{j + 1}", "sag", i, "rad/m", (j, 0)) for j in range(i, 6)]
+        found.append(Feature(f"gravity_backlash{i + 1}", "gravity_backlash", i, "rad"))
+        found += [Feature(f"compliance{i + 1}_{j + 1}", "compliance", i, "rad/m", (j, 0)) for j in range(i, 6)]
     return tuple(found)
 
 
@@ -169,7 +173,7 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
     """Return what one unit of every coefficient adds to its joint's angle.
 
     Args:
-        arm: the nominal arm, whose links the levers of sag are taken from.
+        arm: the nominal arm, whose links give the levers of gravity.
         features: F of them.
         q: (N, 6) joint angles, rad.
         approach: (N, 6) directions of approach, or None.
@@ -179,8 +183,8 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
         (N, F).
     """
     out = np.zeros((len(q), len(features)))
-    weighty = any(f.kind in ("sag", "slack") for f in features)
-    levers = _levers(arm, q, up_base) if weighty else np.zeros((len(q), 6, 6))
+    by_gravity = any(f.kind in ("compliance", "gravity_backlash") for f in features)
+    levers = _levers(arm, q, up_base) if by_gravity else np.zeros((len(q), 6, 6))
     for k, f in enumerate(features):
         angle = q[:, f.joint]
         if f.kind == "gain":
@@ -190,34 +194,36 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
             out[:, k] = np.cos(n * angle) if phase else np.sin(n * angle)
         elif f.kind == "backlash" and approach is not None:
             out[:, k] = -0.5 * approach[:, f.joint]
-        elif f.kind == "slack":
-            out[:, k] = 0.5 * _side(_weight_lever(arm, levers, f.joint), approach, f.joint)
-        elif f.kind == "sag":
+        elif f.kind == "gravity_backlash":
+            out[:, k] = 0.5 * _side(_gravity_lever(arm, levers, f.joint), approach, f.joint)
+        elif f.kind == "compliance":
             out[:, k] = levers[:, f.joint, f.detail[0]]
     return out
 
 
-def _weight_lever(arm: Arm, levers: Array, joint: int) -> Array:
-    """Return the lever (N,), m, of the weight beyond a joint, if links are rods that are all equally heavy by the metre."""
+def _gravity_lever(arm: Arm, levers: Array, joint: int) -> Array:
+    """Return the lever (N,), m, of the gravity load beyond a joint, for links that are rods of one mass per metre."""
     mass = np.hypot(arm.a, arm.d)[joint:] + 1e-9
-    beyond = np.cumsum(mass[::-1])[::-1] - 0.5 * mass  # of a link's own vector: half of itself, and all that follows
+    beyond = (
+        np.cumsum(mass[::-1])[::-1] - 0.5 * mass
+    )  # carried by a link's vector: half of its own mass, and all after it
     return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
 
 
 def _side(lever: Array, approach: Array | None, joint: int) -> Array:
-    """Return on which side of its play a link lies (N,), -1 to 1: weight's, or where that is weaker that of friction.
+    """Return on which side of its backlash a link lies (N,), -1 to 1: by gravity, or by friction where that is stronger.
 
-    Near where one gives way to the other it is the mean of both sides, by how likely each is; where the side that it came
-    from is not known, it is so from there to as far on the other side.
+    Where the two are about as strong it is the mean of both sides, weighted by how likely each is. Where the direction of
+    approach is unknown, that transition covers both signs of the lever.
     """
     if np.abs(lever).max(initial=0.0) < FRICTION_M:
-        return np.zeros(len(lever))  # it carries nothing: that is what ``backlash`` is for
+        return np.zeros(len(lever))  # gravity does not load it: its backlash is of kind ``backlash``
     side = np.zeros(len(lever)) if approach is None else approach[:, joint]
     return np.asarray(np.tanh((lever - FRICTION_M * side) / (FRICTION_M * (1 - 0.5 * np.abs(side)))))
 
 
 def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
-    """Return z_i . (L_j x g) (N, 6, 6) for unit gravity g: m of lever of link j about joint i, by the joint's direction."""
+    """Return z_i . (L_j x g) (N, 6, 6) for unit gravity g: lever of link j about joint i, m, signed by its direction."""
     T = arm.T_base_0
     modified = arm.convention == "modified"
     m = motion(nominal_table(arm), arm.direction * q, modified, T[:3, :3], T[:3, 3])
@@ -227,7 +233,7 @@ def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
 
 
 def approaches(measured: Measured) -> bool:
-    """Say whether directions of approach are known."""
+    """Return whether directions of approach are known."""
     return measured.approach is not None and bool(np.any(measured.approach != 0))
 
 
@@ -260,9 +266,9 @@ class Model(Record):
         arm: the nominal arm; its T_base_0 holds, its tool is not used.
         points: how many points are tracked; 1 with full poses.
         full: whether full poses are measured.
-        features: the causes beyond the table.
-        R_start: (3, 3) turn of the base in the rig that the base's turn counts from.
-        R_tool: (3, 3) turn of the body on frame 6 that the tool's turn counts from, with full poses.
+        features: the error sources beyond the table.
+        R_start: (3, 3) rotation of the base in the rig that the base's rotation parameters start from.
+        R_tool: (3, 3) rotation of the body in frame 6 that the tool's rotation parameters start from, with full poses.
         up_base: (3,) unit vector against gravity, base.
     """
 
@@ -339,7 +345,7 @@ class Model(Record):
         return x[self.tool_at : self.tool_at + 3 * self.points].reshape(-1, 3)
 
     def T_6_body(self, x: Array) -> Array:
-        """Return the body (4, 4) in frame 6; its turn is that of frame 6 where only points are measured."""
+        """Return the body (4, 4) in frame 6; its rotation is that of frame 6 where only points are measured."""
         T = np.eye(4)
         T[:3, 3] = self.tool_points(x)[0]
         if self.full:
@@ -347,22 +353,22 @@ class Model(Record):
         return T
 
     def with_features(self, features: tuple[Feature, ...]) -> Model:
-        """Return the model with other causes."""
+        """Return the model with other error sources."""
         return replace(self, features=features)
 
     def feature_values(self, q: Array, approach: Array | None) -> Array:
-        """Return what one unit of every cause adds to its joint's angle, (N, F), rad."""
+        """Return what one unit of every error source adds to its joint's angle, (N, F), rad per unit."""
         return values(self.arm, self.features, q, approach, self.up_base)
 
     def theta(self, x: Array, q: Array, phi: Array) -> Array:
-        """Return what the joints turn beside their offsets (N, 6), rad; ``phi`` of :meth:`feature_values`."""
+        """Return the joints' rotations without their offsets (N, 6), rad; ``phi`` is :meth:`feature_values`."""
         out = self.arm.direction * q
         for k, f in enumerate(self.features):
             if x[self.sources_at + k] != 0.0:
                 out[:, f.joint] += self.arm.direction[f.joint] * x[self.sources_at + k] * phi[:, k]
         return np.asarray(out)
 
-    def motion(self, x: Array, q: Array, phi: Array) -> Motion:
+    def motion(self, x: Array, q: Array, phi: Array) -> TableMotion:
         """Return frame 6 in the rig, and how it moves."""
         T = self.T_rig_base(x) @ self.arm.T_base_0
         modified = self.arm.convention == "modified"
@@ -372,14 +378,14 @@ class Model(Record):
         """Return predicted minus measured, (N, M); see :class:`Measured` for its axes."""
         return self._residuals(self.motion(x, measured.q, phi), x, measured)
 
-    def _residuals(self, m: Motion, x: Array, measured: Measured) -> Array:
+    def _residuals(self, m: TableMotion, x: Array, measured: Measured) -> Array:
         t = self.tool_points(x)
         off = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2) - measured.p_rig
         if measured.R_rig_body is None:
             return np.asarray(off.reshape(len(off), -1))
         back = measured.R_rig_body.swapaxes(1, 2)
-        turn = log_so3(back @ m.R @ self.T_6_body(x)[:3, :3])
-        return np.concatenate([(back @ off.swapaxes(1, 2))[..., 0], turn], axis=1)
+        angle = log_so3(back @ m.R @ self.T_6_body(x)[:3, :3])
+        return np.concatenate([(back @ off.swapaxes(1, 2))[..., 0], angle], axis=1)
 
     def linearised(self, x: Array, measured: Measured, phi: Array) -> tuple[Array, Array]:
         """Return predicted minus measured (N, M), and its derivative (N, M, P) by the vector."""
@@ -387,40 +393,40 @@ class Model(Record):
         e = self._residuals(m, x, measured)
         t, n, at = self.tool_points(x), len(measured), self.table_at
         J = np.zeros((n, measured.size, len(self.parameters)))
-        ways, by_theta = self._ways(phi), self.arm.direction[[f.joint for f in self.features]].astype(int)
+        joints = [f.joint for f in self.features]
+        direction = self.arm.direction[joints].astype(int)
         for k in range(self.points):
             rows, p = slice(3 * k, 3 * k + 3), m.o + m.R @ t[k]
             J[:, rows, 0:3] = np.eye(3)
-            J[:, rows, 3:6] = -skew(p - x[:3]) @ _left_jacobian(x[3:6])
+            J[:, rows, 3:6] = -skew(p - x[:3]) @ left_jacobian(x[3:6])
             J[:, rows, self.tool_at + 3 * k : self.tool_at + 3 * k + 3] = m.R
             table = point_derivative(m, p)
             J[:, rows, at : self.sources_at] = table.reshape(30, n, 3).transpose(1, 2, 0)
             if self.features:
-                moved = table[ways, OFFSET] * (by_theta[:, None] * phi.T)[..., None]
+                moved = table[joints, OFFSET] * (direction[:, None] * phi.T)[..., None]
                 J[:, rows, self.sources_at :] = moved.transpose(1, 2, 0)
         if measured.R_rig_body is not None:
-            self._turn_rows(m, x, measured, phi, e, J)
+            self._rotation_rows(m, x, measured, phi, e, J)
         return e, J
 
-    def _turn_rows(self, m: Motion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:
-        """Fill in the derivative of full poses: the body's axes, and the turn."""
+    def _rotation_rows(self, m: TableMotion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:
+        """Fill in the derivative of full poses: position residuals in the body's axes, and rotation residuals."""
         assert measured.R_rig_body is not None  # for the type checker: the caller has looked
-        n, at, ways = len(measured), self.table_at, self._ways(phi)
+        n, at, joints = len(measured), self.table_at, [f.joint for f in self.features]
         J[:, :3] = measured.R_rig_body.swapaxes(1, 2) @ J[:, :3]
         R_hat = m.R @ self.T_6_body(x)[:3, :3]
         to_log = (np.eye(3) + 0.5 * skew(e[:, 3:]) + _second(e[:, 3:])) @ R_hat.swapaxes(1, 2)
-        turn = turn_derivative(m)
+        by_rotation = rotation_derivative(m)
         W = np.zeros((n, 3, J.shape[2]))
-        W[:, :, 3:6] = _left_jacobian(x[3:6])
-        W[:, :, at : self.sources_at] = turn.reshape(30, n, 3).transpose(1, 2, 0)
+        W[:, :, 3:6] = left_jacobian(x[3:6])
+        W[:, :, at : self.sources_at] = by_rotation.reshape(30, n, 3).transpose(1, 2, 0)
         if self.features:
-            way = self.arm.direction[[f.joint for f in self.features]]
-            W[:, :, self.sources_at :] = (turn[ways, OFFSET] * (way[:, None] * phi.T)[..., None]).transpose(1, 2, 0)
+            direction = self.arm.direction[joints]
+            W[:, :, self.sources_at :] = (
+                by_rotation[joints, OFFSET] * (direction[:, None] * phi.T)[..., None]
+            ).transpose(1, 2, 0)
         J[:, 3:] = to_log @ W
-        J[:, 3:, at - 3 : at] = (to_log @ R_hat) @ _left_jacobian(-x[at - 3 : at])
-
-    def _ways(self, phi: Array) -> list[int]:
-        return [f.joint for f in self.features]
+        J[:, 3:, at - 3 : at] = (to_log @ R_hat) @ left_jacobian(-x[at - 3 : at])
 
     def tool_in_base(self, x: Array, q: Array, approach: Array | None) -> Array:
         """Return T_base_body (N, 4, 4) at joint angles (N, 6) read by the sensors."""
@@ -428,12 +434,6 @@ class Model(Record):
         T = np.zeros((len(q), 4, 4))
         T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = m.R, m.o, 1.0
         return np.asarray(inverse(self.T_rig_base(x)) @ T @ self.T_6_body(x))
-
-
-def _left_jacobian(v: Array) -> Array:
-    """Return the left Jacobian (3, 3) of exp at a rotation vector: exp(v + dv) = exp(J dv) exp(v)."""
-    columns = [exp_se3(np.concatenate([e, v]))[:3, 3] for e in np.eye(3)]  # the V of SE(3) is this very matrix
-    return np.stack(columns, axis=1)
 
 
 def _second(e: Array) -> Array:

@@ -1,9 +1,10 @@
-"""Which parameters the poses can tell apart at all, before anything is fitted.
+"""Observability: which parameters the poses can distinguish at all, before anything is fitted.
 
-The columns of the whitened Jacobian are taken one after the other, in the order in which one would like to keep them, each
-freed from those kept before it (Gram-Schmidt on the triangle of its QR decomposition, which has the same singular values).
-What nothing is left of is tied: it cannot be told from the others. What too little is left of to beat the prior is frozen:
-these poses do not show it. So Hayati's angle is kept where neighbouring axes are parallel, without being told.
+The columns of the whitened Jacobian are taken one after the other, in order of preference, each orthogonalised against
+those kept before it (Gram-Schmidt on the triangle of its QR decomposition, which has the same singular values). A
+column of which nothing is left is tied: it cannot be distinguished from the others. One of which too little is left to
+beat the prior is
+frozen: these poses do not show it. So Hayati's angle is kept where neighbouring axes are parallel, without any setting.
 """
 
 from __future__ import annotations
@@ -20,31 +21,32 @@ from armsight.loop.identify.model import Model
 
 #: Less than this part of a column left over counts as nothing: rounding leaves 1e-12, the nearest real case 1e-4.
 NOTHING = 1e-7
-#: A parameter is worth fitting where the data alone would tell it better than this many prior sigmas.
+#: A parameter is worth fitting where the data alone would give it a sigma below this many prior sigmas.
 WORTH = 1.0
 #: What moves the tool by less than this part of the noise, a prior sigma off, moves nothing at all.
 STILL = 1e-6
 _MOVES_NOTHING = "it moves nothing at these poses"
-#: A tie names the parameters that take at least this part of it.
+#: A tie names the parameters that contribute at least this part of it.
 NAMED = 0.02
-#: Poses over the joints' whole range that tell what no poses can show.
+#: Poses over the joints' whole range that reveal which ties no poses can resolve.
 PROBES = 300
 #: Poses looked at; more change nothing.
 MOST_POSES = 3000
 #: Kinds that belong to no row of the table.
-ERROR_SOURCES = ("gain", "wave", "ripple", "backlash", "slack", "sag")
-_ORDER = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURCES)
+ERROR_SOURCES = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
+_PREFERENCE = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURCES)
 
 
 class Observed(NamedTuple):
     """What can be fitted.
 
     Attributes:
-        free: (P,) whether a parameter can be told.
-        possible: (P,) what may be off though it cannot all be told: ``free``, what moves the tool too little, and causes
-            that are tied to others, which only their priors tell apart.
-        reasons: name -> why it cannot, or with what its value is shared.
-        singular_values: of the Jacobian of what can, each column in units of a prior sigma (base and tool: 1 m, 1 rad).
+        free: (P,) whether a parameter is observable.
+        possible: (P,) what may be off though not all of it is observable: ``free``, what moves the tool too little, and
+            error sources that are tied to others, which only their priors distinguish.
+        reasons: name -> why it is not observable, or with what its value is shared.
+        singular_values: of the Jacobian of the free parameters, each column in units of a prior sigma (base and tool: 1
+            m, 1 rad).
     """
 
     free: Mask
@@ -54,25 +56,25 @@ class Observed(NamedTuple):
 
 
 def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Observed:
-    """Find what can be told from poses.
+    """Find which parameters are observable from poses.
 
     Args:
         model: the arm.
-        x: (P,) base and tool in place, the rest nominal.
+        x: (P,) base and tool estimated, the rest nominal.
         measured: the poses.
         prior: (P,) prior sigmas; 0 freezes.
         noise: sigmas of the instrument.
     """
     T = _triangle(model, x, measured, prior, noise)
-    order = _order(model, x)
-    kept, ties, weak = _gram_schmidt(T, order, prior)
-    anywhere = _ties_anywhere(model, x, measured, prior, noise, order)
+    preference = _preference(model, x)
+    kept, ties, weak = _gram_schmidt(T, preference, prior)
+    anywhere = _ties_anywhere(model, x, measured, prior, noise, preference)
     reasons = {model.names[k]: "kept at its nominal value: a prior of zero" for k in np.flatnonzero(prior == 0)}
-    reasons |= _told(model, ties, anywhere)
+    reasons |= _tie_texts(model, ties, anywhere)
     for k, sigma in weak.items():
         unit = model.parameters[k].unit
-        told = f"these poses tell it to {sigma:.2g} {unit} at best, worse than it is known before"
-        reasons[model.names[k]] = f"kept at its nominal value: {told}"
+        best = f"these poses determine it to {sigma:.2g} {unit} at best, worse than its prior"
+        reasons[model.names[k]] = f"kept at its nominal value: {best}"
     free = np.zeros(len(x), bool)
     free[kept] = True
     possible = free.copy()
@@ -80,8 +82,8 @@ def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tu
     return Observed(free, possible, reasons, np.asarray(np.linalg.svd(T[:, free], compute_uv=False)))
 
 
-def _told(model: Model, ties: dict[int, list[int]], anywhere: dict[int, list[int]]) -> dict[str, str]:
-    """Say what is tied to what, on both sides."""
+def _tie_texts(model: Model, ties: dict[int, list[int]], anywhere: dict[int, list[int]]) -> dict[str, str]:
+    """Return name -> what a parameter is tied to, for both sides of each tie."""
     reasons: dict[str, str] = {}
     holds: dict[int, list[str]] = {}
     for k, others in ties.items():
@@ -89,12 +91,12 @@ def _told(model: Model, ties: dict[int, list[int]], anywhere: dict[int, list[int
         if not others:
             reasons[name] = f"kept at its nominal value: {_MOVES_NOTHING}"
         elif model.parameters[k].kind == "beta":
-            told = "tells" if len(others) == 1 else "together tell"
-            reasons[name] = f"not needed: {names} {told} the same where neighbouring axes are not parallel"
+            verb = "describes" if len(others) == 1 else "together describe"
+            reasons[name] = f"not needed: {names} {verb} the same where neighbouring axes are not parallel"
         elif k in anywhere:
-            reasons[name] = f"kept at its nominal value: no pose can tell it from {names}"
+            reasons[name] = f"kept at its nominal value: no pose can distinguish it from {names}"
         else:
-            reasons[name] = f"kept at its nominal value: these poses do not tell it from {names}"
+            reasons[name] = f"kept at its nominal value: these poses do not distinguish it from {names}"
         if model.parameters[k].kind != "beta":
             for i in others:
                 holds.setdefault(i, []).append(name)
@@ -103,13 +105,13 @@ def _told(model: Model, ties: dict[int, list[int]], anywhere: dict[int, list[int
     }
 
 
-def _order(model: Model, x: Array) -> Array:
-    """Return the parameters in the order in which one would like to keep them: of two d, the larger one."""
+def _preference(model: Model, x: Array) -> Array:
+    """Return the parameters (P,) in order of preference: of two d, the larger one first."""
     table = model.table(x)
     rank = []
     for k, p in enumerate(model.parameters):
         size = -abs(table[p.joint, chain.D]) if p.kind == "d" else 0.0
-        rank.append((_ORDER.index(p.kind), size, k))
+        rank.append((_PREFERENCE.index(p.kind), size, k))
     return np.array([k for _, _, k in sorted(rank)])
 
 
@@ -125,13 +127,15 @@ def _triangle(model: Model, x: Array, measured: Measured, prior: Array, noise: t
     return np.asarray(np.linalg.qr(np.concatenate([J, np.zeros((rows, len(x)))]), mode="r"))
 
 
-def _gram_schmidt(T: Array, order: Array, prior: Array) -> tuple[list[int], dict[int, list[int]], dict[int, float]]:
-    """Return what is kept, what is tied to what, and what is too weak with the sigma it would have."""
+def _gram_schmidt(
+    T: Array, preference: Array, prior: Array
+) -> tuple[list[int], dict[int, list[int]], dict[int, float]]:
+    """Return the parameters kept; those tied, with what; and those too weak, with the sigma they would have."""
     kept: list[int] = []
     ties: dict[int, list[int]] = {}
     weak: dict[int, float] = {}
     Q = np.zeros((len(T), 0))
-    for k in order:
+    for k in preference:
         if prior[k] == 0:
             continue
         column = T[:, k]
@@ -153,9 +157,9 @@ def _gram_schmidt(T: Array, order: Array, prior: Array) -> tuple[list[int], dict
 
 
 def _ties_anywhere(
-    model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], order: Array
+    model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], preference: Array
 ) -> dict[int, list[int]]:
-    """Return the ties that poses over the whole range would not loosen."""
+    """Return the ties that poses over the whole range would not resolve."""
     rng = np.random.default_rng(0)
     q = rng.uniform(np.maximum(model.arm.q_min, -np.pi), np.minimum(model.arm.q_max, np.pi), (PROBES, 6))
     approach = rng.choice([-1.0, 1.0], (PROBES, 6))
@@ -163,5 +167,7 @@ def _ties_anywhere(
     p = m.o[:, None] + (m.R @ model.tool_points(x).T).swapaxes(1, 2)
     R = m.R @ model.T_6_body(x)[:3, :3] if measured.R_rig_body is not None else None
     probes = Measured(q, p, R, None, approach)
-    _, ties, _ = _gram_schmidt(_triangle(model, x, probes, prior, (noise[0] + 1e-4, noise[1] + 1e-4)), order, prior)
+    _, ties, _ = _gram_schmidt(
+        _triangle(model, x, probes, prior, (noise[0] + 1e-4, noise[1] + 1e-4)), preference, prior
+    )
     return ties

@@ -1,7 +1,8 @@
-"""Where base and tool are, in closed form, so that nothing has to be told.
+"""Initial placement: base in the rig and tool on the flange, in closed form, so that nobody has to give a start.
 
 Points: with M = R^T and c unknown, M p_i + c = o_i + R_i t is linear in M (nine numbers, not yet a rotation), c and the
-point t on frame 6; M tells the scale, too. Full poses: A_i X = Z B_i, solved by ``handeye_start``.
+point t in frame 6; M contains the scale, too. Full poses: A_i X = Z B_i, solved by
+:func:`~armsight.loop.handeye.handeye.starts`.
 """
 
 from __future__ import annotations
@@ -12,14 +13,22 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.geometry.pose import inverse
-from armsight.geometry.rotation import log_so3
+from armsight.geometry.rotation import log_so3, nearest_rotation
 from armsight.loop.handeye.handeye import starts
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
 
-def placed(model: Model, measured: Measured) -> tuple[Model, Array]:
-    """Return the model with its turns counted from where base and tool are, and the vector of the nominal arm there."""
+def with_placement(model: Model, measured: Measured) -> tuple[Model, Array]:
+    """Return the model and vector of the nominal arm with base and tool estimated from the poses.
+
+    Args:
+        model: the arm with every parameter.
+        measured: the poses.
+
+    Returns:
+        The model with the placement's rotations as its ``R_start`` and ``R_tool``, and the vector x (P,).
+    """
     x = model.nominal()
     m = model.motion(x, measured.q, model.feature_values(measured.q, measured.approach))
     if measured.R_rig_body is not None:
@@ -30,8 +39,7 @@ def placed(model: Model, measured: Measured) -> tuple[Model, Array]:
         x[:3] = T[:3, 3]
     else:
         M, c, t = linear_placement(m.R, m.o, measured.p_rig)
-        U, _, Vt = np.linalg.svd(M)
-        R = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt).T
+        R = nearest_rotation(M).T
         model = replace(model, R_start=R)
         x[:3] = -R @ c
     x[model.tool_at : model.tool_at + t.size] = t.ravel()
@@ -65,6 +73,6 @@ def _stacked(R: Array, o: Array) -> Array:
     return T
 
 
-def turn_between(R_a: Array, R_b: Array) -> Array:
-    """Return the angles (N,) between turns (N, 3, 3), rad."""
+def angle_between(R_a: Array, R_b: Array) -> Array:
+    """Return the angles (N,) between rotations (N, 3, 3), rad."""
     return np.asarray(np.linalg.norm(log_so3(R_a.swapaxes(-1, -2) @ R_b), axis=-1))

@@ -1,16 +1,14 @@
-"""Where to look next: the poses that tell most about an arm, and what so many more of them buy.
+"""Optimal choice of the next poses to measure, and the predicted position error after each.
 
-Greedy choice among candidates that can be reached and seen, then exchange joint by joint (``design``): poses that lower
-most the predicted position error over the workspace (the trace of what the parameters' covariance does there, I-optimal, to
-first order; the noise amplification of what is wanted, not of numbers that nobody asks for). A pose brings the information
-J^T C^-1 J with the vision's covariance C there.
+In: the model with its priors, what was measured already, and which poses the cameras see. Out: a :class:`Plan`.
 
-Choosing poses that together tell most: greedy, then exchanged joint by joint.
+The criterion is I-optimality: the mean variance of predicted tool positions over the workspace, to first order in the
+parameters' covariance. A pose adds the information J^T C^-1 J, with the covariance C of the instrument there. A greedy
+choice among random candidates that can be reached and seen is improved by coordinate exchange (Meyer and Nachtsheim,
+Technometrics 37, 1995): every joint of every pose, one after the other, goes to the best of some levels, as long as that
+lowers the criterion.
 
-In: what is known before (a covariance), what is wanted (linear in the unknowns), and what each pose tells (its whitened
-Jacobian). The criterion is the mean variance of what is wanted, I-optimal. The greedy choice among random candidates is
-improved by coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 1995): every joint of every pose in turn goes to
-the best of some levels, as long as it pays.
+The file in order: the choice itself, on whitened Jacobians alone; the plan for an arm; the poses that are allowed.
 """
 
 from __future__ import annotations
@@ -31,31 +29,31 @@ from armsight.loop.identify.model import FAST, RIPPLES, Model, all_features
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.selection import SCALED
 
-#: Candidates weighed at once: bounds the memory.
+#: Candidates compared at once: bounds the memory.
 _BATCH = 250
-#: Levels that a joint is tried at, from both sides; sweeps over all poses at most, and the part that one must win to go on.
+#: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
 LEVELS, SWEEPS, LEAST_WON = 7, 3, 0.01
 
-#: Gives the whitened Jacobians (N, M, F) of poses q (N, 6) come to from sides (N, 6), and which of them are allowed.
-#: Those of poses that are not allowed do not count, but for the first.
-Tells = Callable[[Array, Array], tuple[Array, Mask]]
+#: Returns the whitened Jacobians (N, M, F) of poses q (N, 6) approached from sides (N, 6), and which of them are allowed.
+#: Those of poses that are not allowed do not count, except the first.
+Information = Callable[[Array, Array], tuple[Array, Mask]]
 
 
-def greedy(J: Array, P: Array, wanted: Array, n: int, *, in_order: bool = False) -> tuple[Array, Array]:
-    """Return rows chosen one by one, and the predicted RMS of what is wanted before and after each.
+def greedy(J: Array, P: Array, requested: Array, n: int, *, in_order: bool = False) -> tuple[Array, Array]:
+    """Return rows chosen one by one, and the predicted RMS position error before and after each.
 
     Args:
         J: (N, M, F) whitened Jacobians of the candidates.
         P: (F, F) covariance before.
-        wanted: (3 K, F) derivative of K places.
+        requested: (3 K, F) derivative of K positions, whose error is to be low.
         n: how many to choose.
         in_order: take them as they come instead.
     """
     P = P.copy()
     left = np.ones(len(J), bool)
     chosen: list[int] = []
-    W = wanted.T @ wanted
-    sigma = [rms(P, W, len(wanted))]
+    W = requested.T @ requested
+    sigma = [rms(P, W, len(requested))]
     for k in range(n):
         if in_order:
             best = k
@@ -68,12 +66,12 @@ def greedy(J: Array, P: Array, wanted: Array, n: int, *, in_order: bool = False)
         P = (P + P.T) / 2
         left[best] = False
         chosen.append(best)
-        sigma.append(rms(P, W, len(wanted)))
+        sigma.append(rms(P, W, len(requested)))
     return np.array(chosen), np.array(sigma)
 
 
 def rms(P: Array, W: Array, numbers: int) -> float:
-    """Return the RMS length of the error of places whose derivatives' squares sum to W, three numbers each."""
+    """Return the RMS length of the error of positions whose derivatives' squares sum to W, three numbers each."""
     return float(np.sqrt(3 * np.einsum("ij,ji->", W, P) / numbers))
 
 
@@ -91,33 +89,33 @@ def gains(J: Array, P: Array, W: Array) -> Array:
 def exchanged(
     q: Array,
     approach: Array,
-    tells: Tells,
+    information: Information,
     P: Array,
-    wanted: Array,
+    requested: Array,
     limits: tuple[Array, Array],
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return poses (n, 6) and sides (n, 6) that together tell more than those given.
+    """Return poses (n, 6) and sides (n, 6) that together lower the error more than those given.
 
     Args:
         q: (n, 6) joint angles to start from, rad.
         approach: (n, 6) sides.
-        tells: what poses tell, and which are allowed.
+        information: of poses, and which are allowed.
         P: (F, F) covariance before.
-        wanted: (3 K, F) derivative of what is wanted.
+        requested: (3 K, F) derivative of K positions, whose error is to be low.
         limits: (6,) and (6,) least and greatest angles, rad.
-        rng: where the levels fall, and the order of the joints.
+        rng: sets the levels, and the order of the joints.
     """
-    q, approach, W = q.copy(), approach.copy(), wanted.T @ wanted
-    J, _ = tells(q, approach)
+    q, approach, W = q.copy(), approach.copy(), requested.T @ requested
+    J, _ = information(q, approach)
     H = np.linalg.inv(P) + np.einsum("nki,nkj->ij", J, J)
-    reached = rms(np.linalg.inv(H), W, len(wanted))
+    reached = rms(np.linalg.inv(H), W, len(requested))
     for _ in range(SWEEPS):
         for k in range(len(q)):
             others = H - J[k].T @ J[k]
-            q[k], approach[k], J[k] = _best(q[k], approach[k], tells, np.linalg.inv(others), W, limits, rng)
+            q[k], approach[k], J[k] = _best(q[k], approach[k], information, np.linalg.inv(others), W, limits, rng)
             H = others + J[k].T @ J[k]
-        before, reached = reached, rms(np.linalg.inv(H), W, len(wanted))
+        before, reached = reached, rms(np.linalg.inv(H), W, len(requested))
         if reached > (1 - LEAST_WON) * before:
             break
     return q, approach
@@ -126,7 +124,7 @@ def exchanged(
 def _best(
     q: Array,
     approach: Array,
-    tells: Tells,
+    information: Information,
     P: Array,
     W: Array,
     limits: tuple[Array, Array],
@@ -140,39 +138,39 @@ def _best(
         tried, sides = np.tile(q, (2 * LEVELS + 1, 1)), np.tile(approach, (2 * LEVELS + 1, 1))
         tried[1:, joint] = np.tile(levels, 2)
         sides[1 + LEVELS :, joint] *= -1
-        J, allowed = tells(tried, sides)
+        J, allowed = information(tried, sides)
         allowed[0] = True  # the pose as it was: it stays where nothing is better
         best = int(np.argmax(np.where(allowed, gains(J, P, W), -np.inf)))
         q, approach, kept = tried[best], sides[best], J[best]
     return q, approach, kept
 
 
-#: Candidates drawn, and places of the workspace at which the error is predicted.
+#: Candidates sampled, and positions of the workspace at which the error is predicted.
 CANDIDATES, PROBES = 800, 200
-#: Times that four times as many are drawn at most, of which those allowed become candidates.
-DRAWS = 40
+#: Most rounds of sampling four times as many, of which those allowed become candidates.
+SAMPLING_ROUNDS = 40
 #: Links must stay this far above the base's plane, m, and parts of the arm that are not neighbours this far apart.
 FLOOR_M, APART_M = 0.02, 0.06
-#: What nothing is known of at first: base and tool, m and rad.
+#: Prior sigma of base and tool, m and rad, which have none in a fit.
 UNKNOWN = 0.1
 #: Poses keep this far from the joints' limits, rad: a joint must have room to come from either side.
 ROOM_RAD = 0.03
-#: A prior sigma of a cause says how large it may be (a data sheet's limit); it mostly is this part of it.
+#: A prior sigma of an error source says how large it may be (a data sheet's limit); it mostly is this part of it.
 MOSTLY = 1 / 3
-#: Joints are off by chance by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Else an
-#: instrument of 0.03 mm would have a few poses tell everything.
+#: Joints scatter by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Without it an
+#: instrument of 0.03 mm would seem to learn everything from a few poses.
 CHANCE_RAD = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Plan(Record):
-    """The poses to look at next, best first.
+    """The poses to measure next, best first.
 
     Attributes:
         q: (n, 6) joint angles, rad.
         approach: (n, 6) from which side to come to each.
         sigma_m: (n + 1,) predicted RMS position error over the workspace, m, before and after each pose.
-        random_sigma_m: (n + 1,) the same for poses drawn at random.
+        random_sigma_m: (n + 1,) the same for random poses.
     """
 
     q: Array
@@ -181,7 +179,7 @@ class Plan(Record):
     random_sigma_m: Array
 
     def random_for(self, n: int) -> int | None:
-        """Return how many random poses come as far as the first ``n`` planned ones; None: more than were drawn."""
+        """Return how many random poses reach the error of the first ``n`` planned ones; None: more than were sampled."""
         reached = np.flatnonzero(self.random_sigma_m <= self.sigma_m[n])
         return int(reached[0]) if len(reached) else None
 
@@ -199,17 +197,17 @@ def plan_poses(
     floor_m: float = FLOOR_M,
     seed: int = 0,
 ) -> Plan:
-    """Choose the poses that tell most.
+    """Choose the poses that lower the position error most.
 
     Args:
         model: the arm with every parameter.
-        x: (P,) where its base and tool are, at least roughly.
+        x: (P,) the vector, with base and tool known at least roughly.
         prior: (P,) prior sigmas, as of a fit.
-        noise: sigmas of place, m, and turn, rad, of the instrument, where ``cov`` does not say.
+        noise: sigmas of position, m, and rotation, rad, of the instrument, where ``cov`` is None.
         n: how many poses.
         done: what was measured already.
-        visible: says which poses T_rig_body (N, 4, 4) the cameras can see.
-        cov: gives the covariance (N, M, M) of what is seen of poses T_rig_body (N, 4, 4).
+        visible: returns which poses T_rig_body (N, 4, 4) the cameras can see.
+        cov: returns the covariance (N, M, M) of the measurement of poses T_rig_body (N, 4, 4).
         floor_m: how far above the base's plane the links must stay, m.
         seed: of the candidates.
 
@@ -218,7 +216,7 @@ def plan_poses(
     """
     rng = np.random.default_rng(seed)
     model, x, prior = _with_curves(model, x, prior)
-    scene = Scene(model, x, noise, visible, cov, floor_m)
+    scene = PlanningScene(model, x, noise, visible, cov, floor_m)
     q, approach, seen = _candidates(scene, rng)
     if len(q) < n:
         raise InputError(f"only {len(q)} poses that can be reached and seen were found; {n} were asked for")
@@ -229,27 +227,27 @@ def plan_poses(
         Jd = scene.whitened(done)[:, :, free].reshape(-1, int(free.sum()))
         P = np.asarray(np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd))
     J = scene.whitened(seen)[:, :, free]
-    wanted = _wanted(model, x, seen, free, rng)
+    requested = _position_derivative(model, x, seen, free, rng)
 
-    def tells(q: Array, approach: Array) -> tuple[Array, Mask]:
-        return scene.told(q, approach, free)
+    def information(q: Array, approach: Array) -> tuple[Array, Mask]:
+        return scene.information(q, approach, free)
 
-    chosen, _ = greedy(J, P, wanted, n)
-    better, sides = exchanged(q[chosen], approach[chosen], tells, P, wanted, scene.limits, rng)
-    order, sigma = greedy(tells(better, sides)[0], P, wanted, n)
-    _, drawn = greedy(J[rng.permutation(len(J))[: 4 * n]], P, wanted, min(4 * n, len(J)), in_order=True)
-    return Plan(better[order], sides[order], sigma, drawn)
+    chosen, _ = greedy(J, P, requested, n)
+    better, sides = exchanged(q[chosen], approach[chosen], information, P, requested, scene.limits, rng)
+    order, sigma = greedy(information(better, sides)[0], P, requested, n)
+    _, random_sigma = greedy(J[rng.permutation(len(J))[: 4 * n]], P, requested, min(4 * n, len(J)), in_order=True)
+    return Plan(better[order], sides[order], sigma, random_sigma)
 
 
-class Scene(NamedTuple):
-    """What poses would be seen as, and which can be.
+class PlanningScene(NamedTuple):
+    """The measurements that poses would give, and which poses are allowed.
 
     Attributes:
         model: the arm with every parameter.
         x: (P,) the vector.
-        noise: sigmas of place, m, and turn, rad, beyond ``cov``.
-        visible: says which poses T_rig_body (N, 4, 4) the cameras can see.
-        cov: gives the covariance (N, M, M) of what is seen of them; None: ``noise`` is all.
+        noise: sigmas of position, m, and rotation, rad, beyond ``cov``.
+        visible: returns which poses T_rig_body (N, 4, 4) the cameras can see.
+        cov: returns the covariance (N, M, M) of their measurement; None: ``noise`` is all.
         floor_m: how far above the base's plane the links must stay, m.
     """
 
@@ -271,29 +269,29 @@ class Scene(NamedTuple):
         return np.asarray(self.model.T_rig_base(self.x) @ self.model.tool_in_base(self.x, q, approach))
 
     def allowed(self, q: Array, approach: Array) -> Mask:
-        """Say which poses (N,) are free and visible."""
+        """Return which poses (N,) are free of collision and visible."""
         out = self.visible(self.T_rig_body(q, approach))
         out[out] = free_of_collision(self.model, q[out], self.floor_m)
         return out
 
     def seen(self, q: Array, approach: Array) -> Measured:
-        """Return what would be seen without noise."""
+        """Return the measurements of poses without noise."""
         model, T = self.model, self.T_rig_body(q, approach)
         m = model.motion(self.x, q, model.feature_values(q, approach))
         p = m.o[:, None] + (m.R @ model.tool_points(self.x).T).swapaxes(1, 2)
         return Measured(q, p, T[:, :3, :3] if model.full else None, None if self.cov is None else self.cov(T), approach)
 
-    def told(self, q: Array, approach: Array, free: Mask) -> tuple[Array, Mask]:
+    def information(self, q: Array, approach: Array, free: Mask) -> tuple[Array, Mask]:
         """Return whitened Jacobians (N, M, F) by the free parameters, and which poses (N,) are allowed.
 
-        Of poses that are not allowed there is none (behind a camera no covariance stands for what is seen): zeros. The
-        first is the pose as it was, and always told.
+        Poses that are not allowed have zeros (behind a camera there is no covariance). The first is the pose as it was, and
+        always has its Jacobian.
         """
         allowed = self.allowed(q, approach)
         rows = np.flatnonzero(allowed | (np.arange(len(q)) == 0))
-        told = self.whitened(self.seen(q[rows], approach[rows]))[:, :, free]
-        J = np.zeros((len(q), *told.shape[1:]))
-        J[rows] = told
+        part = self.whitened(self.seen(q[rows], approach[rows]))[:, :, free]
+        J = np.zeros((len(q), *part.shape[1:]))
+        J[rows] = part
         return J, allowed
 
     def whitened(self, measured: Measured) -> Array:
@@ -305,13 +303,13 @@ class Scene(NamedTuple):
         return np.asarray(np.linalg.solve(np.linalg.cholesky(C), J))
 
 
-def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
-    """Return joint angles, directions of approach and what would be seen, of poses that are reachable, free and visible.
+def _candidates(scene: PlanningScene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
+    """Return joint angles, directions of approach and measurements of poses that are reachable, free and visible.
 
-    They are evenly distributed over all that is; where cameras see little of what an arm reaches, more are drawn.
+    They are uniform over all such joint angles; where cameras see little of what an arm reaches, more are sampled.
     """
     angles, sides, found = [], [], 0
-    for _ in range(DRAWS):
+    for _ in range(SAMPLING_ROUNDS):
         q = rng.uniform(*scene.limits, (4 * CANDIDATES, 6))
         approach = rng.choice([-1.0, 1.0], q.shape)
         rows = np.flatnonzero(scene.allowed(q, approach))[: CANDIDATES - found]
@@ -325,7 +323,7 @@ def _candidates(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, M
 
 
 def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
-    """Say which joint angles (N, 6) keep the arm above the base's plane and apart from itself.
+    """Return which joint angles (N, 6) keep the arm above the base's plane and apart from itself.
 
     Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
     """
@@ -339,7 +337,7 @@ def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
 
 
 def _segments_apart(o: Array) -> Mask:
-    """Say whether the base's column and the links (N, 8, 3) from the elbow on stay apart, looked at in steps along them."""
+    """Return whether the base's column and the links (N, 8, 3) from the elbow on stay apart, at steps along them."""
     steps = np.linspace(0, 1, 9)[:, None]
 
     def line(i: int, points: Array) -> Array:
@@ -356,7 +354,7 @@ def _segments_apart(o: Array) -> Mask:
 def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Array]:
     """Return a model, its vector and its priors with every harmonic of the sensors' curves.
 
-    Few poses may not choose among them, but where a curve is not looked at it stays unknown, and poses must be spread.
+    Few poses cannot select among them, but a curve stays unknown where it is not measured, so poses must be spread.
     """
     backlash = any(f.kind == "backlash" for f in model.features)
     whole = model.with_features(all_features(backlash, (*RIPPLES, *FAST)))
@@ -370,8 +368,8 @@ def _prior_covariance(prior: Array, free: Mask) -> Array:
     return np.asarray(np.diag(sigma**2))
 
 
-def _wanted(model: Model, x: Array, seen: Measured, free: Mask, rng: np.random.Generator) -> Array:
-    """Return the derivative (PROBES * 3, F) of places in the rig at poses over the workspace."""
+def _position_derivative(model: Model, x: Array, seen: Measured, free: Mask, rng: np.random.Generator) -> Array:
+    """Return the derivative (PROBES * 3, F) of positions in the rig at poses over the workspace."""
     rows = rng.choice(len(seen), min(PROBES, len(seen)), replace=False)
     part = seen.rows(rows)
     _, J = model.linearised(x, part, model.feature_values(part.q, part.approach))

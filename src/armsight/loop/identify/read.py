@@ -1,8 +1,8 @@
-"""Read joint angles and where the tool was seen from a CSV file.
+"""Read joint angles and the tool's measured positions or poses from a CSV file.
 
-Columns, in any order, others are passed over: q1_rad .. q6_rad (or q1_deg ..); then tracked points p1_x_mm, p1_y_mm,
-p1_z_mm, p2_x_mm, .. (or _m), with rx_deg, ry_deg, rz_deg where an instrument gives angles and it is said how they are
-meant; or full poses x_m, y_m, z_m, qw, qx, qy, qz, with cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 ..
+Columns, in any order; others are ignored: q1_rad .. q6_rad (or q1_deg ..); then tracked points p1_x_mm, p1_y_mm,
+p1_z_mm, p2_x_mm, .. (or _m), with rx_deg, ry_deg, rz_deg where an instrument gives angles and their convention is given;
+or full poses x_m, y_m, z_m, qw, qx, qy, qz, with cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 ..
 approach6 (1, -1, 0).
 """
 
@@ -20,31 +20,32 @@ from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.loop.identify.measured import Measured
 
-#: How three angles are meant: a rotation vector, or turns about x, y, z in this order; capitals: about turned axes.
-TURNS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+#: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
+#: case) or about the axes of the rotated frame (capitals).
+ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnglesMeasured(Measured):
-    """Full poses whose turns came as three angles, which may be meant in another way than was said.
+    """Full poses whose rotations came as three angles, which may follow another convention than was given.
 
     Attributes:
-        angles_deg: (N, 3) rx, ry, rz as they stand in the file, degrees.
-        turns: how they were said to be meant, one of TURNS.
+        angles_deg: (N, 3) rx, ry, rz as in the file, degrees.
+        rotation: the convention given for them, one of ROTATIONS.
     """
 
     angles_deg: Array
-    turns: str
+    rotation: str
 
 
 class Read(NamedTuple):
-    """What a file holds.
+    """The contents of a file.
 
     Attributes:
         measured: its good rows.
-        lines: (N,) the line of the file that each comes from.
-        notes: what was left out, and why.
+        lines: (N,) the line of the file that each row comes from.
+        notes: what was left out, and why, as text.
     """
 
     measured: Measured
@@ -52,18 +53,18 @@ class Read(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_poses(path: str | Path, *, turns: str | None = None) -> Read:
+def read_poses(path: str | Path, *, rotation: str | None = None) -> Read:
     """Read a file.
 
     Args:
         path: a CSV file.
-        turns: how rx_deg, ry_deg, rz_deg are meant, one of TURNS; None: they are not used.
+        rotation: the convention of rx_deg, ry_deg, rz_deg, one of ROTATIONS; None: they are not used.
 
     Raises:
-        InputError: unreadable, columns missing, cells that are no numbers, or hardly a row without gaps.
+        InputError: unreadable, columns missing, fields that are no numbers, or hardly a row without gaps.
     """
-    if turns is not None and turns not in TURNS:
-        raise InputError(f"turns are {turns!r}; known are {', '.join(TURNS)}")
+    if rotation is not None and rotation not in ROTATIONS:
+        raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(ROTATIONS)}")
     rows = read_table(path)
     if len(rows) < 2:
         raise InputError(f"{path}: no rows; a first line of column names and one line a pose are needed")
@@ -71,42 +72,42 @@ def read_poses(path: str | Path, *, turns: str | None = None) -> Read:
     if len(set(header)) != len(header):
         raise InputError(f"{path}: line 1 names a column twice: {_twice(header)}")
     columns = {name: i for i, name in enumerate(header)}
-    wanted = _wanted(path, columns, turns)
-    table, lines, notes = _numbers(path, rows, columns, wanted)
-    at = {name: table[:, i] for i, name in enumerate(wanted)}
-    unused = turns is None and "rx_deg" in columns and "qw" not in columns
+    requested = _requested(path, columns, rotation)
+    table, lines, notes = _numbers(path, rows, columns, requested)
+    at = {name: table[:, i] for i, name in enumerate(requested)}
+    unused = rotation is None and "rx_deg" in columns and "qw" not in columns
     if unused:
-        notes = (*notes, "rx_deg, ry_deg, rz_deg are not used: say how they are meant with --turns")
-    return Read(_measured(path, at, turns), lines, notes)
+        notes = (*notes, "rx_deg, ry_deg, rz_deg are not used: give their convention with --rotation")
+    return Read(_measured(path, at, rotation), lines, notes)
 
 
 def _twice(header: list[str]) -> str:
     return next(name for name in header if header.count(name) > 1)
 
 
-def _wanted(path: str | Path, columns: dict[str, int], turns: str | None) -> list[str]:
+def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) -> list[str]:
     """Return the columns to read."""
-    wanted = _alternative(
+    requested = _alternative(
         path, columns, [[f"q{i}_{unit}" for i in range(1, 7)] for unit in ("rad", "deg")], "joint angles"
     )
     poses = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
     if "qw" in columns:
-        wanted += _alternative(path, columns, [poses], "full poses")
-        wanted += [f"cov_{i}{j}" for i, j in _UPPER] if "cov_00" in columns else []
+        requested += _alternative(path, columns, [poses], "full poses")
+        requested += [f"cov_{i}{j}" for i, j in _UPPER] if "cov_00" in columns else []
     else:
         k = 1
         while k == 1 or any(f"p{k}_x_{unit}" in columns for unit in ("mm", "m")):
             sets = [[f"p{k}_{axis}_{unit}" for axis in "xyz"] for unit in ("mm", "m")]
-            wanted += _alternative(path, columns, sets, f"point {k}")
+            requested += _alternative(path, columns, sets, f"point {k}")
             k += 1
-        if turns is not None:
-            wanted += _alternative(path, columns, [["rx_deg", "ry_deg", "rz_deg"]], "angles")
+        if rotation is not None:
+            requested += _alternative(path, columns, [["rx_deg", "ry_deg", "rz_deg"]], "angles")
     if "approach1" in columns:
-        wanted += _alternative(path, columns, [[f"approach{i}" for i in range(1, 7)]], "directions of approach")
-    missing = [name for name in wanted if name not in columns]
+        requested += _alternative(path, columns, [[f"approach{i}" for i in range(1, 7)]], "directions of approach")
+    missing = [name for name in requested if name not in columns]
     if missing:
         raise InputError(f"{path}: line 1: column {missing[0]} is missing")
-    return wanted
+    return requested
 
 
 def _alternative(path: str | Path, columns: dict[str, int], sets: list[list[str]], what: str) -> list[str]:
@@ -123,19 +124,19 @@ def _alternative(path: str | Path, columns: dict[str, int], sets: list[list[str]
 
 
 def _numbers(
-    path: str | Path, rows: list[list[str]], columns: dict[str, int], wanted: list[str]
+    path: str | Path, rows: list[list[str]], columns: dict[str, int], requested: list[str]
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return the cells wanted, the lines they are from, and what was left out."""
+    """Return the requested fields (N, C), the lines (N,) they are from, and notes on what was left out."""
     table, lines, gaps = [], [], []
     for number, row in enumerate(rows[1:], start=2):
-        if not any(cell.strip() for cell in row):
+        if not any(text.strip() for text in row):
             continue
-        values = [_number(path, number, name, row, columns[name]) for name in wanted]
+        values = [_number(path, number, name, row, columns[name]) for name in requested]
         if np.isfinite(values).all():
             table.append(values)
             lines.append(number)
         else:
-            gaps.append((number, wanted[int(np.argmin(np.isfinite(values)))]))
+            gaps.append((number, requested[int(np.argmin(np.isfinite(values)))]))
     if len(gaps) > len(table):
         line, name = gaps[0]
         raise InputError(
@@ -143,8 +144,8 @@ def _numbers(
         )
     if not table:
         raise InputError(f"{path}: no rows; one line a pose is needed")
-    told = ", ".join(f"line {line} ({name})" for line, name in gaps[:5]) + (", .." if len(gaps) > 5 else "")
-    notes = (f"{len(gaps)} rows left out, empty or no finite number: {told}",) if gaps else ()
+    where = ", ".join(f"line {line} ({name})" for line, name in gaps[:5]) + (", .." if len(gaps) > 5 else "")
+    notes = (f"{len(gaps)} rows left out, empty or no finite number: {where}",) if gaps else ()
     return np.array(table), np.array(lines, float), notes
 
 
@@ -156,8 +157,8 @@ def _number(path: str | Path, line: int, name: str, row: list[str], at: int) -> 
         raise InputError(f"{path}: line {line}: {name} is {text!r}, must be a number") from None
 
 
-def _measured(path: str | Path, at: dict[str, Array], turns: str | None) -> Measured:
-    """Put the columns together, in SI."""
+def _measured(path: str | Path, at: dict[str, Array], rotation: str | None) -> Measured:
+    """Assemble the columns, in SI units."""
     unit = "rad" if "q1_rad" in at else "deg"
     q = np.stack([at[f"q{i}_{unit}"] for i in range(1, 7)], axis=1) * (1.0 if unit == "rad" else np.pi / 180)
     approach = np.stack([at[f"approach{i}"] for i in range(1, 7)], axis=1) if "approach1" in at else None
@@ -175,12 +176,12 @@ def _measured(path: str | Path, at: dict[str, Array], turns: str | None) -> Meas
         )
         k += 1
     p = np.stack(points, axis=1)
-    if turns is None:
+    if rotation is None:
         return Measured(q, p, None, None, approach)
     if p.shape[1] != 1:
         raise InputError(f"{path}: angles go with one point, p1; there are {p.shape[1]}")
     angles = np.stack([at[f"r{axis}_deg"] for axis in "xyz"], axis=1)
-    return AnglesMeasured(q, p, turned(angles, turns), None, approach, angles_deg=angles, turns=turns)
+    return AnglesMeasured(q, p, rotations_of(angles, rotation), None, approach, angles_deg=angles, rotation=rotation)
 
 
 def _rotations(path: str | Path, at: dict[str, Array]) -> Array:
@@ -193,12 +194,12 @@ def _rotations(path: str | Path, at: dict[str, Array]) -> Array:
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 
-def turned(angles_deg: Array, turns: str) -> Array:
-    """Return the turns (N, 3, 3) that angles rx, ry, rz (N, 3), degrees, mean in one of the ways of TURNS."""
-    if turns == "rotvec":
+def rotations_of(angles_deg: Array, rotation: str) -> Array:
+    """Return the rotations (N, 3, 3) of angles rx, ry, rz (N, 3), degrees, in one of the conventions of ROTATIONS."""
+    if rotation == "rotvec":
         return np.asarray(Rotation.from_rotvec(np.radians(angles_deg)).as_matrix())
-    given = np.radians(angles_deg[:, ["xyz".index(axis) for axis in turns.lower()]])
-    return np.asarray(Rotation.from_euler(turns, given).as_matrix())
+    given = np.radians(angles_deg[:, ["xyz".index(axis) for axis in rotation.lower()]])
+    return np.asarray(Rotation.from_euler(rotation, given).as_matrix())
 
 
 def _covariance(path: str | Path, at: dict[str, Array], R: Array) -> Array:

@@ -1,14 +1,15 @@
-"""Which causes pay: the model grows by the error on poses left out, one cause at a time, and gives back what does not pay.
+"""Forward selection of error sources by cross-validation, and the scale of their priors by evidence.
 
-Everything is scored on one linearisation: with each fold's H = J^T J and g = J^T e, a fit to the other folds and its
-squared error on this one are a few small matrix products, so that hundreds of models cost no more than one. Folds are
-made of clusters of joint angles rather than of rows: what is kept must hold where the arm was not looked at.
+:func:`scaled_prior` finds how large the error sources beyond the table are in this arm: one factor per kind on the prior
+sigmas, that of the greatest evidence. A servo's wave of half a degree and an industrial arm's of a hundredth need different
+priors, and hundreds of measurements determine which. The evidence of a linear model with Gaussian priors is closed (MacKay,
+"Bayesian interpolation", Neural Computation 4, 1992); on one linearisation it costs one factorisation of P x P.
 
-How large the causes beyond the table are in this arm: one factor a kind on the prior sigmas, of the greatest evidence.
-
-A servo's wave of half a degree and an industrial arm's of a hundredth need different priors, and hundreds of measurements
-tell which. The evidence of a linear model with Gaussian priors is closed (MacKay, "Bayesian interpolation", Neural
-Computation 4, 1992); on one linearisation it costs one factorisation of P x P.
+:func:`forward_selection` starts with base and tool alone, adds one error source at a time as long as that lowers the error
+on poses left out, and removes again what does not lower it. Everything is scored on one linearisation: with each fold's
+H = J^T J and g = J^T e, a fit to the other folds and its squared error on this one are a few small matrix products, so that
+hundreds of models cost no more than one. Folds are made of clusters of joint angles rather than of rows: what is kept must
+also hold where the arm was not measured.
 """
 
 from __future__ import annotations
@@ -27,22 +28,23 @@ from armsight.loop.identify.fit import Mask, Solution, weighted
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
-#: The kinds whose priors are scaled: what is known of them before differs most from arm to arm.
-SCALED = ("gain", "wave", "ripple", "backlash", "slack", "sag")
+#: The kinds whose priors are scaled: they differ most from arm to arm.
+SCALED = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
 LEAST, MOST = 0.01, 1.0
-#: The factor is itself told by a handful of numbers; it is taken at the upper end of what they allow, where twice the log
-#: of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The other kinds
-#: are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they give way.
+#: The factor is itself determined by a handful of numbers; it is taken at the upper end of what they allow, where twice
+#: the log of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The
+#: other kinds are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they
+#: give way.
 FALLEN, WIDER = 1.0, 1.5
 _RIDGE = 1e-12
 
 
 def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
-    """Return prior sigmas (P,) with each kind of cause scaled to this arm.
+    """Return prior sigmas (P,) with each kind of error source scaled to this arm.
 
     Args:
-        model: the arm with every cause.
+        model: the arm with every error source.
         start: a fit to linearise at, with the poses used and the noise.
         measured: the poses.
         free: (P,) what may be off.
@@ -55,7 +57,7 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
     H, b = _normal(model, start, measured, free, prior)
     flat = ~np.isfinite(prior[free])
     own = np.where(flat, 1.0, prior[free])
-    still = _RIDGE * np.eye(len(own))  # where there is no noise, nothing but rounding holds what cannot be told
+    still = _RIDGE * np.eye(len(own))  # without noise, nothing but rounding bounds what is not observable
 
     def cost(logs: Array) -> float:
         sigma = own * _factors(of[free], logs)
@@ -101,49 +103,49 @@ def _normal(model: Model, start: Solution, measured: Measured, free: Mask, prior
 
 #: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
 FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
-#: A cause pays where it lowers the held-out squares by this many standard errors of the fall over the folds.
-PAYS = 1.0
-#: Parameters further from nominal than this many sigmas pay for sure: their own removal is not tried.
+#: An error source is added where it lowers the held-out squares by this many standard errors of the fall over the folds.
+LEAST_GAIN = 1.0
+#: Parameters further from nominal than this many sigmas are kept without trying their removal.
 SURE = 8.0
 #: A fall by less than this part is rounding's.
 ROUNDING = 1e-6
-#: Squares that are none, so that their logarithm is a number.
+#: Added to squares, so that the logarithm of none is a number.
 _NONE = 1e-200
-#: What the placement alone is.
+#: The kinds that say where the arm is: base in the rig, tool on the flange.
 PLACEMENT = ("base", "tool")
-#: Harmonics make one curve together, and links' loads one sag: it pays or does not, and priors keep it small. Each number
-#: alone says nothing.
+#: A sensor's harmonics make one curve, and the links' loads one compliance: they are added or left out together, and priors
+#: keep them small. One of these numbers alone means nothing.
 CURVE = ("wave", "ripple")
-TOGETHER = (*CURVE, "sag")
+TOGETHER = (*CURVE, "compliance")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
 _ROUNDED = 1e-10
 
 
-class Step(NamedTuple):
-    """One step of the growth.
+class SelectionStep(NamedTuple):
+    """One step of the forward selection.
 
     Attributes:
-        cause: what was added or, with a minus, given back.
+        cause: what was added or, with a minus, removed.
         names: its parameters.
         rms: held-out RMS of the weighted residuals after it: the geometric mean over the folds.
     """
 
-    cause: str
+    source: str
     names: tuple[str, ...]
     rms: float
 
 
 class Selection(NamedTuple):
-    """What pays.
+    """The parameters selected.
 
     Attributes:
         free: (P,) the parameters kept.
-        steps: how the model grew.
+        steps: of the selection, in order.
         reasons: name -> why a parameter was not kept.
     """
 
     free: Mask
-    steps: tuple[Step, ...]
+    steps: tuple[SelectionStep, ...]
     reasons: dict[str, str]
 
 
@@ -194,45 +196,45 @@ def forward_selection(
     together: Mask,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Selection:
-    """Grow the model from base and tool alone.
+    """Select error sources, starting from base and tool alone.
 
     Args:
-        model: the arm with every cause.
+        model: the arm with every error source.
         start: a fit to linearise at, with the poses used and the noise.
         measured: the poses.
-        free: (P,) what the poses can tell.
+        free: (P,) the candidates.
         prior: (P,) prior sigmas.
-        together: (P,) harmonics and loads that stand only as parts of a whole.
-        progress: is told what is tried.
+        together: (P,) harmonics and loads that are selected only as parts of a whole.
+        progress: called with a line of text after each step.
     """
     part = measured.rows(start.used)
     folds = _folds(model, start, part, folds_of(part.q), prior)
     groups = _groups(model, free, together)
     kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])
     losses = folds.losses(kept)
-    steps = [Step("base and tool", _named(model, kept), _rms(losses, folds))]
+    steps = [SelectionStep("base and tool", _named(model, kept), _rms(losses, folds))]
     while groups:
         tried = {name: folds.losses(kept | mask) for name, mask in groups.items()}
-        paying = [name for name in tried if _pays(losses, tried[name], folds)]
-        if not paying:
+        improving = [name for name in tried if _improves(losses, tried[name], folds)]
+        if not improving:
             break
-        name = min(paying, key=lambda n: _rms(tried[n], folds))
+        name = min(improving, key=lambda n: _rms(tried[n], folds))
         added = groups.pop(name)
         kept, losses = kept | added, tried[name]
-        steps.append(Step(name, _named(model, added), _rms(losses, folds)))
+        steps.append(SelectionStep(name, _named(model, added), _rms(losses, folds)))
         progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
     if together.any():
         kept = _together(model, folds, groups, kept, steps)
-    kept, given_back = _pruned(model, folds, kept, together, steps)
-    return Selection(kept, tuple(steps), _reasons(model, folds, kept, groups, given_back))
+    kept, removed = _pruned(model, folds, kept, together, steps)
+    return Selection(kept, tuple(steps), _reasons(model, folds, kept, groups, removed))
 
 
-def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[Step]) -> Mask:
-    """Add what pays only together, as two causes can that hide each other, and give back what is not needed for it."""
+def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[SelectionStep]) -> Mask:
+    """Add what lowers the error only together, as two sources that hide each other do, less what that does not need."""
     losses, whole = folds.losses(kept), kept.copy()
     for mask in groups.values():
         whole |= mask
-    if not groups or not _pays(losses, folds.losses(whole), folds):
+    if not groups or not _improves(losses, folds.losses(whole), folds):
         return kept
     added = dict(groups)
     while added:
@@ -243,20 +245,20 @@ def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, 
         whole &= ~added.pop(name)
     for name in added:
         del groups[name]
-    steps.append(Step(", ".join(added), _named(model, whole & ~kept), _rms(folds.losses(whole), folds)))
+    steps.append(SelectionStep(", ".join(added), _named(model, whole & ~kept), _rms(folds.losses(whole), folds)))
     return whole
 
 
 def _reasons(
-    model: Model, folds: _Folds, kept: Mask, groups: dict[str, Mask], given_back: dict[str, Array]
+    model: Model, folds: _Folds, kept: Mask, groups: dict[str, Mask], removed: dict[str, Array]
 ) -> dict[str, str]:
-    """Say why what was not kept was not."""
+    """Return name -> why a parameter was not kept."""
     rms = _rms(folds.losses(kept), folds)
     reasons: dict[str, str] = {}
     for mask in groups.values():
-        told = _unpaid(folds.losses(kept | mask), folds, rms)
-        reasons |= {model.names[k]: told for k in np.flatnonzero(mask)}
-    return reasons | {name: _unpaid(losses, folds, rms) for name, losses in given_back.items()}
+        why = _not_improving(folds.losses(kept | mask), folds, rms)
+        reasons |= {model.names[k]: why for k in np.flatnonzero(mask)}
+    return reasons | {name: _not_improving(losses, folds, rms) for name, losses in removed.items()}
 
 
 def _folds(model: Model, start: Solution, measured: Measured, labels: NDArray[np.int64], prior: Array) -> _Folds:
@@ -282,7 +284,7 @@ def _named(model: Model, mask: Mask) -> tuple[str, ...]:
 
 
 def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
-    """Return the causes that can be added, each with its parameters."""
+    """Return the error sources that can be added: name -> mask (P,) of its parameters."""
     groups: dict[str, Mask] = {}
     for k, p in enumerate(model.parameters):
         if not free[k] or p.kind in PLACEMENT:
@@ -291,8 +293,8 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
         if p.kind in CURVE:
             curve = [k for k, other in enumerate(model.parameters) if other.kind in CURVE and other.joint == p.joint]
             name = f"sensor curve of joint {p.joint + 1}"
-            turn = p.name.removeprefix(f"{p.kind}{p.joint + 1}_")[3:]  # of "sin12" or "cos2"
-            name += "" if together[curve].any() else f", {turn} a turn"
+            harmonic = p.name.removeprefix(f"{p.kind}{p.joint + 1}_")[3:]  # of "sin12" or "cos2"
+            name += "" if together[curve].any() else f", {harmonic} a revolution"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups
 
@@ -302,32 +304,32 @@ def _rms(losses: Array, folds: _Folds) -> float:
     return float(np.exp(0.5 * np.sum(np.log(losses + _NONE) * folds.numbers) / folds.numbers.sum()))
 
 
-def _pays(without: Array, with_it: Array, folds: _Folds) -> bool:
-    """Say whether the fall of the held-out squares' logarithms is more than chance over the folds."""
+def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
+    """Return whether the fall of the held-out squares' logarithms is more than chance over the folds."""
     fall = np.log((without + _NONE) / (with_it + _NONE)) * folds.numbers
-    return bool(fall.sum() > max(PAYS * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
+    return bool(fall.sum() > max(LEAST_GAIN * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
 
 
 def _pruned(
-    model: Model, folds: _Folds, kept: Mask, together: Mask, steps: list[Step]
+    model: Model, folds: _Folds, kept: Mask, together: Mask, steps: list[SelectionStep]
 ) -> tuple[Mask, dict[str, Array]]:
-    """Give back, one at a time, parameters without which the held-out error is no worse."""
-    given_back: dict[str, Array] = {}
+    """Remove, one at a time, parameters without which the held-out error is no worse."""
+    removed: dict[str, Array] = {}
     stays = together | np.array([p.kind in PLACEMENT for p in model.parameters])
     while True:
         doubtful = [int(k) for k in np.flatnonzero(kept & ~stays) if _doubt(folds, kept, int(k))]
         losses = folds.losses(kept)
         best = min(((_rms(folds.losses(_without(kept, k)), folds), k) for k in doubtful), default=None)
         if best is None or best[0] > _rms(losses, folds):
-            return kept, given_back
+            return kept, removed
         k = best[1]
         kept = _without(kept, k)
-        given_back[model.names[k]] = losses
-        steps.append(Step(f"-{model.names[k]}", (model.names[k],), best[0]))
+        removed[model.names[k]] = losses
+        steps.append(SelectionStep(f"-{model.names[k]}", (model.names[k],), best[0]))
 
 
 def _doubt(folds: _Folds, kept: Mask, k: int) -> bool:
-    """Say whether a parameter is so near its nominal value that leaving it there may cost nothing."""
+    """Return whether a parameter is so near its nominal value that leaving it there may cost nothing."""
     rows = np.flatnonzero(kept)
     A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
     fixed = np.where(kept, 0.0, folds.home)
@@ -344,7 +346,7 @@ def _without(kept: Mask, k: int) -> Mask:
     return out
 
 
-def _unpaid(losses_with: Array, folds: _Folds, rms: float) -> str:
+def _not_improving(losses_with: Array, folds: _Folds, rms: float) -> str:
     change = _rms(losses_with, folds) / rms - 1
-    told = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
-    return f"does not pay: with it the held-out error {told}"
+    text = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
+    return f"not selected: with it the held-out error {text}"

@@ -10,9 +10,10 @@ from armsight.data import Array
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
+from armsight.robot.arm_file import LIMITS
 
-#: Attribute of the arm -> its unit: what an identification leaves as it was, so that the file holds the whole arm.
-LIMITS = {"q_min": "rad", "q_max": "rad", "qd_max": "rad_s", "qdd_max": "rad_s2", "qddd_max": "rad_s3", "home": "rad"}
+#: Of the file. Version 1, which said no version, had [[cause]] tables and other names of the kinds of gravity.
+VERSION = 2
 
 
 def table_text(found: Identified) -> str:
@@ -20,16 +21,17 @@ def table_text(found: Identified) -> str:
     model, x = found.model, found.solution.x
     table, sigma = model.table(x), np.sqrt(np.diag(found.cov))[model.table_at : model.sources_at].reshape(6, 5)
     lines = [
-        f"name = {json.dumps(model.arm.name)}",
-        f"convention = {json.dumps(model.arm.convention)}",
+        f"name = {_quoted(model.arm.name)}",
+        f"convention = {_quoted(model.arm.convention)}",
         "identified = true",
-        "# theta = direction (q + causes) + offset; beta is Hayati's angle, a turn about y after alpha",
+        f"version = {VERSION}",
+        "# theta = direction (q + error sources) + offset; beta is Hayati's angle, a rotation about y after alpha",
         *_transform("T_rig_base", model.T_rig_base(x)),
         *_transform("T_base_0", model.arm.T_base_0),
         *_transform("T_flange_body", model.T_6_body(x)),
     ]
     for i, name in enumerate(model.arm.joint_names):
-        lines += ["", "[[joint]]", f"name = {json.dumps(name)}", f"direction = {model.arm.direction[i]:.0f}"]
+        lines += ["", "[[joint]]", f"name = {_quoted(name)}", f"direction = {model.arm.direction[i]:.0f}"]
         for c, column in enumerate(chain.COLUMNS):
             unit = "m" if c in (chain.D, chain.A) else "rad"
             lines.append(f"{column}_{unit} = {float(table[i, c])!r}")
@@ -39,8 +41,8 @@ def table_text(found: Identified) -> str:
     for k, feature in enumerate(model.features):
         at = model.sources_at + k
         if found.solution.free[at]:
-            lines += ["", "[[cause]]", f"name = {json.dumps(feature.name)}", f"kind = {json.dumps(feature.kind)}"]
-            lines += [f"joint = {feature.joint + 1}", f"unit = {json.dumps(feature.unit)}"]
+            lines += ["", "[[error_source]]", f"name = {_quoted(feature.name)}", f"kind = {_quoted(feature.kind)}"]
+            lines += [f"joint = {feature.joint + 1}", f"unit = {_quoted(feature.unit)}"]
             lines += [f"value = {float(x[at])!r}", f"sigma = {float(np.sqrt(found.cov[at, at]))!r}"]
     return "\n".join(lines) + "\n"
 
@@ -50,7 +52,7 @@ def zeros_text(found: Identified) -> str:
     model = found.model
     lines = [
         "# angle = (1 + gain) reading + zero + sin1 sin(reading) + cos1 cos(reading) + sin2 sin(2 reading) + ..;",
-        "# zero: to be added to every node of the joint's potentiometer table. Backlash and sag are not the board's.",
+        "# zero: to be added to every node of the joint's potentiometer table. Backlash and compliance stay uncorrected.",
     ]
     nominal = model.table(model.nominal())
     for i, name in enumerate(model.arm.joint_names):
@@ -59,7 +61,7 @@ def zeros_text(found: Identified) -> str:
         lines += [
             "",
             "[[joint]]",
-            f"name = {json.dumps(name)}",
+            f"name = {_quoted(name)}",
             f"zero_rad = {zero!r}",
             f"zero_deg = {np.degrees(zero):.5f}",
         ]
@@ -74,5 +76,10 @@ def zeros_text(found: Identified) -> str:
 def _transform(name: str, T: Array) -> list[str]:
     """Return a pose as position and quaternion wxyz."""
     position = ", ".join(repr(float(v)) for v in T[:3, 3])
-    turn = ", ".join(repr(float(v)) for v in quaternion_wxyz(T[:3, :3]))
-    return [f"{name} = {{ position_m = [{position}], quaternion_wxyz = [{turn}] }}"]
+    quaternion = ", ".join(repr(float(v)) for v in quaternion_wxyz(T[:3, :3]))
+    return [f"{name} = {{ position_m = [{position}], quaternion_wxyz = [{quaternion}] }}"]
+
+
+def _quoted(text: str) -> str:
+    """Return a basic string of TOML: JSON's escapes, but every character above ASCII as itself."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

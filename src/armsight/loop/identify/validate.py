@@ -1,7 +1,7 @@
-"""How well an arm says where its tool is, on poses it was not fitted to.
+"""Validation: the error of the predicted tool pose on poses that the arm was not fitted to.
 
-Where the poses were taken in another set-up (the tracker moved, another target), base and tool are placed anew, for the
-nominal arm as for the identified one, and it is said.
+Where the poses were taken in another set-up (the tracker moved, another target), base and tool are fitted again, for the
+nominal arm as for the identified one, and ``placement_refitted`` says so.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.placement import placed
+from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT
 
-#: Another set-up: the error is this many times that of base and tool placed anew,
+#: Another set-up: the error is this many times that with base and tool fitted again,
 OTHER = 5.0
 #: and this far, m: no arm moves so far by itself between two recordings of one set-up.
 OTHER_M = 0.02
-#: Poses needed to place base and tool anew.
+#: Poses needed to fit base and tool again.
 LEAST = 10
 
 
 class Errors(NamedTuple):
-    """Distances between where the tool was said and seen.
+    """Distances between the predicted and the measured tool.
 
     Attributes:
         position_m: (N, K) of every point.
-        angle_rad: (N,) of the body's turn; empty with points only.
+        angle_rad: (N,) of the body's rotation; empty with points only.
     """
 
     position_m: Array
@@ -74,7 +74,7 @@ def errors(model: Model, x: Array, measured: Measured) -> Errors:
 
 
 def validate(found: Identified, measured: Measured) -> Validation:
-    """Hold an identified arm against poses it was not fitted to.
+    """Evaluate an identified arm on poses that it was not fitted to.
 
     Args:
         found: the identified arm.
@@ -101,11 +101,11 @@ def validate(found: Identified, measured: Measured) -> Validation:
 
 def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
     """Return the model, the nominal and the identified vector with base and tool fitted to other poses."""
-    model, start = placed(found.model, measured)
-    place = np.array([p.kind in PLACEMENT for p in model.parameters])
+    model, start = with_placement(found.model, measured)
+    placement = np.array([p.kind in PLACEMENT for p in model.parameters])
     out = []
     for x in (found.nominal, found.solution.x):
-        out.append(fit(model, np.where(place, start, x), measured, place, found.prior).x)
+        out.append(fit(model, np.where(placement, start, x), measured, placement, found.prior).x)
     return model, out[0], out[1]
 
 
@@ -114,7 +114,7 @@ def _over(model: Model, found: Identified, x: Array, measured: Measured) -> floa
     e, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
     free = found.solution.free
     P = found.solution.cov[np.ix_(free, free)]
-    weighed = with_joint_noise(model, x, measured, found.joint_sigma_rad)
-    C = noise_cov(weighed, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
+    weighted = with_joint_noise(model, x, measured, found.joint_sigma_rad)
+    C = noise_cov(weighted, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
     whitened = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
     return float(np.sqrt(np.sum(whitened) / e.size))
