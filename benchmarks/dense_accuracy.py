@@ -1,4 +1,4 @@
-"""Figures of dense.py that have a truth: errors, honesty of sigma, and the pose of a tool without markers."""
+"""Metrics of dense.py that have a truth: errors, honesty of sigma, and the pose of a tool without markers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from armsight.sim.render.mesh import Solid, box, joined, moved, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.depth import depth_of
-from armsight.vision.dense.evaluate import Truth, judge
+from armsight.vision.dense.evaluate import TrueDisparity, evaluate_disparity
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.middlebury import find_scenes, load_scene
 from armsight.vision.dense.postprocess import filled
@@ -30,10 +30,6 @@ OURS = {
     "scanline": Scanline(),
     "semiglobal 5": Semiglobal(5),
     "semiglobal": Semiglobal(),
-    "block cross": Block(support="cross", reach=8),
-    "block guided": Block(support="guided", reach=6),
-    "block sad": Block("sad", reach=5),
-    "block zncc": Block("zncc"),
 }
 #: Bad-1 of Birchfield and Tomasi on tsukuba, both-seen pixels, in %: Scharstein and Szeliski, IJCV 47, 2002, table 5.
 BIRCHFIELD_TOMASI = 5.12
@@ -74,7 +70,9 @@ def errors(folder: Path) -> dict[str, Any]:
         print(f"  {scene.name:<20}{'bad-1':>8}{'bad-2':>8}   both-seen{'bad-1':>8}{'bad-2':>8}")
         rows: dict[str, Any] = {}
         for name, disparity in maps.items():
-            every, nonocc = (judge(disparity, scene.truth, a) for a in (scene.truth.known, scene.truth.seen))
+            every, nonocc = (
+                evaluate_disparity(disparity, scene.truth, a) for a in (scene.truth.known, scene.truth.seen)
+            )
             rows[name] = {"all": every.to_json(), "nonocc": nonocc.to_json()}
             bad = (*every.bad_percent[1:3], *nonocc.bad_percent[1:3])
             print(f"    {name:<18}{bad[0]:>8.2f}{bad[1]:>8.2f}{bad[2]:>20.2f}{bad[3]:>8.2f}", flush=True)
@@ -101,7 +99,7 @@ def holds(rows: dict[str, Any], key: str, limit: float) -> str:
     return "held" if rows["semiglobal"]["all"][key] < limit else "MISSED"
 
 
-def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np.ndarray, Truth]:
+def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np.ndarray, TrueDisparity]:
     """Boxes of any texture before a wall, noise of 1 to 3 levels; the seeds sigma was set on are 0 to 3."""
     rng = np.random.default_rng(seed)
     focal, baseline = 500.0, 0.1
@@ -112,10 +110,13 @@ def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np
     for _ in range(7):
         z = focal * baseline / rng.uniform(14, 52)
         shape = z * rng.uniform((0.1, 0.1, 0.05), (0.5, 0.5, 0.3))
-        look = {"grain_m": z * rng.uniform(0.02, 0.08), "contrast": rng.uniform(4, 40)}
+        prepare_planes = {"grain_m": z * rng.uniform(0.02, 0.08), "contrast": rng.uniform(4, 40)}
         place = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
         solids.append(
-            (box(shape, **look, seed=int(rng.integers(10**6))), pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), place))
+            (
+                box(shape, **prepare_planes, seed=int(rng.integers(10**6))),
+                pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), place),
+            )
         )
     left, depth, _ = see(camera, solids)
     aside = pose(np.eye(3), np.array([-baseline, 0, 0]))
@@ -125,7 +126,7 @@ def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np
     k = np.clip(np.rint(column), 0, size[0] - 1).astype(int)
     seen = (column >= 0) & (np.abs(focal * baseline / np.take_along_axis(depth_right, k, axis=1) - d) < 1)
     noise = rng.uniform(1, 3)
-    return with_noise(left, noise, rng), with_noise(right, noise, rng), Truth(d, seen)
+    return with_noise(left, noise, rng), with_noise(right, noise, rng), TrueDisparity(d, seen)
 
 
 def coverage(folder: Path) -> dict[str, Any]:

@@ -22,14 +22,14 @@ _POLISH_SIGMA_PX = 2.0
 
 
 def plain(shot: SeenShot) -> Correspondences | None:
-    """Return a shot's correspondences by name, or None where a name stands twice in one image."""
+    """Return a shot's correspondences by name, or None where a name occurs twice in one image."""
     if any(len(np.unique(ids)) < len(ids) for ids in shot.ids):
         return None
     return join(*(_detections(ids, uv) for ids, uv in zip(shot.ids, shot.uv, strict=True)))
 
 
 def _detections(ids: Ids, uv: Array) -> Detections:
-    """Sort named places into detections whose covariance is unknown."""
+    """Sort named pixel positions into detections whose covariance is unknown."""
     order = np.argsort(ids)
     return Detections(ids[order], uv[order], np.zeros((len(ids), 2, 2)))
 
@@ -37,7 +37,7 @@ def _detections(ids: Ids, uv: Array) -> Detections:
 def candidates(
     points: Array, cameras: tuple[Camera, Camera], shot: SeenShot
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Return what each camera of one shot alone says about where bodies may be."""
+    """Return the poses that each camera of one shot alone allows."""
     left, right = (consensus_poses(points, camera, shot.ids[i], shot.uv[i]) for i, camera in enumerate(cameras))
     return left, right
 
@@ -55,8 +55,8 @@ def instances(
         points: (M, 3) points of the body, m.
         cameras: left and right.
         T_left_right: (4, 4) their relative pose.
-        shot: what both cameras saw.
-        found: what each camera alone says, as :func:`candidates` returns.
+        shot: the detections of both cameras.
+        found: the poses that each camera alone allows, from :func:`candidates`.
 
     Returns:
         T_left_body (4, 4) and the correspondences of every body, the one with most detections first; no detection is

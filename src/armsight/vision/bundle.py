@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.errors import CalibrationError
-from armsight.vision.projection import Model, Observations, State, moved, predict
+from armsight.vision.projection import BundleModel, BundleState, Observations, moved, predict
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +101,10 @@ def solve_scaled(H: Array, g: Array) -> Array:
 #: Together with the solver stands what it is about.
 __all__ = [
     "CAUCHY_SCALE",
-    "Model",
+    "BundleModel",
+    "BundleSolution",
+    "BundleState",
     "Observations",
-    "Solution",
-    "State",
     "free_parameters",
     "minimise",
     "moved",
@@ -121,7 +121,7 @@ _RELATIVE_DECREASE = 1e-7
 
 
 def _robust_excess() -> float:
-    """Tell how many times the inverse of the reweighted information exceeds a robust fit's covariance, noise being clean.
+    """Return how many times the inverse of the reweighted information exceeds a robust fit's covariance, without outliers.
 
     For an M-estimator with weight w(d^2) the covariance is E[psi^2] / E[psi']^2 times that of unit information (Huber,
     "Robust statistics", 1981, section 6.3); for the Cauchy loss in two dimensions psi' averages to w^2. The inverse of
@@ -136,7 +136,7 @@ _ROBUST_EXCESS = _robust_excess()
 
 
 @dataclass(frozen=True, eq=False)
-class Solution(Record):
+class BundleSolution(Record):
     """A minimum of bundle adjustment.
 
     Attributes:
@@ -150,7 +150,7 @@ class Solution(Record):
         cov_motions: (S, 6, 6) covariance of the motions, or (0, 6, 6).
     """
 
-    state: State
+    state: BundleState
     residuals_px: Array
     sigma_px: float
     cov_shared: Array
@@ -167,7 +167,7 @@ def whiteners(observations: Observations, sigma_px: float) -> Array:
 
 
 def _normal(
-    model: Model, state: State, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
+    model: BundleModel, state: BundleState, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
 ) -> tuple[Arrow, Array]:
     """Assemble the normal equations at a state; also return the raw residuals (N, 2), px."""
     uv, J_shared, J_shot = predict(model, state, observations)
@@ -206,7 +206,7 @@ def _weigh(W: Array, J: Array) -> None:
             J[n, 1, k] = W[n, 1, 0] * u + W[n, 1, 1] * v
 
 
-def _prior(model: Model, count: int) -> Array:
+def _prior(model: BundleModel, count: int) -> Array:
     """(Q,) information about each of ``count`` shared parameters before any image: the shape's."""
     return np.concatenate([np.zeros(count - len(model.modes)), np.full(len(model.modes), 1.0 / model.shape_sigma_m**2)])
 
@@ -220,15 +220,15 @@ def _covariance(normal: Arrow, prior: Array, robust: bool) -> Array:
     return np.asarray(d[:, None] * np.linalg.pinv(d[:, None] * S * d, rcond=1e-14, hermitian=True) * d)
 
 
-def free_parameters(model: Model, state: State) -> NDArray[np.bool_]:
+def free_parameters(model: BundleModel, state: BundleState) -> NDArray[np.bool_]:
     """(Q,) which shared parameters are estimated."""
     n_cameras = sum(camera.parameters.size for camera in state.cameras)
     return np.concatenate([np.full(n_cameras, model.free_cameras), np.ones(6 + len(model.modes), bool)])
 
 
 def minimise(
-    model: Model,
-    start: State,
+    model: BundleModel,
+    start: BundleState,
     observations: Observations,
     sigma_px: float,
     *,
@@ -236,7 +236,7 @@ def minimise(
     free: NDArray[np.bool_] | None = None,
     max_steps: int = _MAX_STEPS,
     least_decrease: float = _RELATIVE_DECREASE,
-) -> Solution:
+) -> BundleSolution:
     """Find the minimum next to ``start`` for a given noise.
 
     Args:
@@ -282,17 +282,17 @@ def minimise(
     if free.any():
         cov[np.ix_(free, free)] = _covariance(normal, _prior(model, len(free))[free], robust)
     cov_motions = normal.cov_shots(cov[np.ix_(free, free)])[:, 6:, 6:] if len(state.motions) else np.zeros((0, 6, 6))
-    return Solution(state, residuals, sigma_px, cov, normal.cost, steps, converged, cov_motions)
+    return BundleSolution(state, residuals, sigma_px, cov, normal.cost, steps, converged, cov_motions)
 
 
-def _with_motions(model: Model, state: State) -> State:
+def _with_motions(model: BundleModel, state: BundleState) -> BundleState:
     """Return the state with a motion for every shot where the model has them, and without where it has not."""
     if len(state.motions) == len(model.motion_sigmas):
         return state
     return replace(state, motions=np.zeros_like(model.motion_sigmas))
 
 
-def _trial(state: State, shared: Array, shots: Array) -> State | None:
+def _trial(state: BundleState, shared: Array, shots: Array) -> BundleState | None:
     """Return the moved state, or None where the step leaves the possible (a focal length below zero)."""
     fx_fy = [camera.intrinsics[:2] for camera in state.cameras]
     sizes = [camera.parameters.size for camera in state.cameras]

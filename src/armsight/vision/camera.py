@@ -106,7 +106,7 @@ def _project(fisheye: bool, k: Array, d: Array, p: Array, uv: Array, J_p: Array,
 
 @numba.njit(cache=True, error_model="numpy")
 def _unproject(fisheye: bool, k: Array, d: Array, uv: Array, rays: Array) -> None:
-    """Turn raw pixels uv (N, 2) into unit rays (N, 3) by Newton's method; NaN where the distortion has no inverse."""
+    """Convert raw pixels uv (N, 2) to unit rays (N, 3) by Newton's method; NaN where the distortion has no inverse."""
     xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))
     for n in range(uv.shape[0]):
         u, v = (uv[n, 0] - k[2]) / k[0], (uv[n, 1] - k[3]) / k[1]
@@ -227,7 +227,7 @@ class Camera(Record):
         return self.project_jacobians(p)[0]
 
     def unproject(self, uv: Array) -> Array:
-        """Turn raw pixels (N, 2) into unit rays (N, 3) of this camera's frame; NaN where distortion has no inverse."""
+        """Convert raw pixels (N, 2) to unit rays (N, 3) of this camera's frame; NaN where distortion has no inverse."""
         rays = np.empty((len(uv), 3))
         _unproject(*self.kernel_arguments(), np.ascontiguousarray(uv, dtype=np.float64), rays)
         return rays

@@ -1,11 +1,11 @@
-"""The chapter's own method: closed-form triangulation by two verging cameras, and orientation from three points.
+"""The closed-form method: triangulation by two verging cameras, and orientation from three points.
 
-Coordinates on two image planes go in, points in the chapter's frame come out, each line under its equation number. The
-chapter (number 18, "Application of Stereo Vision and ARM Processor for Motion Control") puts the origin of a camera's
+Coordinates on two image planes go in, points in the world frame of the method come out, each line under its equation
+number. The source, its equations and its misprints are in docs/concepts/method.md. It puts the origin of a camera's
 frame *in its image plane*, so that a point in front projects inverted: x/u = y/v = -(z - F)/F (18.6). Every length is
 in metres, the focal length and the image coordinates too; ``pitch``, metres a pixel, leads to pixels. The world's axes
-are armsight's: +X right, +Y down, +Z forward. Where the printed equation is wrong the right one stands here:
-docs/chapter.md lists the misprints. These are one special rig: :func:`stereo_rig` builds it for the general functions.
+are armsight's: +X right, +Y down, +Z forward. Where the printed equation is wrong the right one stands here: These
+cameras are one special rig: :func:`stereo_rig` builds it for the general functions.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ SQUARE_RAD = 1e-9
 
 @dataclass(frozen=True)
 class VergingRig:
-    """Two distortion-free cameras turned about Y, as 18.1 to 18.8 have them.
+    """Two distortion-free cameras rotated about Y, as in 18.1 to 18.8.
 
     Attributes:
         F1: focal length of camera 1 (left), m.
         F2: focal length of camera 2 (right), m.
-        beta1: how far camera 1's axis turns inward, about Y, rad.
-        beta2: how far camera 2's axis turns inward, rad.
+        beta1: inward rotation of camera 1's axis, about Y, rad.
+        beta2: inward rotation of camera 2's axis, about Y, rad.
         X01: camera 1 stands at X = -X01, m.
         X02: camera 2 stands at X = +X02, m.
         Y01: camera 1 stands at Y = -Y01, m.
@@ -62,18 +62,18 @@ class VergingRig:
         if not (self.F1 > 0 and self.F2 > 0):
             raise InputError(f"focal lengths must be positive lengths in metres, got {self.F1} and {self.F2}")
         if not (abs(self.beta1) < np.pi / 2 and abs(self.beta2) < np.pi / 2):
-            raise InputError(f"a camera turns by less than 90 degrees (in rad), got {self.beta1} and {self.beta2}")
+            raise InputError(f"a camera is rotated by less than 90 degrees (in rad), got {self.beta1} and {self.beta2}")
 
     @staticmethod
     def symmetric(F: float, B: float, beta: float = 0.0) -> VergingRig:
-        """Return two equal cameras a baseline ``B`` apart (18.9), turned inward by ``beta`` each; 0 is parallel."""
+        """Return two equal cameras a baseline ``B`` apart (18.9), rotated inward by ``beta`` each; 0 is parallel."""
         return VergingRig(F, F, beta, beta, B / 2, B / 2)
 
 
 def rotation(beta: float) -> Array:
-    """Return (3, 3) the turn of a camera about Y by ``beta``, rad: from its own axes to the world's."""
+    """Return (3, 3) the rotation of a camera about Y by ``beta``, rad: from its own axes to the world's."""
     c, s = np.cos(beta), np.sin(beta)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])  # 18.4, lower left mended: -sin
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])  # 18.4, lower left corrected: -sin
 
 
 def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: ArrayLike) -> Array:
@@ -88,7 +88,7 @@ def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: Array
         u2: (N,) image coordinates of camera 2, m.
 
     Returns:
-        (N, 3) points, m, chapter's frame; NaN where the rays are parallel.
+        (N, 3) points, m, the method's world frame; NaN where the rays are parallel.
     """
     F1, F2, X01, X02, Y01, Z01, Z02 = rig.F1, rig.F2, rig.X01, rig.X02, rig.Y01, rig.Z01, rig.Z02
     u1, v1, u2 = (np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (u1, v1, u2))
@@ -99,9 +99,11 @@ def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: Array
     n2 = u2 * c2 + F2 * s2  # 18.8
     across = m1 * n2 - m2 * n1
     across = np.where(across == 0.0, np.nan, across)
-    Z = (m1 * m2 * (X01 + X02) + m1 * F2 * u2 - m2 * F1 * u1 + m1 * n2 * Z02 - m2 * n1 * Z01) / across  # 18.7, mended
+    Z = (
+        m1 * m2 * (X01 + X02) + m1 * F2 * u2 - m2 * F1 * u1 + m1 * n2 * Z02 - m2 * n1 * Z01
+    ) / across  # 18.7, corrected
     X = (u1 * F1 - m1 * X01 - n1 * (Z - Z01)) / np.where(m1 == 0.0, np.nan, m1)  # 18.7
-    Y = v1 - Y01 - v1 / F1 * ((X + X01) * s1 + (Z - Z01) * c1)  # 18.7, mended: (X + X01)
+    Y = v1 - Y01 - v1 / F1 * ((X + X01) * s1 + (Z - Z01) * c1)  # 18.7, corrected: (X + X01)
     return np.stack([X, Y, Z], axis=-1)
 
 
@@ -116,11 +118,11 @@ def triangulate_parallel(F: float, B: float, u1: ArrayLike, v1: ArrayLike, u2: A
         u2: (N,) image coordinates of camera 2 (right), m.
 
     Returns:
-        (N, 3) points, m, chapter's frame; NaN where there is no disparity.
+        (N, 3) points, m, the method's world frame; NaN where there is no disparity.
     """
     u1, v1, u2 = (np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (u1, v1, u2))
     disparity = np.where(u1 == u2, np.nan, u1 - u2)
-    Z = F - B * F / disparity  # 18.10, mended: u1 - u2
+    Z = F - B * F / disparity  # 18.10, corrected: u1 - u2
     X = (F - Z) * u1 / F - B / 2  # 18.10
     Y = (F - Z) * v1 / F  # 18.10
     return np.stack([X, Y, Z], axis=-1)
@@ -129,7 +131,7 @@ def triangulate_parallel(F: float, B: float, u1: ArrayLike, v1: ArrayLike, u2: A
 def T_world_camera(rig: VergingRig, side: Side) -> Array:
     """Return (4, 4) the pose of armsight's left or right camera, whose origin is the projection centre, in the world.
 
-    The chapter's own origin lies a focal length behind it, in the image plane.
+    The method's own origin lies a focal length behind it, in the image plane.
     """
     if side == "left":
         R, origin, F = rotation(rig.beta1), np.array([-rig.X01, -rig.Y01, rig.Z01]), rig.F1
@@ -142,7 +144,7 @@ def stereo_rig(rig: VergingRig, *, pitch: float, image_size_px: tuple[int, int])
     """Build the same two cameras as a StereoRig, for the general functions.
 
     Args:
-        rig: the chapter's rig.
+        rig: two verging cameras.
         pitch: width of a pixel on the sensor, m.
         image_size_px: (width, height); the optical axis meets the image in its middle.
 
@@ -154,11 +156,11 @@ def stereo_rig(rig: VergingRig, *, pitch: float, image_size_px: tuple[int, int])
         Camera(image_size_px, "none", np.array([F / pitch, F / pitch, cx, cy]), np.zeros(0)) for F in (rig.F1, rig.F2)
     )
     T_left_right = inverse(T_world_camera(rig, "left")) @ T_world_camera(rig, "right")
-    return StereoRig(left, right, T_left_right, np.zeros((14, 14)), 0.0, {"origin": "chapter's rig, given"})
+    return StereoRig(left, right, T_left_right, np.zeros((14, 14)), 0.0, {"origin": "closed-form rig, given"})
 
 
 def image_coordinates(uv: Array, *, pitch: float, image_size_px: tuple[int, int]) -> tuple[Array, Array]:
-    """Turn raw pixels of :func:`stereo_rig` into the chapter's image coordinates.
+    """Convert raw pixels of :func:`stereo_rig` to the image coordinates of the method.
 
     Args:
         uv: (N, 2) raw pixels.
@@ -166,7 +168,7 @@ def image_coordinates(uv: Array, *, pitch: float, image_size_px: tuple[int, int]
         image_size_px: (width, height).
 
     Returns:
-        (N,) u and (N,) v, m: inverted, since the chapter's image plane lies behind the projection centre (18.6).
+        (N,) u and (N,) v, m: inverted, since the method's image plane lies behind the projection centre (18.6).
     """
     cx, cy = _middle(image_size_px)
     return (cx - uv[:, 0]) * pitch, (cy - uv[:, 1]) * pitch  # 18.6
@@ -179,7 +181,7 @@ def _middle(image_size_px: tuple[int, int]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Orientation(Record):
-    """How three points on a body are turned.
+    """The orientation of a body, from three of its points.
 
     Attributes:
         R: (3, 3) rotation with columns x_b y_b z_b, from the body's axes to those the points were given in.
@@ -204,8 +206,8 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
     """Find the orientation of a body from three of its points (18.11 to 18.16).
 
     x_b runs along P1 P2, and z_b from P3 to their middle. Where P3 is not equally far from both, these two are not
-    square; x_b, the measured line, is then kept and z_b turned within the plane of the three points: it runs from P3 to
-    the nearest place of the line P1 P2 instead of its middle.
+    perpendicular; x_b, the measured line, is then kept and z_b rotated within the plane of the three points: it runs
+    from P3 to the nearest point of the line P1 P2 instead of its middle.
 
     Args:
         P1: (3,) first point, m.
@@ -224,7 +226,7 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
     square = z_b - cosine * x_b
     sine = float(np.linalg.norm(square))
     if sine < COLLINEAR_SINE:
-        raise InputError("P1, P2 and P3 lie on one line: the turn about that line is not determined")
+        raise InputError("P1, P2 and P3 lie on one line: the rotation about that line is not determined")
     z_b = square / sine
     y_b = np.cross(z_b, x_b)  # 18.11 to 18.14
     R = np.stack([x_b, y_b, z_b], axis=1)  # 18.11 to 18.14
@@ -233,7 +235,10 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
 
 
 def rotation_from_angles(phi: float, theta: float, psi: float) -> Array:
-    """Return R_z(phi) R_y(theta) R_x(psi) (18.15), rad; phi roll, theta pitch, psi yaw in the chapter's naming."""
+    """Return R_z(phi) R_y(theta) R_x(psi) (18.15), rad.
+
+    The source names phi roll, theta pitch and psi yaw; ROS's roll is the angle about x.
+    """
     return from_euler_zyx(phi, theta, psi)  # 18.15; row 1, column 3 is C_phi S_theta C_psi + S_phi S_psi
 
 

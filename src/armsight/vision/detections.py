@@ -63,7 +63,7 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
     index = {name: i for i, name in enumerate(body.point_names)}
     shots: dict[str, tuple[tuple[list[int], list[int]], tuple[list[Array], list[Array]]]] = {}
     for number, row in enumerate(rows[1:], start=2):
-        if not any(cell.strip() for cell in row):
+        if not any(field.strip() for field in row):
             continue
         if len(row) != len(header):
             raise InputError(f"{path}: line {number}: {len(row)} fields, the header has {len(header)}")
@@ -74,11 +74,11 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
             raise InputError(
                 f"{path}: line {number}: unknown marker {marker!r}; body {body.name} has {_some(body.point_names)}"
             )
-        uv = np.array([_number(cell, path, number, name) for cell, name in ((u, "u_px"), (v, "v_px"))])
-        ids, places = shots.setdefault(shot, (([], []), ([], [])))
+        uv = np.array([_number(text, path, number, name) for text, name in ((u, "u_px"), (v, "v_px"))])
+        ids, pixels = shots.setdefault(shot, (([], []), ([], [])))
         side = SIDES.index(camera)
         ids[side].append(index[marker])
-        places[side].append(uv)
+        pixels[side].append(uv)
     if not shots:
         raise InputError(f"{path}: no detections below the header")
     return [

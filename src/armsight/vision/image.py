@@ -1,7 +1,8 @@
-"""Image files in, arrays out; a damaged file is an error, never half a picture.
+"""Image files in, arrays out; a damaged file is an error, never half an image.
 
-OpenCV decodes a truncated file into a picture with a grey rest and says nothing to the caller, so the end of JPEG and
-PNG data is looked for before decoding.
+OpenCV decodes a truncated file to an image with a grey rest and does not report it, so the end of JPEG and PNG data is
+searched before decoding. (Pillow reports truncation, but it reduces 16-bit colours to 8 bits, its JPEG decoder need not
+agree with OpenCV's bit by bit, and it is not a dependency.)
 """
 
 from __future__ import annotations
@@ -24,7 +25,11 @@ _STDERR = threading.Lock()
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Send what C libraries write to stderr nowhere: libjpeg and libpng print warnings there on their own."""
+    """Discard what C libraries write to file descriptor 2: libjpeg and libpng print warnings there, past Python.
+
+    The descriptor is the process's, so the lock admits one decoder at a time and the replacement lasts for one decode
+    only.
+    """
     with _STDERR:
         kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
         try:
@@ -36,40 +41,40 @@ def _quiet() -> Iterator[None]:
             os.close(null)
 
 
-def _jpeg_ends(data: bytes) -> bool:
-    """Whether JPEG data holds the end of its picture: walk the segments to the scan, then look for its end marker.
+def _jpeg_complete(data: bytes) -> bool:
+    """Whether JPEG data holds the end of its image: walk the segments to the scan, then look for its end marker.
 
     Inside a scan FF is always escaped, so the first FF D9 after its start is the end; a thumbnail's lies before.
     """
-    place = 2
-    while place + 4 <= len(data):
-        if data[place] != 0xFF:
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
             return False
-        if data[place + 1] == 0xFF:  # fill byte
-            place += 1
-        elif data[place + 1] == 0xDA:
-            return data.find(b"\xff\xd9", place) >= 0
+        if data[at + 1] == 0xFF:  # fill byte
+            at += 1
+        elif data[at + 1] == 0xDA:
+            return data.find(b"\xff\xd9", at) >= 0
         else:
-            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return False
 
 
-def _png_ends(data: bytes) -> bool:
+def _png_complete(data: bytes) -> bool:
     """Whether PNG data holds its last chunk, whole."""
-    place = 8
-    while place + 12 <= len(data):
-        if data[place + 4 : place + 8] == b"IEND":
+    at = 8
+    while at + 12 <= len(data):
+        if data[at + 4 : at + 8] == b"IEND":
             return True
-        place += 12 + int.from_bytes(data[place : place + 4], "big")
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
     return False
 
 
-#: First bytes of a file -> what it is, and how to tell that it is whole.
-_FORMATS = {b"\xff\xd8\xff": ("JPEG", _jpeg_ends), b"\x89PNG\r\n\x1a\n": ("PNG", _png_ends)}
+#: First bytes of a file -> its format, and the check that it is complete.
+_FORMATS = {b"\xff\xd8\xff": ("JPEG", _jpeg_complete), b"\x89PNG\r\n\x1a\n": ("PNG", _png_complete)}
 
 
 def read_image(path: str | Path) -> Image:
-    """Read an image file as it is stored; an EXIF orientation is ignored, for pixels must stay where the camera saw them.
+    """Read an image file as it is stored; an EXIF orientation is ignored, for pixels must stay where the camera has them.
 
     Returns:
         (H, W) grey or (H, W, 3) BGR, uint8 or uint16.
@@ -85,8 +90,8 @@ def read_image(path: str | Path) -> Image:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
         raise InputError(f"{path}: the file is empty")
-    for start, (kind, ends) in _FORMATS.items():
-        if data.startswith(start) and not ends(data):
+    for start, (kind, complete) in _FORMATS.items():
+        if data.startswith(start) and not complete(data):
             raise InputError(
                 f"{path}: truncated {kind} image ({len(data)} bytes, and its end is missing); copy it again"
             )
@@ -105,14 +110,14 @@ def read_image(path: str | Path) -> Image:
 
 
 def grey(image: Image) -> NDArray[np.uint8]:
-    """Turn an image into 8-bit grey.
+    """Convert an image to 8-bit grey.
 
     Args:
         image: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, uint8 or uint16; 16 bits are scaled by 1/257.
 
     Returns:
-        (H, W) uint8, read-only whatever the image is: to compiled functions arrays that are read-only and arrays that are
-        not are two types, and they would be compiled again for the other.
+        (H, W) uint8, always read-only: for compiled functions read-only and writable arrays are two types, and each
+        type is compiled separately.
 
     Raises:
         InputError: another shape or type.

@@ -1,12 +1,13 @@
-"""Where a body is and how it is turned: maximum likelihood over every detection, with covariance.
+"""Locate a body: the maximum-likelihood pose over all of its detections, with covariance.
 
 The triangulated points give the start (rigid fit); the estimate minimises the covariance-weighted pixel distance of all
 detections, those of one camera included. One bad point is found by a robust fit and dropped by name; the covariance
-is that of plain least squares on what is left, plus what the rig's own covariance does to all points together. Where the
-body fits worse than the pixel noise allows (a print that is not its drawing, a body that moved between the two images)
-the noise is what the residuals show (Birge's ratio), and the estimate says by how much.
+is that of plain least squares on the others, plus the rig's own covariance propagated through the same fit. Where the
+body fits worse than the pixel noise allows (a print that deviates from its drawing, a body that moved between the two
+images) the noise is that of the residuals (Birge ratio), and the estimate reports the ratio as ``misfit``.
 
-Whether what a pose was fitted to is the body at all: its size, its shape, and whether chance explains what is left.
+The checks of plausibility come first: whether the detections are those of the body at all, by its size, its shape, and
+the chi-square of the residuals.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from armsight.vision.posefit import PixelObservations, PoseFit, fit_pose, whiten
 from armsight.vision.rig import StereoRig
 
 _COLLINEAR = 1e-3
-#: Residuals beyond chance and beyond this share of the body's apparent size are of something else than the body: a square
-#: of a wrong size, wrong names. A bent or badly printed body is a few hundredths off.
+#: Residuals beyond chance and beyond this share of the body's apparent size are implausible: a wrong size, wrong names.
+#: A bent or badly printed body deviates by a few hundredths.
 _ALIKE = 0.2
-#: A body whose points are this much too far apart or too close together, and by so many standard deviations, is another.
+#: A body whose points are too far apart or too close together by this share, and by so many sigmas, is another body.
 _SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
 
-def on_one_line(points: Array) -> bool:
-    """Whether points (N, 3), N >= 3, lie on one line, which can turn about itself unseen."""
+def collinear(points: Array) -> bool:
+    """Whether points (N, 3), N >= 3, lie on one line, about which a rotation is unobservable."""
     centred = points - points.mean(axis=0)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     return bool(spread[1] <= _COLLINEAR**2 * spread[2])
@@ -45,33 +46,33 @@ def on_one_line(points: Array) -> bool:
 def implausible(
     rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: PixelObservations, rigid: Array
 ) -> str | None:
-    """Say why a fit is no measurement of the body, or None.
+    """Return the reason why a fit is not a plausible measurement of the body, or None.
 
     Args:
         rig: the calibrated pair.
         body: the body's points, m.
         points: triangulated points, three or more, not all on one line.
         fit: the pose's plain fit.
-        used: the sightings that went in, all of the points' or fewer.
+        used: the observations that were fitted, all of the points' or fewer.
         rigid: (4, 4) T_left_body of the rigid fit to all points.
     """
     everything = len(used.point) == np.count_nonzero(points.seen.seen)
     count = np.bincount(used.point, minlength=len(body.points))
-    if not everything and on_one_line(body.points[count > 0]):
+    if not everything and collinear(body.points[count > 0]):
         return "the points that agree with one pose of the body lie on one line"
     if fit.cost > misfit_limit(2 * len(used.point) - 6) and (reason := _unlike(body, points, fit, used)) is not None:
         return reason
     if everything:
         return _wrong_size(rig, body, points, rigid)
     both = count[points.ids] == 2
-    if both.sum() < 3 or on_one_line(body.points[points.ids[both]]):
+    if both.sum() < 3 or collinear(body.points[points.ids[both]]):
         return None
     arrays = (points.ids[both], points.p_left[both], points.cov[both], points.calibration[both])
     return _wrong_size(rig, body, Points(*arrays, points.seen), fit_rigid(body.points[arrays[0]], arrays[1]))
 
 
 def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -> str | None:
-    """Say that the detections a pose was fitted to are further off it than those of a bent body would be, or None."""
+    """Report that the fitted detections are further off the pose than those of a bent body would be, or None."""
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
     off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
@@ -85,10 +86,10 @@ def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -
 
 
 def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) -> str | None:
-    """Say that the points are closer together or further apart than the body's, beyond what the rig can be wrong, or None.
+    """Report that the points are closer together or further apart than the body's, beyond the rig's errors, or None.
 
-    The scale is that of a similarity fit, ``T_left_body`` being the rigid one; its sigma holds pixel noise and the rig's
-    calibration.
+    The scale is that of a similarity fit, ``T_left_body`` being the rigid one; its sigma includes pixel noise and the
+    rig's calibration.
     """
     p_body = body.points[points.ids]
     p = (p_body - p_body.sum(axis=0) / len(p_body)) @ T_left_body[:3, :3].T
@@ -112,8 +113,8 @@ def misfit_limit(freedom: int) -> float:
     return float(chdtri(freedom, 1 - _MISFIT_QUANTILE)) if freedom > 0 else np.inf
 
 
-#: A detection whose whitened squared distance from a robust fit is beyond this share of the chi-square distribution is
-#: no detection of the body.
+#: A detection whose whitened squared distance from a robust fit is beyond this quantile of the chi-square distribution
+#: is an outlier.
 OUTLIER_QUANTILE = 1.0 - 1e-5
 _LIMIT, _MEDIAN = float(chdtri(2, 1 - OUTLIER_QUANTILE)), float(chdtri(2, 0.5))
 #: A shot in which less than this share of the detections agrees with one pose is missed.
@@ -122,7 +123,7 @@ _AGREEING = 0.5
 #: tried too, mirror solutions among them.
 _SAFE_POINTS = 8
 #: A robust fit whose median squared distance is this many times the expected one may be in a wrong minimum: then rigid
-#: fits of so many triples are judged, and the best few tried.
+#: fits of so many triples are compared, and the best few tried.
 _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
 
 
@@ -159,11 +160,11 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
 
 
 def _unlocatable(body: Body, points: Points) -> str | None:
-    """Say why a pose cannot be determined, or None."""
+    """Return the reason why a pose cannot be determined, or None."""
     if len(points.ids) < 3:
         lost = f"; dropped: {_listed(points.dropped)}" if points.dropped else ""
         return f"{len(points.ids)} matched points, 3 are needed{lost}"
-    return "the matched points lie on one line" if on_one_line(body.points[points.ids]) else None
+    return "the matched points lie on one line" if collinear(body.points[points.ids]) else None
 
 
 def _listed(dropped: tuple[Dropped, ...]) -> str:
@@ -211,7 +212,7 @@ def _best(rig: StereoRig, body: Body, observations: PixelObservations, starts: l
 def _without_outliers(
     rig: StereoRig, body: Body, robust: PoseFit, observations: PixelObservations
 ) -> tuple[NDArray[np.bool_], PoseFit | None]:
-    """Drop what the robust fit leaves far off, and fit the rest by plain least squares."""
+    """Drop the outliers of the robust fit, and fit the rest by plain least squares."""
     d2, T = robust.distance2, robust.T_left_body
     good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
@@ -230,7 +231,7 @@ def _without_outliers(
 
 
 def _distances(rig: StereoRig, body: Body, T: Array, observations: PixelObservations) -> tuple[Array, Array]:
-    """Return (N,) distances of all sightings from a pose's projections, px, and their squares in standard deviations."""
+    """Return (N,) distances of all observations from a pose's projections, px, and their squares in standard deviations."""
     fit = fit_pose(rig.cameras, rig.T_left_right, body.points, observations, T, robust=False, steps=0)
     if fit is None:
         return np.full(len(observations.point), np.inf), np.full(len(observations.point), np.inf)
@@ -265,7 +266,7 @@ def _estimate(
 def _thinned(
     rig: StereoRig, body: Body, points: Points, T: Array, observations: PixelObservations, good: NDArray[np.bool_]
 ) -> tuple[Points, tuple[Dropped, ...]]:
-    """Return the points whose detections are all good, and the others' names with how far off they are."""
+    """Return the points whose detections are all good, and the others' names with their distances."""
     distance = _distances(rig, body, T, observations)[0]
     dropped = tuple(
         Dropped(
@@ -285,11 +286,11 @@ def _chosen(observations: PixelObservations, good: NDArray[np.bool_]) -> PixelOb
 
 
 def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
-    """Tell how many times the variance of a fit's residuals exceeds what pixel noise and calibration explain.
+    """Return how many times the variance of a fit's residuals exceeds what pixel noise and calibration explain.
 
     Args:
         residuals: (M,) whitened residuals of a fit of six parameters.
-        by_rig: (M, P) what the rig's parameters do to them.
+        by_rig: (M, P) their derivative by the rig's parameters.
         cov_rig: (P, P) covariance of the rig's parameters.
 
     Returns:
@@ -309,5 +310,5 @@ def _rms(gaps: Array) -> float:
 
 def _median(values: Array) -> float:
     """Return the median of (N,) values, N > 0; numpy's own takes as long as fitting a pose."""
-    ordered, half = np.sort(values), len(values) // 2
-    return float(ordered[half] + ordered[-1 - half]) / 2
+    values_sorted, half = np.sort(values), len(values) // 2
+    return float(values_sorted[half] + values_sorted[-1 - half]) / 2

@@ -1,7 +1,7 @@
-"""Which detection of the left camera and which of the right are the same point: identity, then the epipolar gate.
+"""Match the detections of the left and the right camera: by identity, then by the epipolar gate.
 
-Coded points (board corners, tags, named markers) carry their identity; the epipolar gate throws out what contradicts the
-rig, by name. Distances are measured in undistorted pixels of each camera.
+Coded points (board corners, tags, named markers) carry their identity; the epipolar gate rejects, by name, pairs that
+contradict the rig. Distances are measured in undistorted pixels of each camera.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
 from armsight.vision.rig import StereoRig
 
 #: The gate in standard deviations of the epipolar distance, and the least it may be, px. A wrong identity is many
-#: pixels off; what is only noisier than expected stays and is judged against the body in locate.
+#: pixels off; a pair that is only noisier than expected stays and is tested against the body in locate.
 GATE_SIGMAS = 6.0
 GATE_PX = 2.0
-#: Epipolar distance beyond which a pair says nothing in favour of an order of a board's names, px.
+#: Epipolar distance beyond which a pair does not support an order of a board's names, px.
 FLIP_PX = 20.0
 
 
@@ -31,7 +31,7 @@ def join(left: Detections, right: Detections) -> Correspondences:
 
 
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
-    """Measure how far each point lies from the epipolar line of its partner.
+    """Measure the distance of each point from the epipolar line of its partner.
 
     Args:
         rig: the calibrated pair.
@@ -78,7 +78,7 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
         seen: correspondences by identity.
 
     Returns:
-        What is left; every dropped point is named with its distance.
+        The correspondences that remain; every dropped point is named with its distance.
     """
     rows = np.flatnonzero(seen.paired)
     uv, cov = seen.uv[rows], seen.cov_uv[rows]
@@ -98,32 +98,32 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
 
 
 def match(
-    rig: StereoRig, body: Body, left: Detections, right: Detections, *, flips: tuple[Ids, ...] = ()
+    rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[Ids, ...] = ()
 ) -> Correspondences:
     """Match one shot's detections: identity, then the epipolar gate.
 
     Args:
         rig: the calibrated pair.
-        body: the body both detections speak of.
-        left: what the left camera saw.
-        right: what the right camera saw.
-        flips: other orders in which a symmetric board's points may have been named, each an (M,) permutation; the one
-            on which most pairs agree with the rig is taken for the right camera.
+        body: the body of both detections.
+        left: detections of the left camera.
+        right: detections of the right camera.
+        symmetries: permutations (M,) under which the body looks the same, so that its points may have been named by any
+            of them; the one with which most pairs agree with the rig is applied to the right camera.
 
     Returns:
-        The correspondences; points seen by one camera only are kept for what they tell about the pose.
+        The correspondences; points seen by one camera only are kept, for they constrain the pose too.
     """
     best = join(left, right)
-    if flips and best.paired.any():
-        candidates = [best, *(join(left, renamed(right, flip)) for flip in flips)]
+    if symmetries and best.paired.any():
+        candidates = [best, *(join(left, renamed(right, permutation)) for permutation in symmetries)]
         best = max(candidates, key=lambda candidate: _agreement(rig, candidate))
     return gate(rig, body, best)
 
 
 def _agreement(rig: StereoRig, seen: Correspondences) -> float:
-    """Tell how well names agree with the rig: the sum, over pairs, of how much nearer to its line one is than FLIP_PX.
+    """Return how well names agree with the rig: the sum, over pairs, of FLIP_PX less the epipolar distance.
 
-    Not the mean: the middle of a board keeps its name when the board is turned, and may be the only pair left then.
+    Not the mean: the middle of a board keeps its name when the board is rotated, and may be the only pair left then.
     """
     pair = seen.uv[seen.paired]
     distance = epipolar_distances(rig, pair[:, 0], pair[:, 1]).max(axis=1)

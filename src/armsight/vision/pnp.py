@@ -126,8 +126,8 @@ def consensus_poses(points: Array, camera: Camera, ids: Ids, uv: Array) -> list[
             continue
         T = _polished(points[ids[rows]], camera, T, uv[rows])
         rows, rms = _agreeing(points, camera, T, ids, uv)
-        turned = [np.linalg.norm(log_so3(c.T_camera_body[:3, :3].T @ T[:3, :3])) for c in found]
-        if len(rows) >= 3 and all(angle > _SAME_ROTATION_RAD for angle in turned):
+        angles = [np.linalg.norm(log_so3(c.T_camera_body[:3, :3].T @ T[:3, :3])) for c in found]
+        if len(rows) >= 3 and all(angle > _SAME_ROTATION_RAD for angle in angles):
             found.append(Candidate(T, rows, rms))
     return sorted(found, key=lambda c: (-len(c.rows), c.rms_px))
 

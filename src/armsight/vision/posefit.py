@@ -1,7 +1,7 @@
 """The pose of a body from detections of two known cameras: one compiled Levenberg-Marquardt.
 
-The same cost as :mod:`~armsight.vision.bundle` with everything but one pose held, for the places that solve it thousands
-of times: locating, trying mirror solutions, telling bodies apart.
+The same cost as :mod:`~armsight.vision.bundle` with everything but one pose held, for the functions that solve it
+thousands of times: locating, trying mirror solutions, distinguishing bodies.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class PixelObservations(Record):
 
     @staticmethod
     def of(seen: Correspondences, sigma_px: float) -> PixelObservations:
-        """Flatten a shot's correspondences; ``sigma_px`` adds to what the image tells."""
+        """Flatten a shot's correspondences; ``sigma_px`` adds to the image's own covariance."""
         rows, sides = np.nonzero(seen.seen)
         cov = seen.cov_uv[rows, sides] + max(sigma_px, 1e-6) ** 2 * np.eye(2)
         return PixelObservations(sides.astype(np.int64), seen.ids[rows], seen.uv[rows, sides], cov)
@@ -52,14 +52,14 @@ class PixelObservations(Record):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit(Record):
-    """A minimum.
+    """The minimum of a pose fit.
 
     Attributes:
         T_left_body: (4, 4) the pose.
         residuals_px: (N, 2) detection minus projection.
         distance2: (N,) squared distance in standard deviations.
         information: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right.
-        cost: what was minimised: the sum of the squared distances, or their Cauchy loss.
+        cost: the minimum: the sum of the squared distances, or their Cauchy loss.
     """
 
     T_left_body: Array
@@ -79,20 +79,20 @@ def fit_pose(
     robust: bool,
     steps: int = _STEPS,
 ) -> PoseFit | None:
-    """Minimise the whitened pixel distance of all sightings over the pose of the body.
+    """Minimise the whitened pixel distance of all observations over the pose of the body.
 
     Args:
         cameras: left and right.
         T_left_right: (4, 4) pose of the right camera in the left one's frame.
         points: (M, 3) points of the body, m.
         observations: N detections.
-        start: (4, 4) T_left_body to begin with.
+        start: (4, 4) T_left_body at the start.
         robust: Cauchy loss as in bundle adjustment, else plain least squares.
         steps: iterations at the most.
 
     Returns:
         The minimum next to the start, or None where the start puts a point behind its camera or the
-        sightings do not determine a pose.
+        observations do not determine a pose.
     """
     T, p = np.array(start), np.ascontiguousarray(points[observations.point])
     n = len(p)
@@ -117,7 +117,7 @@ def whitened(
     observations: PixelObservations,
     T_left_body: Array,
 ) -> tuple[Array, Array, Array]:
-    """Differentiate the projections of all sightings, in standard deviations of each.
+    """Differentiate the projections of all observations, in standard deviations of each.
 
     Args:
         cameras: left and right.
@@ -148,6 +148,21 @@ def _invert(cov: Array, weight: Array) -> None:
         weight[n, 0, 1], weight[n, 1, 0] = -cov[n, 0, 1] / det, -cov[n, 1, 0] / det
 
 
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _to_camera(M: Array, p: Array, q: Array) -> None:
+    """Fill q (3,), a point p (3,) of the body in the frame of the camera with T_camera_body M (4, 4)."""
+    for i in range(3):
+        q[i] = M[i, 0] * p[0] + M[i, 1] * p[1] + M[i, 2] * p[2] + M[i, 3]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _by_rotation(J: Array, p: Array) -> None:
+    """Fill the last three of J (6,), a pixel's derivative by the rotation of the body, from the first three."""
+    J[3] = J[2] * p[1] - J[1] * p[2]
+    J[4] = J[0] * p[2] - J[2] * p[0]
+    J[5] = J[1] * p[0] - J[0] * p[1]
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _differentiate(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array,
@@ -159,17 +174,14 @@ def _differentiate(
     for n in range(len(p)):
         c = camera[n]
         M = Ts[c]
-        for i in range(3):
-            q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
+        _to_camera(M, p[n], q)
         distort(fisheye[c], d[c], q, xy, J_p, J_d)
         pose, shared = by_pose[2 * n : 2 * n + 2], by_rig[2 * n : 2 * n + 2]
         for i in range(2):
             J_p[i] *= k[c, i]
             for j in range(3):
                 pose[i, j] = J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j]
-            pose[i, 3] = pose[i, 2] * p[n, 1] - pose[i, 1] * p[n, 2]
-            pose[i, 4] = pose[i, 0] * p[n, 2] - pose[i, 2] * p[n, 0]
-            pose[i, 5] = pose[i, 1] * p[n, 0] - pose[i, 0] * p[n, 1]
+            _by_rotation(pose[i], p[n])
             start = starts[c]
             shared[i, start + i], shared[i, start + 2 + i] = xy[i], 1.0
             for j in range(counts[c]):
@@ -204,8 +216,7 @@ def _assemble(
     for n in range(p.shape[0]):
         c = camera[n]
         M = Ts[c]
-        for i in range(3):
-            q[i] = M[i, 0] * p[n, 0] + M[i, 1] * p[n, 1] + M[i, 2] * p[n, 2] + M[i, 3]
+        _to_camera(M, p[n], q)
         if q[2] <= 0.0:
             return np.inf
         distort(fisheye[c], d[c], q, xy, J_p, J_d)
@@ -213,9 +224,7 @@ def _assemble(
             residuals[n, i] = uv[n, i] - k[c, i] * xy[i] - k[c, 2 + i]
             for j in range(3):
                 J[i, j] = k[c, i] * (J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j])
-            J[i, 3] = J[i, 2] * p[n, 1] - J[i, 1] * p[n, 2]
-            J[i, 4] = J[i, 0] * p[n, 2] - J[i, 2] * p[n, 0]
-            J[i, 5] = J[i, 1] * p[n, 0] - J[i, 0] * p[n, 1]
+            _by_rotation(J[i], p[n])
         r0, r1 = residuals[n, 0], residuals[n, 1]
         w00, w01, w11 = weight[n, 0, 0], weight[n, 0, 1], weight[n, 1, 1]
         d2[n] = w00 * r0 * r0 + 2 * w01 * r0 * r1 + w11 * r1 * r1
@@ -235,7 +244,7 @@ def _assemble(
 
 @numba.njit(cache=True, error_model="numpy")
 def moved(T: Array, xi: Array, out: Array) -> None:
-    """Move a pose by a tangent, on the right; to first order T exp(xi), and a pose exactly."""
+    """Move a pose by a tangent, on the right: T exp(xi) to first order, and an exact rotation matrix."""
     angle = np.sqrt(xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
     b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-4 else 0.5
@@ -259,7 +268,7 @@ def _fit(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
     T: Array, robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
 ) -> float:  # fmt: skip
-    """Levenberg-Marquardt on T in place; residuals, distances and information are those of the result."""
+    """Levenberg-Marquardt; T is replaced by the minimum; residuals, distances and information are those of the result."""
     g, damped, trial = np.empty(6), np.empty((6, 6)), np.empty((4, 4))
     new_H, new_g, new_r, new_d2 = np.empty((6, 6)), np.empty(6), np.empty_like(residuals), np.empty_like(d2)
     cost = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, T, robust, residuals, d2, H, g)

@@ -1,11 +1,10 @@
-"""What bundle adjustment is about: detections, where everything is, what is believed beforehand, and what would be seen.
+"""The model of bundle adjustment: the observations, what is estimated, what is fixed, and the predicted pixels.
 
-Observations and states go in, projections with their analytic derivatives come out.
+Observations and a state go in, projections with their analytic derivatives come out (:func:`predict`).
 
-How a body may differ from its drawing: shape modes for bundle adjustment.
-
-A body's pose in every shot takes its rigid motions, and the images cannot tell its size from the distance of the
-cameras: these seven freedoms are taken out, and what remains moves one point against another.
+First the shape modes: how a body may deviate from its drawing. The body's pose in every shot absorbs its rigid motions,
+and its size is unobservable against the distance of the cameras: these seven freedoms are removed
+(:func:`without_gauge`), and the remaining modes move points relative to each other.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ def without_gauge(points: Array, modes: Array) -> Array:
     generators = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
     generators += [centred @ skew(axis).T for axis in np.eye(3)] + [centred]
     _, sizes, Q = np.linalg.svd(np.stack([g.ravel() for g in generators]), full_matrices=False)
-    Q = Q[sizes > 1e-9 * sizes[0]]  # points on one line have six freedoms: turning about it moves none
+    Q = Q[sizes > 1e-9 * sizes[0]]  # points on one line have six freedoms: a rotation about it moves none
     flat = modes.reshape(len(modes), -1)
     flat = flat - (flat @ Q.T) @ Q
     _, sizes, basis = np.linalg.svd(flat, full_matrices=False)
@@ -115,15 +114,15 @@ def _still() -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class State(Record):
-    """What bundle adjustment estimates.
+class BundleState(Record):
+    """The state that bundle adjustment estimates.
 
     Attributes:
         cameras: left and right.
         T_left_right: (4, 4) pose of the right camera in the left one's frame.
         Ts_left_body: (S, 4, 4) pose of the body in every shot.
         shape: (K,) coordinates of the body's shape along its modes, m.
-        motions: (S, 6) how the body moved from the left exposure to the right one, in its own frame: the way of its
+        motions: (S, 6) motion of the body from the left exposure to the right one, in its own frame: translation of its
             middle, m, and the rotation vector about it, rad; (0, 6) where it stood still.
     """
 
@@ -135,8 +134,8 @@ class State(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Model(Record):
-    """What bundle adjustment holds fixed, and what it believes beforehand.
+class BundleModel(Record):
+    """What bundle adjustment holds fixed, and its priors.
 
     The shared parameters are: left intrinsics and distortion, right intrinsics and distortion, the tangent of
     T_left_right, and the shape.
@@ -147,7 +146,7 @@ class Model(Record):
         shape_sigma_m: standard deviation of every shape coordinate before any image, m.
         free_cameras: whether intrinsics and distortion are estimated.
         motion_sigmas: (S, 6) standard deviation of every shot's motion between the exposures before any image, m and
-            rad, as in :class:`State`; (0, 6) where the body stands still.
+            rad, as in :class:`BundleState`; (0, 6) where the body stands still.
     """
 
     points: Array
@@ -168,7 +167,7 @@ def _fill(
     J_k: Array,
     rig: int,
     by_rig: Array,
-    turned: Array,
+    by_point: Array,
     points: Ids,
     modes: Array,
     J: Array,
@@ -181,7 +180,7 @@ def _fill(
         J_k: (n, 2, c) derivative by the camera's parameters.
         rig: column of the relative pose.
         by_rig: (n, 2, 6) derivative by it; (0, 2, 6) for the left camera.
-        turned: (n, 2, 3) derivative by the body's points.
+        by_point: (n, 2, 3) derivative by the body's points.
         points: (n,) which points.
         modes: (M, 3, K) the shape's modes by point.
         J: to be written.
@@ -195,17 +194,17 @@ def _fill(
             if by_rig.shape[0]:
                 for k in range(6):
                     row[rig + k] = by_rig[n, i, k]
-            x, y, z = turned[n, i, 0], turned[n, i, 1], turned[n, i, 2]
+            x, y, z = by_point[n, i, 0], by_point[n, i, 1], by_point[n, i, 2]
             for k in range(mode.shape[1]):
                 row[rig + 6 + k] = x * mode[0, k] + y * mode[1, k] + z * mode[2, k]
 
 
-def predict(model: Model, state: State, observations: Observations) -> tuple[Array, Array, Array]:
+def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
     """Project every observation and differentiate.
 
     Args:
         model: the body and its modes.
-        state: where everything is.
+        state: cameras, poses and shape.
         observations: N rows.
 
     Returns:
@@ -226,39 +225,41 @@ def predict(model: Model, state: State, observations: Observations) -> tuple[Arr
         T = state.Ts_left_body[shots]
         T = T if side == 0 else T_right_left @ T
         p_body, by_body = body[points], T[:, :3, :3]
-        turned = by_body
+        by_point = by_body
         if side == 1 and len(state.motions):
             arm = p_body - middle
             R = exp_so3(np.array(state.motions[:, 3:]))[shots]
             p_body = (R @ arm[..., None])[..., 0] + middle + state.motions[shots, :3]
-            turned = by_body @ R
+            by_point = by_body @ R
         p = transform(T, p_body)
         uv[rows], J_p, J_k = camera.project_jacobians(p)
-        by_body, turned = J_p @ by_body, J_p @ turned
+        by_body, by_point = J_p @ by_body, J_p @ by_point
         J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
         if side == 1 and len(state.motions):
-            by_rotation = -turned @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
+            by_rotation = -by_point @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
             J_shot[rows, :, 6:] = np.concatenate([by_body, by_rotation], axis=2)
         start = 0 if side == 0 else sizes[0]
         by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
-        _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, turned, points, modes, J_shared)
+        _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, by_point, points, modes, J_shared)
     return uv, J_shared, J_shot
 
 
-def _right_jacobians(turns: Array) -> Array:
-    """(S, 3, 3) how the rotations of vectors (S, 3) turn, on the right, as the vectors change.
+def _right_jacobians(rotations: Array) -> Array:
+    """(S, 3, 3) right Jacobians of SO(3) at rotation vectors (S, 3), rad.
 
-    It is the transpose of the matrix by which exp_se3 takes its translation.
+    Each is the transpose of the matrix by which exp_se3 multiplies its translation.
     """
-    tangents = np.concatenate([np.tile(np.eye(3), (len(turns), 1, 1)), np.repeat(turns[:, None], 3, axis=1)], axis=2)
+    tangents = np.concatenate(
+        [np.tile(np.eye(3), (len(rotations), 1, 1)), np.repeat(rotations[:, None], 3, axis=1)], axis=2
+    )
     return np.asarray(exp_se3(tangents)[..., :3, 3])
 
 
-def moved(state: State, shared: Array, shots: Array) -> State:
+def moved(state: BundleState, shared: Array, shots: Array) -> BundleState:
     """Return the state moved by ``shared`` (Q,) and ``shots``: tangents (S, 6) of the poses, or (S, 12) with motions."""
     left, right = state.cameras
     n_left, n = left.parameters.size, left.parameters.size + right.parameters.size
-    return State(
+    return BundleState(
         (
             left.with_parameters(left.parameters + shared[:n_left]),
             right.with_parameters(right.parameters + shared[n_left:n]),

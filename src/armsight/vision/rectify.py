@@ -1,10 +1,9 @@
-"""Standard form: a pair as two equal cameras side by side would have seen it, and back.
+"""Rectify a pair: convert its images to those of two equal cameras side by side, and pixels between raw and rectified.
 
-Both cameras are turned about their own centres until the rows of both images are the same planes through the baseline
-(the chapter's "standard form"; Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA
-12(1), 2000). A scene point is then in one row, and its column in the left image less that in the right one, the
-disparity d, tells its depth: z = f b / d. Both images have one principal point, so that what is infinitely far has no
-disparity.
+Both cameras are rotated about their own centres until the rows of both images are the same planes through the baseline
+(Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA 12(1), 2000). A scene point is
+then in one row, and its column in the left image less that in the right one, the disparity d, gives its depth: z = f b
+/ d. Both images have one principal point, so that a point at infinity has no disparity.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
 
 
-#: How far two unit rays may be apart and be the same: a raw pixel is kept to a float's precision.
+#: Largest difference of two unit rays that count as the same: a raw pixel is stored in single precision.
 _SAME_RAY = 1e-5
-#: Rows that are worked on at a time, and pixels between those that are looked at twice.
+#: Rows that are processed at a time, and step between the pixels that are checked for folds, px.
 _ROWS, _STEP = 32, 8
 #: Least sine of the angle between the view and the baseline: below it one camera is behind the other.
 _ASIDE = 0.2
@@ -35,16 +34,16 @@ _ASIDE = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Rectification(Record):
-    """How a rig's images become standard form.
+    """The rectification of a rig's images.
 
     Attributes:
         rig: the rig.
-        image_size_px: (width, height) of both images in standard form.
+        image_size_px: (width, height) of both rectified images.
         focal_px: f, of both.
         principal_px: (column, row) of the principal point, of both.
-        T_left_rectleft: (4, 4) a rotation.
-        T_right_rectright: (4, 4) a rotation.
-        map_left: (H, W, 2) the raw pixel that each pixel shows; NaN where the camera sees nothing.
+        T_left_rectleft: (4, 4) a rotation, from the rectified to the raw left camera.
+        T_right_rectright: (4, 4) a rotation, the same of the right camera.
+        map_left: (H, W, 2) the raw pixel that each rectified pixel shows; NaN where the camera sees nothing.
         map_right: the same of the right image.
     """
 
@@ -58,7 +57,7 @@ class Rectification(Record):
     map_right: NDArray[np.float32]
 
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Turn raw images into standard form; what a camera does not see is black.
+        """Rectify a pair of raw images; where a camera sees nothing they are black.
 
         Raises:
             InputError: an image is not of the size its camera was calibrated at.
@@ -70,24 +69,24 @@ class Rectification(Record):
                 raise InputError(
                     f"{side} image: {image.shape[1]}x{image.shape[0]} px, the rig was calibrated at {width}x{height}"
                 )
-            place = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
+            raw_uv = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
             out.append(
                 np.asarray(
-                    cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+                    cv2.remap(image, raw_uv[..., 0], raw_uv[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
                 )
             )
         return out[0], out[1]
 
     def seen(self, side: Side) -> NDArray[np.bool_]:
-        """(H, W) where an image in standard form shows something: where disparity is defined, in the left one."""
+        """(H, W) whether a rectified pixel lies within the raw image; disparity is defined there in the left one."""
         camera = self.rig.left if side == "left" else self.rig.right
-        place = self.map_left if side == "left" else self.map_right
+        raw_uv = self.map_left if side == "left" else self.map_right
         high = np.array(camera.image_size_px) - 1
         with np.errstate(invalid="ignore"):
-            return np.asarray(((place >= 0) & (place <= high)).all(axis=2))
+            return np.asarray(((raw_uv >= 0) & (raw_uv <= high)).all(axis=2))
 
     def to_rect(self, uv: Array, side: Side) -> Array:
-        """Take raw pixels (N, 2) to standard form (N, 2); NaN where there is none."""
+        """Convert raw pixels (N, 2) to rectified ones (N, 2); NaN where there is none."""
         camera = self.rig.left if side == "left" else self.rig.right
         T = self.T_left_rectleft if side == "left" else self.T_right_rectright
         ray = camera.unproject(uv) @ T[:3, :3]
@@ -95,13 +94,13 @@ class Rectification(Record):
         return np.asarray(self.focal_px * ray[:, :2] / z[:, None] + self.principal_px)
 
     def to_raw(self, uv_rect: Array, side: Side) -> Array:
-        """Take pixels in standard form (N, 2) to raw ones (N, 2); NaN where the camera sees nothing."""
+        """Convert rectified pixels (N, 2) to raw ones (N, 2); NaN where the camera sees nothing."""
         camera = self.rig.left if side == "left" else self.rig.right
         T = self.T_left_rectleft if side == "left" else self.T_right_rectright
         return camera.project(_rays(uv_rect, self.focal_px, self.principal_px) @ T[:3, :3].T)
 
     def points(self, uv_rect: Array, disparity: Array) -> Array:
-        """Take pixels (N, 2) of the left image in standard form and their disparities (N,) to points (N, 3), m, left frame.
+        """Convert pixels (N, 2) of the rectified left image and their disparities (N,) to points (N, 3), m, left frame.
 
         NaN where a disparity is not that of a point in front of the cameras.
         """
@@ -110,7 +109,7 @@ class Rectification(Record):
         return np.asarray((rays * z[:, None]) @ self.T_left_rectleft[:3, :3].T)
 
     def depth(self, disparity: NDArray[np.floating[Any]]) -> Array:
-        """Return depths, m, along the axis of the left camera in standard form, of disparities; NaN where there is none."""
+        """Return depths, m, along the axis of the rectified left camera, of disparities; NaN where there is none."""
         d = np.where(np.asarray(disparity) > 0, disparity, np.nan).astype(np.float64)
         return np.asarray(self.focal_px * self.rig.baseline_m / d)
 
@@ -120,18 +119,18 @@ class Rectification(Record):
 
 
 def _rays(uv: Array, focal_px: float, principal: tuple[float, float]) -> Array:
-    """Return rays (N, 3) of unit depth through pixels (N, 2) in standard form."""
+    """Return rays (N, 3) of unit depth through rectified pixels (N, 2)."""
     return np.column_stack([(uv - np.asarray(principal)) / focal_px, np.ones(len(uv))])
 
 
 def rectify(rig: StereoRig) -> Rectification:
-    """Put a rig's images into standard form.
+    """Compute the rectification of a rig.
 
-    The new axes: x along the baseline, z as near to both optical axes as can be. The images keep the left one's size
-    and the mean focal length; what the two cameras look at on average is in the middle.
+    The new axes: x along the baseline, z as near to both optical axes as possible. The images keep the left one's size
+    and the mean focal length; the mean of the two viewing directions is in the middle.
 
     Raises:
-        InputError: the baseline lies along the optical axes: there is no standard form.
+        InputError: the baseline lies along the optical axes: the images cannot be rectified.
     """
     baseline = rig.T_left_right[:3, 3] / rig.baseline_m
     ahead = np.array([0.0, 0.0, 1.0]) + rig.T_left_right[:3, 2]
@@ -139,18 +138,18 @@ def rectify(rig: StereoRig) -> Rectification:
         raise InputError("the right camera is on the left camera's left: exchange the two in the rig file")
     z = ahead - (ahead @ baseline) * baseline
     if np.linalg.norm(z) < _ASIDE * np.linalg.norm(ahead):
-        raise InputError("one camera is behind the other, along their view: such a rig has no standard form")
+        raise InputError("one camera is behind the other, along their view: such a rig cannot be rectified")
     z = z / np.linalg.norm(z)
     R_left_rect = np.column_stack([baseline, np.cross(z, baseline), z])
     T_left_rectleft = pose(R_left_rect, np.zeros(3))
     T_right_rectright = pose(inverse(rig.T_left_right)[:3, :3] @ R_left_rect, np.zeros(3))
     focal = float(np.mean([camera.intrinsics[:2].mean() for camera in rig.cameras]))
     size = np.array(rig.left.image_size_px)
-    turns = (T_left_rectleft[:3, :3], T_right_rectright[:3, :3])
-    looks = [_middle_ray(camera) @ R for camera, R in zip(rig.cameras, turns, strict=True)]
+    rotations = (T_left_rectleft[:3, :3], T_right_rectright[:3, :3])
+    looks = [_middle_ray(camera) @ R for camera, R in zip(rig.cameras, rotations, strict=True)]
     column, row = (size - 1) / 2 - np.mean([focal * look[:2] / look[2] for look in looks], axis=0)
     principal = (float(column), float(row))
-    maps = [_map(camera, R, size, focal, principal) for camera, R in zip(rig.cameras, turns, strict=True)]
+    maps = [_map(camera, R, size, focal, principal) for camera, R in zip(rig.cameras, rotations, strict=True)]
     return Rectification(rig, rig.left.image_size_px, focal, principal, T_left_rectleft, T_right_rectright, *maps)
 
 
@@ -162,15 +161,15 @@ def _middle_ray(camera: Camera) -> Array:
 def _map(
     camera: Camera, R_camera_rect: Array, size: NDArray[np.int64], focal: float, principal: tuple[float, float]
 ) -> NDArray[np.float32]:
-    """Return the raw pixel (H, W, 2) of every pixel in standard form, NaN where there is none."""
+    """Return the raw pixel (H, W, 2) of every rectified pixel, NaN where there is none."""
     width, height = int(size[0]), int(size[1])
     out = np.empty((height, width, 2), np.float32)
     for top in range(0, height, _ROWS):
         v, u = np.mgrid[top : min(top + _ROWS, height), :width].astype(np.float64)
         rays = _rays(np.column_stack([u.ravel(), v.ravel()]), focal, principal) @ R_camera_rect.T
         out[top : top + _ROWS] = camera.project(rays).reshape(*u.shape, 2)
-    # Far off its axis a distortion polynomial folds back: what does not lead back to its own ray is no view. Folds are
-    # far larger than a few pixels, so that these are looked at only.
+    # Far off its axis a distortion polynomial folds back: a pixel whose ray is not its own is invalid. Folds are far
+    # larger than a few pixels, so only every eighth pixel is checked.
     v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
     rays = _rays(np.column_stack([u.ravel(), v.ravel()]), focal, principal) @ R_camera_rect.T
     ahead = rays / np.linalg.norm(rays, axis=1, keepdims=True)

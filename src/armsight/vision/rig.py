@@ -45,7 +45,7 @@ class StereoRig(Record):
         cov: (P, P) covariance of the rig's parameters: left intrinsics and distortion, right intrinsics and distortion,
             and the tangent [translation m; rotation rad] of T_left_right (perturbation on the right). Zero where a
             parameter was given and not estimated.
-        sigma_px: standard deviation of a detection, beyond what the image itself tells, px: what calibration found.
+        sigma_px: standard deviation of a detection beyond the image's own covariance, px: from the calibration.
         provenance: where the rig comes from: command, data, versions.
     """
 
@@ -68,7 +68,7 @@ class StereoRig(Record):
         checked(self.cov, (self.parameter_count, self.parameter_count), "rig covariance")
         _check_covariance(self.cov, self.parameter_names)
         if not np.linalg.norm(self.T_left_right[:3, 3]) > 0:
-            raise InputError("T_left_right has no translation: two cameras in one place measure no distance")
+            raise InputError("T_left_right has no translation: two cameras at one position measure no distance")
         if not 0 <= self.sigma_px < np.inf:
             raise InputError(f"sigma_px must be a finite number not below zero, got {self.sigma_px}")
 
@@ -116,7 +116,7 @@ class StereoRig(Record):
         )
 
     def rectify(self) -> Rectification:
-        """Return how the rig's images become standard form, and back; see :func:`~armsight.vision.rectify.rectify`."""
+        """Return the rectification of the rig's images; see :func:`~armsight.vision.rectify.rectify`."""
         from armsight.vision.rectify import rectify
 
         return rectify(self)
@@ -181,7 +181,7 @@ def _row(numbers: Array) -> str:
 
 
 def _check_covariance(cov: Array, names: tuple[str, ...]) -> None:
-    """Refuse what cannot be a covariance (P, P) of the named parameters: negative variances, or no symmetry."""
+    """Reject what cannot be a covariance (P, P) of the named parameters: negative variances, or no symmetry."""
     variance = np.diag(cov)
     if (variance < 0).any():
         raise InputError(f"rig covariance: the variance of {names[int(np.argmin(variance))]} is negative")

@@ -1,4 +1,4 @@
-"""Where matched points are: optimal triangulation on raw pixels, through the distortion.
+"""Optimal triangulation of matched points on raw pixels, through the distortion.
 
 Minimises the covariance-weighted pixel distance in both images (the maximum-likelihood point; Hartley and Sturm,
 "Triangulation", 1997, here by Gauss-Newton so that any distortion and any covariance is allowed).
@@ -16,10 +16,10 @@ from armsight.vision.camera import distort, pair_arguments
 from armsight.vision.rig import StereoRig
 
 _STEPS = 10
-#: A minimum is reached by a step that gains less than this, in units of chi-square: a thousandth of a standard deviation,
-#: and the step after it would be a hundred times smaller at least.
+#: A minimum is reached by a step that lowers chi-square by less than this: a thousandth of a standard deviation; the
+#: step after it would be a hundred times smaller at least.
 _REACHED = 1e-6
-#: A pivot of the normal equations below this share of its diagonal leaves a direction open.
+#: A pivot of the normal equations below this share of its diagonal leaves a direction undetermined.
 _SINGULAR = 1e-15
 #: Cosine of the angle, 8 degrees, within which a point must lie of the ray of its pixel.
 _LOOKING = 0.99
@@ -100,8 +100,8 @@ def _linearise(
 ) -> None:  # fmt: skip
     """Fill the residuals r (2, 2) of a point p of the left frame and their Jacobian J (2, 2, 3) by it.
 
-    Of both cameras: q (2, 3) the point in the camera's own frame, xy (2, 2) where it is in focal lengths, J_p (2, 2, 3)
-    pixel by q, J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
+    Of both cameras: q (2, 3) the point in the camera's own frame, xy (2, 2) its projection in focal lengths, J_p (2, 2,
+    3) pixel by q, J_d (2, 2, 8) by the distortion. Residuals are NaN behind a camera.
     """
     q[0] = p
     _to_right(T_right_left, p, q[1])
@@ -169,7 +169,7 @@ def _minimise(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array,
     rays_left: Array, rays_right: Array, p: Array, cov: Array, by_rig: Array,
 ) -> None:  # fmt: skip
-    """Take points p from their start to the minimum, NaN where there is none, and fill covariances and derivatives."""
+    """Move points p from their start to the minimum, NaN where there is none, and fill covariances and derivatives."""
     r, J, q, xy, J_p, J_d = (
         np.empty((2, 2)),
         np.empty((2, 2, 3)),
@@ -232,7 +232,7 @@ def _rig_jacobian(counts: Ids, q: Array, xy: Array, J_p: Array, J_d: Array, J_ri
 
 @numba.njit(cache=True, error_model="numpy")
 def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
-    """Whether a point lies where its pixels look, and not behind a camera or where the distortion folds back."""
+    """Whether a point lies along the rays of its pixels, not behind a camera or where the distortion folds back."""
     left = ray_left[0] * p[0] + ray_left[1] * p[1] + ray_left[2] * p[2]
     right = ray_right[0] * q[0] + ray_right[1] * q[1] + ray_right[2] * q[2]
     far = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -243,13 +243,13 @@ def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
     """Triangulate one shot's matched points.
 
     Args:
-        rig: the calibrated pair; its ``sigma_px`` adds to what the image tells.
+        rig: the calibrated pair; its ``sigma_px`` adds to the detections' covariance.
         body: names the points.
-        seen: what both cameras saw, gated.
+        seen: the correspondences of both cameras, gated.
 
     Returns:
-        The points with their covariance; what does not lie before both cameras is dropped by name, and its detections
-        with it.
+        The points with their covariance; a point that does not lie before both cameras is dropped by name, and its
+        detections with it.
     """
     rows = np.flatnonzero(seen.paired)
     cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)

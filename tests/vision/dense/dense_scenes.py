@@ -9,7 +9,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.camera import Camera
-from armsight.vision.dense.evaluate import Truth, seen_by_right
+from armsight.vision.dense.evaluate import TrueDisparity, seen_by_right
 
 
 def texture(height, width, rng, grain=2.0):
@@ -32,7 +32,7 @@ def layers(height=120, width=200, far=6, near=22, seed=0, noise=1.0):
     right[box_[0], moved] = square[box_]
     truth[box_] = near
     images = [np.clip(np.rint(i + noise * rng.normal(size=i.shape)), 0, 255).astype(np.uint8) for i in (left, right)]
-    return (*images, Truth(truth, seen_by_right(truth)))
+    return (*images, TrueDisparity(truth, seen_by_right(truth)))
 
 
 @lru_cache
@@ -62,5 +62,5 @@ def rendered(seed, size=(360, 270), noise=2.0):
     column = np.arange(size[0])[None] - d
     k = np.clip(np.rint(column), 0, size[0] - 1).astype(int)
     there = focal * baseline / np.take_along_axis(depth_right, k, axis=1)
-    truth = Truth(d, (column >= 0) & (np.abs(there - d) < 1))
+    truth = TrueDisparity(d, (column >= 0) & (np.abs(there - d) < 1))
     return with_noise(left, noise, rng), with_noise(right, noise, rng), truth

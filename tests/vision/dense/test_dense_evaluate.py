@@ -6,7 +6,7 @@ import pytest
 from dense_scenes import layers
 
 from armsight.errors import InputError
-from armsight.vision.dense.evaluate import TrueDisparity, judge, seen_by_right
+from armsight.vision.dense.evaluate import TrueDisparity, evaluate_disparity, seen_by_right
 from armsight.vision.dense.middlebury import find_scenes, load_scene, read_pfm, write_pfm
 
 pytestmark = pytest.mark.opencv
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.opencv
 def test_figures_are_those_counted_by_hand():
     truth = TrueDisparity(np.array([[10.0, 10.0, 10.0, 10.0, np.nan]]), np.array([[True, True, True, False, True]]))
     d = np.array([[10.4, 11.5, np.nan, 15.0, 3.0]])
-    whole, nonocc = judge(d, truth, truth.known), judge(d, truth, truth.seen)
+    whole, nonocc = evaluate_disparity(d, truth, truth.known), evaluate_disparity(d, truth, truth.seen)
     assert whole.pixels == 4
     assert whole.bad_percent == (75, 75, 50, 50)
     assert whole.average_px == pytest.approx((0.4 + 1.5 + 5) / 3)
@@ -27,8 +27,8 @@ def test_figures_are_those_counted_by_hand():
 
 def test_nothing_to_judge_is_nan_and_nothing_given_is_all_bad():
     truth = TrueDisparity(np.array([[5.0]]), np.array([[True]]))
-    assert judge(np.array([[np.inf]]), truth, truth.known).bad_percent == (100,) * 4
-    assert np.isnan(judge(np.array([[1.0]]), truth, np.array([[False]])).bad_percent).all()
+    assert evaluate_disparity(np.array([[np.inf]]), truth, truth.known).bad_percent == (100,) * 4
+    assert np.isnan(evaluate_disparity(np.array([[1.0]]), truth, np.array([[False]])).bad_percent).all()
 
 
 def test_occlusion_follows_from_the_truth():

@@ -79,7 +79,7 @@ def test_no_sum_leaves_its_type():
 @numba.njit
 def worked(a, b, out):
     """Write what each operation makes of 32 bytes, one row after another."""
-    p, q, o, n = lanes.start(a), lanes.start(b), lanes.start(out), np.uintp(lanes.LANES)
+    p, q, o, n = lanes.start(a), lanes.start(b), lanes.start(out), np.uintp(lanes.SIMD_WIDTH)
     x, y = lanes.load(p, np.uintp(0)), lanes.load(q, np.uintp(3))
     lanes.store(o, np.uintp(0), lanes.plus(x, y))
     lanes.store(o, n, lanes.minus(x, y))
@@ -99,16 +99,16 @@ def widened(a, out):
 
 def test_vectors_work_as_numbers_do():
     rng = np.random.default_rng(0)
-    a, b = (rng.integers(0, 256, lanes.LANES + 3).astype(np.uint8) for _ in range(2))
-    x, y = a[: lanes.LANES], b[3:]
-    out = np.zeros(8 * lanes.LANES, np.uint8)
+    a, b = (rng.integers(0, 256, lanes.SIMD_WIDTH + 3).astype(np.uint8) for _ in range(2))
+    x, y = a[: lanes.SIMD_WIDTH], b[3:]
+    out = np.zeros(8 * lanes.SIMD_WIDTH, np.uint8)
     worked(a, b, out)
-    counted = (250 + np.arange(lanes.LANES)).astype(np.uint8)
+    counted = (250 + np.arange(lanes.SIMD_WIDTH)).astype(np.uint8)
     wanted = [
         x + y, x - y, np.minimum(x, y), np.where(x > y, x - y, 0), x ^ y, np.bitwise_count(x), x // 2,
         np.where(x < y, 1, counted),
     ]  # fmt: skip
     np.testing.assert_array_equal(out.reshape(8, -1), np.array(wanted))
-    wide = np.zeros(lanes.LANES, np.uint16)
+    wide = np.zeros(lanes.SIMD_WIDTH, np.uint16)
     widened(a, wide)
     np.testing.assert_array_equal(wide, x.astype(np.uint16) + 1000)

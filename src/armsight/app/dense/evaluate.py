@@ -13,9 +13,9 @@ import numpy as np
 
 from armsight.app.dense.files import paint_disparity, paint_errors, write_png
 from armsight.files import write_text
-from armsight.vision.dense.evaluate import Judgement, judge
+from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.methods import open_method
-from armsight.vision.dense.middlebury import Scene
+from armsight.vision.dense.middlebury import MiddleburyScene
 from armsight.vision.dense.rectified import plain_grey
 
 
@@ -39,9 +39,9 @@ class Line:
     scene: str
     method: str
     weight: float
-    all_pixels: Judgement
-    nonocc: Judgement
-    measured: Judgement
+    all_pixels: DisparityErrors
+    nonocc: DisparityErrors
+    measured: DisparityErrors
     density_percent: float
     within_percent: float
     seconds: float
@@ -62,7 +62,7 @@ class Line:
         }
 
 
-def evaluate_scene(scene: Scene, name: str, out: Path | None) -> Line:
+def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Line:
     """Match a scene by a method and judge it; with a folder, paint where it is wrong."""
     method, truth = open_method(name), scene.truth
     left, right = plain_grey(scene.left, "left"), plain_grey(scene.right, "right")
@@ -80,9 +80,9 @@ def evaluate_scene(scene: Scene, name: str, out: Path | None) -> Line:
         scene.name,
         name,
         scene.weight,
-        judge(result.disparity, truth, truth.known),
-        judge(result.disparity, truth, truth.seen),
-        judge(result.disparity, truth, sure),
+        evaluate_disparity(result.disparity, truth, truth.known),
+        evaluate_disparity(result.disparity, truth, truth.seen),
+        evaluate_disparity(result.disparity, truth, sure),
         100 * float(result.measured[truth.known].mean()),
         within,
         seconds,
@@ -143,7 +143,7 @@ def table_text(lines: list[Line]) -> str:
     return "\n".join(text)
 
 
-def _numbers(judgement: Judgement) -> list[float]:
+def _numbers(judgement: DisparityErrors) -> list[float]:
     """Return a judgement's figures in the table's order."""
     return [*judgement.bad_percent, judgement.average_px, judgement.rms_px, *judgement.quantiles_px]
 

@@ -1,1 +1,11 @@
-"""Dense stereo: a pair in standard form goes in, a disparity for every pixel comes out; the contract is in method.py."""
+"""Dense stereo: a rectified pair goes in, a disparity for every pixel of the left image comes out.
+
+The contract is :class:`~armsight.vision.dense.method.Method` in ``method.py``; ``methods.py`` is the registry.
+
+- The methods: ``block.py`` (windows, kernels in ``window.py``), ``scanline.py`` (dynamic programming),
+  ``semiglobal.py``, ``opencv.py``. What they share: ``cost.py`` (matching costs), ``winner.py`` (the least total),
+  ``simd.py`` (vectors for numba), ``postprocess.py`` (rejection, smoothing, filling, sigma).
+- Before and after: ``rectified.py`` (checks of a pair), ``depth.py`` (depth with its standard deviation),
+  ``registration.py`` (the pose of a body from a point cloud).
+- ``evaluate.py`` and ``middlebury.py``: errors against a true disparity map, and the benchmark's files.
+"""

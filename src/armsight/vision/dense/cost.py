@@ -1,4 +1,4 @@
-"""What it costs to match two pixels: census and Birchfield and Tomasi's dissimilarity, a row at a time.
+"""Matching costs of two pixels: census and Birchfield and Tomasi's dissimilarity, a row at a time.
 
 A pair goes in; one byte comes out for every pixel of a row and every disparity, the disparities of a pixel side by
 side. The right image's rows are kept mirrored: the pixels that a left pixel is compared with, one further left for each
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from armsight.data import Image
 
 Bytes = NDArray[np.uint8]
-Words = NDArray[np.uint32]
+Words32 = NDArray[np.uint32]
 ONE, TWO = np.uintp(1), np.uintp(2)
-#: Disparities are worked on in blocks of so many, the width of a vector; a search is padded to whole blocks.
+#: Disparities are processed in blocks of so many, the width of a vector; a search is padded to whole blocks.
 BLOCK = np.uintp(64)
 #: The census window is 5 x 5 pixels: 24 bits, one for each neighbour that is darker than the middle.
 _CENSUS_REACH = 2
-#: Beyond this many grey levels two pixels are just different: a glint must not cost more than a wrong surface.
+#: Beyond this many grey levels the difference is cut off: a glint must not cost more than a wrong surface.
 _BT_CUT = np.uint8(20)
 #: Cost of a match beyond the right image's edge, where nothing can be compared: about that of an undecided pixel.
 _OUTSIDE = np.uint8(13)
@@ -35,8 +35,8 @@ _RAW_MAX = np.uint8(34)
 COST_MAX = 3 * 34
 
 
-class Pair(NamedTuple):
-    """A pair as the costs need it; what is the right image's is mirrored and padded by the search.
+class CensusPair(NamedTuple):
+    """A pair as the costs need it; the planes of the right image are mirrored and padded by the search.
 
     Attributes:
         left: (H, W) grey.
@@ -52,11 +52,11 @@ class Pair(NamedTuple):
     left: Bytes
     left_low: Bytes
     left_high: Bytes
-    left_census: Words
+    left_census: Words32
     right: Bytes
     right_low: Bytes
     right_high: Bytes
-    right_census: Words
+    right_census: Words32
 
 
 @intrinsic
@@ -69,12 +69,12 @@ def _popcount(typing: Any, x: Any) -> Any:  # noqa: ANN401
     return x(x), emit
 
 
-#: To numba an intrinsic takes what its signature says; its type says it is the function above.
+#: Numba calls an intrinsic by its signature; its Python type would be that of the function above.
 popcount: Any = _popcount
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _census(padded: Bytes, out: Words) -> None:
+def _census(padded: Bytes, out: Words32) -> None:
     """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
     height, width = out.shape
     for y in range(height):
@@ -103,7 +103,7 @@ def _half_way(padded: Bytes, low: Bytes, high: Bytes) -> None:
             high[y, x] = max(c, max(a, b))
 
 
-def _looks(image: Image) -> tuple[Bytes, Bytes, Bytes, Words]:
+def _census_planes(image: Image) -> tuple[Bytes, Bytes, Bytes, Words32]:
     """Return an image (H, W), its least and greatest levels half way to the neighbours, and its census words."""
     reach = _CENSUS_REACH
     padded = np.pad(image, reach, mode="edge")
@@ -117,8 +117,8 @@ def _looks(image: Image) -> tuple[Bytes, Bytes, Bytes, Words]:
     return np.ascontiguousarray(padded[reach:-reach, reach:-reach]), low, high, words
 
 
-def prepare(left: Image, right: Image, pad: int) -> Pair:
-    """Look at both images of a pair.
+def prepare(left: Image, right: Image, pad: int) -> CensusPair:
+    """Compute the planes of both images of a pair.
 
     Args:
         left: (H, W) uint8.
@@ -131,7 +131,7 @@ def prepare(left: Image, right: Image, pad: int) -> Pair:
         out[:, : a.shape[1]] = a[:, ::-1]
         return out
 
-    return Pair(*_looks(left), *(mirrored(a) for a in _looks(right)))
+    return CensusPair(*_census_planes(left), *(mirrored(a) for a in _census_planes(right)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -149,7 +149,7 @@ def _bt(g: np.uint8, g_low: np.uint8, g_high: np.uint8, r: np.uint8, r_low: np.u
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def raw_row(pair: Pair, y: int, first: int, count: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
+def raw_row(pair: CensusPair, y: int, first: int, count: int, size: np.uintp, out: Bytes, base: np.uintp) -> None:
     """Write the raw costs of one row into ``out`` from ``base`` on: W times ``size`` bytes.
 
     Census distance plus half of Birchfield and Tomasi's dissimilarity, cut off; disparities from ``count`` on cost the

@@ -1,8 +1,8 @@
-"""From disparity to depth, with what matching and calibration leave uncertain.
+"""From disparity to depth, with the standard deviation that matching and calibration cause.
 
-sigma_z^2 = (z^2 / (f b) sigma_d)^2 + what the rig's covariance does to the depth. The second is smooth over image and
-depth: it is worked out at a few places, by triangulating the same pixels with rigs that are off by one standard
-deviation along each principal axis of the covariance, and interpolated.
+sigma_z^2 = (z^2 / (f b) sigma_d)^2 + the share of the rig's covariance. The second term is smooth over image and depth:
+it is computed at a few positions, by triangulating the same pixels with rigs that are off by one standard deviation
+along each principal axis of the covariance, and interpolated.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from armsight.vision.dense.method import Disparity
 from armsight.vision.rectify import Rectification
 from armsight.vision.triangulate import midpoints
 
-#: Places along rows, columns and inverse disparity at which the calibration's share is worked out.
+#: Number of positions along rows, columns and inverse disparity at which the calibration's share is computed.
 _COLUMNS, _ROWS, _DEPTHS = 7, 5, 4
 _ROWS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Depth(Record):
-    """Depths of a left image in standard form.
+    """Depths of a rectified left image.
 
     Attributes:
         depth_m: (H, W) along the camera's axis; NaN where the camera sees nothing, or infinitely far.
@@ -38,17 +38,20 @@ class Depth(Record):
     calibration_m: Array
 
 
-def calibration_share(form: Rectification, uv: Array, disparity: Array) -> Array:
-    """Return the standard deviation (N,) of depths, relative to them, that the rig's covariance brings.
+def calibration_share(rectification: Rectification, uv: Array, disparity: Array) -> Array:
+    """Return the relative standard deviation (N,) of depths that the rig's covariance causes.
 
     Args:
-        form: how the images became standard form.
-        uv: (N, 2) pixels of the left image in standard form.
+        rectification: of the pair.
+        uv: (N, 2) pixels of the rectified left image.
         disparity: (N,) px.
     """
-    rig = form.rig
-    raw = form.to_raw(uv, "left"), form.to_raw(uv - np.column_stack([disparity, np.zeros(len(disparity))]), "right")
-    axis = form.T_left_rectleft[:3, 2]
+    rig = rectification.rig
+    raw = (
+        rectification.to_raw(uv, "left"),
+        rectification.to_raw(uv - np.column_stack([disparity, np.zeros(len(disparity))]), "right"),
+    )
+    axis = rectification.T_left_rectleft[:3, 2]
     z = midpoints(rig, *raw) @ axis
     values, vectors = np.linalg.eigh(rig.cov)
     variance = np.zeros(len(uv))
@@ -58,48 +61,50 @@ def calibration_share(form: Rectification, uv: Array, disparity: Array) -> Array
     return np.asarray(np.sqrt(variance) / z)
 
 
-def depth_of(form: Rectification, result: Disparity) -> Depth:
+def depth_of(rectification: Rectification, result: Disparity) -> Depth:
     """Return depths with their standard deviations."""
-    seen, shape = form.seen("left"), result.disparity.shape
-    z, share = np.full(shape, np.nan), _calibration(form, result.disparity, result.measured & seen)
+    seen, shape = rectification.seen("left"), result.disparity.shape
+    z, share = np.full(shape, np.nan), _calibration(rectification, result.disparity, result.measured & seen)
     sigma = np.empty(shape)
     for top in range(0, shape[0], _ROWS_AT_ONCE):
         rows = slice(top, top + _ROWS_AT_ONCE)
-        z[rows] = np.where(seen[rows], form.depth(result.disparity[rows]), np.nan)
+        z[rows] = np.where(seen[rows], rectification.depth(result.disparity[rows]), np.nan)
         share[rows] *= z[rows]
-        per_px = z[rows] ** 2 / (form.focal_px * form.rig.baseline_m)
+        per_px = z[rows] ** 2 / (rectification.focal_px * rectification.rig.baseline_m)
         sigma[rows] = np.hypot(per_px * result.sigma_px[rows], share[rows])
     return Depth(z, sigma, share)
 
 
-def _calibration(form: Rectification, disparity: NDArray[np.float32], measured: NDArray[np.bool_]) -> Array:
+def _calibration(rectification: Rectification, disparity: NDArray[np.float32], measured: NDArray[np.bool_]) -> Array:
     """Return the calibration's relative share (H, W) where it was measured, NaN elsewhere; a few rows at a time."""
     measured = measured & (disparity > 0)  # what is infinitely far has no depth
     out = np.where(measured, 0.0, np.nan)
-    if not form.rig.cov.any() or not measured.any():
+    if not rectification.rig.cov.any() or not measured.any():
         return out
     height, width = measured.shape
     least, most = (float(f(disparity[measured])) for f in (np.min, np.max))
     low, high = 1 / most, 1 / least * (1 + 1e-9) + 1e-12
     axes = (np.linspace(0, height - 1, _ROWS), np.linspace(0, width - 1, _COLUMNS), np.linspace(low, high, _DEPTHS))
     rows, columns, inverses = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
-    share = calibration_share(form, np.column_stack([columns, rows]), 1 / inverses).reshape(_ROWS, _COLUMNS, _DEPTHS)
+    share = calibration_share(rectification, np.column_stack([columns, rows]), 1 / inverses).reshape(
+        _ROWS, _COLUMNS, _DEPTHS
+    )
     whole = np.isfinite(share)
     share = np.where(whole, share, share[whole].max() if whole.any() else 0.0)  # corners that a camera does not see
     for top in range(0, height, _ROWS_AT_ONCE):
         strip = slice(top, top + _ROWS_AT_ONCE)
         v, u = np.nonzero(measured[strip])
         inverse = 1 / disparity[strip][v, u].astype(np.float64)
-        places = ((v + top) / max(height - 1, 1), u / max(width - 1, 1), (inverse - low) / (high - low))
-        out[strip][v, u] = _between(share, *(np.clip(p, 0, 1) for p in places))
+        positions = ((v + top) / max(height - 1, 1), u / max(width - 1, 1), (inverse - low) / (high - low))
+        out[strip][v, u] = _between(share, *(np.clip(p, 0, 1) for p in positions))
     return out
 
 
-def _between(grid: Array, *places: Array) -> Array:
-    """Return the values (N,) of an evenly spaced grid between its points, linearly; places are 0 to 1 along each axis."""
-    out = np.zeros(len(places[0]))
-    cells = [np.minimum((p * (n - 1)).astype(int), n - 2) for p, n in zip(places, grid.shape, strict=True)]
-    parts = [p * (n - 1) - c for p, n, c in zip(places, grid.shape, cells, strict=True)]
+def _between(grid: Array, *positions: Array) -> Array:
+    """Interpolate an evenly spaced grid linearly, (N,); positions are 0 to 1 along each axis."""
+    out = np.zeros(len(positions[0]))
+    cells = [np.minimum((p * (n - 1)).astype(int), n - 2) for p, n in zip(positions, grid.shape, strict=True)]
+    parts = [p * (n - 1) - c for p, n, c in zip(positions, grid.shape, cells, strict=True)]
     for corner in product((0, 1), repeat=grid.ndim):
         weight = np.prod([t if k else 1 - t for k, t in zip(corner, parts, strict=True)], axis=0)
         out += weight * grid[tuple(c + k for c, k in zip(cells, corner, strict=True))]

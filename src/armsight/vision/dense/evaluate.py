@@ -1,10 +1,10 @@
-"""How good a disparity map is, in the Middlebury benchmark's figures.
+"""Evaluate a disparity map by the metrics of the Middlebury benchmark.
 
 Scharstein and Szeliski, "A taxonomy and evaluation of dense two-frame stereo correspondence algorithms", IJCV 47, 2002,
 and the benchmark's third version (Scharstein et al., GCPR 2014): shares of pixels that are off by more than a
 threshold, mean, RMS and quantiles of the error, over all pixels with a truth and over those that both cameras see. A
-pixel without a disparity is bad at every threshold, and left out of mean, RMS and quantiles. Disparities are judged as
-they are, never rounded.
+pixel without a disparity is bad at every threshold, and left out of mean, RMS and quantiles. Disparities are evaluated
+as they are, never rounded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ QUANTILES = (50, 90, 95, 99)
 
 
 @dataclass(frozen=True)
-class Judgement:
+class DisparityErrors:
     """The errors over one set of pixels.
 
     Attributes:
@@ -41,7 +41,7 @@ class Judgement:
     quantiles_px: tuple[float, ...]
 
     def to_json(self) -> dict[str, float]:
-        """Return the figures by name."""
+        """Return the metrics by name."""
         names = [f"bad_{t:g}_percent" for t in THRESHOLDS_PX]
         quantiles = [f"a{q}_px" for q in QUANTILES]
         return {
@@ -54,8 +54,8 @@ class Judgement:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth(Record):
-    """What is true of a left image.
+class TrueDisparity(Record):
+    """The true disparities of a left image.
 
     Attributes:
         disparity: (H, W) px, NaN where unknown.
@@ -71,12 +71,14 @@ class Truth(Record):
         return np.asarray(np.isfinite(self.disparity))
 
 
-def judge(disparity: NDArray[np.floating[Any]], truth: Truth, among: NDArray[np.bool_]) -> Judgement:
-    """Judge a disparity map over some of its pixels.
+def evaluate_disparity(
+    disparity: NDArray[np.floating[Any]], truth: TrueDisparity, among: NDArray[np.bool_]
+) -> DisparityErrors:
+    """Evaluate a disparity map over some of its pixels.
 
     Args:
         disparity: (H, W) px; NaN or infinite where there is none.
-        truth: what is true.
+        truth: the true disparities.
         among: (H, W) the pixels that count, of those with a truth.
     """
     chosen = among & truth.known
@@ -85,8 +87,8 @@ def judge(disparity: NDArray[np.floating[Any]], truth: Truth, among: NDArray[np.
     count, missing = error.size, error.size - given.size
     if not given.size:
         nothing = float("nan")
-        return Judgement(count, (100.0,) * 4 if count else (nothing,) * 4, nothing, nothing, (nothing,) * 4)
-    return Judgement(
+        return DisparityErrors(count, (100.0,) * 4 if count else (nothing,) * 4, nothing, nothing, (nothing,) * 4)
+    return DisparityErrors(
         count,
         tuple(100 * float((given > t).sum() + missing) / count for t in THRESHOLDS_PX),
         float(given.mean()),
@@ -97,9 +99,9 @@ def judge(disparity: NDArray[np.floating[Any]], truth: Truth, among: NDArray[np.
 
 @numba.njit(cache=True, error_model="numpy")
 def seen_by_right(disparity: Array) -> NDArray[np.bool_]:
-    """Tell from a true disparity map (H, W) which pixels the right camera sees.
+    """Return which pixels of a true disparity map (H, W) the right camera sees.
 
-    Not what falls outside its image, and not what a surface nearer by more than a pixel falls on.
+    A pixel is hidden outside of its image, and where a surface that is nearer by more than a pixel covers it.
     """
     height, width = disparity.shape
     out = np.zeros((height, width), np.bool_)

@@ -1,4 +1,4 @@
-"""The contract of a dense method: a pair in standard form goes in, a disparity for every pixel of the left image comes out.
+"""The contract of a dense method: a rectified pair goes in, a disparity for every pixel of the left image comes out.
 
 To add a method: write one file with a class that fulfils :class:`Method`, and add one line to the registry in
 ``methods.py``. The laws in tests/vision/dense are parametrised over that registry, so the new member inherits them.
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from armsight.data import Image, Record
 from armsight.errors import InputError
 
-#: What a pixel's disparity is: nothing, measured, filled because the right camera cannot see it, or filled because what
-#: was measured there cannot be believed.
+#: State of a pixel's disparity: nothing, measured, filled because the right camera cannot see it, or filled because the
+#: measurement there was rejected.
 NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
 
 
 @dataclass(frozen=True)
 class Search:
-    """Which disparities are tried.
+    """The range of disparities that are tried.
 
     Attributes:
         first: the least, px.
@@ -33,7 +33,7 @@ class Search:
     count: int
 
     def __post_init__(self) -> None:
-        """Refuse a range that is none."""
+        """Reject an invalid range."""
         if self.first < 0 or self.count < 2:
             raise InputError(
                 f"a search must hold two disparities or more, none below 0 px; got {self.count} from {self.first} px on"
@@ -53,7 +53,7 @@ class Disparity(Record):
         disparity: (H, W) px, column in the left image less column in the right one; filled where it was not measured;
             NaN everywhere where nothing at all was.
         state: (H, W) NOTHING, MEASURED, OCCLUDED or FILLED.
-        sigma_px: (H, W) standard deviation of what was measured; NaN elsewhere.
+        sigma_px: (H, W) standard deviation where it was measured; NaN elsewhere.
         confidence: (H, W) of 0 to 1: share of the neighbourhood that measured the same surface; 0 elsewhere.
         search: which disparities were tried.
         problem: why nothing was measured; None where something was.
@@ -82,7 +82,7 @@ class Method(Protocol):
     """A way to find disparities."""
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
-        """Match a pair in standard form.
+        """Match a rectified pair.
 
         Args:
             left: (H, W) uint8.

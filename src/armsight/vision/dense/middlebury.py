@@ -1,17 +1,15 @@
-"""Scenes with a truth, in the folder layouts of the Middlebury benchmark.
+"""Scenes with true disparities, in the folder layouts of the Middlebury benchmark, and the files they use.
 
 - 2001 and 2003: ``im2`` and ``im6`` with ``disp2``, or ``im3`` and ``im4`` with ``disp3`` (Tsukuba); 2005 and 2006:
-``view1``
-  and ``view5`` with ``disp1``. The truth is an 8-bit image of scaled disparities, 0 where unknown.
+  ``view1`` and ``view5`` with ``disp1``. The truth is an 8-bit image of scaled disparities, 0 where unknown.
 - 2014: ``im0`` and ``im1`` with ``disp0.pfm`` or ``disp0GT.pfm`` and ``calib.txt``; infinity where unknown.
 - ``NAME_left`` and ``NAME_right`` with ``NAME_left_gt``, disparities as they are, 0 where unknown.
 
 A mask says which pixels both cameras see: ``mask0nocc``, ``nonocc``, ``nocc`` or ``occlusion_left``, 255 there. Without
 one it follows from the truth.
 
-Portable float maps (PFM): the Middlebury benchmark's disparity files, rows from the bottom up.
-
-TIFF files as they are, floats included: some scenes keep their truth so, some cameras their images.
+Portable float maps (PFM) store disparities, rows from the bottom up. TIFF files are read as they are, floats included:
+some scenes store their truth so, some cameras their images.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Image, Record
 from armsight.errors import InputError
 from armsight.files import read_text, replacing
-from armsight.vision.dense.evaluate import Truth, seen_by_right
+from armsight.vision.dense.evaluate import TrueDisparity, seen_by_right
 from armsight.vision.dense.method import Search
 from armsight.vision.image import read_image
 
@@ -63,7 +61,7 @@ def write_pfm(path: str | Path, image: NDArray[np.floating[Any]], scale: float =
     Args:
         path: where to.
         image: (H, W).
-        scale: what is written is so many times as much, as for mm in place of m.
+        scale: factor of the values written, such as 1000 for mm instead of m.
 
     Raises:
         InputError: the file cannot be written.
@@ -97,7 +95,7 @@ _LAYOUTS = (
     ("im3", "im4", "disp3"),
     ("view1", "view5", "disp1"),
 )
-#: Weights of the benchmark's third version: these of its training scenes count half, for they are hard beyond measure.
+#: Weights of the benchmark's third version: these of its training scenes count half, for they are very hard.
 _HALF = {"pianol", "playroom", "playtable", "shelves", "vintage"}
 #: Scale of the truth of the 2001 scenes, of Tsukuba, and by the width of a full-size image of the others' layouts.
 _SCALE_2001 = 8
@@ -106,14 +104,14 @@ _WIDTH_2003, _WIDTH_2006 = 1800, 1240
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(Record):
+class MiddleburyScene(Record):
     """A pair with its truth.
 
     Attributes:
         name: the folder's.
         left: as read.
         right: as read.
-        truth: what is true of the left image.
+        truth: the true disparities of the left image.
         search: the disparities a method may try.
         weight: in averages over scenes.
     """
@@ -121,7 +119,7 @@ class Scene(Record):
     name: str
     left: Image
     right: Image
-    truth: Truth
+    truth: TrueDisparity
     search: Search
     weight: float
 
@@ -191,7 +189,7 @@ def _seen(folder: Path, truth: Array) -> NDArray[np.bool_]:
     return np.asarray(seen_by_right(truth))
 
 
-def load_scene(folder: str | Path) -> Scene:
+def load_scene(folder: str | Path) -> MiddleburyScene:
     """Load a scene.
 
     The search holds every true disparity: as many as ``calib.txt`` says, or as the truth's greatest in steps of 16.
@@ -215,7 +213,7 @@ def load_scene(folder: str | Path) -> Scene:
     count = _calibration(folder, "ndisp") or 16 * int(np.ceil((np.nanmax(truth) + 1) / 16))
     search = Search(0, min(count, left.shape[1] - 1))
     weight = 0.5 if name.lower() in _HALF else 1.0
-    return Scene(name, left, right, Truth(truth, _seen(folder, truth)), search, weight)
+    return MiddleburyScene(name, left, right, TrueDisparity(truth, _seen(folder, truth)), search, weight)
 
 
 def find_scenes(folder: str | Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""OpenCV's block matching and semi-global matching behind the same contract, to compare with and to fall back on."""
+"""OpenCV's block matching and semi-global matching behind the same contract, as a reference and a fallback."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.vision.dense.method import Disparity, Search
-from armsight.vision.dense.postprocess import Trust, finished
-from armsight.vision.dense.winner import Found, Singles
+from armsight.vision.dense.postprocess import SigmaModel, finished
+from armsight.vision.dense.winner import Singles, Winners
 
 _WINDOW_BM, _WINDOW_SGBM = 15, 3
 #: What OpenCV's samples recommend: penalties of a slant and of a jump a pixel of the window, and a uniqueness of 10%.
@@ -23,8 +23,8 @@ MODES = {
     "hh": cv2.STEREO_SGBM_MODE_HH,
     "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
 }
-#: See finish.py.
-_TRUST = Trust(0.36)
+#: See postprocess.py.
+_SIGMA_MODEL = SigmaModel(0.36)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class OpenCV:
         d = self.disparity(left, right, search)
         good = d >= search.first
         none = np.zeros(d.shape, np.float32)
-        return finished(Found(d, good, good.astype(np.float32), none), left, search, _TRUST)
+        return finished(Winners(d, good, good.astype(np.float32), none), left, search, _SIGMA_MODEL)
 
     def disparity(self, left: Image, right: Image, search: Search) -> Singles:
         """Return what OpenCV finds (H, W), px; below the search where it finds nothing.

@@ -1,27 +1,24 @@
-"""From what was found to a result: what cannot be believed goes, the rest is smoothed, gaps are filled, sigma is added.
+"""From the winners to a result: implausible disparities are rejected, the rest smoothed, gaps filled, sigma added.
 
-All methods end here, so that they differ in how they match and in nothing else.
+All methods end here (:func:`finished`), so that they differ in how they match and in nothing else.
 
-Depth breaks drawn where the image has its edges.
-
-A window that matches sees both sides of a break, so that the nearer surface comes out a few pixels too wide, and what
-is filled beside it is a guess. Near breaks and gaps every pixel takes the weighted median of its neighbourhood,
-neighbours that look like it and are near counting more: the surface that its looks belong to (Ma, He, Wei, Sun and Wu,
-"Constant time weighted median filtering for stereo matching and beyond", ICCV 2013). A measured pixel that finds itself
-on another surface is measured no more.
-
-What stands where nothing was measured, told apart by why.
-
-The right camera cannot see what lies behind a nearer surface or beyond its image; what it cannot see continues the
-farther of the surfaces beside it in its row. Where a pixel could have been seen and was not matched, the same is a
-guess.
-
-Disparities smoothed within their own surface.
-
-Winners come from whole disparities with a place between them, and that place is noisy where there is little texture.
-Every measured pixel becomes the mean of those near it that lie within a little of it in disparity, weighted by how
-alike they are in grey: along rows, then along columns, a bilateral filter taken apart (Pham and van Vliet 2005). Depth
-breaks stay, for what lies across them is too far off to count.
+1. Rejection (:func:`without_speckles`): disparities on which the two images do not agree, and patches that are too
+small. 2. Smoothing (:func:`smoothed`): sub-pixel positions are noisy where there is little texture. Every measured
+pixel becomes
+   the mean of those near it within a small difference of disparity, weighted by their similarity in grey: along rows,
+   then along columns, a separated bilateral filter (Pham and van Vliet 2005). Depth breaks stay, for disparities across
+   them differ too much to count.
+3. Filling (:func:`filled`): the right camera cannot see a surface behind a nearer one or beyond its image; there the
+farther
+   of the neighbouring surfaces in the row continues. Where a pixel could have been seen and was not matched, the same
+   is a guess; the two states differ.
+4. Edges (:func:`aligned_to_edges`): a window that matches covers both sides of a break, so the nearer surface comes out
+a
+   few pixels too wide, and the fill beside it is a guess. Near breaks and gaps every pixel takes the weighted median of
+   its neighbourhood, similar and near neighbours counting more (Ma, He, Wei, Sun and Wu, "Constant time weighted median
+   filtering for stereo matching and beyond", ICCV 2013). A measured pixel that moves to another surface counts as
+   filled.
+5. Sigma (:class:`SigmaModel`).
 """
 
 from __future__ import annotations
@@ -35,11 +32,11 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.vision.dense.method import FILLED, MEASURED, OCCLUDED, Disparity, Search
-from armsight.vision.dense.winner import Found, Singles, on_strips
+from armsight.vision.dense.winner import Singles, Winners, for_each_strip
 
 #: Half the window, of which every other row and column counts, px; the spread of its weights, px and grey levels.
 _EDGE_REACH, _NEAR_PX, _EDGE_ALIKE = 8, 6.0, 10.0
-#: A step in disparity that is a break, px, and how near to one a pixel is drawn again, px.
+#: A step in disparity that is a break, px, and the distance from one within which a pixel is computed again, px.
 _BREAK, _BESIDE = 1.5, 3
 #: A measured disparity stays if it is so near to the median, px.
 _SAME = np.float32(1.0)
@@ -47,7 +44,7 @@ _EDGE_STRIP_ROWS = 64
 
 
 def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return where (H, W) a pixel is drawn again: near breaks, and in gaps that a window bridges."""
+    """Return where (H, W) a pixel is computed again: near breaks, and in gaps that a window bridges."""
     three = np.ones((3, 3), np.uint8)
     broken = cv2.dilate(disparity, three) - cv2.erode(disparity, three) > _BREAK
     size = 2 * _BESIDE + 1
@@ -58,7 +55,7 @@ def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _redraw(
+def _weighted_medians(
     disparity: Singles,
     image: Image,
     doubtful: NDArray[np.uint8],
@@ -111,25 +108,25 @@ def _mean_of(
     return up / down if down > 0 else np.float32(middle)
 
 
-def redrawn(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
-    """Draw breaks and gaps again.
+def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
+    """Align depth breaks and gaps to the edges of the image.
 
     Args:
         disparity: (H, W) px, filled.
-        state: (H, W) what each is.
+        state: (H, W) the state of each.
         image: (H, W) uint8, the left image.
 
     Returns:
-        The same two, drawn again; what was measured and moves to another surface is FILLED.
+        The same two, aligned; a measured pixel that moves to another surface is FILLED.
     """
     doubtful, median = _doubtful(disparity, state), np.empty_like(disparity)
     alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
     near = np.exp(-((np.arange(_EDGE_REACH + 1) / _NEAR_PX) ** 2) / 2).astype(np.float32)
 
     def work(begin: int, end: int) -> None:
-        _redraw(disparity, image, doubtful, alike, near, begin, end, median)
+        _weighted_medians(disparity, image, doubtful, alike, near, begin, end, median)
 
-    on_strips(disparity.shape[0], _EDGE_STRIP_ROWS, work)
+    for_each_strip(disparity.shape[0], _EDGE_STRIP_ROWS, work)
     stays = (state == MEASURED) & (np.abs(median - disparity) <= _SAME)
     moved = (state == MEASURED) & ~stays
     return np.where(stays, disparity, median), np.where(moved, np.uint8(FILLED), state)
@@ -141,7 +138,7 @@ _HIDES = np.float32(1.0)
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill_row(d: Singles, state: NDArray[np.uint8], nearest: Singles) -> bool:
-    """Fill a row from its measured neighbours, and say what was hidden; False where it holds nothing measured."""
+    """Fill a row from its measured neighbours and set the states; False where it holds nothing measured."""
     width, last = d.shape[0], np.float32(np.inf)
     any_measured = False
     nearest[:] = -1
@@ -202,7 +199,7 @@ def filled(disparity: Singles) -> tuple[Singles, NDArray[np.uint8]]:
 
 #: How far to either side, px, and the grey level difference that halves a weight.
 _SMOOTH_REACH, _SMOOTH_ALIKE = 4, np.float32(8.0)
-#: What counts as the same surface in each round, px: more than the error between two disparities, less than a break.
+#: Difference that counts as the same surface in each round, px: above the sub-pixel error, below a break.
 _ROUNDS = (1.5, 1.0)
 _SMOOTH_STRIP_ROWS = 96
 
@@ -278,14 +275,14 @@ def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.floa
         def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
             _columns(half, image, limit, begin, end, out, share)
 
-        on_strips(height, _SMOOTH_STRIP_ROWS, rows)
-        on_strips(height, _SMOOTH_STRIP_ROWS, columns)
+        for_each_strip(height, _SMOOTH_STRIP_ROWS, rows)
+        for_each_strip(height, _SMOOTH_STRIP_ROWS, columns)
     return out, share
 
 
-#: A patch of one disparity that is not larger than the pixels one match looks at (7 x 7) is one mistake, not a surface.
+#: A patch of one disparity that is not larger than the window of one match (7 x 7) is one mistake, not a surface.
 _SPECKLE_PX = 50
-#: Disparities are told apart to this, px, when patches are found.
+#: Steps per pixel in which disparities are compared when patches are found.
 _FINE = 16
 #: With less than this share of the image measured, there is no result: chance alone gives some.
 _LEAST_SHARE = 0.005
@@ -293,12 +290,13 @@ _STRIP_ROWS = 192
 
 
 @dataclass(frozen=True)
-class Trust:
-    """How sure a method is: sigma^2 = floor^2 + (gain * least / curvature)^2.
+class SigmaModel:
+    """The uncertainty of a method: sigma^2 = floor^2 + (gain * least / curvature)^2.
 
-    The second term is the noise of a minimum: what a match still costs is noise, and the bend of the costs turns it
-    into pixels. The first is what no cost tells: the pull towards whole disparities, slants, the smoothing. Both are
-    set so that 1.96 sigma holds about 95% of the errors on four rendered scenes; others, and real ones, then check it.
+    The second term is the noise of a minimum: the cost that remains is noise, and the curvature of the costs converts
+    it to pixels. The first is independent of the costs: the pull towards whole disparities, slants, the smoothing. Both
+    are set so that 1.96 sigma covers about 95% of the errors on four rendered scenes; others, and real ones, then check
+    it.
 
     Attributes:
         floor_px: px.
@@ -310,7 +308,7 @@ class Trust:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _coarse(found: Found, begin: int, end: int, out: NDArray[np.int16]) -> None:
+def _coarse(found: Winners, begin: int, end: int, out: NDArray[np.int16]) -> None:
     """Write disparities in steps of a pixel's sixteenth, below zero where the two images do not agree."""
     for y in range(begin, end):
         for x in range(out.shape[1]):
@@ -319,26 +317,26 @@ def _coarse(found: Found, begin: int, end: int, out: NDArray[np.int16]) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sure(found: Found, kept: NDArray[np.int16], begin: int, end: int, out: Singles) -> None:
+def _sure(found: Winners, kept: NDArray[np.int16], begin: int, end: int, out: Singles) -> None:
     """Write the disparities that are kept, NaN elsewhere."""
     for y in range(begin, end):
         for x in range(kept.shape[1]):
             out[y, x] = found.disparity[y, x] if kept[y, x] >= 0 else np.float32(np.nan)
 
 
-def without_speckles(found: Found) -> Singles:
-    """Return the disparities (H, W) that the images agree on, NaN where a patch is too small to be believed."""
+def without_speckles(found: Winners) -> Singles:
+    """Return the disparities (H, W) that the images agree on, NaN where a patch is too small to be plausible."""
     height, width = found.disparity.shape
     coarse, out = np.empty((height, width), np.int16), np.empty((height, width), np.float32)
-    on_strips(height, _STRIP_ROWS, lambda begin, end: _coarse(found, begin, end, coarse))
+    for_each_strip(height, _STRIP_ROWS, lambda begin, end: _coarse(found, begin, end, coarse))
     cv2.filterSpeckles(coarse, -_FINE, _SPECKLE_PX, _FINE)
-    on_strips(height, _STRIP_ROWS, lambda begin, end: _sure(found, coarse, begin, end, out))
+    for_each_strip(height, _STRIP_ROWS, lambda begin, end: _sure(found, coarse, begin, end, out))
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _judge(
-    found: Found,
+def _write_sigmas(
+    found: Winners,
     state: NDArray[np.uint8],
     floor: float,
     gain: float,
@@ -347,7 +345,7 @@ def _judge(
     sigma: Singles,
     share: Singles,
 ) -> None:
-    """Write sigmas; what was not measured has neither sigma nor confidence."""
+    """Write sigmas; a pixel that was not measured has neither sigma nor confidence."""
     low, slope = np.float32(floor), np.float32(gain)
     for y in range(begin, end):
         for x in range(state.shape[1]):
@@ -357,15 +355,15 @@ def _judge(
             share[y, x] = share[y, x] if measured else np.float32(0)
 
 
-def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: bool = False) -> Disparity:
-    """Turn what was found into a result.
+def finished(found: Winners, left: Image, search: Search, sigma_model: SigmaModel, *, edges: bool = False) -> Disparity:
+    """Convert the winners of a method to a result.
 
     Args:
-        found: what a method found.
+        found: the winners.
         left: (H, W) uint8, the left image.
         search: which disparities were tried.
-        trust: how sure the method is.
-        edges: whether depth breaks are drawn again where the image has its edges.
+        sigma_model: the uncertainty of the method.
+        edges: whether depth breaks are aligned to the edges of the image.
     """
     sure = without_speckles(found)
     if np.count_nonzero(sure == sure) < _LEAST_SHARE * sure.size:  # NaN is not even itself
@@ -378,11 +376,13 @@ def finished(found: Found, left: Image, search: Search, trust: Trust, *, edges: 
     surface, share = smoothed(sure, left)
     full, state = filled(surface)
     if edges:
-        full, state = redrawn(full, state, left)
+        full, state = aligned_to_edges(full, state, left)
     sigma = np.empty_like(full)
-    on_strips(
+    for_each_strip(
         left.shape[0],
         _STRIP_ROWS,
-        lambda begin, end: _judge(found, state, trust.floor_px, trust.gain, begin, end, sigma, share),
+        lambda begin, end: _write_sigmas(
+            found, state, sigma_model.floor_px, sigma_model.gain, begin, end, sigma, share
+        ),
     )
     return Disparity(full, state, sigma, share, search)

@@ -1,8 +1,7 @@
-"""Is it a pair, and is it in standard form: checks before any matching, each with what to do about it.
+"""Check a rectified pair before any matching; every message says what to do.
 
-The two images must be of one size, their rows must show the same rows of the scene, and what is seen must lie further
-left in the right image than in the left one. The last two are told from a few hundred corners that look alike in both
-images.
+The two images must have one size, their rows must show the same rows of the scene, and points must lie further left in
+the right image than in the left one. The last two are tested with a few hundred corners that look alike in both images.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from armsight.vision.image import grey
 _CORNERS = 1500
 #: A corner's match must be this much better than its next best, and there must be so many before anything is concluded.
 _RATIO, _ENOUGH = 0.75, 30
-#: Rows that the images may be apart, px: at the first the matching suffers, beyond the second it is no pair in standard
-#: form.
+#: Rows that the images may be apart, px: at the first the matching suffers, beyond the second the pair is not
+#: rectified.
 _VERTICAL_NOTE_PX, VERTICAL_MAX_PX = 1.0, 2.5
-#: Share of corners that must lie on the wrong side before the images are taken for exchanged.
+#: Share of corners that must lie on the wrong side before the images count as exchanged.
 _EXCHANGED = 0.8
 #: An image that, with its pixel noise smoothed away, stays within so many grey levels of its surroundings almost
 #: everywhere has no texture to match.
@@ -52,16 +51,16 @@ def plain_grey(image: NDArray[np.generic], side: str) -> Image:
 def alike(left: Image, right: Image) -> Array:
     """Return (N, 4) columns and rows of corners that look alike in both images: u and v left, u and v right."""
     finder = cv2.ORB.create(_CORNERS, 1.2, 4, fastThreshold=8)
-    places, words = zip(*(finder.detectAndCompute(image, None) for image in (left, right)), strict=True)
-    if any(w is None or len(w) < 2 for w in words):
+    corners, descriptors = zip(*(finder.detectAndCompute(image, None) for image in (left, right)), strict=True)
+    if any(w is None or len(w) < 2 for w in descriptors):
         return np.zeros((0, 4))
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(words[0], words[1], k=2)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors[0], descriptors[1], k=2)
     good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < _RATIO * p[1].distance]
-    return np.array([[*places[0][m.queryIdx].pt, *places[1][m.trainIdx].pt] for m in good]).reshape(-1, 4)
+    return np.array([[*corners[0][m.queryIdx].pt, *corners[1][m.trainIdx].pt] for m in good]).reshape(-1, 4)
 
 
 def vertical_offset_px(corners: Array) -> Array:
-    """Return what the rows are apart: (N,) a plane through the corners' vertical differences, outliers left out, px."""
+    """Return the vertical offset (N,), px: a plane through the corners' vertical differences, outliers rejected."""
     A = np.column_stack([np.ones(len(corners)), corners[:, :2] - corners[:, :2].mean(axis=0)])
     off = corners[:, 3] - corners[:, 1]
     kept = np.abs(off - np.median(off)) <= 3 + 3 * np.median(np.abs(off - np.median(off)))
@@ -73,7 +72,7 @@ def vertical_offset_px(corners: Array) -> Array:
 
 
 def check_rectified(left: Image, right: Image) -> str | None:
-    """Tell whether two images are a pair in standard form, as far as corners tell.
+    """Check by corners whether two images are a rectified pair.
 
     Args:
         left: (H, W) uint8.
@@ -83,7 +82,7 @@ def check_rectified(left: Image, right: Image) -> str | None:
         A remark where they are a little off; None where nothing is.
 
     Raises:
-        InputError: exchanged, or not in standard form.
+        InputError: exchanged, or not rectified.
     """
     corners = alike(left, right)
     if len(corners) < _ENOUGH:
@@ -92,13 +91,13 @@ def check_rectified(left: Image, right: Image) -> str | None:
     size = float(np.sqrt((apart**2).mean()))
     if size > VERTICAL_MAX_PX:
         raise InputError(
-            f"the images are not in standard form: what is in one row of the left image is {size:.1f} px off that row "
+            f"the images are not rectified: what is in one row of the left image is {size:.1f} px off that row "
             f"in the right one (median {np.median(apart):+.1f}); rectify them first, or give the rig they were taken with"
         )
     level = np.abs(corners[:, 3] - corners[:, 1] - apart) <= 3
     if level.sum() >= _ENOUGH and (corners[level, 2] > corners[level, 0] + 1).mean() > _EXCHANGED:
         raise InputError(
-            "left and right image are exchanged: what is near lies further right in the right one; swap them"
+            "left and right image are exchanged: what is near lies further right in the right one; exchange them"
         )
     if size > _VERTICAL_NOTE_PX:
         return f"the rows of the two images are {size:.1f} px apart: matching suffers; calibrate again"
@@ -106,10 +105,10 @@ def check_rectified(left: Image, right: Image) -> str | None:
 
 
 def check_sizes(left: Image, right: Image) -> None:
-    """Refuse images of two sizes.
+    """Reject images of two sizes.
 
     Raises:
-        InputError: they are.
+        InputError: the sizes differ.
     """
     if left.shape != right.shape:
         (h, w), (k, m) = left.shape, right.shape
@@ -117,7 +116,7 @@ def check_sizes(left: Image, right: Image) -> None:
 
 
 def check_search(search: Search, width: int) -> None:
-    """Refuse a search that leaves the image.
+    """Reject a search that leaves the image.
 
     Raises:
         InputError: the greatest disparity is not within the image.
@@ -129,7 +128,7 @@ def check_search(search: Search, width: int) -> None:
 
 
 def untextured(image: Image, side: str) -> str | None:
-    """Say that an image has nothing to match, or None."""
+    """Return the reason why an image has nothing to match, or None."""
     smooth, surround = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) for sigma in (1.5, 6.0))
     if float((np.abs(smooth - surround) > _TEXTURE).mean()) > _TEXTURED_SHARE:
         return None
@@ -143,20 +142,20 @@ def match_pair(
     search: Search,
     note: Callable[[str], None] = lambda line: None,
 ) -> Disparity:
-    """Check a pair in standard form and match it.
+    """Check a rectified pair and match it.
 
     Args:
-        method: how.
+        method: the dense method.
         left: (H, W) or (H, W, 3) BGR; uint8, uint16, or floats of 0 to 255.
         right: the same.
         search: which disparities to try.
-        note: told what is a little wrong with the pair.
+        note: called with a remark on a pair that is slightly off.
 
     Returns:
         The disparities; empty, with the reason, where there is nothing to match.
 
     Raises:
-        InputError: not images, not of one size, exchanged, not in standard form, or a search that leaves the image.
+        InputError: not images, not of one size, exchanged, not rectified, or a search that leaves the image.
     """
     a, b = plain_grey(left, "left"), plain_grey(right, "right")
     check_sizes(a, b)

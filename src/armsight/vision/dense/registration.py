@@ -1,21 +1,19 @@
-"""Where a body without markers is: its known surface is laid on a point cloud.
+"""Locate a body without markers: its known surface is registered to a point cloud.
 
-A surface (a mesh's, or what a reference shot showed), a cloud with its uncertainty and a first pose, such as the arm's,
-go in; a pose with covariance comes out. Iterative closest points, from each measured point to the tangent plane of the
-surface there (Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a reach that
-shrinks to what the cloud's own noise leaves (Zhang 1994) and Tukey's weights against what does not belong to the body;
-a mesh's outline too (``locate_cloud_outline.py``).
+A surface (a mesh's, or that of a reference shot), a cloud with its uncertainty and a first pose, such as the arm's, go
+in; a pose with covariance comes out. The method is iterative closest points, from each measured point to the tangent
+plane of the surface there (Chen and Medioni, "Object modelling by registration of multiple range images", 1992), with a
+reach that shrinks to the cloud's own noise (Zhang 1994) and Tukey's weights against points that do not belong to the
+body; a mesh's outline counts too.
 
-A disparity is that of a window: where a surface turns or ends, its pixel shows a place beside. Points near an edge are
-therefore uncertain sideways by about half a window, and along the normal of a face that is seen askance that is most of
-their error; with the depth's sigma alone such faces, the worst measured ones, would outweigh all others.
+A disparity is that of a window: where a surface bends or ends, its pixel shows a point beside. Points near an edge are
+therefore uncertain sideways by about half a window, and along the normal of a face that is seen obliquely that is most
+of their error; with the depth's sigma alone such faces, the worst measured ones, would outweigh all others.
 
-What a cloud says about a body's outline, as the camera sees it.
-
-The planes of a body's faces do not hold it sideways where a view shows little but one face; its outline does. A ray that
-ended on the body must meet it, and a ray that went past must miss it: every measured point on the wrong side of the
-outline, of a body whose pose is a little off, says how far the outline is to move there. Both kinds are needed: a rim
-where nothing was measured then pulls to neither side.
+The planes of a body's faces do not determine it sideways where a view shows little but one face; its outline does
+(:func:`outline_pull`). A ray that ended on the body must meet it, and a ray that went past must miss it: every measured
+point on the wrong side of the outline, of a body whose pose is slightly off, shows how far the outline must move there.
+Both kinds are needed: an outline where nothing was measured then pulls to neither side.
 """
 
 from __future__ import annotations
@@ -33,12 +31,12 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, transform
 
-#: Cells of the picture the outline is drawn in, for each step from ray to ray; cells at most to a side; bits of a cell's
-#: fraction that OpenCV draws with.
-_CELLS, _MOST_CELLS, _SHIFT = 2, 1500, 4
-#: Nearest depth that a triangle may have to be drawn, m, and points on the wrong side at least, to conclude anything.
+#: Pixels of the image that the outline is rendered in, for each step from ray to ray; most pixels to a side; bits of
+#: the fraction of a pixel that OpenCV renders with.
+_PIXELS, _MOST_PIXELS, _SHIFT = 2, 1500, 4
+#: Nearest depth of a triangle that is rendered, m, and least number of points on the wrong side.
 _NEAREST_M, _LEAST_OUTSIDE = 0.01, 10
-#: Rays that their step is measured at.
+#: Number of rays at which their step is measured.
 _LOOKED_AT = 2000
 
 
@@ -54,30 +52,30 @@ def ray_step(p: Array) -> float:
     return float(np.median(np.asarray(cKDTree(rays).query(some, k=2)[0])[:, 1]))
 
 
-def _drawn(flat: Array, step: float, margin: float) -> tuple[NDArray[np.uint8], Array, float]:
-    """Draw triangles (T, 3, 2) at unit depth: the picture, the place of its first cell, and a cell's size."""
+def _rendered(flat: Array, step: float, margin: float) -> tuple[NDArray[np.uint8], Array, float]:
+    """Render triangles (T, 3, 2) at unit depth: the mask, the position of its first pixel, and a pixel's size."""
     low, high = flat.min(axis=(0, 1)) - margin, flat.max(axis=(0, 1)) + margin
-    cell = max(step / _CELLS, float((high - low).max()) / _MOST_CELLS)
-    columns, rows = np.ceil((high - low) / cell).astype(int) + 1
-    picture = np.zeros((int(rows), int(columns)), np.uint8)
-    for triangle in np.rint((flat - low) / cell * 2**_SHIFT).astype(np.int32):
-        cv2.fillConvexPoly(picture, triangle, 1, cv2.LINE_8, _SHIFT)
-    return picture, low, cell
+    pixel = max(step / _PIXELS, float((high - low).max()) / _MOST_PIXELS)
+    columns, rows = np.ceil((high - low) / pixel).astype(int) + 1
+    mask = np.zeros((int(rows), int(columns)), np.uint8)
+    for triangle in np.rint((flat - low) / pixel * 2**_SHIFT).astype(np.int32):
+        cv2.fillConvexPoly(mask, triangle, 1, cv2.LINE_8, _SHIFT)
+    return mask, low, pixel
 
 
-def _beyond(picture: NDArray[np.uint8], uv: Array, limit: float) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Tell how far places (N, 2), cells, are outside a drawn body.
+def _beyond(mask: NDArray[np.uint8], uv: Array, limit: float) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Measure how far uv (N, 2), pixels, are outside of a rendered body.
 
     Returns:
-        (N,) which of them are within a limit of its outline, and of those (M,) how far outside, cells, less than zero
+        (N,) which of them are within a limit of its outline, and of those (M,) the distance outside, pixels, negative
         inside, and (M, 2) the unit direction outward.
     """
-    outside, inside = (cv2.distanceTransform(m, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for m in (1 - picture, picture))
-    far = np.where(picture > 0, 0.5 - inside, outside - 0.5).astype(np.float32)
+    outside, inside = (cv2.distanceTransform(m, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for m in (1 - mask, mask))
+    far = np.where(mask > 0, 0.5 - inside, outside - 0.5).astype(np.float32)
     smooth = cv2.GaussianBlur(far, (0, 0), 1.5)
     slopes = [cv2.Sobel(smooth, cv2.CV_32F, *along, ksize=3, scale=1 / 8) for along in ((1, 0), (0, 1))]
     k = np.rint(uv).astype(int)
-    near = np.asarray(((k >= 0) & (k < np.array(picture.shape[::-1]))).all(axis=1))
+    near = np.asarray(((k >= 0) & (k < np.array(mask.shape[::-1]))).all(axis=1))
     u, v = k[near].T
     out = np.stack([s[v, u] for s in slopes], axis=1).astype(np.float64)
     size = np.linalg.norm(out, axis=1)
@@ -90,7 +88,7 @@ def _beyond(picture: NDArray[np.uint8], uv: Array, limit: float) -> tuple[NDArra
 def outline_pull(
     corners: Array, surface: tuple[Array, Array], p: Array, T: Array, step: float, reach_m: float, sigma_m: float
 ) -> tuple[Array, Array]:
-    """Let points on the wrong side of a body's outline pull it.
+    """Compute how points on the wrong side of a body's outline pull its pose.
 
     Args:
         corners: (T, 3, 3) triangles of all of the body's surface, m, body frame, counter-clockwise seen from outside.
@@ -98,8 +96,8 @@ def outline_pull(
         p: (N, 3) the cloud around the body, whatever it lies on, m, camera frame.
         T: (4, 4) the body's pose in the camera frame.
         step: of the cloud's rays.
-        reach_m: how far the outline may be off, m; what is so much behind it is background.
-        sigma_m: how well a point tells the outline, m.
+        reach_m: how far the outline may be off, m; points so much behind it are background.
+        sigma_m: standard deviation of a point across the outline, m.
 
     Returns:
         (6, 6) information and (6,) gradient; zero where there is nothing to conclude.
@@ -111,16 +109,16 @@ def outline_pull(
     if not len(seen) or not len(samples) or seen[:, 2].min() <= _NEAREST_M:
         return H, g
     around = 1.5 * reach_m / float(np.median(samples[:, 2]))
-    picture, low, cell = _drawn(tangents(seen).reshape(-1, 3, 2), step, around)
-    places = (tangents(p) - low) / cell
-    near, beyond, out = _beyond(picture, places, around / cell)
-    rim = (places[near] - beyond[:, None] * out) * cell + low
+    mask, low, pixel = _rendered(tangents(seen).reshape(-1, 3, 2), step, around)
+    uv = (tangents(p) - low) / pixel
+    near, beyond, out = _beyond(mask, uv, around / pixel)
+    rim = (uv[near] - beyond[:, None] * out) * pixel + low
     z = samples[cKDTree(tangents(samples)).query(rim)[1], 2]
     behind = p[near, 2] - z
     wrong = np.where(beyond > 0, np.abs(behind) < reach_m, behind > reach_m)
     if np.count_nonzero(wrong) < _LEAST_OUTSIDE:
         return H, g
-    rim, z, out, off = rim[wrong], z[wrong], out[wrong], (beyond * cell * z)[wrong]
+    rim, z, out, off = rim[wrong], z[wrong], out[wrong], (beyond * pixel * z)[wrong]
     # A body that moves by t moves its outline by (t_xy - rim t_z) / z.
     n = np.column_stack([out, -np.einsum("ni,ni->n", out, rim)]) @ T[:3, :3]
     q = transform(inverse(T), np.column_stack([rim * z[:, None], z]))
@@ -131,22 +129,23 @@ def outline_pull(
 
 #: Distance between the points a mesh is sampled at, m, and the neighbours that a normal of a cloud is fitted to.
 _SPACING_M, _NEIGHBOURS = 0.002, 24
-#: The reach begins at what the first pose may be off and shrinks by this share each step, to so many sigmas of the
+#: The reach begins at the largest error of the first pose and shrinks by this share each step, to so many sigmas of the
 #: noise.
 _SHRINK, _SIGMAS = 0.9, 10.0
-#: How uncertain a point is sideways, in steps from ray to ray: near an edge, where half of the 7 x 7 px that a match
-#: looks at shows something else, as a spread; and within a face.
+#: How uncertain a point is sideways, in steps from ray to ray: near an edge, where half of the 7 x 7 px of a match
+#: shows something else, as a standard deviation; and within a face.
 _SIDEWAYS, _WITHIN = 2.0, 1.0
-#: How near to an edge is near, in steps: the window's half and most of what smoothing adds. An edge is where normals turn
-#: by more than this (cosine), among so many neighbours at most.
-_NEAR_EDGE, _TURN, _AROUND = 6.0, 0.9, 40
+#: Distance from an edge that counts as near, in steps: half of the window and most of the smoothing's width. An edge is
+#: where normals differ by more than this (cosine), among so many neighbours at most.
+_NEAR_EDGE, _EDGE_COSINE, _AROUND = 6.0, 0.9, 40
 #: The outline's reach is not less than so many of these.
 _OUTLINE_SIGMAS = 3.0
 _STEPS, _SETTLED_M = 60, 1e-5
-#: Points of a cloud at most (a fixed draw of them), at least, and how many neighbours share one error: disparities are
+#: Most points of a cloud (a fixed random sample), least, and how many neighbours share one error: disparities are
 #: smoothed over 9 x 9 px, half of it by weight.
 _MOST, _LEAST, _SHARED = 20000, 100, 40
-#: A direction that the surface leaves open (a sphere's turn): its pose is no measurement beyond this, m or rad.
+#: A direction that the surface does not determine (a sphere's rotation): standard deviation that is too large, m or
+#: rad.
 _OPEN = 0.05
 _NOTHING = f"fewer than {_LEAST} points of the cloud lie near the body's surface at the first pose"
 
@@ -195,7 +194,7 @@ class Surface(Record):
 
     @staticmethod
     def of_cloud(points: Array, towards: Array) -> Surface:
-        """Take a cloud of a reference shot for the surface.
+        """Use the cloud of a reference shot as the surface.
 
         Args:
             points: (N, 3) m, in the frame that is to be the body's.
@@ -211,7 +210,7 @@ class Surface(Record):
 
 @dataclass(frozen=True, eq=False)
 class CloudPose(Record):
-    """Where a body was found in a cloud.
+    """The pose of a body in a cloud.
 
     Attributes:
         T_left_body: (4, 4) its pose.
@@ -236,10 +235,11 @@ def locate_cloud(
         p_left: (N, 3) measured points, m, left camera's frame; the body and whatever else is in view.
         sigma_m: (N,) standard deviation of their depths, m.
         T_left_body: (4, 4) first pose, such as the arm's.
-        reach_m: how far off the first pose may be, m, at the body's surface.
+        reach_m: largest error of the first pose, m, at the body's surface.
 
     Returns:
-        The pose, or why there is none: nothing of the body near the first pose, or a surface that leaves the pose open.
+        The pose, or why there is none: nothing of the body near the first pose, or a surface that does not determine
+        the pose.
     """
     T: Array = checked(T_left_body, (4, 4), "T_left_body")
     p, sigma = checked(p_left, (None, 3), "p_left"), checked(sigma_m, (None,), "sigma_m")
@@ -251,8 +251,8 @@ def locate_cloud(
     sideways = _SIDEWAYS * step * float(np.median(p[near, 2]))
     p, sigma = p[near], sigma[near]
     if len(p) > _MOST:
-        drawn = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
-        p, sigma = p[drawn], sigma[drawn]
+        sampled = np.random.default_rng(0).choice(len(p), _MOST, replace=False)
+        p, sigma = p[sampled], sigma[sampled]
     beside = (
         np.where(_near_edges(surface, tree, _NEAR_EDGE / _SIDEWAYS * sideways), 1.0, _WITHIN / _SIDEWAYS) * sideways
     )
@@ -264,11 +264,11 @@ def locate_cloud(
         H, g, gaps, least_reach = fit
         if surface.corners is not None:
             within = max(reach, _OUTLINE_SIGMAS * sideways)
-            sampled = surface.points, surface.normals
-            more = outline_pull(surface.corners, sampled, around, T, step, within, sideways)
+            samples = surface.points, surface.normals
+            more = outline_pull(surface.corners, samples, around, T, step, within, sideways)
             H, g = H + more[0], g + more[1]
         if np.linalg.eigvalsh(H)[0] <= 1 / _OPEN**2:
-            return Missed("the body's surface in view does not fix its pose: it can slide or turn along itself")
+            return Missed("the body's surface in view does not determine its pose: it can slide or rotate along itself")
         move = -np.linalg.solve(H, g)
         T = np.asarray(T @ exp_se3(np.asarray(move, np.float64)))
         settled = reach <= least_reach and np.abs(move).max() < _SETTLED_M
@@ -280,7 +280,7 @@ def locate_cloud(
 
 
 def _around(surface: Surface, p: Array, T: Array, reach_m: float) -> NDArray[np.bool_]:
-    """Tell which points (N, 3) a body at a first pose, and twice the reach around it, may cover or lie beside."""
+    """Return which points (N, 3) a body at a first pose, and twice the reach around it, may cover or lie beside."""
     body = transform(T, surface.points)
     body = body[body[:, 2] > 0]
     if not len(body):
@@ -294,11 +294,11 @@ def _around(surface: Surface, p: Array, T: Array, reach_m: float) -> NDArray[np.
 
 
 def _near_edges(surface: Surface, tree: cKDTree, radius_m: float) -> NDArray[np.bool_]:
-    """Tell which points (N,) of a surface have others within a radius where it faces elsewhere."""
+    """Return which points (N,) of a surface have others within a radius whose normals differ."""
     rows = np.asarray(tree.query(surface.points, k=_AROUND, distance_upper_bound=radius_m)[1])
     padded = np.vstack([surface.normals, np.zeros(3)])  # a neighbour that is not there has the row after the last
     cosine = np.einsum("nki,ni->nk", padded[rows], surface.normals)
-    return np.asarray(((cosine < _TURN) & (rows < len(surface.points))).any(axis=1))
+    return np.asarray(((cosine < _EDGE_COSINE) & (rows < len(surface.points))).any(axis=1))
 
 
 def _nearest(tree: cKDTree, p: Array, reach: float) -> tuple[Array, NDArray[np.int64]]:

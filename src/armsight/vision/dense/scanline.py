@@ -1,17 +1,15 @@
-"""Dynamic programming along rows, and what rows tell their neighbours.
+"""Dynamic programming along rows, and votes between rows.
 
 Birchfield and Tomasi, "Depth discontinuities by pixel-to-pixel stereo", IJCV 35(3), 1999: along a row, matches keep
-their order, left pixels that the right camera cannot see are skipped, every break costs, and less where the light
-changes, for that is where depth breaks. A break to a lesser disparity starts from the best way up to there only: their
-pruning. Rows matched by themselves disagree in streaks, so that they then vote (``rows.py``). Where they forbid a break
-without an edge, it costs more here, and a slant of one disparity a pixel is allowed anywhere, for surfaces slant.
+their order, left pixels that the right camera cannot see are skipped, every break has a penalty, and a smaller one
+where the light changes, for that is where depth breaks. A break to a lesser disparity starts from the best path up to
+there only: their pruning. Where they forbid a break without an edge, it has a larger penalty here, and a slant of one
+disparity per pixel is allowed anywhere, for surfaces slant.
 
-Rows that were matched by themselves vote.
-
-Birchfield and Tomasi, IJCV 35(3), 1999, section 4, let disparities that many rows agree on spread over those that few
-agree on, up to where the light changes. Here every pixel takes the disparity that most of its column near it holds,
-those that look like it counting more, and then the same along its row: no thresholds, and a streak is outvoted where it
-is thin.
+Rows that are matched independently disagree in streaks, so they vote. In section 4 of the same paper disparities that
+many rows agree on spread over those that few agree on, up to where the light changes. Here every pixel takes the
+disparity that most of its column near it has, similar pixels counting more, and then the same along its row: no
+thresholds, and a thin streak is outvoted.
 """
 
 from __future__ import annotations
@@ -24,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
-from armsight.vision.dense.cost import BLOCK, ONE, Bytes, Pair, prepare, raw_row, smooth_row
+from armsight.vision.dense.cost import BLOCK, ONE, Bytes, CensusPair, prepare, raw_row, smooth_row
 from armsight.vision.dense.method import Disparity, Search
-from armsight.vision.dense.postprocess import Trust, finished
-from armsight.vision.dense.winner import Found, make_found, on_strips
+from armsight.vision.dense.postprocess import SigmaModel, finished
+from armsight.vision.dense.winner import Winners, for_each_strip, make_winners
 
 Whole = NDArray[np.int16]
 #: How far to either side, px, and the grey level difference that halves a vote.
@@ -61,7 +59,7 @@ def _vote(
 
 
 def vote(whole: Whole, image: Image, count: int) -> Whole:
-    """Let rows vote.
+    """Let neighbouring rows, and then columns, vote.
 
     Args:
         whole: (H, W) disparities from the search's first on, -1 where a pixel was skipped.
@@ -69,7 +67,7 @@ def vote(whole: Whole, image: Image, count: int) -> Whole:
         count: how many disparities there are.
 
     Returns:
-        (H, W) what they agree on; -1 where there is nobody to vote.
+        (H, W) the disparities with most votes; -1 where there are no votes.
     """
     weights = (_ALIKE / (_ALIKE + np.arange(256))).astype(np.float32)
     size = -(-count // 64) * 64
@@ -79,13 +77,13 @@ def vote(whole: Whole, image: Image, count: int) -> Whole:
         def work(begin: int, end: int, source: Whole = source, out: Whole = whole, dy: int = dy, dx: int = dx) -> None:
             _vote(source, image, weights, dy, dx, size, begin, end, out)
 
-        on_strips(whole.shape[0], _STRIP_ROWS, work)
+        for_each_strip(whole.shape[0], _STRIP_ROWS, work)
     return whole
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def seen(d: Whole, first: int) -> NDArray[np.bool_]:
-    """Tell which pixels (H, W) the right camera sees: no nearer pixel of the row is matched to the same place."""
+    """Return which pixels (H, W) the right camera sees: no nearer pixel of the row is matched to the same column."""
     height, width = d.shape
     out = np.zeros((height, width), np.bool_)
     nearest = np.empty(width, np.int16)
@@ -103,15 +101,15 @@ def seen(d: Whole, first: int) -> NDArray[np.bool_]:
 
 
 #: Penalties in thirds of a census bit. Of a slant; of a break at an edge in the image and without one, so high that
-#: noise in a window of 25 pixels does not pay for it; of a skipped pixel, what an undecided match costs. An edge is a
+#: noise in a window of 25 pixels does not cause it; of a skipped pixel, the cost of an ambiguous match. An edge is a
 #: step of so many grey levels within a pixel to either side, Birchfield and Tomasi's own threshold.
 _SLANT, _BREAK_AT_EDGE, _BREAK, _SKIPPED = np.int16(16), np.int16(150), np.int16(250), np.int16(39)
 _EDGE = 5
 _HIGH, _LOW = np.int16(16000), np.int16(-16000)
 #: Entries beside a pixel's disparities, never the least: before the first and after the last.
 _GUARD = np.uintp(32)
-#: See finish.py.
-_TRUST = Trust(0.38)
+#: See postprocess.py.
+_SIGMA_MODEL = SigmaModel(0.38)
 
 
 class Table(NamedTuple):
@@ -252,7 +250,7 @@ def _backward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _strip(pair: Pair, begin: int, end: int, first: int, count: int, size: np.uintp, out: Whole) -> None:
+def _strip(pair: CensusPair, begin: int, end: int, first: int, count: int, size: np.uintp, out: Whole) -> None:
     """Match the rows from ``begin`` to ``end``, each by itself."""
     height, width = pair.left.shape
     n, room = np.uintp(width) * size, (width + 3) * int(size + _GUARD)
@@ -278,18 +276,18 @@ class Scanline:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search, _TRUST)
+        return finished(self.search(left, right, search), left, search, _SIGMA_MODEL)
 
-    def search(self, left: Image, right: Image, search: Search) -> Found:
-        """Find disparities, without judging, smoothing or filling them."""
+    def search(self, left: Image, right: Image, search: Search) -> Winners:
+        """Find disparities, without rejecting, smoothing or filling any."""
         size = np.uintp(-(-search.count // int(BLOCK)) * int(BLOCK))
         pair, whole = prepare(left, right, search.first + int(size)), np.zeros(left.shape, np.int16)
 
         def work(begin: int, end: int) -> None:
             _strip(pair, begin, end, search.first, search.count, size, whole)
 
-        on_strips(left.shape[0], _STRIP_ROWS, work)
-        found = make_found(*left.shape)
+        for_each_strip(left.shape[0], _STRIP_ROWS, work)
+        found = make_winners(*left.shape)
         whole[whole >= search.count] = -1
         voted = vote(whole, left, search.count)
         found.agreed[:] = (whole >= 0) & seen(voted, search.first)

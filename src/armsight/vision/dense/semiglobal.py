@@ -1,16 +1,14 @@
 """Semi-global matching: the sum of the best paths from four, five or eight directions.
 
 Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008, with census and
-Birchfield and Tomasi's dissimilarity as the cost. The image is worked on in strips of rows, each by itself from some
+Birchfield and Tomasi's dissimilarity as the cost. The image is processed in strips of rows, each by itself from some
 rows before it (with four or eight paths, behind it too): the memory is that of a strip, strips go to threads, and the
 result is the same for any number of them.
 
-Costs of the best paths that end in a pixel: the recurrence of semi-global matching, in bytes.
-
-L(p, d) = C(p, d) + min(L(q, d), L(q, d -+ 1) + P1, min L(q) + P2) - min L(q), with q the pixel before p on the path:
-equation 13 of Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008. With
-the least of q taken away no L is above C + P2, so a byte holds it as long as P1 + P2 plus the largest cost stays below
-256; a vector then holds twice the disparities that it holds of two bytes each.
+The costs of the best paths that end in a pixel follow the recurrence (equation 13 of the same paper), in bytes: L(p, d)
+= C(p, d) + min(L(q, d), L(q, d -+ 1) + P1, min L(q) + P2) - min L(q), with q the pixel before p on the path. With the
+least of q subtracted no L is above C + P2, so a byte holds it as long as P1 + P2 plus the largest cost stays below 256;
+a SIMD vector then holds twice as many disparities as with two bytes each.
 """
 
 from __future__ import annotations
@@ -24,21 +22,21 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.vision.dense.cost import BLOCK, ONE, TWO, Bytes, Pair, prepare, raw_row, smooth_row
+from armsight.vision.dense.cost import BLOCK, ONE, TWO, Bytes, CensusPair, prepare, raw_row, smooth_row
 from armsight.vision.dense.method import Disparity, Search
-from armsight.vision.dense.postprocess import Trust, finished
-from armsight.vision.dense.winner import Counts, Found, choose_row, make_found, on_strips
+from armsight.vision.dense.postprocess import SigmaModel, finished
+from armsight.vision.dense.winner import Counts, Winners, choose_row, for_each_strip, make_winners
 
 #: Bytes beyond the disparities in a slot of path costs: one before the first and one after the last are never the
 #: least.
 _GUARD = np.uintp(16)
-#: What becomes of a row's path costs.
+#: Use of a row's path costs.
 RUN_UP, WRITE, ADD = range(3)
 Starts = NDArray[np.uintp]
 
 
-class Work(NamedTuple):
-    """What one strip of rows needs to be worked on.
+class PathBuffers(NamedTuple):
+    """The buffers of one strip of rows.
 
     Attributes:
         raw: (3 * W * size,) raw costs of three rows.
@@ -59,13 +57,13 @@ class Work(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def make_work(width: int, size: int, pad: int, rows: int) -> Work:
+def make_work(width: int, size: int, pad: int, rows: int) -> PathBuffers:
     """Return room for a strip; ``rows`` totals are kept."""
     slot, n = size + int(_GUARD), width * size
     arena = np.full((6 * width + 3) * slot + n, 255, np.uint8)
     start = (6 * width + 2) * slot
     arena[start : start + size + 1] = 0
-    return Work(
+    return PathBuffers(
         np.empty(3 * n, np.uint8),
         np.empty(n, np.uint8),
         arena,
@@ -126,7 +124,7 @@ def _sum(arena: Bytes, slots: Starts, total: Counts, at: np.uintp, size: np.uint
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def forward(
-    work: Work,
+    work: PathBuffers,
     image: Bytes,
     y: int,
     from_y: int,
@@ -137,13 +135,13 @@ def forward(
     p1: np.uint8,
     p2: Bytes,
 ) -> None:
-    """Go to row y on the paths from the row before, and along it to the right.
+    """Advance the paths from the row before to row y, and the path along the row to the right.
 
-    The paths take turns pixel by pixel: the one along the row waits for its own last step, and the others fill the
-    time.
+    The paths alternate pixel by pixel: the one along the row depends on its own last step, and the others fill the
+    waiting time.
 
     Args:
-        work: the strip's room, the row's costs in it.
+        work: the strip's buffers, the row's costs in them.
         image: (H, W) left image, for the steps between pixels.
         y: this row.
         from_y: the row before, above or below; < 0 where there is none.
@@ -182,7 +180,7 @@ def forward(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def leftward(
-    work: Work,
+    work: PathBuffers,
     image: Bytes,
     y: int,
     size: np.uintp,
@@ -214,13 +212,15 @@ _RUN_UP = 24
 #: window. P2, of a jump, falls by half at an edge of _EDGE grey levels, for depth breaks where light does; the most of
 #: the two and the largest cost must fit a byte.
 _P1, _P2, _EDGE = 12, 80, 16
-#: See finish.py.
-_TRUST = Trust(0.15, 0.25)
+#: See postprocess.py.
+_SIGMA_MODEL = SigmaModel(0.15, 0.25)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _costs(pair: Pair, y: int, direction: int, begun: bool, first: int, count: int, size: np.uintp, work: Work) -> None:
-    """Put the costs of row y into the arena; the rows before it are there already once the strip has begun."""
+def _costs(
+    pair: CensusPair, y: int, direction: int, begun: bool, first: int, count: int, size: np.uintp, work: PathBuffers
+) -> None:
+    """Write the costs of row y into the arena; the rows before it are there already once the strip has begun."""
     height, width = pair.left.shape
     n = np.uintp(width) * size
     for row in range(y - 1, y + 2):
@@ -231,7 +231,7 @@ def _costs(pair: Pair, y: int, direction: int, begun: bool, first: int, count: i
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _strip(
-    pair: Pair,
+    pair: CensusPair,
     begin: int,
     end: int,
     paths: int,
@@ -240,7 +240,7 @@ def _strip(
     size: np.uintp,
     p1: np.uint8,
     p2: Bytes,
-    found: Found,
+    found: Winners,
 ) -> None:
     """Match the rows from ``begin`` to ``end``."""
     height, width = pair.left.shape
@@ -273,7 +273,7 @@ class Semiglobal:
 
     Attributes:
         paths: 4, 5 or 8. Five are fastest and need the least memory, for all come from above or along the row.
-        edges: whether depth breaks are drawn again where the image has its edges (``edges.py``).
+        edges: whether depth breaks are aligned to the edges of the image (``postprocess.py``).
     """
 
     paths: int = 8
@@ -286,12 +286,12 @@ class Semiglobal:
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search, _TRUST, edges=self.edges)
+        return finished(self.search(left, right, search), left, search, _SIGMA_MODEL, edges=self.edges)
 
-    def search(self, left: Image, right: Image, search: Search) -> Found:
-        """Find disparities, without judging, smoothing or filling them."""
+    def search(self, left: Image, right: Image, search: Search) -> Winners:
+        """Find disparities, without rejecting, smoothing or filling any."""
         size = -(-search.count // int(BLOCK)) * int(BLOCK)
-        pair, found = prepare(left, right, search.first + size), make_found(*left.shape)
+        pair, found = prepare(left, right, search.first + size), make_winners(*left.shape)
         steps = np.arange(256)
         p2 = np.maximum(_P2 * _EDGE // (_EDGE + steps), _P1 + 4).astype(np.uint8)
 
@@ -299,5 +299,5 @@ class Semiglobal:
             _strip(pair, begin, end, self.paths, search.first, search.count, np.uintp(size), np.uint8(_P1), p2, found)
 
         kept = int(np.clip(_STRIP_BYTES / (2 * left.shape[1] * size), _RUN_UP, _STRIP_ROWS_KEPT))
-        on_strips(left.shape[0], _STRIP_ROWS if self.paths == 5 else kept, work)
+        for_each_strip(left.shape[0], _STRIP_ROWS if self.paths == 5 else kept, work)
         return found

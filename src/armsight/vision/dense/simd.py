@@ -1,9 +1,9 @@
-"""Vectors for numba: 32 numbers side by side, on which one instruction works at once.
+"""SIMD vectors for numba: 32 numbers side by side, on which one instruction works at once.
 
-The compiler finds vectors by itself where a loop is plain; where a loop reads and writes many arrays it must prove that
-none overlaps another, and gives up. Here the program says what it wants: 32 bytes or 32 two-byte numbers, which LLVM
-cuts into registers of the machine's own width. Works in compiled code only; nothing is checked, so that who calls keeps
-the 32 places from ``at`` on inside the array.
+The compiler vectorises plain loops by itself; where a loop reads and writes many arrays it must prove that none
+overlaps another, and gives up. Here the vectors are explicit: 32 bytes or 32 two-byte numbers, which LLVM splits into
+registers of the processor's own width. They work in compiled code only; nothing is checked, so the caller must keep the
+32 numbers from ``at`` on inside the array.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic, models, register_model
 
 #: How many numbers stand side by side.
-LANES = 32
+SIMD_WIDTH = 32
 
 
-class Lanes(types.Type):
+class SimdVector(types.Type):
     """The type of a vector of unsigned numbers of so many bits."""
 
     def __init__(self, bits: int) -> None:
-        """Name it."""
-        super().__init__(name=f"lanes{bits}x{LANES}")
+        """Set the name of the type."""
+        super().__init__(name=f"simd{bits}x{SIMD_WIDTH}")
         self.bits = bits
 
     @property
     def shape(self) -> ir.VectorType:
-        """What it is to LLVM."""
-        return ir.VectorType(ir.IntType(self.bits), LANES)
+        """The type in LLVM."""
+        return ir.VectorType(ir.IntType(self.bits), SIMD_WIDTH)
 
 
-@register_model(Lanes)
+@register_model(SimdVector)
 class _Model(models.PrimitiveModel):
     """A vector is kept in registers as it is."""
 
-    def __init__(self, manager: Any, kind: Lanes) -> None:  # noqa: ANN401
+    def __init__(self, manager: Any, kind: SimdVector) -> None:  # noqa: ANN401
         super().__init__(manager, kind, kind.shape)  # type: ignore[no-untyped-call]
 
 
@@ -48,27 +48,27 @@ def _start(typing: Any, array: Any) -> Any:  # noqa: ANN401
     return types.CPointer(array.dtype)(array), emit  # type: ignore[no-untyped-call]
 
 
-def _place(builder: Any, kind: Lanes, start: Any, at: Any) -> Any:  # noqa: ANN401
+def _address(builder: Any, kind: SimdVector, start: Any, at: Any) -> Any:  # noqa: ANN401
     """Return the address of 32 numbers."""
     return builder.bitcast(builder.gep(start, [at]), kind.shape.as_pointer())
 
 
 @intrinsic
 def _load(typing: Any, start: Any, at: Any) -> Any:  # noqa: ANN401
-    kind = Lanes(start.dtype.bitwidth)
+    kind = SimdVector(start.dtype.bitwidth)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
-        return builder.load(_place(builder, kind, *arguments), align=kind.bits // 8)
+        return builder.load(_address(builder, kind, *arguments), align=kind.bits // 8)
 
     return kind(start, types.uintp), emit
 
 
 @intrinsic
 def _store(typing: Any, start: Any, at: Any, v: Any) -> Any:  # noqa: ANN401
-    kind = Lanes(start.dtype.bitwidth)
+    kind = SimdVector(start.dtype.bitwidth)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
-        builder.store(arguments[2], _place(builder, kind, *arguments[:2]), align=kind.bits // 8)
+        builder.store(arguments[2], _address(builder, kind, *arguments[:2]), align=kind.bits // 8)
         return context.get_dummy_value()
 
     return types.none(start, types.uintp, kind), emit
@@ -76,11 +76,11 @@ def _store(typing: Any, start: Any, at: Any, v: Any) -> Any:  # noqa: ANN401
 
 @intrinsic
 def _spread(typing: Any, x: Any) -> Any:  # noqa: ANN401
-    kind = Lanes(x.bitwidth)
+    kind = SimdVector(x.bitwidth)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         one = builder.insert_element(ir.Constant(kind.shape, ir.Undefined), arguments[0], ir.IntType(32)(0))
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_WIDTH), [0] * SIMD_WIDTH)
         return builder.shuffle_vector(one, one, mask)
 
     return kind(x), emit
@@ -88,12 +88,12 @@ def _spread(typing: Any, x: Any) -> Any:  # noqa: ANN401
 
 @intrinsic
 def _count_up(typing: Any, x: Any) -> Any:  # noqa: ANN401
-    kind = Lanes(x.bitwidth)
+    kind = SimdVector(x.bitwidth)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         one = builder.insert_element(ir.Constant(kind.shape, ir.Undefined), arguments[0], ir.IntType(32)(0))
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return builder.add(builder.shuffle_vector(one, one, mask), ir.Constant(kind.shape, list(range(LANES))))
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_WIDTH), [0] * SIMD_WIDTH)
+        return builder.add(builder.shuffle_vector(one, one, mask), ir.Constant(kind.shape, list(range(SIMD_WIDTH))))
 
     return kind(x), emit
 
@@ -112,13 +112,13 @@ def _pairwise(operation: Any) -> Any:  # noqa: ANN401
 
 
 def _llvm(name: str) -> Any:  # noqa: ANN401
-    """Return what emits one of LLVM's own functions."""
+    """Return a function that emits a call of one of LLVM's own functions."""
 
     def emit(builder: Any, *arguments: Any) -> Any:  # noqa: ANN401
         kind = arguments[0].type
-        wanted = ir.FunctionType(kind, [a.type for a in arguments])
+        signature_type = ir.FunctionType(kind, [a.type for a in arguments])
         full = f"{name}.v{kind.count}i{kind.element.width}"
-        function = cgutils.get_or_insert_function(builder.module, wanted, full)  # type: ignore[no-untyped-call]
+        function = cgutils.get_or_insert_function(builder.module, signature_type, full)  # type: ignore[no-untyped-call]
         return builder.call(function, arguments)
 
     return emit
@@ -135,14 +135,14 @@ def _bits_set(typing: Any, v: Any) -> Any:  # noqa: ANN401
 @intrinsic
 def _half(typing: Any, v: Any) -> Any:  # noqa: ANN401
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
-        return builder.lshr(arguments[0], ir.Constant(v.shape, [1] * LANES))
+        return builder.lshr(arguments[0], ir.Constant(v.shape, [1] * SIMD_WIDTH))
 
     return v(v), emit
 
 
 @intrinsic
 def _as_in(typing: Any, v: Any, start: Any) -> Any:  # noqa: ANN401
-    kind = Lanes(start.dtype.bitwidth)
+    kind = SimdVector(start.dtype.bitwidth)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         return arguments[0] if kind.bits == v.bits else builder.zext(arguments[0], kind.shape)
@@ -158,13 +158,13 @@ def _where_less(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:  # noqa:
     return yes(a, b, yes, no), emit
 
 
-#: ``start(array)``: where the numbers of an array of one dimension are. Vectors are loaded from there, not from the
-#: array: an array that goes in and out of functions counts who holds it, which costs more than the vector's work.
+#: ``start(array)``: the address of the numbers of an array of one dimension. Vectors are loaded from there, not from
+#: the array: an array that is passed between functions counts its references, which costs more than the vector's work.
 start: Any = _start
 #: ``load(start, at)``: 32 numbers from ``at`` on; ``store(start, at, v)`` writes them.
 load: Any = _load
 store: Any = _store
-#: ``spread(x)``: a number in all places; ``count_up(x)``: x, x + 1, x + 2, ...
+#: ``spread(x)``: a number in all positions; ``count_up(x)``: x, x + 1, x + 2, ...
 spread: Any = _spread
 count_up: Any = _count_up
 #: Sum and difference, cut to the numbers' bits; least; bits that differ; difference, but not below zero.

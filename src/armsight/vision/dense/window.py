@@ -1,12 +1,13 @@
-"""Local matching over square windows: a pair's looks go in, a strip's winners come out.
+"""Local matching over square windows: the planes of a pair go in, a strip's winners come out.
 
-A byte a pixel and disparity says what a match costs: twice the bits in which two census words of eight neighbours
-differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute difference of the
-grey levels, cut off: order holds where the light differs, levels tell where order does not (Mei et al., "On building an
-accurate stereo matching system on graphics hardware", 2011). Costs are summed along the row, and then by a running sum
-down the columns, so that the work for a pixel does not grow with the window's height. Pixels of a row lie side by side
-and take turns with the disparities: the least so far, of the left pixel and of the right one, needs no search across a
-vector. No cost volume is kept, but the sums of as many rows as the window is high.
+A byte per pixel and disparity holds the cost of a match: twice the number of bits in which two census words of eight
+neighbours differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute
+difference of the grey levels, cut off: the order of grey levels is robust to light, their values help where the order
+is ambiguous (Mei et al., "On building an accurate stereo matching system on graphics hardware", 2011). Costs are summed
+along the row, and then by a running sum down the columns, so that the work for a pixel does not grow with the window's
+height. Pixels of a row lie side by side, and the loop over disparities is outside: the least so far, of the left pixel
+and of the right one, needs no search across a vector. No cost volume is kept, only the sums of as many rows as the
+window is high.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from armsight.data import Image
 from armsight.vision.dense.cost import Bytes
 from armsight.vision.dense.simd import (
-    LANES,
+    SIMD_WIDTH,
     above,
     as_in,
     bits_set,
@@ -36,13 +37,13 @@ from armsight.vision.dense.simd import (
     store,
     where_less,
 )
-from armsight.vision.dense.winner import NOWHERE, Counts, Found
+from armsight.vision.dense.winner import NOWHERE, Counts, Winners
 
-ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(LANES)
-#: Neighbours in a census word lie so far from the middle, px, along rows, columns and diagonals.
+ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(SIMD_WIDTH)
+#: Distance of the neighbours in a census word from the middle, px, along rows, columns and diagonals.
 _CENSUS_REACH = 2
-#: Beyond this many grey levels two pixels are just different; what a match beyond the right image's edge costs: about
-#: that of an undecided pixel; the most that a match can cost.
+#: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
+#: an ambiguous pixel; the largest cost of a match.
 _CUT, _OUTSIDE, RAW_MAX = np.uint8(20), np.uint8(10), 2 * 8 + 20 // 2
 #: The reach whose sum is written out.
 _USUAL = 4
@@ -50,16 +51,16 @@ _USUAL = 4
 BYTE_REACH = (255 // RAW_MAX - 1) // 2
 
 
-class Looks(NamedTuple):
+class PairPlanes(NamedTuple):
     """A pair as the costs need it: rows of bytes, one after another, widened so that every window lies inside.
 
     Attributes:
         left: grey levels.
         left_census: census words.
-        right: grey levels; one place further left for each disparity.
+        right: grey levels; one pixel further left for each disparity.
         right_census: census words.
-        left_stride: places in a row of the left image's.
-        right_stride: places in a row of the right image's.
+        left_stride: bytes in a row of the left planes.
+        right_stride: bytes in a row of the right planes.
     """
 
     left: Bytes
@@ -85,8 +86,8 @@ def _census(padded: Bytes, out: Bytes) -> None:
                     row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + i] < middle[x + _CENSUS_REACH])
 
 
-def look(left: Image, right: Image, reach: int, further: int) -> Looks:
-    """Look at both images of a pair.
+def prepare_planes(left: Image, right: Image, reach: int, further: int) -> PairPlanes:
+    """Compute the planes of both images of a pair.
 
     Args:
         left: (H, W) uint8.
@@ -97,7 +98,7 @@ def look(left: Image, right: Image, reach: int, further: int) -> Looks:
 
     def widened(image: Image, before: int) -> Bytes:
         return np.asarray(
-            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * LANES, cv2.BORDER_REPLICATE)
+            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * SIMD_WIDTH, cv2.BORDER_REPLICATE)
         )
 
     def census(image: Image) -> Bytes:
@@ -108,12 +109,12 @@ def look(left: Image, right: Image, reach: int, further: int) -> Looks:
 
     planes = (widened(left, 0), widened(census(left), 0), widened(right, further), widened(census(right), further))
     a, b, c, d = (plane.reshape(-1) for plane in planes)
-    return Looks(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
+    return PairPlanes(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _costs(g: Any, word: Any, r: Any, other: Any) -> Any:  # noqa: ANN401
-    """Return what it costs to match grey levels and census words."""
+    """Return the costs of matching grey levels and census words."""
     apart = least(plus(above(g, r), above(r, g)), spread(_CUT))
     bits = bits_set(differing(word, other))
     return plus(plus(bits, bits), half(apart))
@@ -121,7 +122,7 @@ def _costs(g: Any, word: Any, r: Any, other: Any) -> Any:  # noqa: ANN401
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _over(raw: Bytes, threes: Bytes, at: np.uintp, reach: int, kept: Bytes) -> Any:  # noqa: ANN401
-    """Return costs summed over 2 ``reach`` + 1 pixels, in as many bits as ``kept`` has; all are where arrays start."""
+    """Return costs summed over 2 ``reach`` + 1 pixels, in as many bits as ``kept`` has; all are addresses of arrays."""
     if reach == _USUAL:
         a, b = load(threes, at), load(threes, at + np.uintp(3))
         return as_in(plus(plus(a, b), load(threes, at + np.uintp(6))), kept)
@@ -133,8 +134,8 @@ def _over(raw: Bytes, threes: Bytes, at: np.uintp, reach: int, kept: Bytes) -> A
     return total
 
 
-class Room(NamedTuple):
-    """What a strip needs to be worked on.
+class StripBuffers(NamedTuple):
+    """The buffers of a strip.
 
     Attributes:
         raw: one row's costs at one disparity, with the windows' reach to either side.
@@ -155,13 +156,13 @@ class Room(NamedTuple):
     right: Counts
 
 
-def make_room(width: int, reach: int, further: int, count: int) -> Room:
-    """Return room for strips of images of a width."""
-    wide = -(-width // LANES) * LANES
+def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffers:
+    """Return buffers for strips of images of a width."""
+    wide = -(-width // SIMD_WIDTH) * SIMD_WIDTH
     kind = np.uint8 if reach <= BYTE_REACH else np.uint16
-    return Room(
-        np.zeros(wide + 2 * reach + 2 * LANES, np.uint8),
-        np.zeros(wide + 2 * reach + 2 * LANES, np.uint8),
+    return StripBuffers(
+        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
+        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
         np.zeros((2 * reach + 1) * count * wide, kind),
         np.zeros(count * wide, np.uint16),
         np.zeros(wide, np.uint16),
@@ -171,16 +172,16 @@ def make_room(width: int, reach: int, further: int, count: int) -> Room:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _cost_row(looks: Looks, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
+def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
     """Write the costs of a row at disparity d, from ``reach`` pixels before it to ``reach`` after it."""
     grey, word, r_grey, r_word = (
-        start(looks.left),
-        start(looks.left_census),
-        start(looks.right),
-        start(looks.right_census),
+        start(planes.left),
+        start(planes.left_census),
+        start(planes.right),
+        start(planes.right_census),
     )
-    left = np.uintp(row) * looks.left_stride
-    right, out = np.uintp(row) * looks.right_stride + np.uintp(pad - d), start(raw)
+    left = np.uintp(row) * planes.left_stride
+    right, out = np.uintp(row) * planes.right_stride + np.uintp(pad - d), start(raw)
     for j in range(np.uintp(0), np.uintp(width + 2 * reach), BLOCK):
         costs = _costs(load(grey, left + j), load(word, left + j), load(r_grey, right + j), load(r_word, right + j))
         store(out, j, costs)
@@ -190,19 +191,28 @@ def _cost_row(looks: Looks, row: int, d: int, pad: int, width: int, reach: int, 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_row(
-    looks: Looks, row: int, choose: bool, reach: int, first: int, count: int, width: int, pad: int, room: Room
+    planes: PairPlanes,
+    row: int,
+    choose: bool,
+    reach: int,
+    first: int,
+    count: int,
+    width: int,
+    pad: int,
+    buffers: StripBuffers,
 ) -> None:
-    """Let the windows move down by a row of the widened images; with ``choose`` find the least totals.
+    """Move the windows down by a row of the widened images; with ``choose`` find the least totals.
 
-    Pixels from which a disparity leads out of the right image do not choose it, nor do places beyond the left one's end.
+    Pixels from which a disparity leads out of the right image do not choose it, nor do columns beyond the left one's
+    end.
     """
-    stride, end = np.uintp(room.least.shape[0]), np.uintp(width)
+    stride, end = np.uintp(buffers.least.shape[0]), np.uintp(width)
     slot = np.uintp(row % (2 * reach + 1)) * np.uintp(count) * stride
-    raw, threes, kept, total = start(room.raw), start(room.threes), start(room.kept), start(room.total)
-    lowest, where, right = start(room.least), start(room.where), start(room.right)
+    raw, threes, kept, total = start(buffers.raw), start(buffers.threes), start(buffers.kept), start(buffers.total)
+    lowest, where, right = start(buffers.least), start(buffers.where), start(buffers.right)
     for k in range(count):
         d = first + k
-        _cost_row(looks, row, d, pad, width, reach, room.raw)
+        _cost_row(planes, row, d, pad, width, reach, buffers.raw)
         for x in range(np.uintp(0), stride + np.uintp(2 * reach), BLOCK):
             store(threes, x, plus(plus(load(raw, x), load(raw, x + ONE)), load(raw, x + np.uintp(2))))
         at, here, begin = np.uintp(k) * stride, spread(np.uint16(k)), np.uintp(d)
@@ -224,14 +234,14 @@ def _add_row(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _place_row(y: int, first: int, count: int, pad: int, room: Room, found: Found) -> None:
-    """Write what row y found: places between disparities, curvatures, and whether the right image agrees."""
-    stride, total = np.uintp(room.least.shape[0]), room.total
+def _write_row(y: int, first: int, count: int, pad: int, buffers: StripBuffers, found: Winners) -> None:
+    """Write the winners of row y: sub-pixel disparities, curvatures, and whether the right image agrees."""
+    stride, total = np.uintp(buffers.least.shape[0]), buffers.total
     width = found.disparity.shape[1]
     for x in range(min(first, width)):  # nothing of the search lies in the right image
         found.disparity[y, x], found.agreed[y, x], found.curvature[y, x] = first, False, 0
     for x in range(first, width):
-        k, reached = np.uintp(room.where[x]), np.uintp(min(x - first + 1, count))
+        k, reached = np.uintp(buffers.where[x]), np.uintp(min(x - first + 1, count))
         at = k * stride + np.uintp(x)
         around = total[at]
         low, offset, curvature = np.float32(around), np.float32(0), np.float32(0)
@@ -246,21 +256,29 @@ def _place_row(y: int, first: int, count: int, pad: int, room: Room, found: Foun
             around = min(around, total[at + stride + ONE])
         found.disparity[y, x] = np.float32(first) + np.float32(k) + offset
         found.least[y, x], found.curvature[y, x] = low, curvature
-        found.agreed[y, x] = around <= room.right[np.uintp(x - first + pad) - k]
+        found.agreed[y, x] = around <= buffers.right[np.uintp(x - first + pad) - k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def match_windows(
-    looks: Looks, begin: int, end: int, reach: int, first: int, count: int, pad: int, room: Room, found: Found
+    planes: PairPlanes,
+    begin: int,
+    end: int,
+    reach: int,
+    first: int,
+    count: int,
+    pad: int,
+    buffers: StripBuffers,
+    found: Winners,
 ) -> None:
     """Choose the disparities of the rows from ``begin`` to ``end`` by the least sum over a window."""
     width = found.disparity.shape[1]
-    room.kept[:] = 0
-    room.total[:] = 0
+    buffers.kept[:] = 0
+    buffers.total[:] = 0
     for row in range(begin, end + 2 * reach):
         y = row - 2 * reach  # the row whose window this one completes
-        room.least[:] = NOWHERE
-        room.right[:] = NOWHERE
-        _add_row(looks, row, y >= begin, reach, first, count, width, pad, room)
+        buffers.least[:] = NOWHERE
+        buffers.right[:] = NOWHERE
+        _add_row(planes, row, y >= begin, reach, first, count, width, pad, buffers)
         if y >= begin:
-            _place_row(y, first, count, pad, room, found)
+            _write_row(y, first, count, pad, buffers, found)

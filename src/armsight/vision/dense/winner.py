@@ -1,9 +1,9 @@
-"""Which disparity wins: the least total, whether the right image agrees, where between two disparities it lies.
+"""Choose the winning disparity: the least total, the consistency check with the right image, the sub-pixel position.
 
 Both kinds of matching that sum costs, local and semi-global, end here. The right image's choice is made from the same
 totals: the least over all left pixels that could be its match.
 
-Strips of rows, each by itself: to threads where there are some, with the same result for any number of them.
+:func:`for_each_strip` distributes strips of rows to threads, with the same result for any number of them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from armsight.vision.dense.cost import BLOCK
 
 
-def on_strips(height: int, rows: int, work: Callable[[int, int], None]) -> None:
+def for_each_strip(height: int, rows: int, work: Callable[[int, int], None]) -> None:
     """Call ``work(begin, end)`` for strips that cover all rows, on as many threads as numba may use.
 
     Args:
@@ -44,11 +44,11 @@ Counts = NDArray[np.uint16]
 NOWHERE = np.uint16(65535)
 
 
-class Found(NamedTuple):
-    """What was found for every pixel of the left image.
+class Winners(NamedTuple):
+    """The winning disparity of every pixel of the left image.
 
     Attributes:
-        disparity: (H, W) px, with the place between two disparities; the winner even where nothing agrees.
+        disparity: (H, W) px, sub-pixel; the winner even where the images do not agree.
         agreed: (H, W) whether the right image's choice is the same to one disparity.
         curvature: (H, W) second difference of the totals at the winner; 0 at the ends of the search.
         least: (H, W) the winner's total.
@@ -60,10 +60,10 @@ class Found(NamedTuple):
     least: Singles
 
 
-def make_found(height: int, width: int) -> Found:
-    """Return room for what is found."""
+def make_winners(height: int, width: int) -> Winners:
+    """Return arrays for the winners."""
     single = [np.zeros((height, width), np.float32) for _ in range(3)]
-    return Found(single[0], np.zeros((height, width), np.bool_), single[1], single[2])
+    return Winners(single[0], np.zeros((height, width), np.bool_), single[1], single[2])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -106,7 +106,7 @@ def choose_row(
     first: int,
     count: int,
     size: np.uintp,
-    found: Found,
+    found: Winners,
 ) -> None:
     """Choose the disparities of row y.
 
@@ -118,13 +118,12 @@ def choose_row(
         first: first disparity of the search.
         count: how many there are; ``size`` with the padding.
         size: stride.
-        found: where to.
+        found: filled.
     """
     width = found.disparity.shape[1]
     best_right[:] = NOWHERE
-    for phase in range(
-        count
-    ):  # pixels that share no right pixel follow one another: none waits for what the last wrote
+    # Pixels that share no right pixel follow one another: none stalls on the last one's write.
+    for phase in range(count):
         for x in range(phase, width, count):
             n, right = _tried(x, first, count), np.uintp(width - 1 - x + first)
             found.disparity[y, x] = _least_of(total, at + np.uintp(x) * size, n, best_right, right)
@@ -159,7 +158,7 @@ def _agreed(
     size: np.uintp,
     width: int,
 ) -> bool:
-    """Tell whether the right pixel that x was matched with chose x, or x's neighbour at the next disparity."""
+    """Return whether the right pixel that x was matched with chose x, or x's neighbour at the next disparity."""
     d = int(disparity + 0.5) - first
     if x - d - first < 0:
         return False
