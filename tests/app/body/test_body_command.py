@@ -1,4 +1,4 @@
-"""``armsight body``: the verdict on good and bad bodies, drawings to scale, and what is typed wrongly."""
+"""``armsight body``: the assessment of good and bad bodies, drawings to scale, and what is typed wrongly."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from armsight.app.body import draw as body_draw
-from armsight.app.body.check import TOLD, judge
+from armsight.app.body.check import SEPARATED_SIGMAS, assess
 from armsight.data import Discs, Missed
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.discs.bias import project_discs
@@ -28,9 +28,9 @@ TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
 PAPER_MM = 0.05
 
 
-def disc(name, place, normal="normal = [0, 0, -1]", radius=8.0, bright="true"):
+def disc(name, position, normal="normal = [0, 0, -1]", radius=8.0, bright="true"):
     return (
-        f'[[markers]]\nname = "{name}"\nposition_mm = {[float(c) for c in place]}\n{normal}\n'
+        f'[[markers]]\nname = "{name}"\nposition_mm = {[float(c) for c in position]}\n{normal}\n'
         f"disc = {{ radius_mm = {radius}, bright = {bright} }}\n"
     )
 
@@ -49,9 +49,9 @@ BOARD = (
 def body(tmp_path):
     """Write a body of discs and more."""
 
-    def written(places=TRIANGLE, more="", **looks):
+    def written(positions=TRIANGLE, more="", **looks):
         path = tmp_path / "body.toml"
-        path.write_text("".join(disc(f"P{i + 1}", p, **looks) for i, p in enumerate(places)) + more)
+        path.write_text("".join(disc(f"P{i + 1}", p, **looks) for i, p in enumerate(positions)) + more)
         return path
 
     return written
@@ -62,61 +62,61 @@ def regular(count, radius=60.0):
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1).tolist()
 
 
-def facts(said):
+def answer(said):
     (one,) = said.lines
     return one
 
 
-def kinds(verdict, grade):
-    return {f["kind"] for f in verdict["findings"] if f["grade"] == grade}
+def kinds(assessment, grade):
+    return {f["kind"] for f in assessment["findings"] if f["grade"] == grade}
 
 
-def test_the_chapters_plate_is_usable_and_its_twin_is_settled_by_the_normals(armsight):
+def test_the_example_plate_is_usable_and_its_twin_is_settled_by_the_normals(armsight):
     said = armsight("body", "check", PLATE, "--json")
     assert said.code == 0
-    got = facts(said)
-    assert got["verdict"] == "usable"
+    got = answer(said)
+    assert got["assessment"] == "usable"
     side = np.hypot(55, 85)
     assert [d["mm"] for d in got["distances_mm"]] == pytest.approx([side, side, 110.0])
-    (swap,) = got["swaps"]
-    assert swap["words"] == "P1 and P2 exchanged"
-    assert swap["from_behind"]
-    assert swap["settled_by_normals"]
+    (ambiguity,) = got["ambiguities"]
+    assert ambiguity["description"] == "P1 and P2 exchanged"
+    assert ambiguity["from_behind"]
+    assert ambiguity["settled_by_normals"]
     assert [e["disc_px"] for e in got["expected"]] == [pytest.approx([16 * 0.9 / d] * 2) for d in (0.6, 0.8, 1.2)]
     text = armsight("body", "check", PLATE).out
-    assert "verdict: usable" in text
+    assert "assessment: usable" in text
     assert "P1 and P2 exchanged would fit, but seen from behind: the normals settle it" in text
 
 
 def test_without_normals_the_same_plate_is_ambiguous_and_normals_are_asked_for(armsight, body):
     said = armsight("body", "check", body(normal=""))
     assert said.code == 1
-    assert "verdict: ambiguous" in said.out
+    assert "assessment: ambiguous" in said.out
     assert "P1 and P2 exchanged, seen from behind, is the same body" in said.out
     assert "change: give every disc its normal" in said.out
 
 
-@pytest.mark.parametrize(("count", "turns"), [(3, 2), (4, 3), (5, 4)])
+@pytest.mark.parametrize(("count", "rotations"), [(3, 2), (4, 3), (5, 4)])
 def test_a_regular_body_is_ambiguous_by_each_of_its_turns_and_the_move_that_is_advised_mends_it(
-    armsight, body, tmp_path, count, turns
+    armsight, body, tmp_path, count, rotations
 ):
     path = body(regular(count))
     said = armsight("body", "check", path, "--json")
     assert said.code == 1
-    got = facts(said)
-    assert got["verdict"] == "ambiguous"
-    assert sum(not s["distinguishable"] for s in got["swaps"]) == turns
-    assert sum(s["settled_by_normals"] for s in got["swaps"]) == count  # the mirror axes
+    got = answer(said)
+    assert got["assessment"] == "ambiguous"
+    assert sum(not s["distinguishable"] for s in got["ambiguities"]) == rotations
+    assert sum(s["settled_by_normals"] for s in got["ambiguities"]) == count  # the mirror axes
     (advice,) = [f["change"] for f in got["findings"] if f["kind"] == "change"]
     name, mm, sign, axis = re.search(r"move P(\d) by (\d+) mm along ([+-])([xyz])", advice).groups()
-    places = regular(count)
-    places[int(name) - 1]["xyz".index(axis)] += float(f"{sign}{mm}")
-    assert armsight("body", "check", body(places)).code == 0
+    positions = regular(count)
+    positions[int(name) - 1]["xyz".index(axis)] += float(f"{sign}{mm}")
+    assert armsight("body", "check", body(positions)).code == 0
 
 
-def test_the_side_of_a_body_with_a_tag_is_told_by_the_tag(armsight, body):
-    got = facts(armsight("body", "check", body(more=TAG, normal=""), "--json"))
-    assert got["verdict"] == "usable"
+def test_the_side_of_a_body_with_a_tag_is_identified_by_the_tag(armsight, body):
+    got = answer(armsight("body", "check", body(more=TAG, normal=""), "--json"))
+    assert got["assessment"] == "usable"
     assert got["coded"]
 
 
@@ -126,25 +126,25 @@ def test_a_mirror_image_is_harmless_and_said(armsight, body):
     assert "note  P1 and P2 exchanged is its mirror image: harmless to two cameras, not to one alone" in said.out
 
 
-def test_nearly_equal_distances_are_told_apart_near_and_not_far(armsight, body):
+def test_nearly_equal_distances_are_distinguished_near_and_not_far(armsight, body):
     path = body(((-55, 0, 0), (61, 0, 0), (0, 95, 0)))
-    near, far = (facts(armsight("body", "check", path, "--distance", d, "--json")) for d in (0.4, 1.6))
-    assert near["verdict"] == "usable"
-    assert far["verdict"] == "ambiguous"
+    near, far = (answer(armsight("body", "check", path, "--distance", d, "--json")) for d in (0.4, 1.6))
+    assert near["assessment"] == "usable"
+    assert far["assessment"] == "ambiguous"
     (text, *_) = [f["text"] for f in far["findings"] if f["kind"] == "ambiguous"]
-    wanted, reckoned = map(float, re.search(r"is known to ([\d.]+) px \(reckoned with: ([\d.]+) px", text).groups())
-    assert wanted < reckoned
+    needed, assumed = map(float, re.search(r"is known to ([\d.]+) px \(assumed: ([\d.]+) px", text).groups())
+    assert needed < assumed
 
 
 def test_dark_and_bright_discs_are_not_taken_for_each_other(armsight, body):
     path = body(regular(3)[:2], more=disc("D", regular(3)[2], bright="false"))
-    got = facts(armsight("body", "check", path, "--json"))
-    assert got["verdict"] == "usable"
-    assert [s["words"] for s in got["swaps"]] == ["P1 and P2 exchanged"]
+    got = answer(armsight("body", "check", path, "--json"))
+    assert got["assessment"] == "usable"
+    assert [s["description"] for s in got["ambiguities"]] == ["P1 and P2 exchanged"]
 
 
 @pytest.mark.parametrize(
-    ("places", "looks", "more", "kind", "words"),
+    ("positions", "looks", "more", "kind", "part"),
     [
         (TRIANGLE, {"radius": 1.5}, "", "size", "4.5 px across, below 5"),
         (TRIANGLE, {"radius": 26.0}, "", "size", "78 px across, above 60"),
@@ -160,12 +160,12 @@ def test_dark_and_bright_discs_are_not_taken_for_each_other(armsight, body):
         ),
     ],
 )
-def test_what_makes_a_body_unusable_is_said(armsight, body, places, looks, more, kind, words):
-    said = armsight("body", "check", body(places, more, **looks))
+def test_what_makes_a_body_unusable_is_said(armsight, body, positions, looks, more, kind, part):
+    said = armsight("body", "check", body(positions, more, **looks))
     assert said.code == 1
-    assert "verdict: unusable" in said.out
-    assert words in said.out
-    assert kind in kinds(facts(armsight("body", "check", body(places, more, **looks), "--json")), "bad")
+    assert "assessment: unusable" in said.out
+    assert part in said.out
+    assert kind in kinds(answer(armsight("body", "check", body(positions, more, **looks), "--json")), "bad")
 
 
 def test_what_could_be_better_is_said_and_the_body_is_usable(armsight, body):
@@ -173,75 +173,77 @@ def test_what_could_be_better_is_said_and_the_body_is_usable(armsight, body):
     assert close.code == 0
     assert "weak  P1 and P2 leave only 3.0 mm of plain surround" in close.out
     slim = armsight("body", "check", body(((-55, 0, 0), (65, 0, 0), (10, 20, 0))))
-    assert "known least: the turn about the body's x axis" in slim.out
+    assert "known least: the rotation about the body's x axis" in slim.out
     far = armsight("body", "check", body([(x, y, 400) for x, y, _ in TRIANGLE]))
     assert "the body's origin lies 401 mm from the markers' middle" in far.out
 
 
 def named(rig, target, distance, rng):
-    """What identification makes of a body's discs at five turns: right, wrong or missed; places as good as they get."""
-    words = []
-    for turn in ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7)):
-        T = view(rig, target.body.points, target.normals, distance, turn).T_left_body
+    """What identification makes of a body's discs at five orientations: right, wrong or missed."""
+    outcomes = []
+    for rotation in ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7)):
+        T = view(rig, target.body.points, target.normals, distance, rotation).T_left_body
         sides = []
         for camera, T_camera_body in ((rig.left, T), (rig.right, inverse(rig.T_left_right) @ T)):
             p, n = transform(T_camera_body, target.body.points), target.normals @ T_camera_body[:3, :3].T
             uv, shape, _, _ = project_discs(camera, p, n, target.radii_m)
-            order = rng.permutation(len(uv))
-            noisy = uv[order] + rng.normal(0, 0.02, uv.shape)
-            sides.append(Discs(noisy, np.tile(4e-4 * np.eye(2), (len(uv), 1, 1)), shape[order], target.bright[order]))
+            shuffled = rng.permutation(len(uv))
+            noisy = uv[shuffled] + rng.normal(0, 0.02, uv.shape)
+            sides.append(
+                Discs(noisy, np.tile(4e-4 * np.eye(2), (len(uv), 1, 1)), shape[shuffled], target.bright[shuffled])
+            )
         found = identify(rig, target, *sides)
         if isinstance(found, Missed):
-            words.append(found.reason.split(":")[0])
+            outcomes.append(found.reason.split(":")[0])
         else:
             off = transform(found.T_left_body, target.body.points) - transform(T, target.body.points)
             # Depth is known to sqrt(2) 0.02 z^2 / (f b) = 0.2 mm at 1.2 m; another naming is 100 mm off.
-            words.append("right" if np.abs(off).max() < 2e-3 else "wrong")
-    return words
+            outcomes.append("right" if np.abs(off).max() < 2e-3 else "wrong")
+    return outcomes
 
 
 @pytest.mark.parametrize(
-    "places", [TRIANGLE, regular(3), [(64, 0, 0), *regular(3)[1:]], [(-55, 0, 0), (55.4, 0, 0), (0, 95, 0)]]
+    "positions", [TRIANGLE, regular(3), [(64, 0, 0), *regular(3)[1:]], [(-55, 0, 0), (55.4, 0, 0), (0, 95, 0)]]
 )
-def test_identification_names_what_is_called_usable_and_misses_what_is_called_ambiguous(armsight, body, places):
-    path = body(places)
+def test_identification_names_what_is_called_usable_and_misses_what_is_called_ambiguous(armsight, body, positions):
+    path = body(positions)
     for distance in (0.6, 1.2):
         said = armsight("body", "check", path, "--distance", distance, "--json")
-        words = set(named(plain_rig(), read_layout(path).discs, distance, np.random.default_rng(5)))
-        assert words == {"right" if facts(said)["verdict"] == "usable" else "ambiguous"}
+        outcomes = set(named(plain_rig(), read_layout(path).discs, distance, np.random.default_rng(5)))
+        assert outcomes == {"right" if answer(said)["assessment"] == "usable" else "ambiguous"}
 
 
 def test_one_hidden_disc_is_looked_into(armsight, body):
     """Three of the four are an equilateral triangle: without the fourth they are ambiguous."""
-    got = facts(armsight("body", "check", body([*regular(3), (20.0, 5.0, -40.0)]), "--json"))
-    assert got["verdict"] == "usable"
+    got = answer(armsight("body", "check", body([*regular(3), (20.0, 5.0, -40.0)]), "--json"))
+    assert got["assessment"] == "usable"
     assert any("where P4 is hidden" in (f["text"] or "") for f in got["findings"])
 
 
 def test_a_better_rig_knows_more_and_a_rigs_own_uncertainty_counts(armsight, bench):
-    plain = facts(armsight("body", "check", PLATE, "--distance", "0.5", "--json"))["expected"][0]
-    got = facts(armsight("body", "check", PLATE, "--rig", bench.rig, "--distance", "0.5", "--json"))
+    plain = answer(armsight("body", "check", PLATE, "--distance", "0.5", "--json"))["expected"][0]
+    got = answer(armsight("body", "check", PLATE, "--rig", bench.rig, "--distance", "0.5", "--json"))
     assert str(bench.rig) in got["cameras"]
     assert got["expected"][0]["sigma_depth_mm"] > plain["sigma_depth_mm"]
 
 
-def test_the_tolerance_of_a_verdict_is_the_one_that_is_named():
+def test_the_tolerance_of_an_assessment_is_the_one_that_is_named():
     layout = read_layout(PLATE)
-    verdict = judge(layout, plain_rig(), (0.6,))
-    assert verdict.word == "usable"
-    assert all((swap.told >= TOLD).all() for swap in verdict.swaps)
+    assessment = assess(layout, plain_rig(), (0.6,))
+    assert assessment.grade == "usable"
+    assert all((one.separation_sigmas >= SEPARATED_SIGMAS).all() for one in assessment.ambiguities)
 
 
 @pytest.mark.parametrize("command", [["check"], ["draw", "-o", "OUT"]])
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "parts"),
     [
         (None, ["no such file"]),
         ("", ["[[markers]]"]),
         ("name = ", ["not TOML"]),
         (disc("P1", TRIANGLE[0]), ["1 disc", "3 or more"]),
         ("".join(disc(f"P{i}", (i, 0, 0), radius=0.1) for i in range(3)), ["one line"]),
-        ("".join(disc(f"P{i}", (1, 2, 3)) for i in range(3)), ["same place"]),
+        ("".join(disc(f"P{i}", (1, 2, 3)) for i in range(3)), ["same position"]),
         ("".join(disc(f"P{i}", p, radius=0) for i, p in enumerate(TRIANGLE)), ["radius_mm"]),
         ("".join(disc(f"P{i}", np.array(p) * 1e3) for i, p in enumerate(TRIANGLE)), ["110 m", "mm?"]),
         ("".join(disc(f"P{i}", p, bright="1") for i, p in enumerate(TRIANGLE)), ["bright", "true or false"]),
@@ -252,12 +254,12 @@ def test_the_tolerance_of_a_verdict_is_the_one_that_is_named():
         ),
     ],
 )
-def test_a_wrong_body_file_is_one_clear_line(armsight, tmp_path, command, text, words):
+def test_a_wrong_body_file_is_one_clear_line(armsight, tmp_path, command, text, parts):
     path = tmp_path / "wrong.toml"
     if text is not None:
         path.write_text(text)
     arguments = [str(tmp_path / "out.pdf") if a == "OUT" else a for a in command]
-    refused(armsight("body", *arguments, path), "wrong.toml", *words)
+    refused(armsight("body", *arguments, path), "wrong.toml", *parts)
     assert not (tmp_path / "out.pdf").exists()
 
 
@@ -287,11 +289,11 @@ DPI = 300
 PX_PER_MM = DPI / 25.4
 
 
-def drawn(armsight, path, folder, *more):
+def pages_of(armsight, path, folder, *more):
     """Draw as PNG and return the pages, grey."""
-    said = armsight("body", "draw", path, "-o", folder / "drawn.png", "--dpi", DPI, "--json", *more)
+    said = armsight("body", "draw", path, "-o", folder / "pages.png", "--dpi", DPI, "--json", *more)
     assert said.code == 0, said.err
-    return [cv2.imread(name, cv2.IMREAD_GRAYSCALE) for name in facts(said)["files"]]
+    return [cv2.imread(name, cv2.IMREAD_GRAYSCALE) for name in answer(said)["files"]]
 
 
 def measured_disc(image, middle, radius_px, bright):
@@ -299,10 +301,10 @@ def measured_disc(image, middle, radius_px, bright):
     x, y = (round(float(c)) for c in middle)
     half = int(1.6 * radius_px)
     window = image[y - half : y + half + 1, x - half : x + half + 1].astype(float)
-    weight = window if bright else 255.0 - window
+    brightness = window if bright else 255.0 - window
     rows, columns = np.mgrid[y - half : y + half + 1, x - half : x + half + 1]
-    area = weight.sum() / 255.0
-    centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    area = brightness.sum() / 255.0
+    centre = np.array([(brightness * columns).sum(), (brightness * rows).sum()]) / brightness.sum()
     return centre / PX_PER_MM, np.sqrt(area / np.pi) / PX_PER_MM
 
 
@@ -319,7 +321,7 @@ def blobs(image, bright, radius_px):
 @pytest.mark.parametrize("paper", ["a4", "letter", "fit"])
 def test_discs_are_drawn_to_scale(armsight, body, tmp_path, bright, paper):
     path = body(((-50, -10, 0), (55, 0, 0), (5, 85, 0)), radius=6.35, bright=str(bright).lower())
-    (image,) = drawn(armsight, path, tmp_path, "--paper", paper)
+    (image,) = pages_of(armsight, path, tmp_path, "--paper", paper)
     if paper != "fit":
         assert image.shape[::-1] == tuple(int(mm * PX_PER_MM) for mm in body_draw.PAPERS[paper])
     radius_px = 6.35 * PX_PER_MM
@@ -332,7 +334,7 @@ def test_discs_are_drawn_to_scale(armsight, body, tmp_path, bright, paper):
 
 
 def test_the_bar_is_as_long_as_it_says(armsight, tmp_path):
-    (image,) = drawn(armsight, PLATE, tmp_path)
+    (image,) = pages_of(armsight, PLATE, tmp_path)
     low = image[int(0.9 * len(image)) :] < 128
     (row,) = np.unravel_index(low.sum(axis=1).argmax(), (len(low),))
     columns = np.flatnonzero(low[row])
@@ -348,7 +350,7 @@ def test_tags_and_boards_are_drawn_to_scale_and_found_where_the_body_has_them(ar
     path = body(more=TAG if spec == "tag" else BOARD.replace("SPEC", spec))
     if spec != "tag":
         path = body(((-80, 0, 0), (55, 0, 0)), more=BOARD.replace("SPEC", spec))
-    (image,) = drawn(armsight, path, tmp_path)
+    (image,) = pages_of(armsight, path, tmp_path)
     target = open_target(str(path))
     found = target.detect(cv2.GaussianBlur(image, (0, 0), 0.8))
     assert found.problem is None
@@ -381,7 +383,7 @@ def test_each_plane_has_its_page(armsight, body, tmp_path):
 def test_a_bright_disc_beside_a_tag_keeps_its_surround_off_it(armsight, body, tmp_path):
     path = body(((-29, 30, 0), (55, 0, 0), (0, 85, 0)), more=TAG.replace("[1, 1, 0]", "[1, 0, 0]"))
     said = armsight("body", "draw", path, "-o", tmp_path / "near.png", "--dpi", DPI)
-    # The tag reaches 15 mm and its white margin a cell of 30/8 mm: 29 - 18.75 - 8 mm are left.
+    # The tag reaches 15 mm and its white margin a square of 30/8 mm: 29 - 18.75 - 8 mm are left.
     assert "P1 has only 2.2 mm of dark surround" in said.err
     image = cv2.imread(str(tmp_path / "near.png"), cv2.IMREAD_GRAYSCALE)
     assert len(open_target(str(path)).detect(cv2.GaussianBlur(image, (0, 0), 0.8)).ids) == 4
@@ -419,4 +421,4 @@ def test_the_command_ends_with_its_code():
     arguments = [sys.executable, "-c", code, "body", "check", str(PLATE), "--json", "--distance", "5"]
     run = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert run.returncode == 1
-    assert json.loads(run.stdout)["verdict"] == "unusable"
+    assert json.loads(run.stdout)["assessment"] == "unusable"

@@ -1,10 +1,9 @@
-"""Is a body good before it is built: which discs may be taken for which, how well it fixes a pose, what to change.
+"""Assess a body before it is built: its markers, its predicted pose, and which discs may be taken for which.
 
-A layout and a rig go in, figures and findings in words come out; ``armsight body check`` prints them.
+In: a body's layout, a stereo rig and distances. Out: an ``Assessment``; ``armsight body check`` prints it.
 
-What is wrong or weak about a body's markers themselves: overlaps, sizes, what is in view, what its pose lacks.
-
-Which discs of a body may be taken for which, whether that is told apart, and what would separate them.
+From top to bottom: :func:`assess`; findings about the markers themselves (overlaps, visibility, sizes) and about the
+predicted pose; ambiguities of discs, whether they are separated, and what would separate them.
 """
 
 from __future__ import annotations
@@ -13,23 +12,90 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from armsight.app.body.finding import Finding, Grade, Outlook, Swap, Verdict, ambiguity_text, axis_text, pair_text
+from armsight.app.body.finding import (
+    Ambiguity,
+    Assessment,
+    Finding,
+    Grade,
+    Prediction,
+    ambiguity_text,
+    axis_text,
+    pair_text,
+)
 from armsight.data import Array, Ids
 from armsight.geometry.rotation import skew
 from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
 from armsight.vision.discs.predict import FACING, look_direction, pose_covariance, separation, view
-from armsight.vision.discs.symmetry import Relabeling, flat, other_side, relabelings
-from armsight.vision.markers.body_check import on_one_line
+from armsight.vision.discs.symmetry import Symmetry, flat, other_side, symmetries
+from armsight.vision.markers.body_file import collinear
 from armsight.vision.markers.body_layout import Layout
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter in an image that can be used, px.
 DISC_PX = (5.0, 60.0)
-#: The plain surround that a disc's edge wants, as a share of its radius.
+#: The plain surround that a disc's edge needs, as a share of its radius.
 SURROUND = 0.5
-#: A face turned away by less than this is seen by both cameras wherever it is in their images, cosine.
+#: A face whose cosine to the direction of sight is above this is seen by both cameras wherever it is in their images.
 _WELL_FACING = 0.7
+#: A wrong assignment is separated from the right one where it misses by this many standard deviations: the odds of a
+#: million that identification asks for take five, chance may favour the wrong one by three.
+SEPARATED_SIGMAS = 8.0
+#: More discs than this are not searched for ambiguities.
+SEARCHED = 25
+#: More discs than this are not searched with one of them hidden.
+SEARCHED_HIDDEN = 10
+#: Of more discs than this none is moved to find a better position.
+SEARCHED_MOVES = 6
+#: Symmetries that are examined, the closest first.
+_LOOKED_INTO = 60
+#: Moves of a disc that are tried, mm, the smallest first.
+_MOVES_MM = (2, 3, 4, 6, 8, 10, 15, 20, 30, 40)
+#: A body is flat whose discs are within this of one plane, m.
+_FLAT_M = 1e-4
+#: Standard deviation of a disc's position in its image, px: what the fit reaches on a clean print.
+IMAGE_SIGMA_PX = 0.02
+
+
+def assess(layout: Layout, rig: StereoRig, distances_m: tuple[float, ...]) -> Assessment:
+    """Assess a body by its layout.
+
+    Args:
+        layout: the body.
+        rig: the cameras that are to see it.
+        distances_m: where it is to be used.
+    """
+    predictions = tuple(predict_at(layout, rig, distance) for distance in distances_m)
+    findings = [*neighbours(layout), *in_view(layout, rig, predictions), *sizes(layout, rig, predictions)]
+    found: tuple[Ambiguity, ...] = ()
+    discs = layout.discs
+    if discs is not None and layout.disc_count > SEARCHED:
+        text = f"{layout.disc_count} discs: ambiguities are not searched above {SEARCHED}"
+        grade: Grade = "note" if layout.coded else "bad"
+        findings.append(Finding(grade, "ambiguous", text, "" if layout.coded else "take fewer discs, or add a tag"))
+    elif discs is not None and layout.disc_count >= 3 and not any(f.kind in ("view", "overlap") for f in findings):
+        found = tuple(s for seen in seen_together(discs) for s in find_symmetries(rig, discs, distances_m, seen))
+        findings += ambiguity_findings(rig, discs, distances_m, found, layout.coded)
+        findings += [] if layout.coded else single_camera(discs)
+    return Assessment(predictions, found, (*findings, *pose_findings(layout, predictions)))
+
+
+def sigma_px(rig: StereoRig) -> float:
+    """Return the standard deviation of a disc's position with a rig, px: the image's share and the rig's own."""
+    return float(np.hypot(IMAGE_SIGMA_PX, rig.sigma_px))
+
+
+def predict_at(layout: Layout, rig: StereoRig, distance_m: float) -> Prediction:
+    """Predict the pose of a body that faces the cameras at a distance."""
+    points = layout.body.points
+    seen = view(rig, points, layout.normals, distance_m)
+    cov = pose_covariance(rig, points, seen, sigma_px(rig))
+    diameters = np.array([np.nan, np.nan])
+    if layout.discs is not None:
+        d = 2 * layout.discs.radii_m * rig.left.intrinsics[0] / distance_m
+        diameters = np.array([d.min(), d.max()])
+    forward = seen.T_left_body[:3, :3].T @ seen.forward
+    return Prediction(distance_m, np.full((6, 6), np.nan) if cov is None else cov, forward, diameters)
 
 
 def neighbours(layout: Layout) -> list[Finding]:
@@ -37,13 +103,13 @@ def neighbours(layout: Layout) -> list[Finding]:
     if layout.discs is None:
         return []
     findings = []
-    places, normals, radii = layout.discs.body.points, layout.discs.normals, layout.discs.radii_m
+    points, normals, radii = layout.discs.body.points, layout.discs.normals, layout.discs.radii_m
     names = layout.discs.body.point_names
-    for i in range(len(places)):
-        for j in range(i + 1, len(places)):
+    for i in range(len(points)):
+        for j in range(i + 1, len(points)):
             if normals[i] @ normals[j] < FACING:
                 continue
-            gap = float(np.linalg.norm(places[i] - places[j]) - radii[i] - radii[j])
+            gap = float(np.linalg.norm(points[i] - points[j]) - radii[i] - radii[j])
             apart = f"move them at least {1e3 * (SURROUND * max(radii[i], radii[j]) - gap):.1f} mm further apart"
             if gap < 0:
                 text = f"{names[i]} and {names[j]} overlap by {-1e3 * gap:.1f} mm"
@@ -60,9 +126,11 @@ def _on_squares(layout: Layout, discs: DiscTarget) -> list[Finding]:
     for tag in () if layout.tags is None else layout.tags.tags:
         half = np.full(2, tag.size_m / 2)
         squares.append((tag.name, tag.T_body_tag, np.stack([-half, half])))
-    for placed in () if layout.boards is None else layout.boards.boards:
-        flat_points = placed.board.body.points[:, :2]
-        squares.append((placed.name, placed.T_body_board, np.stack([flat_points.min(axis=0), flat_points.max(axis=0)])))
+    for mounted in () if layout.boards is None else layout.boards.boards:
+        flat_points = mounted.board.body.points[:, :2]
+        squares.append(
+            (mounted.name, mounted.T_body_board, np.stack([flat_points.min(axis=0), flat_points.max(axis=0)]))
+        )
     findings = []
     for name, T, (low, high) in squares:
         p = (discs.body.points - T[:3, 3]) @ T[:3, :3]
@@ -79,16 +147,16 @@ def _on_squares(layout: Layout, discs: DiscTarget) -> list[Finding]:
     return findings
 
 
-def in_view(layout: Layout, rig: StereoRig, outlooks: tuple[Outlook, ...]) -> list[Finding]:
+def in_view(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
     """Say where too few points are seen together."""
     points, normals = layout.body.points, layout.normals
     cosine = normals @ look_direction(points, normals)
     facing, well = ~(cosine <= FACING), ~(cosine <= _WELL_FACING)
-    if facing.sum() < 3 or on_one_line(points[facing]):
+    if facing.sum() < 3 or collinear(points[facing]):
         text = f"at most {facing.sum()} points are seen together from any side, and 3 off one line are needed"
         return [Finding("bad", "view", text, "put 3 or more markers on one side")]
     findings = []
-    for one in outlooks:
+    for one in predictions:
         lost_rows = np.flatnonzero(well & ~view(rig, points, normals, one.distance_m).seen.all(axis=1))
         lost = [layout.body.point_names[i] for i in lost_rows]
         if lost:
@@ -102,28 +170,28 @@ def in_view(layout: Layout, rig: StereoRig, outlooks: tuple[Outlook, ...]) -> li
     return findings
 
 
-def sizes(layout: Layout, rig: StereoRig, outlooks: tuple[Outlook, ...]) -> list[Finding]:
+def sizes(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
     """Say which discs are too small or too large in the images."""
     if layout.discs is None:
         return []
     findings = []
     low, high = DISC_PX
-    for one in outlooks:
+    for one in predictions:
         per_px = 1e3 * one.distance_m / rig.left.intrinsics[0] / 2
-        wanted = f"radii of {low * per_px:.1f} to {high * per_px:.1f} mm suit {one.distance_m:g} m"
+        advice = f"radii of {low * per_px:.1f} to {high * per_px:.1f} mm suit {one.distance_m:g} m"
         if one.disc_px[0] < low:
             text = f"at {one.distance_m:g} m the smallest disc is {one.disc_px[0]:.1f} px across, below {low:g}"
-            findings.append(Finding("bad", "size", text, wanted))
+            findings.append(Finding("bad", "size", text, advice))
         if one.disc_px[1] > high:
             text = f"at {one.distance_m:g} m the largest disc is {one.disc_px[1]:.0f} px across, above {high:g}"
-            findings.append(Finding("bad", "size", text, wanted))
+            findings.append(Finding("bad", "size", text, advice))
     return findings
 
 
-def pose_findings(layout: Layout, outlooks: tuple[Outlook, ...]) -> list[Finding]:
-    """Say which turn is known least, what would help, and what else weakens the pose."""
+def pose_findings(layout: Layout, predictions: tuple[Prediction, ...]) -> list[Finding]:
+    """Say which rotation is known least, what would help, and what else weakens the pose."""
     findings = []
-    known = [one for one in outlooks if np.isfinite(one.cov).all()]
+    known = [one for one in predictions if np.isfinite(one.cov).all()]
     if known:
         one = known[len(known) // 2]
         values, vectors = np.linalg.eigh(one.cov[3:, 3:])
@@ -134,7 +202,7 @@ def pose_findings(layout: Layout, outlooks: tuple[Outlook, ...]) -> list[Finding
         alike = values[-1] < 1.3 * values[-2]
         about = "any axis across the direction of sight" if alike else axis_text(axis, one.forward, layout)
         text = (
-            f"known least: the turn about {about}, {sigma:.2g} deg at {one.distance_m:g} m: the markers reach "
+            f"known least: the rotation about {about}, {sigma:.2g} deg at {one.distance_m:g} m: the markers reach "
             f"{1e3 * reach:.0f} mm from that axis"
         )
         lopsided = values[-1] > 9 * values[-2]
@@ -145,10 +213,10 @@ def pose_findings(layout: Layout, outlooks: tuple[Outlook, ...]) -> list[Finding
         worse = float(np.sqrt(np.trace(one.cov[:3, :3]) / np.trace(at_middle[:3, :3])))
         if worse > 2:
             text = (
-                f"the body's origin lies {1e3 * lever:.0f} mm from the markers' middle, so turns move it: its position is "
-                f"known {worse:.1f} times worse than the middle's"
+                f"the body's origin lies {1e3 * lever:.0f} mm from the markers' middle, so rotations move it: its position "
+                f"is known {worse:.1f} times worse than the middle's"
             )
-            findings.append(Finding("weak", "origin", text, "put markers around the place that matters"))
+            findings.append(Finding("weak", "origin", text, "put markers around the point that matters"))
     if layout.disc_count == 3 and not layout.coded:
         text = "three discs leave nothing over: where one is hidden there is no pose"
         findings.append(Finding("note", "spare", text, "a fourth disc, best off the plane of the three"))
@@ -162,19 +230,8 @@ def _moved_origin(cov: Array, to: Array) -> Array:
     return np.asarray(A @ cov @ A.T)
 
 
-#: A wrong reading is told from the right one where it misses by so many standard deviations: the odds of a million that
-#: identification asks for take five, chance may favour the wrong one by three.
-TOLD = 8.0
-#: More discs than these are not searched for what may be taken for what; with one of them hidden; for a better place.
-SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 25, 10, 6
-#: Ways to take discs for others that are looked into, the closest first.
-_LOOKED_INTO = 60
-_MOVES_MM = (2, 3, 4, 6, 8, 10, 15, 20, 30, 40)
-_FLAT_M = 1e-4
-
-
-def told_sigma_px(rig: StereoRig, discs: DiscTarget, distance_m: float) -> float:
-    """Return how well identification takes a disc's place to be known, px: noise, and a body not made quite as drawn."""
+def identification_sigma_px(rig: StereoRig, discs: DiscTarget, distance_m: float) -> float:
+    """Return the sigma that identification assumes of a disc's position, px: noise, and a body not built exactly so."""
     made_m = UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(discs.body.points, axis=0)))
     return float(np.hypot(np.hypot(rig.sigma_px, UNMODELLED_PX), made_m * rig.left.intrinsics[0] / distance_m))
 
@@ -188,11 +245,11 @@ def alike(discs: DiscTarget) -> NDArray[np.bool_]:
 
 
 def search_tolerance_m(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...]) -> float:
-    """Return how much two lengths may differ and still be worth a closer look, m: by far more than is told apart."""
-    f, sigma = rig.left.intrinsics[0], told_sigma_px(rig, discs, max(distances_m))
+    """Return how much two lengths may differ and still be worth a closer look, m: by far more than is separated."""
+    f, sigma = rig.left.intrinsics[0], identification_sigma_px(rig, discs, max(distances_m))
     depth = np.sqrt(2) * sigma * max(distances_m) ** 2 / (f * rig.baseline_m)
     size = float(pdist(discs.body.points).max())
-    return float(min(TOLD * depth, 0.5 * size))
+    return float(min(SEPARATED_SIGMAS * depth, 0.5 * size))
 
 
 def seen_together(discs: DiscTarget) -> list[Ids]:
@@ -202,15 +259,15 @@ def seen_together(discs: DiscTarget) -> list[Ids]:
     found: dict[tuple[int, ...], Ids] = {}
     for direction in np.vstack([look_direction(points, normals), known]):
         rows = np.flatnonzero(~(normals @ direction <= FACING))
-        if len(rows) >= 3 and not on_one_line(points[rows]):
+        if len(rows) >= 3 and not collinear(points[rows]):
             found.setdefault(tuple(rows), rows)
     return list(found.values())
 
 
 def find_symmetries(
     rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], seen: Ids, hidden: int = -1
-) -> tuple[Swap, ...]:
-    """Find what may be taken for what where a distance is not told apart, or only the normals tell.
+) -> tuple[Ambiguity, ...]:
+    """Find what may be taken for what where no distance separates it, or only the normals do.
 
     Args:
         rig: the cameras.
@@ -221,88 +278,101 @@ def find_symmetries(
     """
     points, normals = discs.body.points, discs.normals
     far = max(distances_m)
-    sigma = told_sigma_px(rig, discs, far)
-    swaps = []
-    found = relabelings(points, alike(discs), seen, search_tolerance_m(rig, discs, distances_m))
+    sigma = identification_sigma_px(rig, discs, far)
+    ambiguities = []
+    found = symmetries(points, alike(discs), seen, search_tolerance_m(rig, discs, distances_m))
     for one in found[:_LOOKED_INTO]:
-        told = separation(rig, points, normals, one, far, sigma, hidden)
-        by_side = np.isinf(told) and _sideless(rig, points, one, far, sigma) < TOLD
-        if told < TOLD or by_side:
-            each = [separation(rig, points, normals, one, d, told_sigma_px(rig, discs, d), hidden) for d in distances_m]
-            swaps.append(Swap(one, np.array(each), flat(points[seen], _FLAT_M) and other_side(one, points)))
-    return tuple(swaps)
+        sigmas = separation(rig, points, normals, one, far, sigma, hidden)
+        by_side = np.isinf(sigmas) and _sideless(rig, points, one, far, sigma) < SEPARATED_SIGMAS
+        if sigmas < SEPARATED_SIGMAS or by_side:
+            each = [
+                separation(rig, points, normals, one, d, identification_sigma_px(rig, discs, d), hidden)
+                for d in distances_m
+            ]
+            ambiguities.append(Ambiguity(one, np.array(each), flat(points[seen], _FLAT_M) and other_side(one, points)))
+    return tuple(ambiguities)
 
 
-def _sideless(rig: StereoRig, points: Array, one: Relabeling, distance_m: float, sigma: float) -> float:
-    """Tell by how many standard deviations discs taken for each other miss if it were not known which way they look."""
+def _sideless(rig: StereoRig, points: Array, one: Symmetry, distance_m: float, sigma: float) -> float:
+    """Return by how many standard deviations discs taken for each other miss if their normals were unknown."""
     if set(one.seen.tolist()) != set(one.taken_for.tolist()):
         return np.inf
     count = len(one.seen)
-    here = Relabeling(np.arange(count), np.searchsorted(one.seen, one.taken_for), one.T, one.mirrored, one.off_m)
+    here = Symmetry(np.arange(count), np.searchsorted(one.seen, one.taken_for), one.T, one.mirrored, one.off_m)
     return separation(rig, points[one.seen], np.full((count, 3), np.nan), here, distance_m, sigma)
 
 
-def ambiguities(
-    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: tuple[Swap, ...], coded: bool
+def ambiguity_findings(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], ambiguities: tuple[Ambiguity, ...], coded: bool
 ) -> list[Finding]:
     """Say what may be taken for what, what settles it, and what would; ``coded``: whether a tag or a board is there too."""
     names, points = discs.body.point_names, discs.body.points
-    unsettled = [swap for swap in swaps if (swap.told < TOLD).any()]
-    findings = [_ambiguity(rig, discs, distances_m, swap, coded) for swap in unsettled[:4]]
+    unsettled = [one for one in ambiguities if (one.separation_sigmas < SEPARATED_SIGMAS).any()]
+    findings = [_ambiguity_finding(rig, discs, distances_m, one, coded) for one in unsettled[:4]]
     if len(unsettled) > 4:
-        findings.append(Finding("note", "swap", f"and {len(unsettled) - 4} more ways to take discs for others"))
+        findings.append(Finding("note", "ambiguity", f"and {len(unsettled) - 4} more ways to take discs for others"))
     if unsettled and not coded:
         findings.append(Finding("note", "change", "", _what_separates(rig, discs, distances_m, unsettled)))
-    for swap in swaps:
-        if swap.by_side:
-            text = f"{ambiguity_text(swap.relabeling, names)} would fit, but seen from behind: the normals settle it"
+    for one in ambiguities:
+        if one.by_side:
+            text = f"{ambiguity_text(one.symmetry, names)} would fit, but seen from behind: the normals settle it"
             findings.append(Finding("note", "behind", text))
     most = seen_together(discs)[0]
     if unsettled or coded or not 4 <= len(most) <= SEARCHED_HIDDEN:
         return findings
     for hidden in most:
         seen = most[most != hidden]
-        if on_one_line(points[seen]):
+        if collinear(points[seen]):
             findings.append(Finding("weak", "hidden", f"where {names[hidden]} is hidden, the others lie on one line"))
             continue
         lost = [
-            swap for swap in find_symmetries(rig, discs, distances_m, seen, int(hidden)) if (swap.told < TOLD).any()
+            one
+            for one in find_symmetries(rig, discs, distances_m, seen, int(hidden))
+            if (one.separation_sigmas < SEPARATED_SIGMAS).any()
         ]
         if lost:
-            what = ambiguity_text(lost[0].relabeling, names)
-            at = distances_m[int(np.flatnonzero(lost[0].told < TOLD)[0])]
+            what = ambiguity_text(lost[0].symmetry, names)
+            at = distances_m[int(np.flatnonzero(lost[0].separation_sigmas < SEPARATED_SIGMAS)[0])]
             text = f"where {names[hidden]} is hidden, {what} fits as well or nearly from {at:g} m on: it may be missed"
             findings.append(Finding("weak", "hidden", text))
     return findings
 
 
-def _ambiguity(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swap: Swap, coded: bool) -> Finding:
+def _ambiguity_finding(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], one: Ambiguity, coded: bool
+) -> Finding:
     """Say what one way to take discs for others means."""
-    what = ambiguity_text(swap.relabeling, discs.body.point_names) + (", seen from behind," if swap.behind else "")
-    if swap.relabeling.off_m < 1e-6:
+    what = ambiguity_text(one.symmetry, discs.body.point_names) + (", seen from behind," if one.behind else "")
+    if one.symmetry.off_m < 1e-6:
         text = f"{what} is the same body"
     else:
-        k = int(np.flatnonzero(swap.told < TOLD)[-1])
-        sigma = told_sigma_px(rig, discs, distances_m[k])
-        wanted = f"; {1e3 * swap.relabeling.off_m * TOLD / swap.told[k]:.1f} mm would do" if swap.told[k] > 0.1 else ""
-        lengths = pair_text(swap.relabeling, discs.body)
-        known = f"{sigma * swap.told[k] / TOLD:.2g} px (reckoned with: {sigma:.2g} px){wanted}"
-        only = f"told apart at {distances_m[k]:g} m only if a disc's place is known to {known}"
+        k = int(np.flatnonzero(one.separation_sigmas < SEPARATED_SIGMAS)[-1])
+        sigma = identification_sigma_px(rig, discs, distances_m[k])
+        enough = (
+            f"; {1e3 * one.symmetry.off_m * SEPARATED_SIGMAS / one.separation_sigmas[k]:.1f} mm would do"
+            if one.separation_sigmas[k] > 0.1
+            else ""
+        )
+        lengths = pair_text(one.symmetry, discs.body)
+        known = f"{sigma * one.separation_sigmas[k] / SEPARATED_SIGMAS:.2g} px (assumed: {sigma:.2g} px){enough}"
+        only = f"distinguished at {distances_m[k]:g} m only if a disc's position is known to {known}"
         text = f"{what.rstrip(',')}: {lengths}, {only}"
     if coded:
-        return Finding("note", "swap", f"{text}; a tag or a board in view settles it")
+        return Finding("note", "ambiguity", f"{text}; a tag or a board in view settles it")
     return Finding("bad", "ambiguous", text)
 
 
-def _what_separates(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], swaps: list[Swap]) -> str:
-    """Say how the discs can be told apart: by normals, or by moving one of them as little as will do."""
+def _what_separates(
+    rig: StereoRig, discs: DiscTarget, distances_m: tuple[float, ...], ambiguities: list[Ambiguity]
+) -> str:
+    """Say how the discs can be distinguished: by normals, or by moving one of them as little as will do."""
     points, names = discs.body.points, discs.body.point_names
     unknown = np.isnan(discs.normals)
     normals = np.where(unknown, look_direction(points, discs.normals), discs.normals)
     given = "give every disc its normal and " if unknown.any() else ""
     if unknown.any() and _separate(rig, discs, max(distances_m), points, normals):
-        return "give every disc its normal: then its side tells which is which"
-    pairs = [(int(i), int(j)) for s in swaps for i, j in zip(s.relabeling.seen, s.relabeling.taken_for, strict=True)]
+        return "give every disc its normal: then its side distinguishes them"
+    pairs = [(int(i), int(j)) for s in ambiguities for i, j in zip(s.symmetry.seen, s.symmetry.taken_for, strict=True)]
     moved = sorted({i for i, j in pairs if i != j})
     for step in _MOVES_MM if len(points) <= SEARCHED_MOVES else ():
         for i in moved:
@@ -314,75 +384,30 @@ def _what_separates(rig: StereoRig, discs: DiscTarget, distances_m: tuple[float,
                 if _separate(rig, discs, max(distances_m), trial, normals):
                     axis = f"{'+' if direction.sum() > 0 else '-'}{'xyz'[int(np.abs(direction).argmax())]}"
                     return f"{given}move {names[i]} by {step} mm along {axis}: then the distances differ enough"
-    return f"{given}place the discs so that no two distances are alike, or add a tag"
+    return f"{given}arrange the discs so that no two distances are alike, or add a tag"
 
 
 def _separate(rig: StereoRig, discs: DiscTarget, distance_m: float, points: Array, normals: Array) -> bool:
-    """Whether no disc may be taken for another at a distance, with a margin of a tenth, were they at other places."""
+    """Whether no disc may be taken for another at a distance, with a margin of a tenth, were they at other positions."""
     if float(pdist(points).min()) < (2 + SURROUND) * float(discs.radii_m.max()):
         return False
-    tolerance, sigma = search_tolerance_m(rig, discs, (distance_m,)), told_sigma_px(rig, discs, distance_m)
+    tolerance, sigma = search_tolerance_m(rig, discs, (distance_m,)), identification_sigma_px(rig, discs, distance_m)
     return all(
-        separation(rig, points, normals, one, distance_m, sigma) >= 1.1 * TOLD
+        separation(rig, points, normals, one, distance_m, sigma) >= 1.1 * SEPARATED_SIGMAS
         for seen in seen_together(discs)
-        for one in relabelings(points, alike(discs), seen, tolerance)
+        for one in symmetries(points, alike(discs), seen, tolerance)
     )
 
 
 def single_camera(discs: DiscTarget) -> list[Finding]:
-    """Say what one camera alone cannot tell."""
+    """Say what one camera alone cannot distinguish."""
     points = discs.body.points
     if flat(points, _FLAT_M):
-        text = "a flat body has two poses that one camera alone hardly tells apart; two cameras do"
+        text = "a flat body has two poses that one camera alone hardly distinguishes; two cameras do"
         return [Finding("note", "single", text)]
     everything = np.arange(len(points))
-    mirrored = relabelings(points, alike(discs), everything, 1e-3, mirrored=True)
+    mirrored = symmetries(points, alike(discs), everything, 1e-3, mirrored=True)
     if not mirrored:
         return []
     what = ambiguity_text(mirrored[0], discs.body.point_names)
     return [Finding("note", "mirror", f"{what} is its mirror image: harmless to two cameras, not to one alone")]
-
-
-#: Standard deviation of a disc's place in its image, px: what the fit reaches on a clean print.
-IMAGE_SIGMA_PX = 0.02
-
-
-def judge(layout: Layout, rig: StereoRig, distances_m: tuple[float, ...]) -> Verdict:
-    """Judge a body by its drawing.
-
-    Args:
-        layout: the body.
-        rig: the cameras that are to see it.
-        distances_m: where it is to be used.
-    """
-    outlooks = tuple(outlook(layout, rig, distance) for distance in distances_m)
-    findings = [*neighbours(layout), *in_view(layout, rig, outlooks), *sizes(layout, rig, outlooks)]
-    swaps: tuple[Swap, ...] = ()
-    discs = layout.discs
-    if discs is not None and layout.disc_count > SEARCHED:
-        text = f"{layout.disc_count} discs: which may be taken for which is not looked into above {SEARCHED}"
-        grade: Grade = "note" if layout.coded else "bad"
-        findings.append(Finding(grade, "ambiguous", text, "" if layout.coded else "take fewer discs, or add a tag"))
-    elif discs is not None and layout.disc_count >= 3 and not any(f.kind in ("view", "overlap") for f in findings):
-        swaps = tuple(s for seen in seen_together(discs) for s in find_symmetries(rig, discs, distances_m, seen))
-        findings += ambiguities(rig, discs, distances_m, swaps, layout.coded)
-        findings += [] if layout.coded else single_camera(discs)
-    return Verdict(outlooks, swaps, (*findings, *pose_findings(layout, outlooks)))
-
-
-def sigma_px(rig: StereoRig) -> float:
-    """Return the standard deviation of a disc's place with a rig, px: the image's share and the rig's own."""
-    return float(np.hypot(IMAGE_SIGMA_PX, rig.sigma_px))
-
-
-def outlook(layout: Layout, rig: StereoRig, distance_m: float) -> Outlook:
-    """Predict how well a body that faces the cameras is known at a distance."""
-    points = layout.body.points
-    seen = view(rig, points, layout.normals, distance_m)
-    cov = pose_covariance(rig, points, seen, sigma_px(rig))
-    diameters = np.array([np.nan, np.nan])
-    if layout.discs is not None:
-        d = 2 * layout.discs.radii_m * rig.left.intrinsics[0] / distance_m
-        diameters = np.array([d.min(), d.max()])
-    forward = seen.T_left_body[:3, :3].T @ seen.forward
-    return Outlook(distance_m, np.full((6, 6), np.nan) if cov is None else cov, forward, diameters)

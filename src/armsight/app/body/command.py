@@ -1,4 +1,4 @@
-"""``armsight body``: is a body file's geometry good, and its markers on paper."""
+"""``armsight body``: assess a body file's geometry, and draw its markers to scale."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
-from armsight.app.body.check import TOLD, judge, sigma_px
+from armsight.app.body.check import SEPARATED_SIGMAS, assess, sigma_px
 from armsight.app.body.draw import PAPERS, draw_body
-from armsight.app.body.finding import Outlook, Verdict, ambiguity_text
+from armsight.app.body.finding import Assessment, Prediction, ambiguity_text
 from armsight.errors import InputError
 from armsight.files import check_writable
 from armsight.vision.discs.predict import plain_rig
@@ -26,7 +26,7 @@ _DISTANCES = 15
 def command() -> None:
     """Check a body file's geometry before the body is built, and print its markers to scale.
 
-    The form of a body file: docs/targets.md.
+    The form of a body file: docs/howto/targets.md.
     """
 
 
@@ -44,7 +44,7 @@ def command() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.pass_context
 def check(context: click.Context, path: str, rig_path: str | None, distances: tuple[float, ...], as_json: bool) -> None:
-    """Say whether a body can be told from its discs, how well it fixes a pose, and what to change.
+    """Assess whether a body is identified by its discs, how well its pose is known, and what to change.
 
     Exit code 0: usable at every distance; 1: ambiguous or unusable at one of them; 2: no body file.
     """
@@ -53,13 +53,13 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
             raise InputError(f"--distance {distance:g}: expected metres, between 0.01 and 100")
     layout = read_layout(path)
     rig = plain_rig() if rig_path is None else StereoRig.load(rig_path)
-    verdict = judge(layout, rig, tuple(sorted(set(distances))) or (0.6, 0.8, 1.2))
+    assessment = assess(layout, rig, tuple(sorted(set(distances))) or (0.6, 0.8, 1.2))
     cameras = _cameras(rig, rig_path)
     if as_json:
-        click.echo(json.dumps(_facts(path, layout, rig, cameras, verdict), allow_nan=False))
+        click.echo(json.dumps(_assessment_json(path, layout, rig, cameras, assessment), allow_nan=False))
     else:
-        click.echo("\n".join(_lines(path, layout, cameras, verdict)))
-    context.exit(0 if verdict.word == "usable" else 1)
+        click.echo("\n".join(_lines(path, layout, cameras, assessment)))
+    context.exit(0 if assessment.grade == "usable" else 1)
 
 
 @command.command()
@@ -74,26 +74,26 @@ def draw(path: str, output: str, paper: str, dpi: int, as_json: bool) -> None:
     One page for each plane of the body; .svg and .png have a file for each.
     """
     check_writable(output, apart_from=(path,))
-    drawn = draw_body(path, output, paper=paper.lower(), dpi=dpi)
-    for note in drawn.notes:
+    drawing = draw_body(path, output, paper=paper.lower(), dpi=dpi)
+    for note in drawing.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
-        pages = [{"normal": page.normal.tolist(), "markers": page.names} for page in drawn.pages]
-        click.echo(json.dumps({"body": path, "files": drawn.files, "paper": paper.lower(), "pages": pages}))
+        pages = [{"normal": page.normal.tolist(), "markers": page.names} for page in drawing.pages]
+        click.echo(json.dumps({"body": path, "files": drawing.files, "paper": paper.lower(), "pages": pages}))
         return
-    for number, page in enumerate(drawn.pages, start=1):
+    for number, page in enumerate(drawing.pages, start=1):
         click.echo(f"page {number}: {', '.join(page.names)}")
-    click.echo(f"written to {', '.join(drawn.files)}; print at 100%, not fitted to the page, and measure the bar")
+    click.echo(f"written to {', '.join(drawing.files)}; print at 100%, not fitted to the page, and measure the bar")
 
 
 def _cameras(rig: StereoRig, path: str | None) -> str:
-    """Say which cameras the figures are for."""
+    """Say which cameras the numbers are for."""
     (width, height), f = rig.left.image_size_px, rig.left.intrinsics[0]
     name = "two perfect cameras" if path is None else path
     uncertain = "" if path is None or rig.cov.any() else ", its calibration taken as perfect"
     return (
-        f"{name}, {width}x{height} px, f {f:.0f} px, {rig.baseline_m:.3g} m apart, places known to {sigma_px(rig):.2g} px"
-        f"{uncertain}"
+        f"{name}, {width}x{height} px, f {f:.0f} px, {rig.baseline_m:.3g} m apart, "
+        f"positions known to {sigma_px(rig):.2g} px{uncertain}"
     )
 
 
@@ -116,8 +116,8 @@ def _closest(distances: list[tuple[str, str, float]]) -> list[str]:
     ]
 
 
-def _lines(path: str, layout: Layout, cameras: str, verdict: Verdict) -> list[str]:
-    """Return the verdict as lines for people: mm, degrees, px."""
+def _lines(path: str, layout: Layout, cameras: str, assessment: Assessment) -> list[str]:
+    """Return the assessment as lines of text: mm, degrees, px."""
     count = {
         "disc": layout.disc_count,
         "tag": 0 if layout.tags is None else len(layout.tags.tags),
@@ -125,41 +125,44 @@ def _lines(path: str, layout: Layout, cameras: str, verdict: Verdict) -> list[st
     }
     kinds = ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in count.items() if n)
     size = np.ptp(layout.body.points, axis=0) * 1e3
-    lines = [f"{path}: {layout.name}: {kinds}; {' x '.join(f'{s:.1f}' for s in size)} mm", f"verdict: {verdict.word}"]
-    lines += [f"unique: {_unique(layout, verdict)}"]
+    lines = [
+        f"{path}: {layout.name}: {kinds}; {' x '.join(f'{s:.1f}' for s in size)} mm",
+        f"assessment: {assessment.grade}",
+    ]
+    lines += [f"unique: {_unique(layout, assessment)}"]
     if distances := _distances(layout):
         if len(distances) <= _DISTANCES:
             lines.append("distances, mm: " + ", ".join(f"{a}-{b} {1e3 * d:.2f}" for a, b, d in distances))
         if len(distances) > 1:
             lines.append("closest: " + "; ".join(_closest(distances)))
-    lines += ["", f"expected sigma: {cameras}; the body faces them", *_table(verdict), ""]
-    word = {"bad": "bad ", "weak": "weak", "note": "note"}
-    for finding in sorted(verdict.findings, key=lambda f: list(word).index(f.grade)):
+    lines += ["", f"expected sigma: {cameras}; the body faces them", *_table(assessment), ""]
+    grades = {"bad": "bad ", "weak": "weak", "note": "note"}
+    for finding in sorted(assessment.findings, key=lambda f: list(grades).index(f.grade)):
         if finding.text:
-            lines.append(f"{word[finding.grade]}  {finding.text}")
+            lines.append(f"{grades[finding.grade]}  {finding.text}")
         if finding.change:
             lines.append(f"      change: {finding.change}")
     return lines
 
 
-def _unique(layout: Layout, verdict: Verdict) -> str:
-    """Say whether the body can be told, in one line."""
+def _unique(layout: Layout, assessment: Assessment) -> str:
+    """Say whether the body can be identified, in one line."""
     if layout.coded:
         return "yes, where a tag or a board is in view"
-    if any(f.grade == "bad" and f.kind == "ambiguous" for f in verdict.findings):
+    if any(f.grade == "bad" and f.kind == "ambiguous" for f in assessment.findings):
         return "no"
-    unseen = all(np.isnan(one.cov).any() for one in verdict.outlooks)
-    if unseen or any(f.kind in ("view", "overlap") for f in verdict.findings):
-        return "not judged"
-    if any(f.kind == "behind" for f in verdict.findings):
+    unseen = all(np.isnan(one.cov).any() for one in assessment.predictions)
+    if unseen or any(f.kind in ("view", "overlap") for f in assessment.findings):
+        return "not assessed"
+    if any(f.kind == "behind" for f in assessment.findings):
         return "yes, by distances and normals"
     return "yes, by distances"
 
 
-def _table(verdict: Verdict) -> list[str]:
+def _table(assessment: Assessment) -> list[str]:
     """Return the expected sigma at each distance."""
     rows = [("distance", "across", "depth", "tilt", "about sight", "disc across")]
-    for one in verdict.outlooks:
+    for one in assessment.predictions:
         if np.isnan(one.cov).any():
             rows.append((f"{one.distance_m:g} m", "no pose", "", "", "", _pixels(one)))
             continue
@@ -176,11 +179,11 @@ def _table(verdict: Verdict) -> list[str]:
         )
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return [
-        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        "  " + "  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
 
 
-def _pixels(one: Outlook) -> str:
+def _pixels(one: Prediction) -> str:
     """Return the discs' diameters in the image."""
     low, high = one.disc_px
     if np.isnan(low):
@@ -188,41 +191,41 @@ def _pixels(one: Outlook) -> str:
     return f"{low:.1f} px" if high - low < 0.05 else f"{low:.1f} to {high:.1f} px"
 
 
-def _facts(path: str, layout: Layout, rig: StereoRig, cameras: str, verdict: Verdict) -> dict[str, Any]:
-    """Return the verdict as one JSON object."""
-    swaps = [
+def _assessment_json(path: str, layout: Layout, rig: StereoRig, cameras: str, assessment: Assessment) -> dict[str, Any]:
+    """Return the assessment as JSON has it."""
+    ambiguities = [
         {
-            "seen": [layout.body.point_names[i] for i in swap.relabeling.seen],
-            "taken_for": [layout.body.point_names[i] for i in swap.relabeling.taken_for],
-            "words": ambiguity_text(swap.relabeling, layout.body.point_names),
-            "off_mm": 1e3 * swap.relabeling.off_m,
-            "from_behind": swap.behind,
-            "settled_by_normals": swap.by_side,
-            "separation_sigmas": [_number(sigmas) for sigmas in swap.told],
-            "distinguishable": not bool((swap.told < TOLD).any()),
+            "seen": [layout.body.point_names[i] for i in one.symmetry.seen],
+            "taken_for": [layout.body.point_names[i] for i in one.symmetry.taken_for],
+            "description": ambiguity_text(one.symmetry, layout.body.point_names),
+            "off_mm": 1e3 * one.symmetry.off_m,
+            "from_behind": one.behind,
+            "settled_by_normals": one.by_side,
+            "separation_sigmas": [_number(sigmas) for sigmas in one.separation_sigmas],
+            "distinguishable": not bool((one.separation_sigmas < SEPARATED_SIGMAS).any()),
         }
-        for swap in verdict.swaps
+        for one in assessment.ambiguities
     ]
     return {
         "body": path,
         "name": layout.name,
-        "verdict": verdict.word,
+        "assessment": assessment.grade,
         "cameras": cameras,
         "sigma_px": sigma_px(rig),
         "points": len(layout.body.points),
         "discs": layout.disc_count,
         "coded": layout.coded,
         "distances_mm": [{"from": a, "to": b, "mm": 1e3 * d} for a, b, d in _distances(layout)],
-        "swaps": swaps,
-        "expected": [_expected(one) for one in verdict.outlooks],
+        "ambiguities": ambiguities,
+        "expected": [_expected(one) for one in assessment.predictions],
         "findings": [
             {"grade": f.grade, "kind": f.kind, "text": f.text or None, "change": f.change or None}
-            for f in verdict.findings
+            for f in assessment.findings
         ],
     }
 
 
-def _expected(one: Outlook) -> dict[str, Any]:
+def _expected(one: Prediction) -> dict[str, Any]:
     """Return the expected sigma at a distance as JSON."""
     (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
     return {

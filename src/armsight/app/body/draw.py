@@ -1,11 +1,10 @@
 """A body's markers on paper, to scale: ``armsight body draw``.
 
-A page is a figure of the paper's size whose only axes cover it and count millimetres from its upper left corner.
+In: a body's layout. Out: a page for each plane of the body, seen from outside, as PDF, SVG or PNG.
 
-Where a body's markers lie on paper: one page for each plane, millimetres, seen from outside.
-
-A page's frame has the body's origin projected to (0, 0), x to the right and y down; whole and to scale, not yet put on
-paper.
+First the markers are sorted by plane. The coordinates of a ``Page`` are millimetres, x to the right and y down, the body's
+origin projected to (0, 0). Then each page is put on paper: a figure of the paper's size whose only axes cover it and count
+millimetres from its upper left corner.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class Mark(Record):
         dark: whether its discs are dark; then they are printed, else their surround is.
         reach: of the dark surround of a bright disc from its middle, mm; 0 for others.
         square: whether that surround is a square, else a circle.
-        polygons: (N, 4, 2) its dark cells.
+        polygons: (N, 4, 2) its dark squares.
         box: (2, 2) low and high corner of what it needs for itself, margins included.
     """
 
@@ -98,8 +97,8 @@ class Page(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed(Record):
-    """A marker before it is on a page: its name, middle (3,) and normal (3,), and how it is marked with a page's axes."""
+class _PosedMarker(Record):
+    """A marker before it is on a page: its name, middle (3,) and normal (3,), and the function that marks it on a page."""
 
     name: str
     middle: Array
@@ -118,12 +117,12 @@ def pages(path: str | Path, layout: Layout) -> tuple[tuple[Page, ...], list[str]
         The pages, and what should be said about them.
 
     Raises:
-        InputError: a disc has no normal and lies in no plane that others tell.
+        InputError: a disc has no normal and lies in no plane that others define.
     """
     notes: list[str] = []
-    placed = [*_patterns(layout), *_discs(path, layout, notes)]
-    groups: list[list[_Placed]] = []
-    for one in placed:
+    markers = [*_patterns(layout), *_discs(path, layout, notes)]
+    groups: list[list[_PosedMarker]] = []
+    for one in markers:
         for group in groups:
             level = abs(1e3 * group[0].normal @ (one.middle - group[0].middle))
             if group[0].normal @ one.normal > _PARALLEL and level < _LEVEL_MM:
@@ -146,7 +145,7 @@ def _flat(axes: Array, p_body: Array) -> Array:
     return np.asarray(1e3 * p_body @ axes[:, :2])
 
 
-def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_Placed]:
+def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_PosedMarker]:
     """Return the discs; one without a normal takes that of the plane it lies in."""
     discs = layout.discs
     if discs is None:
@@ -160,7 +159,7 @@ def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_Placed]:
             f"({', '.join(f'{c + 0.0:.2g}' for c in normals[unknown][0])}), the other side is the mirror image"
         )
     return [
-        _Placed(name, p, normal, _disc(name, p, 1e3 * radius, bool(bright)))
+        _PosedMarker(name, p, normal, _disc(name, p, 1e3 * radius, bool(bright)))
         for name, p, normal, radius, bright in zip(
             discs.body.point_names, discs.body.points, normals, discs.radii_m, discs.bright, strict=True
         )
@@ -190,39 +189,39 @@ def _disc(name: str, p: Array, radius: float, bright: bool) -> Callable[[Array],
     return mark
 
 
-def _patterns(layout: Layout) -> list[_Placed]:
+def _patterns(layout: Layout) -> list[_PosedMarker]:
     """Return tags and boards."""
-    placed = []
+    markers = []
     for one in () if layout.tags is None else layout.tags.tags:
         pattern = tag(cells(one.family, one.identity) > 0, one.size_m, black=0.0, white=1.0)
         T = one.T_body_tag
-        placed.append(_Placed(one.name, T[:3, 3], -T[:3, 2], _pattern(one.name, pattern, T)))
+        markers.append(_PosedMarker(one.name, T[:3, 3], -T[:3, 2], _pattern(one.name, pattern, T)))
     for two in () if layout.boards is None else layout.boards.boards:
         pattern = BOARD_PATTERNS[type(two.board)](two.board)
         T = two.T_body_board
         mark = _pattern(two.name, pattern, T @ pattern.T_body_pattern)
-        placed.append(_Placed(two.name, T[:3, 3], two.normal, mark))
-    return placed
+        markers.append(_PosedMarker(two.name, T[:3, 3], two.normal, mark))
+    return markers
 
 
 def _pattern(name: str, pattern: Pattern, T_body_pattern: Array) -> Callable[[Array], Mark]:
-    """Return how a pattern is marked on a page: runs of dark cells as quadrangles."""
+    """Return how a pattern is marked on a page: runs of dark squares as quadrangles."""
 
     def mark(axes: Array) -> Mark:
-        def place(xy: Array) -> Array:
+        def on_page(xy: Array) -> Array:
             return _flat(axes, transform(T_body_pattern, np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1)))
 
         xs, ys = pattern.x_edges, pattern.y_edges
-        outer = place(np.array([[xs[0], ys[0]], [xs[-1], ys[0]], [xs[-1], ys[-1]], [xs[0], ys[-1]]]))
-        circles = np.column_stack([place(pattern.discs[:, :2]), 1e3 * pattern.discs[:, 2]])
+        outer = on_page(np.array([[xs[0], ys[0]], [xs[-1], ys[0]], [xs[-1], ys[-1]], [xs[0], ys[-1]]]))
+        circles = np.column_stack([on_page(pattern.discs[:, :2]), 1e3 * pattern.discs[:, 2]])
         quads = np.array(_runs(pattern)).reshape(-1, 4, 2)
-        return Mark(name, circles, True, 0.0, False, place(quads), np.stack([outer.min(axis=0), outer.max(axis=0)]))
+        return Mark(name, circles, True, 0.0, False, on_page(quads), np.stack([outer.min(axis=0), outer.max(axis=0)]))
 
     return mark
 
 
 def _runs(pattern: Pattern) -> list[list[tuple[float, float]]]:
-    """Return the dark cells of a pattern, those side by side as one, as corners in its own frame."""
+    """Return the dark squares of a pattern, those side by side as one, as corners in its own frame."""
     quads = []
     xs, ys = pattern.x_edges.tolist(), pattern.y_edges.tolist()
     dark = (pattern.values < 0.5) & (pattern.values != CLEAR)
@@ -277,8 +276,8 @@ _PLAIN: dict[str, Any] = {"linewidth": 0.0, "antialiased": True, "snap": False}
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn(Record):
-    """What was drawn.
+class Drawing(Record):
+    """A drawing that was written.
 
     Attributes:
         files: the files written.
@@ -291,13 +290,13 @@ class Drawn(Record):
     notes: tuple[str, ...]
 
 
-def draw_body(path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600) -> Drawn:
+def draw_body(path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600) -> Drawing:
     """Draw a body's markers to scale.
 
     Args:
         path: the TOML body file.
         output: .pdf (a page for each plane), .svg or .png (a file for each, numbered from the second on).
-        paper: a key of PAPERS; turned where that fits better.
+        paper: a key of PAPERS; rotated where that fits better.
         dpi: pixels an inch of a .png.
 
     Raises:
@@ -322,7 +321,7 @@ def draw_body(path: str | Path, output: str | Path, *, paper: str = "a4", dpi: i
             head = plain(layout.name) + (f", plane {number} of {len(sheets)}" if len(sheets) > 1 else "")
             figures.append(_figure(page, size, head, foot))
         files = _SAVERS[suffix](figures, Path(output), dpi)
-    return Drawn(tuple(str(file) for file in files), sheets, tuple(notes))
+    return Drawing(tuple(str(file) for file in files), sheets, tuple(notes))
 
 
 def _content(page: Page) -> Array:
@@ -336,14 +335,14 @@ def _content(page: Page) -> Array:
 
 
 def _paper(path: str | Path, page: Page, paper: str) -> tuple[float, float]:
-    """Return the width and height of the paper, upright or turned, mm."""
+    """Return the width and height of the paper, upright or rotated, mm."""
     low, high = _content(page)
     needed = high - low + [2 * _EDGE, 2 * _EDGE + _FOOT]
     needed[0] = max(needed[0], _FOOT_WIDTH + 2 * _EDGE)
     if paper == "fit":
         return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
-    larger = [name for name, size in PAPERS.items() if name != "fit" and _turned(size, needed) is not None]
-    size = _turned(PAPERS[paper], needed)
+    larger = [name for name, size in PAPERS.items() if name != "fit" and _rotated(size, needed) is not None]
+    size = _rotated(PAPERS[paper], needed)
     if size is None:
         hint = f"--paper {larger[0]}, or " if larger else ""
         raise InputError(
@@ -354,8 +353,8 @@ def _paper(path: str | Path, page: Page, paper: str) -> tuple[float, float]:
     return size
 
 
-def _turned(size: tuple[float, float], needed: Array) -> tuple[float, float] | None:
-    """Return a paper's size upright or, where that does not fit, turned; None where neither does."""
+def _rotated(size: tuple[float, float], needed: Array) -> tuple[float, float] | None:
+    """Return a paper's size upright or, where that does not fit, rotated; None where neither does."""
     return next((s for s in (size, size[::-1]) if needed[0] <= s[0] and needed[1] <= s[1]), None)
 
 
@@ -416,7 +415,7 @@ def _surround(axes: Axes, mark: Mark, shift: Array) -> None:
 
 
 def _print(axes: Axes, mark: Mark, shift: Array) -> None:
-    """Draw a marker: its discs, and its dark cells as one path, so that no seam shows between them."""
+    """Draw a marker: its discs, and its dark squares as one path, so that no seam shows between them."""
     from matplotlib.patches import Circle, PathPatch
     from matplotlib.path import Path as Outline
 
@@ -436,8 +435,8 @@ def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:
     name = plain(mark.name, 24)
     half = np.array([0.3 * _TEXT * len(name), 0.6 * _TEXT])
     middle, beyond = (low + high) / 2, (high - low) / 2 + half + 1.0
-    places = [middle + beyond * step for step in np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])]
-    at = next((p for p in places if _free(np.array([p - half, p + half]), taken)), places[0])
+    positions = [middle + beyond * step for step in np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])]
+    at = next((p for p in positions if _free(np.array([p - half, p + half]), taken)), positions[0])
     taken.append(np.array([at - half, at + half]))
     _write(axes, at, name, _TEXT, ha="center", va="center")
 
@@ -466,9 +465,9 @@ def _arrows(axes: Axes, page: Page, at: Array, title: str) -> None:
             _write(axes, at + (_ARROW + 2.5) * along, letter, _SMALL, ha="center", va="center")
         if abs(on_page[2, k]) > 0.2:
             away.append(f"{letter} {'into' if on_page[2, k] > 0 else 'out of'} the page")
-    words = ", ".join([*([title] if title else []), *away])
+    note = ", ".join([*([title] if title else []), *away])
     beside = np.array([-_ARROW - 4.5, 0.0]) if title else np.array([-2.0, -1.5])
-    _write(axes, at + beside, words, _SMALL, ha="right" if title else "left", va="center" if title else "bottom")
+    _write(axes, at + beside, note, _SMALL, ha="right" if title else "left", va="center" if title else "bottom")
 
 
 def _footer(axes: Axes, height: float, lines: list[str]) -> None:

@@ -1,7 +1,4 @@
-"""What is said of a body before it is built, as records.
-
-Words for what is said of a body: swaps of discs, distances, axes.
-"""
+"""The records of a body's assessment: findings, predictions, ambiguities; the text for ambiguities, distances, axes."""
 
 from __future__ import annotations
 
@@ -12,26 +9,26 @@ from typing import Literal
 import numpy as np
 
 from armsight.data import Array, Body, Record
-from armsight.vision.discs.symmetry import Relabeling
+from armsight.vision.discs.symmetry import Symmetry
 from armsight.vision.markers.body_layout import Layout
 
-#: Within this angle a direction is called by the name of an axis, cosine.
+#: Within this angle a direction is given the name of an axis, cosine.
 _ALONG = float(np.cos(np.radians(8.0)))
 
 
-def ambiguity_text(relabeling: Relabeling, names: Sequence[str]) -> str:
-    """Say which discs are taken for which: "P1 and P2 exchanged", "P1 P2 P3 taken for P2 P3 P1"."""
-    pairs = [(i, j) for i, j in zip(relabeling.seen.tolist(), relabeling.taken_for.tolist(), strict=True) if i != j]
+def ambiguity_text(symmetry: Symmetry, names: Sequence[str]) -> str:
+    """Return which discs are taken for which: "P1 and P2 exchanged", "P1 P2 P3 taken for P2 P3 P1"."""
+    pairs = [(i, j) for i, j in zip(symmetry.seen.tolist(), symmetry.taken_for.tolist(), strict=True) if i != j]
     if len(pairs) == 2 and pairs[0] == pairs[1][::-1]:
         return f"{names[pairs[0][0]]} and {names[pairs[0][1]]} exchanged"
     shown, more = pairs[:6], " ..." if len(pairs) > 6 else ""
     return f"{' '.join(names[i] for i, _ in shown)}{more} taken for {' '.join(names[j] for _, j in shown)}{more}"
 
 
-def pair_text(relabeling: Relabeling, body: Body) -> str:
-    """Say which distance tells a swap best: "P1-P3 is 63.20 mm and P2-P3 63.60 mm, 0.40 mm apart"."""
+def pair_text(symmetry: Symmetry, body: Body) -> str:
+    """Return which distance separates an ambiguity best: "P1-P3 is 63.20 mm and P2-P3 63.60 mm, 0.40 mm apart"."""
     p = body.points
-    seen, taken = relabeling.seen, relabeling.taken_for
+    seen, taken = symmetry.seen, symmetry.taken_for
     own = np.linalg.norm(p[seen][:, None] - p[seen][None], axis=2)
     other = np.linalg.norm(p[taken][:, None] - p[taken][None], axis=2)
     a, b = np.unravel_index(int(np.abs(own - other).argmax()), own.shape)
@@ -45,22 +42,22 @@ def pair_text(relabeling: Relabeling, body: Body) -> str:
 
 def axis_text(axis: Array, forward: Array, layout: Layout) -> str:
     """Name a direction (3,) of the body: one of its axes, the line of two markers, or numbers."""
-    words = []
+    found = []
     for name, unit in zip("xyz", np.eye(3), strict=True):
         if abs(axis @ unit) > _ALONG:
-            words.append(f"the body's {name} axis")
-    if not words and layout.discs is not None:
+            found.append(f"the body's {name} axis")
+    if not found and layout.discs is not None:
         p, names = layout.discs.body.points, layout.discs.body.point_names
         i, j = np.triu_indices(len(p), 1)
         along = np.abs((p[j] - p[i]) @ axis) / np.maximum(np.linalg.norm(p[j] - p[i], axis=1), 1e-12)
         if len(along) and along.max() > _ALONG:
             best = int(along.argmax())
-            words.append(f"the line {names[i[best]]}-{names[j[best]]}")
-    if not words:
-        words.append(f"the body's direction ({', '.join(f'{c:.2f}' for c in axis + 0.0)})")
+            found.append(f"the line {names[i[best]]}-{names[j[best]]}")
+    if not found:
+        found.append(f"the body's direction ({', '.join(f'{c:.2f}' for c in axis + 0.0)})")
     if abs(axis @ forward) > _ALONG:
-        words.append("the direction of sight")
-    return words[0] + (f" ({words[1]})" if len(words) > 1 else "")
+        found.append("the direction of sight")
+    return found[0] + (f" ({found[1]})" if len(found) > 1 else "")
 
 
 Grade = Literal["bad", "weak", "note"]
@@ -84,8 +81,8 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook(Record):
-    """How well a body is known at a distance.
+class Prediction(Record):
+    """The predicted pose of a body at a distance.
 
     Attributes:
         distance_m: from the cameras, the body facing them.
@@ -111,43 +108,43 @@ class Outlook(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Swap(Record):
+class Ambiguity(Record):
     """Discs that may be taken for others.
 
     Attributes:
-        relabeling: which for which.
-        told: (D,) by how many standard deviations it misses at each distance; infinite where the discs' faces tell, NaN
-            where these discs are not in view.
+        symmetry: which for which.
+        separation_sigmas: (D,) by how many standard deviations it misses at each distance; infinite where the discs' faces
+            separate it, NaN where these discs are not in view.
         behind: whether it shows the other side of a flat body, so that normals settle it.
     """
 
-    relabeling: Relabeling
-    told: Array
+    symmetry: Symmetry
+    separation_sigmas: Array
     behind: bool
 
     @property
     def by_side(self) -> bool:
         """Whether the normals alone settle it."""
-        return bool(np.isinf(self.told).any() and not np.isfinite(self.told).any())
+        return bool(np.isinf(self.separation_sigmas).any() and not np.isfinite(self.separation_sigmas).any())
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict(Record):
-    """All that is said of a body.
+class Assessment(Record):
+    """The assessment of a body.
 
     Attributes:
-        outlooks: one for each distance.
-        swaps: what may be taken for what where all discs of a side are in view, whether or not it is told apart.
-        findings: in words.
+        predictions: one for each distance.
+        ambiguities: what may be taken for what where all discs of a side are in view, whether or not it is separated.
+        findings: as text.
     """
 
-    outlooks: tuple[Outlook, ...]
-    swaps: tuple[Swap, ...]
+    predictions: tuple[Prediction, ...]
+    ambiguities: tuple[Ambiguity, ...]
     findings: tuple[Finding, ...]
 
     @property
-    def word(self) -> str:
-        """The verdict: usable, ambiguous or unusable."""
+    def grade(self) -> str:
+        """The body as a whole: usable, ambiguous or unusable."""
         bad = {finding.kind for finding in self.findings if finding.grade == "bad"}
         return "unusable" if bad - {"ambiguous"} else "ambiguous" if bad else "usable"
 
