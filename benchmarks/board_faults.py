@@ -384,7 +384,7 @@ class Campaign:
         self.board.receive(0.03)
         first = self.board.status.first_fault
         if first is None or (first.fault, first.joint) != (fault, joint):
-            self.violate(f"{fault.name} of joint {joint} is told as {first}")
+            self.violate(f"{fault.name} of joint {joint} is reported as {first}")
         else:
             self.out.told[fault.name] += 1
         if fault not in HELD and self.outputs["drives_on"]:

@@ -69,8 +69,9 @@ class Speaker:
         getattr(self.mav, f"{kind}_send")(*fields)
         return self.packed[0]
 
-    def welcome(self, *, dialect_version=1, config_version=1, tick=0):
-        return self.say("welcome", dialect_version, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9")
+    def welcome(self, *, dialect_version=None, config_version=1, tick=0):
+        ours = dialect().ARMSIGHT_DIALECT_VERSION if dialect_version is None else dialect_version
+        return self.say("welcome", ours, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9")
 
     def status(self, tick=0, *, state=0, rejected=(0, 0, 0)):
         sequence, count, rejection = rejected

@@ -45,7 +45,7 @@ def test_a_fresh_board_runs_on_factory_values_and_cannot_be_enabled():
         board.enable()
 
 
-@pytest.mark.parametrize("versions", [{"dialect_version": 2}, {"config_version": 7}])
+@pytest.mark.parametrize("versions", [{"dialect_version": 99}, {"config_version": 7}])
 def test_a_board_of_another_version_is_rejected_by_name(versions):
     link = ScriptedLink(talking(Speaker(), **versions))
     with pytest.raises(DeviceError) as raised:

@@ -54,7 +54,7 @@ def test_every_emulator_and_compiler_gives_the_same_bits(images, expected, emula
     if emulator is QemuEmulator and not shutil.which(qemu.PROGRAM):
         pytest.skip(f"{qemu.PROGRAM} is not installed")
     for name, scenario in DRIVEN.items():
-        assert run_scenario(scenario, emulator(images[compiler])) == expected[name], name
+        assert run_scenario(scenario, emulator.open(images[compiler])) == expected[name], name
 
 
 def test_one_bit_of_a_potentiometer_is_another_trace():
@@ -124,4 +124,4 @@ def test_a_file_that_is_no_firmware_is_named(emulator, tmp_path):
     wrong = tmp_path / "wrong.so"
     wrong.write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"wrong\.so"):
-        emulator(wrong)
+        emulator.open(wrong)
