@@ -47,7 +47,7 @@ def load(name: str) -> Set:
     kind, spec, bad = SETS[name]
     board = open_board(spec)
     folder = DATA / "stereo" / name
-    source = PairsSource(f"{folder}/left*.{kind}", f"{folder}/right*.{kind}")
+    source = PairsSource.open(f"{folder}/left*.{kind}", f"{folder}/right*.{kind}")
     pairs, opencv = [], {"findChessboardCorners+cornerSubPix": {}, "findChessboardCornersSB": {}}
     for stored in source.pairs:
         shot = stored.load()

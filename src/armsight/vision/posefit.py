@@ -100,8 +100,8 @@ def fit_pose(
     _invert(np.array(observations.cov_uv), weight)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
     arguments: tuple[Any, ...] = (
-        *pair_arguments(cameras), inverse(T_left_right), p, np.array(observations.camera), np.array(observations.uv), weight,
-        T, robust, steps, residuals, d2, H,
+        *pair_arguments(cameras), inverse(T_left_right), p, np.array(observations.camera), np.array(observations.uv),
+        weight, T, robust, steps, residuals, d2, H,
     )  # fmt: skip
     try:
         cost = _fit(*arguments)

@@ -8,8 +8,9 @@ import sys
 
 import pytest
 
-from armsight.app.cameras import command as cameras
+from armsight.app.cameras import command
 from armsight.app.main import main
+from armsight.vision.sources import v4l2 as cameras
 
 # Filled in C with <linux/videodev2.h> and dumped: (hex of the head, length); the rest is zeros.
 CAPTURE_NODE = (
@@ -123,7 +124,7 @@ def test_a_driver_without_lists_has_no_sizes():
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch):
+def computer(tmp_path, monkeypatch):
     """A /sys and a /dev with two cameras of one model, each with its metadata node, the second not permitted."""
     sys_dir, dev = tmp_path / "sys", tmp_path / "dev"
     nodes = {"video0": CAPTURE_NODE, "video1": METADATA_NODE, "video2": CAPTURE_NODE, "video10": CAPTURE_NODE}
@@ -152,25 +153,26 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setattr(cameras, "_ioctl", lambda handle, *rest: Driver(opened[handle])(handle, *rest))
     find = cameras.find_cameras
     monkeypatch.setattr(cameras, "find_cameras", lambda: find(sys_dir, dev))
+    monkeypatch.setattr(command, "find_cameras", cameras.find_cameras)
     return dev
 
 
-def test_cameras_are_found_with_their_stable_paths(machine):
+def test_cameras_are_found_with_their_stable_paths(computer):
     first, second, closed = cameras.find_cameras()
-    assert first == cameras.Camera(
-        f"{machine}/video0",
+    assert first == cameras.VideoDevice(
+        f"{computer}/video0",
         "HD Webcam C525",
-        (f"{machine}/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0",),
+        (f"{computer}/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0",),
         "uvcvideo",
         "usb-0000:00:14.0-2",
         EXPECTED,
     )
     assert [path.rsplit("/", 2)[1] for path in second.stable] == ["by-id", "by-path"]
-    assert (closed.device, closed.name, closed.formats) == (f"{machine}/video10", "HD Webcam C525: HD Webcam", ())
+    assert (closed.device, closed.name, closed.formats) == (f"{computer}/video10", "HD Webcam C525: HD Webcam", ())
     assert closed.problem == "no permission; join the group video: sudo usermod -aG video $USER, then log in again"
 
 
-def test_a_device_that_does_not_answer_is_listed_with_the_reason(machine, monkeypatch):
+def test_a_device_that_does_not_answer_is_listed_with_the_reason(computer, monkeypatch):
     def gone(*_):
         raise OSError(errno.ENODEV, "No such device")
 
@@ -185,12 +187,12 @@ def run(monkeypatch, capsys, *arguments):
     return caught.value.code, *capsys.readouterr()
 
 
-def test_the_command_lists_for_people_and_machines(machine, monkeypatch, capsys):
+def test_the_command_lists_for_people_and_machines(computer, monkeypatch, capsys):
     code, out, err = run(monkeypatch, capsys)
     assert (code, err) == (0, "")
     assert out.splitlines()[:7] == [
-        f"{machine}/video0  HD Webcam C525  (uvcvideo, usb-0000:00:14.0-2)",
-        f"  {machine}/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0",
+        f"{computer}/video0  HD Webcam C525  (uvcvideo, usb-0000:00:14.0-2)",
+        f"  {computer}/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0",
         "  MJPG  Motion-JPEG",
         "    640x480  30 frames per second",
         "    1280x720  30 15 frames per second",
@@ -200,7 +202,7 @@ def test_the_command_lists_for_people_and_machines(machine, monkeypatch, capsys)
     code, out, _ = run(monkeypatch, capsys, "--json")
     assert code == 0
     listed = json.loads(out)["cameras"]
-    assert [camera["device"] for camera in listed] == [f"{machine}/video{n}" for n in (0, 2, 10)]
+    assert [camera["device"] for camera in listed] == [f"{computer}/video{n}" for n in (0, 2, 10)]
     assert listed[0]["formats"][0]["sizes"][1] == {
         "width_px": 1280,
         "height_px": 720,

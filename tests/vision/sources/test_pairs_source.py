@@ -26,7 +26,7 @@ def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, 
     for k in (1, 2, 10):
         store(tmp_path / f"left{k}.png", "left", k)
         store(tmp_path / f"right{k}.png", "right", k)
-    found = shots(PairsSource(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png"))
+    found = shots(PairsSource.open(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png"))
     assert [shot.name for shot in found] == ["left1", "left2", "left10"]
     assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in (1, 2, 10)]
     assert all(shot.t_s is None and shot.problem is None for shot in found)
@@ -110,9 +110,9 @@ def test_a_hole_on_one_side_is_always_named(numbers, data):
 
 def test_a_glob_that_matches_nothing_or_a_folder_says_so(tmp_path):
     with pytest.raises(InputError, match=r"nothing\*.png: no such file"):
-        PairsSource(f"{tmp_path}/nothing*.png", f"{tmp_path}/*")
+        PairsSource.open(f"{tmp_path}/nothing*.png", f"{tmp_path}/*")
     with pytest.raises(InputError, match="is a folder; give its images"):
-        PairsSource(str(tmp_path), str(tmp_path))
+        PairsSource.open(str(tmp_path), str(tmp_path))
 
 
 def test_a_folder_with_left_and_right_subfolders(tmp_path, store, told):
@@ -126,12 +126,12 @@ def test_a_folder_with_left_and_right_subfolders(tmp_path, store, told):
 
 def test_a_folder_without_shots_or_none_at_all(tmp_path):
     with pytest.raises(InputError, match=r"holds no shots: expected shots.csv, images left\* and right\*"):
-        FolderSource(tmp_path)
+        FolderSource.open(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         open_source(f"folder:{tmp_path}/none")
     (tmp_path / "left1.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"right\*: no such file"):
-        FolderSource(tmp_path)
+        FolderSource.open(tmp_path)
 
 
 HEADER = "shot,t_s,left,right,problem\n"
@@ -154,14 +154,14 @@ HEADER = "shot,t_s,left,right,problem\n"
 def test_a_damaged_index_is_named_with_its_line(tmp_path, text, said):
     (tmp_path / "shots.csv").write_text(text)
     with pytest.raises(InputError, match=f"{tmp_path}/shots.csv: .*{said}"):
-        FolderSource(tmp_path)
+        FolderSource.open(tmp_path)
 
 
 def test_an_index_is_obeyed(tmp_path, store, told):
     store(tmp_path / "b.png", "left", 3)
     store(tmp_path / "a.png", "right", 3)
     (tmp_path / "shots.csv").write_text(HEADER + "x,1.25,b.png,a.png,\ny,1.5,,,camera asleep\nz,,gone.png,a.png,\n")
-    x, y, z = shots(FolderSource(tmp_path))
+    x, y, z = shots(FolderSource.open(tmp_path))
     assert (x.name, x.t_s, told(x.left), told(x.right)) == ("x", 1.25, ("left", 3), ("right", 3))
     assert (y.name, y.t_s, y.problem, y.left) == ("y", 1.5, "camera asleep", None)
     assert (z.t_s, z.problem) == (None, f"{tmp_path}/gone.png: no such file")

@@ -316,6 +316,7 @@ class HandFed:
 def fed():
     left, right = HandFed("left"), HandFed("right")
     source = UrlSource(left, right, timeout_s=0.3)
+    source.start()
     yield source, left, right
     source.close()
     assert threads() == set()

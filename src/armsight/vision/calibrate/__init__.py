@@ -1,1 +1,9 @@
-"""Calibration of two cameras: board images or a known body's detections in, a StereoRig and its held-out errors out."""
+"""Calibration: detections of pairs of images go in, a rig with its covariance and held-out errors comes out.
+
+``boards.py`` calibrates cameras from a board, ``bodies.py`` the relative pose of known cameras from a known body; both
+return a :class:`~armsight.vision.calibrate.result.Calibration`.
+
+- ``start.py``: focal lengths and poses from nothing. ``screen.py``: robust rejection of gross errors.
+- ``motion.py``: motion of the board between the two exposures of a pair.
+- ``heldout.py``: errors on pairs that were left out of the fit. ``weak.py``: weaknesses of a calibration, with advice.
+"""

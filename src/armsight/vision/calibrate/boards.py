@@ -1,11 +1,15 @@
 """Pairs of board images in, a calibrated rig and its held-out errors out.
 
-1. Start from nothing (start), mend boards named in another order, throw out gross errors (screen).
-2. Adjust cameras, relative pose, poses of the board and the board itself jointly. A print is stretched and bowed by a
-   tenth of a millimetre, several times what a good corner is off; left out of the adjustment it ends up in the cameras
-   (Strobl and Hirzinger, ICCV workshops 2011). A board in the hand before cameras that are not synchronised moves
-   between the exposures of a pair; where that shows, every pair has a motion of its own (motion).
-3. Choose the distortion model by held-out error, never by the fit (choose).
+1. Start from nothing (``start.py``), correct boards named in another order, reject gross errors (``screen.py``). 2.
+Adjust cameras, relative pose, poses of the board and the board itself jointly. A print is distorted and bowed by a
+tenth
+   of a millimetre, several times the error of a good corner; if it is not estimated, it biases the cameras (Strobl and
+   Hirzinger, ICCV workshops 2011). A board in the hand before cameras that are not synchronised moves between the
+   exposures of a pair; where that is significant, every pair has a motion of its own (``motion.py``).
+3. Choose the distortion model by held-out error, never by the fit (:class:`LensModelSearch`).
+
+The noise of the corners, the tolerance of the print and the motion between the exposures are estimated together with
+what they blur (empirical Bayes), so a perfect board stays perfect.
 """
 
 from __future__ import annotations
@@ -15,20 +19,213 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from armsight.data import Detections, Record
+from armsight.data import Array, Detections, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.vision.bundle import Model, Observations, Solution, State
-from armsight.vision.calibrate.choose import Search, Trial, drawn, motion_of, shaped
-from armsight.vision.calibrate.heldout import residual_epipolar_rms, rig_of, scaled, unfinished
-from armsight.vision.calibrate.result import Calibration, HeldOut, Rejected
-from armsight.vision.calibrate.screen import LEAST_CORNERS, MOTION_EASE, Screened, mend_flips, robust_sigma, screen
-from armsight.vision.calibrate.start import fits, start_board
+from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary, unfinished
+from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.result import Calibration, HeldOutErrors, PairErrors, RejectedPair
+from armsight.vision.calibrate.screen import (
+    LEAST_CORNERS,
+    MOTION_EASE,
+    Screened,
+    correct_symmetries,
+    noise_px,
+    robust_sigma,
+    screen,
+)
+from armsight.vision.calibrate.start import fits, imitated, start_board
 from armsight.vision.calibrate.weak import weaknesses
-from armsight.vision.markers.board import Board
+from armsight.vision.camera import DISTORTION_MODELS, Camera
+from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.match import join, renamed
+from armsight.vision.projection import smooth
+from armsight.vision.rig import StereoRig
+
+#: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
+#: use for an ordinary lens, by more.
+WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
+#: Convergence and steps of adjustments that only estimate noise or a held-out error: the long valleys of the rational
+#: model are not followed to their ends.
+_ROUGHLY, _STEPS = 1e-6, 25
+#: Motion between the exposures must lower the corners' noise by this share to be accepted: a fifth less is a sigma that
+#: was 1.25 times too large. Synchronised cameras lower it by a hundredth, by chance; what a lens model lacks, by a
+#: tenth.
+MOTION_WORTH = 0.2
+#: Degree of the polynomials in which a printed board may differ from its drawing.
+BOARD_DEGREE = 4
+#: Prior standard deviation of a board from its drawing at first, RMS of one mode, as a share of its diagonal, and the
+#: least, m.
+BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
+#: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
+_NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
+
+
+def rigid_board(points: Array) -> BundleModel:
+    """Return the model of a board without tolerance, points (M, 3) of the drawing, m."""
+    return BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
+
+
+def printed_board(points: Array) -> BundleModel:
+    """Return the model of a board with the tolerance of a print, points (M, 3) of the drawing, m."""
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    return BundleModel(points, smooth(points, BOARD_DEGREE), BOARD_SIGMA_SHARE * diagonal, True)
+
+
+def motion_of(model: BundleModel, screened: Screened, count: int) -> ExposureMotion | None:
+    """Test whether the board moved between the exposures: each camera agrees with itself better than with the other.
+
+    Args:
+        model: the board.
+        screened: the screened detections, under the assumption that it stood still.
+        count: number of pairs before screening.
+
+    Returns:
+        A first motion for all ``count`` pairs, or None where it is not significant.
+    """
+    guess = ExposureMotion.guessed(model.points, len(screened.kept))
+    still, observations = screened.solution, screened.observations
+    before = noise_px(still, observations, _freed(model, still))
+    moving = replace(model, motion_sigmas=guess.sigmas)
+    solution = minimise(moving, still.state, observations, before)
+    motion, taken = guess.updated(solution)
+    if noise_px(solution, observations, _freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
+        return None
+    return replace(motion, weights=np.ones(count))
+
+
+def _freed(model: BundleModel, solution: BundleSolution) -> float:
+    """Count the shared parameters that the detections determined; a shape that its prior holds counts in part."""
+    variance, modes = np.diag(solution.cov_shared), len(model.modes)
+    freed = float((variance > 0).sum() - modes)
+    return freed + float(modes - variance[len(variance) - modes :].sum() / model.shape_sigma_m**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial(Record):
+    """One way to model cameras and board, adjusted to all pairs and evaluated on held-out ones.
+
+    Attributes:
+        model: the board, its tolerance and its motion as learned.
+        motion: how far the board moved between the exposures; None where it stood still.
+        solution: the adjustment to all pairs.
+        errors: held-out errors of every pair.
+        heldout: their summary.
+    """
+
+    model: BundleModel
+    motion: ExposureMotion | None
+    solution: BundleSolution
+    errors: PairErrors
+    heldout: HeldOutErrors
+
+
+@dataclass(frozen=True, eq=False)
+class LensModelSearch(Record):
+    """The choice of the distortion model by held-out error.
+
+    Attributes:
+        model: the board.
+        motion: first motion of the board between the exposures; None where it stands still.
+        screened: the detections to fit, and those to evaluate on.
+        folds: how many parts the pairs are split into.
+        sizes: image size of the left and of the right camera, px.
+        progress: called with a line about what is being done.
+    """
+
+    model: BundleModel
+    motion: ExposureMotion | None
+    screened: Screened
+    folds: int
+    sizes: tuple[tuple[int, int], tuple[int, int]]
+    progress: Callable[[str], None]
+
+    def best(self, models: tuple[str, ...]) -> tuple[Trial, dict[str, HeldOutErrors]]:
+        """Return the first model that no later one beats by more than WORTH, and the held-out errors of all."""
+        trials = {name: trial for name in models if (trial := self.trial(name)) is not None}
+        if not trials:
+            raise CalibrationError("no distortion model could be adjusted to the detections")
+        reference = next(iter(trials.values())).heldout
+        chosen, least = next(iter(trials.values())), np.sqrt(2.0)
+        for name, trial in trials.items():
+            h = trial.heldout
+            score = np.hypot(h.epipolar_rms_px / reference.epipolar_rms_px, h.rigid_rms_m / reference.rigid_rms_m)
+            if score < least * (1 - WORTH[name]):
+                chosen, least = trial, score
+        return chosen, {name: trial.heldout for name, trial in trials.items()}
+
+    def trial(self, distortion: str) -> Trial | None:
+        """Adjust and cross-validate one distortion model; None where its adjustment fails."""
+        self.progress(f"evaluating distortion model {distortion} on held-out pairs")
+        try:
+            model, motion, solution = self._adjusted(self._converted(distortion))
+            errors = cross_validate(
+                lambda rows: self._fold(model, motion, solution, rows),
+                model.points,
+                self.screened.unscreened,
+                self.folds,
+            )
+        except (CalibrationError, np.linalg.LinAlgError):
+            return None
+        return Trial(model, motion, solution, errors, summary(errors, self.folds, motion))
+
+    def _converted(self, distortion: str) -> BundleState:
+        """Return the screened state with cameras of another distortion model."""
+        state = self.screened.solution.state
+        if state.cameras[0].model == distortion:
+            return state
+        if "fisheye" in (distortion, state.cameras[0].model):
+            seen = self.screened.observations
+            sides = [seen.uv[seen.camera == side] for side in (0, 1)]
+            left, right = (imitated(c, distortion, uv) for c, uv in zip(state.cameras, sides, strict=True))
+            if left is not None and right is not None:
+                return replace(state, cameras=(left, right))
+            return replace(start_board(self.model.points, self.sizes, seen, distortion).state, shape=state.shape)
+        cameras = []
+        for camera in state.cameras:
+            d = np.zeros(DISTORTION_MODELS[distortion])
+            n = min(len(d), camera.distortion.size)
+            d[:n] = camera.distortion[:n]
+            cameras.append(Camera(camera.image_size_px, distortion, camera.intrinsics, d))
+        return replace(state, cameras=(cameras[0], cameras[1]))
+
+    def _adjusted(self, state: BundleState) -> tuple[BundleModel, ExposureMotion | None, BundleSolution]:
+        """Adjust with the noise of the residuals and the estimated tolerances of the board and of its motion."""
+        model, motion, sigma, modes = self.model, self.motion, 0.1, len(self.model.modes)
+        observations = self.screened.observations
+        for _ in range(_NOISE_ROUNDS if motion is None else _MOTION_ROUNDS):
+            if motion is not None:
+                model = replace(model, motion_sigmas=motion.sigmas)
+            solution = minimise(model, state, observations, sigma, max_steps=_STEPS, least_decrease=_ROUGHLY)
+            state, freed = solution.state, _freed(model, solution)
+            if modes:
+                posterior = np.diag(solution.cov_shared)[-modes:]
+                tolerance = float(np.sqrt(np.mean(state.shape**2 + posterior)))
+                model = replace(model, shape_sigma_m=max(tolerance, BOARD_SIGMA_LEAST_M))
+            if motion is not None:
+                motion, taken = motion.updated(solution)
+                freed += taken
+            sigma = noise_px(solution, observations, freed)
+        return model, motion, minimise(model, state, observations, sigma)
+
+    def _fold(
+        self, model: BundleModel, motion: ExposureMotion | None, full: BundleSolution, rows: NDArray[np.intp]
+    ) -> tuple[StereoRig, Array, ExposureMotion | None]:
+        """Adjust to some of the shots, from the start that all of them gave; their motion is estimated from them alone."""
+        state = replace(full.state, Ts_left_body=full.state.Ts_left_body[rows])
+        if motion is not None:
+            motion = motion.shots(rows)
+            model, state = replace(model, motion_sigmas=motion.sigmas), replace(state, motions=state.motions[rows])
+        seen = self.screened.observations.shots(rows)
+        solution = minimise(model, state, seen, full.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY)
+        if motion is not None:
+            motion = motion.updated(solution)[0]
+        return rig_of(solution), model.body(solution.state.shape), motion
+
 
 #: Distortion models tried, simplest first.
 MODELS = ("brown4", "brown5", "brown8", "fisheye")
@@ -53,7 +250,7 @@ class Pair(Record):
 
 
 def calibrate_boards(
-    board: Board,
+    board: CalibrationBoard,
     pairs: Sequence[Pair],
     sizes: tuple[tuple[int, int], tuple[int, int]],
     *,
@@ -74,7 +271,7 @@ def calibrate_boards(
         progress: called with a line about what is being done.
 
     Returns:
-        The rig, its held-out errors, and what was thrown away.
+        The rig, its held-out errors, and what was rejected.
 
     Raises:
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
@@ -82,21 +279,21 @@ def calibrate_boards(
     points = board.body.points
     usable, rejected = _usable(pairs)
     _enough(len(usable), len(pairs), rejected)
-    progress("placing cameras and boards")
+    progress("estimating poses of cameras and boards")
     first, usable, notes = _start(board, usable, sizes, models)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
     progress("looking for gross errors")
-    model = drawn(points) if flat else shaped(points)
-    judge = _Judge(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
-    screened, trial, tried = judge.chosen(first.state, models)
+    model = rigid_board(points) if flat else printed_board(points)
+    selection = _Selection(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
+    screened, trial, tried = selection.chosen(first.state, models)
     lens = trial.solution.state.cameras[0].model
     if lens != first.state.cameras[0].model and (screened.rejected or screened.notes):
-        # What was thrown out under a simple lens may fit the one that was chosen.
+        # Pairs rejected under a simple lens may fit the one that was chosen.
         progress(f"looking for gross errors again, under {lens}")
         with contextlib.suppress(CalibrationError):
             chosen = trial.solution.state
             start = replace(first.state, cameras=chosen.cameras, T_left_right=chosen.T_left_right)
-            again, trial_again, _ = judge.chosen(start, (lens,))
+            again, trial_again, _ = selection.chosen(start, (lens,))
             if len(again.observations.shot) > len(screened.observations.shot):
                 screened, trial = again, trial_again
                 tried = {**tried, lens: trial.heldout}
@@ -126,24 +323,24 @@ def calibrate_boards(
     return replace(calibration, weaknesses=weaknesses(calibration))
 
 
-def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Rejected]]:
+def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
     """Split the pairs into those that show the board in both images and those that do not, with reasons."""
     usable, rejected = [], []
     for pair in pairs:
         common = np.intersect1d(pair.left.ids, pair.right.ids)
         problems = [f"{side}: {d.problem}" for side, d in (("left", pair.left), ("right", pair.right)) if d.problem]
         if problems:
-            rejected.append(Rejected(pair.name, "; ".join(problems)))
+            rejected.append(RejectedPair(pair.name, "; ".join(problems)))
         elif len(common) < LEAST_CORNERS:
             rejected.append(
-                Rejected(pair.name, f"{len(common)} points seen by both cameras, {LEAST_CORNERS} are needed")
+                RejectedPair(pair.name, f"{len(common)} points seen by both cameras, {LEAST_CORNERS} are needed")
             )
         else:
             usable.append(pair)
     return usable, rejected
 
 
-def _enough(usable: int, given: int, rejected: list[Rejected]) -> None:
+def _enough(usable: int, given: int, rejected: list[RejectedPair]) -> None:
     """Raise unless there are enough pairs, with the first reasons why not."""
     if usable >= LEAST_PAIRS:
         return
@@ -152,20 +349,20 @@ def _enough(usable: int, given: int, rejected: list[Rejected]) -> None:
     raise CalibrationError(
         f"{usable} of {given} pairs are usable, at least {LEAST_PAIRS} are needed, 15 or more are better"
         + (f": {why}{more}" if why else "")
-        + ". Is --board the board in the images (inner corners, columns x rows)?"
+        + ". Is --target the board in the images (inner corners, columns x rows)?"
     )
 
 
 def _start(
-    board: Board, usable: list[Pair], sizes: tuple[tuple[int, int], tuple[int, int]], models: tuple[str, ...]
-) -> tuple[Solution, list[Pair], list[str]]:
-    """Start from nothing, under a plain and a fisheye lens where both are allowed, and mend boards named in reverse."""
+    board: CalibrationBoard, usable: list[Pair], sizes: tuple[tuple[int, int], tuple[int, int]], models: tuple[str, ...]
+) -> tuple[BundleSolution, list[Pair], list[str]]:
+    """Start from nothing, under a plain and a fisheye lens where both are allowed, and correct boards named in reverse."""
     families = dict.fromkeys("fisheye" if model == "fisheye" else "brown4" for model in models)
     points = board.body.points
 
-    def attempt(pairs: list[Pair]) -> Solution:
+    def attempt(pairs: list[Pair]) -> BundleSolution:
         observations = Observations.from_shots([join(pair.left, pair.right) for pair in pairs])
-        found: list[Solution] = []
+        found: list[BundleSolution] = []
         for family in families:
             found.append(start_board(points, sizes, observations, family))
             if fits(found[-1]):
@@ -174,21 +371,24 @@ def _start(
 
     first = attempt(usable)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
-    mended = mend_flips(points, first.state, observations, board.flips)
-    if not mended:
+    corrected = correct_symmetries(points, first.state, observations, board.symmetries)
+    if not corrected:
         return first, usable, []
-    notes = [f"{usable[j].name}: the right image names the corners in another order; mended" for j in sorted(mended)]
+    notes = [
+        f"{usable[j].name}: the right image names the corners in another order; corrected" for j in sorted(corrected)
+    ]
     usable = [
-        replace(pair, right=renamed(pair.right, mended[j])) if j in mended else pair for j, pair in enumerate(usable)
+        replace(pair, right=renamed(pair.right, corrected[j])) if j in corrected else pair
+        for j, pair in enumerate(usable)
     ]
     return attempt(usable), usable, notes
 
 
 @dataclass(frozen=True, eq=False)
-class _Judge(Record):
+class _Selection(Record):
     """Screening and the choice of the model, from a start."""
 
-    model: Model
+    model: BundleModel
     observations: Observations
     names: tuple[str, ...]
     sizes: tuple[tuple[int, int], tuple[int, int]]
@@ -196,22 +396,22 @@ class _Judge(Record):
     given: int
     progress: Progress
 
-    def chosen(self, start: State, models: tuple[str, ...]) -> tuple[Screened, Trial, dict[str, HeldOut]]:
-        """Throw out gross errors, then return the best model's trial and the held-out errors of all."""
+    def chosen(self, start: BundleState, models: tuple[str, ...]) -> tuple[Screened, Trial, dict[str, HeldOutErrors]]:
+        """Reject gross errors, then return the best model's trial and the held-out errors of all."""
         start = replace(start, shape=np.zeros(len(self.model.modes)))
         screened, motion = self._screened(self.model, start), None
         if (moving := motion_of(self.model, screened, self.observations.shot_count)) is not None:
-            # A board that moved between the exposures looks like gross errors to who believes that it stood still.
+            # A board that moved between the exposures looks like gross errors under the assumption that it stood still.
             self.progress("looking for gross errors again: the board moved between the exposures")
             eased = replace(self.model, motion_sigmas=MOTION_EASE * moving.sigmas)
             screened = self._screened(eased, start, robust_sigma(screened.solution))
             motion = moving.shots(screened.kept)
         folds = min(self.folds, len(screened.kept))
-        search = Search(self.model, motion, screened, folds, self.sizes, self.progress)
+        search = LensModelSearch(self.model, motion, screened, folds, self.sizes, self.progress)
         return screened, *search.best(models)
 
-    def _screened(self, model: Model, start: State, sigma_px: float = 1.0) -> Screened:
-        """Throw out gross errors; too few pairs are no calibration."""
+    def _screened(self, model: BundleModel, start: BundleState, sigma_px: float = 1.0) -> Screened:
+        """Reject gross errors; too few pairs are an error."""
         screened = screen(model, start, self.observations, self.names, sigma_px=sigma_px)
         _enough(len(screened.kept), self.given, list(screened.rejected))
         return screened

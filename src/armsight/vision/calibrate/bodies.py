@@ -1,9 +1,9 @@
-"""A known body moving in view of two cameras of known intrinsics: their relative pose, and the body made better.
+"""A known body moving in view of two cameras of known intrinsics: their relative pose, and a refined body.
 
 Per shot, every pose that one camera alone allows, mirror solutions included; the relative pose that most shots agree
 on; then the joint adjustment of relative pose, poses and (on request) the body's shape under a prior. The prior's sigma
-is stated and is judged on left-out shots: a looser body must lower the error of shots it was not fitted to. Rigid motion
-and size of the body are held, for the images cannot tell them from poses and baseline.
+is given and is evaluated on left-out shots: a looser body must lower the error of shots it was not fitted to. Rigid
+motion and size of the body are held: they are not observable, for poses and baseline have the same effect.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.assign import candidates, instances, plain
-from armsight.vision.bundle import Model, Observations, Solution, State, minimise
+from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate.heldout import (
     cross_validate,
     folds_of,
@@ -29,7 +29,7 @@ from armsight.vision.calibrate.heldout import (
     summary,
     unfinished,
 )
-from armsight.vision.calibrate.result import Calibration, Rejected
+from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.start import relative_poses
 from armsight.vision.calibrate.weak import weaknesses
@@ -39,7 +39,7 @@ from armsight.vision.pnp import Candidate
 from armsight.vision.projection import every_point
 from armsight.vision.rig import StereoRig
 
-#: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the drawing as it is.
+#: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the exact drawing.
 TOLERANCES_M = (0.0, 1e-4, 2e-4, 4e-4, 1e-3, 2e-3)
 #: A looser body must lower the held-out error by this share.
 WORTH = 0.005
@@ -64,8 +64,8 @@ def calibrate_bodies(
     """Find the relative pose of two cameras from detections of a known body.
 
     Args:
-        body: the body's points, m, as drawn.
-        shots: what both cameras saw in every shot.
+        body: the body's points, m, of its drawing.
+        shots: the detections of both cameras in every shot.
         cameras: the cameras with their known intrinsics.
         refine_body: estimate how the body differs from its drawing.
         folds: how many parts the shots are split into for the held-out errors.
@@ -79,7 +79,7 @@ def calibrate_bodies(
     """
     progress("looking for the body in every image")
     found = [candidates(body.points, cameras, shot) for shot in shots]
-    progress("placing one camera against the other")
+    progress("estimating the relative pose of the cameras")
     T_left_right, points = _start(body.points, cameras, shots, found), body.points
     for tolerance in (0.0, 0.0, *((_START_TOLERANCE_M,) if refine_body else ())):
         names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
@@ -87,15 +87,15 @@ def calibrate_bodies(
             why = "; ".join(f"shot {r.pair}: {r.reason}" for r in rejected[:2])
             raise CalibrationError(f"{len(seen)} of {len(shots)} shots are usable, {LEAST_SHOTS} are needed: {why}")
         observations, model = Observations.from_shots(seen), _model(body.points, tolerance)
-        state = State(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
+        state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
         state = _adjusted(model, state, observations).state
         T_left_right, points = state.T_left_right, model.body(state.shape)
     names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
     observations = Observations.from_shots(seen)
-    state = State(cameras, T_left_right, np.stack(poses), np.zeros(0))
+    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(0))
     trials = {}
     for tolerance in TOLERANCES_M if refine_body else TOLERANCES_M[:1]:
-        progress(f"judging a body within {tolerance * 1e3:g} mm of its drawing on held-out shots")
+        progress(f"evaluating a body within {tolerance * 1e3:g} mm of its drawing on held-out shots")
         model = _model(body.points, tolerance)
         start = replace(state, shape=np.zeros(len(model.modes)))
         solution = _adjusted(model, start, observations)
@@ -108,7 +108,7 @@ def calibrate_bodies(
     notes: tuple[str, ...] = ()
     if refine_body:
         held = f"with a prior sigma of {chosen * 1e3:g} mm per coordinate" if chosen else "exactly"
-        notes = (f"the body is held to its drawing {held}, as left-out shots judge",)
+        notes = (f"the body is held to its drawing {held}, chosen by left-out shots",)
     return _result(body, model, solution, observations, names, len(shots), rejected, min(folds, len(seen)), notes)
 
 
@@ -123,7 +123,7 @@ def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenSh
     best, most = None, -1
     for T in relative_poses(views[0], views[1], float(np.median(depths))):
         T = _refined(points, cameras, T, [shots[j] for j in both], [found[j] for j in both])
-        # A body that one camera alone sees says nothing of the other: any relative pose explains it.
+        # A body that one camera alone sees does not constrain the other: any relative pose explains it.
         explained = sum(
             sum(int(seen.seen.sum(axis=0).min()) for _, seen in instances(points, cameras, T, shots[j], found[j]))
             for j in both
@@ -153,7 +153,7 @@ def _refined(
         assert joined is not None, "a candidate names every point once"
         seen.append(joined)
         poses.append(a.T_camera_body)
-    state = State(cameras, T_left_right, np.stack(poses), np.zeros(0))
+    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(0))
     try:
         return minimise(_model(points, 0.0), state, Observations.from_shots(seen), _START_SIGMA_PX).state.T_left_right
     except (CalibrationError, np.linalg.LinAlgError):
@@ -162,14 +162,14 @@ def _refined(
 
 def _assigned(
     points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: Sequence[SeenShot], found: list[Found]
-) -> tuple[list[str], list[Correspondences], list[Array], list[Rejected]]:
+) -> tuple[list[str], list[Correspondences], list[Array], list[RejectedPair]]:
     """Give every shot its detections of the body and its pose, or the reason why it has none."""
     names, seen, poses, rejected = [], [], [], []
     for shot, candidates_of_shot in zip(shots, found, strict=True):
         bodies = instances(points, cameras, T_left_right, shot, candidates_of_shot)
         if not bodies:
             count = sum(len(ids) for ids in shot.ids)
-            rejected.append(Rejected(shot.name, f"no pose of the body agrees with its {count} detections"))
+            rejected.append(RejectedPair(shot.name, f"no pose of the body agrees with its {count} detections"))
             continue
         T, correspondences = bodies[0]
         names.append(shot.name)
@@ -178,16 +178,16 @@ def _assigned(
     return names, seen, poses, rejected
 
 
-def _model(points: Array, tolerance_m: float) -> Model:
-    """The body as drawn, or free within a tolerance."""
+def _model(points: Array, tolerance_m: float) -> BundleModel:
+    """The body of the drawing, or free within a tolerance."""
     if tolerance_m == 0:
-        return Model(points, np.zeros((0, len(points), 3)), 1.0, False)
+        return BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False)
     # A mode moves the points by one RMS: K modes of sigma s together give each coordinate a sigma of s sqrt(K / 3).
     modes = every_point(points)
-    return Model(points, modes, tolerance_m / np.sqrt(len(modes) / 3), False)
+    return BundleModel(points, modes, tolerance_m / np.sqrt(len(modes) / 3), False)
 
 
-def _adjusted(model: Model, state: State, observations: Observations) -> Solution:
+def _adjusted(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution:
     """Adjust with the noise that the residuals show."""
     sigma = _START_SIGMA_PX
     for _ in range(3):
@@ -200,7 +200,7 @@ def _adjusted(model: Model, state: State, observations: Observations) -> Solutio
     return minimise(model, state, observations, sigma)
 
 
-def _heldout_cost(model: Model, full: Solution, observations: Observations, folds: int) -> float:
+def _heldout_cost(model: BundleModel, full: BundleSolution, observations: Observations, folds: int) -> float:
     """Mean squared pixel distance, px^2, of left-out shots from the body and rig that the others give."""
     total, count = 0.0, 0
     everyone = np.arange(observations.shot_count)
@@ -208,7 +208,7 @@ def _heldout_cost(model: Model, full: Solution, observations: Observations, fold
         rest = np.setdiff1d(everyone, held)
         state = replace(full.state, Ts_left_body=full.state.Ts_left_body[rest])
         fitted = minimise(model, state, observations.shots(rest), full.sigma_px).state
-        fixed = Model(model.body(fitted.shape), np.zeros((0, len(model.points), 3)), 1.0, False)
+        fixed = BundleModel(model.body(fitted.shape), np.zeros((0, len(model.points), 3)), 1.0, False)
         start = replace(fitted, Ts_left_body=full.state.Ts_left_body[held], shape=np.zeros(0))
         nothing = np.zeros(sum(camera.parameters.size for camera in fitted.cameras) + 6, bool)
         solution = minimise(fixed, start, observations.shots(held), full.sigma_px, free=nothing)
@@ -219,12 +219,12 @@ def _heldout_cost(model: Model, full: Solution, observations: Observations, fold
 
 def _result(
     body: Body,
-    model: Model,
-    solution: Solution,
+    model: BundleModel,
+    solution: BundleSolution,
     observations: Observations,
     names: list[str],
     given: int,
-    rejected: list[Rejected],
+    rejected: list[RejectedPair],
     folds: int,
     notes: tuple[str, ...],
 ) -> Calibration:

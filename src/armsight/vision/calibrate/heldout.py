@@ -1,6 +1,6 @@
-"""Errors on pairs a rig was not fitted on: the only figures that tell whether its millimetres are right.
+"""Errors on pairs that a rig was not fitted on: the only metrics that show whether its millimetres are right.
 
-K folds of pairs; each fold is measured with a rig fitted on the others, by the very functions that measure later.
+K folds of pairs; each fold is measured with a rig fitted on the others, by the same functions that measure later.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
-from armsight.vision.bundle import Observations, Solution
-from armsight.vision.calibrate.motion import Motion
-from armsight.vision.calibrate.result import HeldOut, PairErrors
+from armsight.vision.bundle import BundleSolution, Observations
+from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.result import HeldOutErrors, PairErrors
 from armsight.vision.match import epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
 _LEAST_SIGMA_PX = 1e-6
-#: A point this many times as far from the rigid fit as the usual one is a blunder, which measuring drops by name.
-BLUNDER_RATIO = 10.0
+#: A point this many times as far from the rigid fit as the usual one is an outlier, which a measurement drops by name.
+OUTLIER_RATIO = 10.0
 
 
 def correspondences(observations: Observations, shot: int) -> Correspondences:
@@ -45,7 +45,7 @@ def pair_errors(
     observations: Observations,
     *,
     estimated: Array | None = None,
-    motion: Motion | None = None,
+    motion: ExposureMotion | None = None,
 ) -> PairErrors:
     """Measure every pair of ``observations`` with a rig and compare with the perfect body.
 
@@ -53,8 +53,8 @@ def pair_errors(
         rig: the calibrated pair.
         drawing: (M, 3) points of the perfect body, m.
         observations: detections of S shots.
-        estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is judged: how
-            a print differs from its drawing is no error of the cameras; the drawing by default.
+        estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is evaluated:
+            the deviation of a print from its drawing is not an error of the cameras; the drawing by default.
         motion: how far the body is expected to move between the two exposures; it stands still by default.
 
     Returns:
@@ -70,15 +70,15 @@ def pair_errors(
 
 
 def _pair_error(
-    rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences, motion: Motion | None
+    rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences, motion: ExposureMotion | None
 ) -> tuple[float, ...] | None:
-    """Return one shot's figures in the order of _FIELDS; None where it has too little."""
+    """Return one shot's metrics in the order of _FIELDS; None where it has too few points."""
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
     cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
     p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
     good = np.flatnonzero(np.isfinite(p).all(axis=1))
     if len(good) >= 3:
-        good = good[_without_blunders(estimated[seen.ids[good]], p[good])]
+        good = good[_without_outliers(estimated[seen.ids[good]], p[good])]
     if len(good) < 3:
         return None
     board, found = drawing[seen.ids[good]], estimated[seen.ids[good]]
@@ -88,7 +88,7 @@ def _pair_error(
     epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
     T_found, cov_rig = fit_rigid(found, p), np.array(rig.cov)
     if motion is not None:
-        # What moved between the exposures looks as if the right camera stood elsewhere for this one pair.
+        # A motion between the exposures has the effect of another position of the right camera for this one pair.
         cov_rig[-6:, -6:] += motion.seen_from(inverse(rig.T_left_right) @ T_found, estimated.mean(axis=0))
     return (
         float(np.sqrt((epipolar**2).mean())),
@@ -99,13 +99,13 @@ def _pair_error(
     )
 
 
-def _without_blunders(body: Array, p: Array) -> NDArray[np.bool_]:
+def _without_outliers(body: Array, p: Array) -> NDArray[np.bool_]:
     """(N,) which points a measurement would keep: all but those far off what most agree on."""
     good = np.ones(len(p), bool)
     for _ in range(3):
         T = fit_rigid(body[good], p[good])
         gap = np.linalg.norm(p - transform(T, body), axis=1)
-        now = gap <= BLUNDER_RATIO * np.median(gap)
+        now = gap <= OUTLIER_RATIO * np.median(gap)
         if now.sum() < 3 or (now == good).all():
             break
         good = now
@@ -115,8 +115,8 @@ def _without_blunders(body: Array, p: Array) -> NDArray[np.bool_]:
 def _normalised(fitted: Array, p: Array, cov: Array, by_rig: Array, cov_rig: Array) -> tuple[float, float]:
     """RMS of a rigid fit's residuals (N, 3) over their predicted sigma, less the fit: with the calibration, without it.
 
-    The fit takes the residuals' part along six directions Q: what is left of a covariance C is (I - QQ') C (I - QQ'). Only
-    its diagonal is needed.
+    The fit takes the residuals' part along six directions Q: what is left of a covariance C is (I - QQ') C (I - QQ').
+    Only its diagonal is needed.
     """
     n, gap = len(p), (p - fitted).ravel()
     A = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), -skew(fitted - fitted.mean(axis=0))], axis=2).reshape(3 * n, 6)
@@ -141,7 +141,7 @@ def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:
 
 
 def cross_validate(
-    fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array, Motion | None]],
+    fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array, ExposureMotion | None]],
     drawing: Array,
     observations: Observations,
     folds: int,
@@ -171,7 +171,7 @@ def cross_validate(
 _FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised", "over_noise")
 
 
-def summary(errors: PairErrors, folds: int, motion: Motion | None = None) -> HeldOut:
+def summary(errors: PairErrors, folds: int, motion: ExposureMotion | None = None) -> HeldOutErrors:
     """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs.
 
     Args:
@@ -180,10 +180,10 @@ def summary(errors: PairErrors, folds: int, motion: Motion | None = None) -> Hel
         motion: how far the board was expected to move between the exposures.
     """
     if not len(errors.pair):
-        raise CalibrationError("no left-out shot has three points seen by both cameras, so the rig cannot be judged")
+        raise CalibrationError("no left-out shot has three points seen by both cameras, so the rig cannot be evaluated")
     w = errors.weight / errors.weight.sum()
     rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}
-    return HeldOut(
+    return HeldOutErrors(
         folds,
         rms["epipolar_px"],
         rms["rigid_m"],
@@ -205,17 +205,17 @@ def residual_epipolar_rms(rig: StereoRig, observations: Observations) -> float:
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def unfinished(solution: Solution) -> tuple[str, ...]:
+def unfinished(solution: BundleSolution) -> tuple[str, ...]:
     """Note that an adjustment ran out of steps, if it did."""
     if solution.converged:
         return ()
     return (
-        f"the adjustment stopped at its last step, {solution.steps}, while still getting better: the detections hardly "
-        "determine some parameter; take more pairs, or fix --model",
+        f"the adjustment stopped at its last step, {solution.steps}, while still improving: the detections hardly "
+        "determine some parameter; take more pairs, or fix --lens-model",
     )
 
 
-def rig_of(solution: Solution) -> StereoRig:
+def rig_of(solution: BundleSolution) -> StereoRig:
     """Return the rig of an adjusted state: its covariance is that of cameras and relative pose, the shape averaged over.
 
     Raises:
@@ -234,18 +234,18 @@ def rig_of(solution: Solution) -> StereoRig:
     return replace(rig, cov=(cov + cov.T) / 2)
 
 
-def scaled(rig: StereoRig, heldout: HeldOut) -> StereoRig:
+def scaled(rig: StereoRig, heldout: HeldOutErrors) -> StereoRig:
     """Scale a rig's uncertainty by what the held-out pairs show.
 
     Up where residuals are not white, down where both cameras err alike and their points agree the better for it. Where
-    boards moved between the exposures, the rig's ``sigma_px`` holds that motion as if it were noise of the detections:
-    who measures with these cameras does not know whether a body moves before them.
+    boards moved between the exposures, the rig's ``sigma_px`` includes that motion as if it were noise of the
+    detections: a measurement does not know whether a body moves before the cameras.
 
     Raises:
-        CalibrationError: the held-out residuals say nothing.
+        CalibrationError: the held-out residuals do not determine the noise.
     """
     factor = heldout.normalised_rms
     if not (np.isfinite(factor) and factor > 0):
-        raise CalibrationError("the left-out shots do not tell how noisy the detections are: take more pairs")
+        raise CalibrationError("the left-out shots do not determine the noise of the detections: take more pairs")
     noise = factor if heldout.motion_rms_m == 0 else heldout.over_noise_rms
     return replace(rig, cov=rig.cov * factor**2, sigma_px=rig.sigma_px * noise)

@@ -1,6 +1,6 @@
 """How far the board moves between the two exposures of a pair: a random effect, learned from the pairs themselves.
 
-Cameras that are not synchronised see a board in the hand at two places. Each pair has its own motion, small for most
+Cameras that are not synchronised see a board in the hand at two positions. Each pair has its own motion, small for most
 and large for a few: normal with a variance of the pair's own, whose inverse is gamma distributed, which makes motions
 of Student's t distribution (Lange, Little and Taylor, "Robust statistical modeling using the t distribution", 1989).
 Scale and weights are found by EM, with MacKay's step for the scale, which reaches zero where nothing moves. A pair that
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.geometry.pose import transform
 from armsight.geometry.rotation import skew
-from armsight.vision.bundle import Solution
+from armsight.vision.bundle import BundleSolution
 
 #: Degrees of freedom of the motions' distribution: four leave the variance finite, and let one pair move five times as
 #: far as the rest.
@@ -27,15 +27,15 @@ START_SHARE, _LEAST = 1e-3, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Record):
+class ExposureMotion(Record):
     """How boards move between the exposures: the motion's scale, and how each of S pairs departs from it.
 
     Attributes:
-        scale_m: scale of the way of the board's middle along each axis, m.
-        scale_rad: scale of the turn about each axis, rad.
+        scale_m: scale of the translation of the board's middle along each axis, m.
+        scale_rad: scale of the rotation about each axis, rad.
         weights: (S,) by how much each pair's variance is smaller than the scale's square: 1 usual, near 0 moved far.
-        rms_m: root mean square of the way along an axis over all pairs, m: what a new pair is expected to do.
-        rms_rad: the same of the turn about an axis, rad.
+        rms_m: root mean square of the translation along an axis over all pairs, m: the prediction for a new pair.
+        rms_rad: the same of the rotation about an axis, rad.
     """
 
     scale_m: float
@@ -45,11 +45,11 @@ class Motion(Record):
     rms_rad: float
 
     @staticmethod
-    def guessed(points: Array, count: int) -> Motion:
+    def guessed(points: Array, count: int) -> ExposureMotion:
         """Return the motion to begin with for a board of points (M, 3), m, in ``count`` pairs."""
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-        way, turn = START_SHARE * diagonal, 2 * START_SHARE
-        return Motion(way, turn, np.ones(count), way, turn)
+        translation, rotation = START_SHARE * diagonal, 2 * START_SHARE
+        return ExposureMotion(translation, rotation, np.ones(count), translation, rotation)
 
     @property
     def sigmas(self) -> Array:
@@ -61,14 +61,14 @@ class Motion(Record):
         """(6,) variance of a new pair's motion."""
         return np.repeat([self.rms_m**2, self.rms_rad**2], 3)
 
-    def shots(self, rows: NDArray[np.intp]) -> Motion:
+    def shots(self, rows: NDArray[np.intp]) -> ExposureMotion:
         """Return the motion of some of the pairs only."""
-        return Motion(self.scale_m, self.scale_rad, self.weights[rows], self.rms_m, self.rms_rad)
+        return ExposureMotion(self.scale_m, self.scale_rad, self.weights[rows], self.rms_m, self.rms_rad)
 
-    def scaled(self, factor: float) -> Motion:
+    def scaled(self, factor: float) -> ExposureMotion:
         """Return the motion with every standard deviation multiplied."""
-        way, turn = factor * self.scale_m, factor * self.scale_rad
-        return Motion(way, turn, self.weights, factor * self.rms_m, factor * self.rms_rad)
+        translation, rotation = factor * self.scale_m, factor * self.scale_rad
+        return ExposureMotion(translation, rotation, self.weights, factor * self.rms_m, factor * self.rms_rad)
 
     def seen_from(self, T_camera_board: Array, middle: Array) -> Array:
         """Return the (6, 6) covariance of a new pair's motion as a tangent [translation; rotation] in a camera's frame.
@@ -81,7 +81,7 @@ class Motion(Record):
         A = np.block([[R, skew(centre) @ R], [np.zeros((3, 3)), R]])
         return np.asarray(A * self.variance @ A.T)
 
-    def updated(self, solution: Solution) -> tuple[Motion, float]:
+    def updated(self, solution: BundleSolution) -> tuple[ExposureMotion, float]:
         """Learn from an adjustment under this motion: the better motion, and how many freedoms the pairs' motions took."""
         estimate, unsure = solution.state.motions**2, np.diagonal(solution.cov_motions, axis1=1, axis2=2)
         scales = np.array([self.scale_m, self.scale_rad])
@@ -91,7 +91,7 @@ class Motion(Record):
         moved = (weights[:, None, None] * estimate.reshape(-1, 2, 3)).sum(axis=(0, 2))
         scale = np.sqrt(moved / np.maximum(freed, 1e-3))
         rms = np.sqrt((estimate + unsure).reshape(-1, 2, 3).mean(axis=(0, 2)))
-        motion = Motion(
+        motion = ExposureMotion(
             max(float(scale[0]), _LEAST), max(float(scale[1]), _LEAST), weights, float(rms[0]), float(rms[1])
         )
         return motion, float(freed.sum())

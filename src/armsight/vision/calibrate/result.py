@@ -1,17 +1,17 @@
-"""What a calibration says about itself: the rig, the errors on held-out pairs, what was thrown away, what is weak."""
+"""The result of a calibration: the rig, the errors on held-out pairs, what was rejected, what is weak."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from armsight.data import Array, Body, Record
-from armsight.vision.bundle import Observations, Solution
-from armsight.vision.calibrate.motion import Motion
+from armsight.vision.bundle import BundleSolution, Observations
+from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.rig import StereoRig
 
 
 @dataclass(frozen=True)
-class Rejected:
+class RejectedPair:
     """A pair that was not used, or not all of it, and why."""
 
     pair: str
@@ -42,7 +42,7 @@ class PairErrors(Record):
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutErrors:
     """Errors on pairs left out of the fit, RMS over all their points.
 
     Attributes:
@@ -51,10 +51,11 @@ class HeldOut:
         rigid_rms_m: triangulated board against the perfect one, after a rigid fit, m.
         scale_error: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%.
         normalised_rms: rigid residual over its predicted sigma; 1 where the uncertainty is honest.
-        over_noise_rms: rigid residual over the sigma that the corners' noise alone gives it, without calibration or motion.
+        over_noise_rms: rigid residual over the sigma that the corners' noise alone gives it, without calibration or
+            motion.
         motion_rms_m: how far the board is expected to move along an axis between the exposures of a left-out pair, m; 0
             where boards stand still.
-        motion_rms_rad: by how much it is expected to turn about an axis, rad.
+        motion_rms_rad: by how much it is expected to rotate about an axis, rad.
     """
 
     folds: int
@@ -69,11 +70,11 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Record):
-    """A calibrated rig and everything that was learned on the way.
+    """A calibrated rig with the estimates and errors of its calibration.
 
     Attributes:
         rig: the result.
-        body: the board or body as estimated, laid on its drawing.
+        body: the board or body as estimated, aligned to its drawing.
         deviation_m: RMS distance of the estimated body from its drawing, m; zero where it was held to it.
         pairs: names of the pairs used, in the order of the observations' shots.
         pairs_found: how many pairs were given.
@@ -83,8 +84,8 @@ class Calibration(Record):
         heldout: errors on held-out pairs.
         errors: the same per pair.
         models: held-out errors of every distortion model that was tried.
-        rejected: pairs thrown away, and why.
-        notes: what was mended or partly dropped, and why.
+        rejected: pairs rejected, and why.
+        notes: what was corrected or partly dropped, and why.
         weaknesses: what is weak, and what to do about it.
         motion: how far the board moved between the two exposures of a pair; None where it stood still.
     """
@@ -95,15 +96,15 @@ class Calibration(Record):
     pairs: tuple[str, ...]
     pairs_found: int
     observations: Observations
-    solution: Solution
+    solution: BundleSolution
     epipolar_rms_px: float
-    heldout: HeldOut
+    heldout: HeldOutErrors
     errors: PairErrors
-    models: dict[str, HeldOut]
-    rejected: tuple[Rejected, ...]
+    models: dict[str, HeldOutErrors]
+    rejected: tuple[RejectedPair, ...]
     notes: tuple[str, ...]
     weaknesses: tuple[str, ...]
-    motion: Motion | None = None
+    motion: ExposureMotion | None = None
 
     @property
     def reprojection_rms_px(self) -> float:

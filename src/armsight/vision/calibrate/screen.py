@@ -1,7 +1,7 @@
-"""Throwing out what would spoil a calibration: gross corner errors, bad pairs, boards named in another order.
+"""Reject what would spoil a calibration: gross corner errors, bad pairs, boards named in another order.
 
-A robust adjustment comes first; the noise is read off its residuals, so no threshold is in pixels. Everything thrown
-away is named with its reason.
+A robust adjustment comes first; the noise is estimated from its residuals, so no threshold is in pixels. Everything
+rejected is named with its reason.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, transform
-from armsight.vision.bundle import Model, Observations, Solution, State, minimise
-from armsight.vision.calibrate.result import Rejected
+from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.calibrate.result import RejectedPair
 from armsight.vision.camera import Camera
 from armsight.vision.pnp import body_poses
 
@@ -22,8 +22,8 @@ from armsight.vision.pnp import body_poses
 CORNER_SIGMAS = 6.0
 #: A pair whose typical corner is this many times the usual error is bad as a whole.
 PAIR_RATIO = 3.0
-#: While errors are looked for, a board may move between the exposures this many times as far as is usual at no great cost;
-#: twice as far again, RMS over the six freedoms, and it is no board in a hand.
+#: While errors are looked for, a board may move between the exposures this many times as far as is usual at no great
+#: cost; twice as far again, RMS over the six freedoms, and it is no board in a hand.
 MOTION_EASE, _FAR = 5.0, 2.0
 #: A pair that loses more than this share of its corners is not trusted for the rest.
 LOST_SHARE = 0.25
@@ -35,26 +35,26 @@ _MEDIAN_CHI2_2 = 1.3863  # median of the chi-square distribution of two degrees 
 
 @dataclass(frozen=True, eq=False)
 class Screened(Record):
-    """What is left after screening.
+    """The detections that remain after screening.
 
     Attributes:
         observations: the good detections, shots renumbered.
-        unscreened: all detections of the same pairs: what a measurement would have to cope with.
-        kept: (S,) rows of the pairs that are left.
-        solution: the robust adjustment of what is left.
-        rejected: pairs thrown out, and why.
+        unscreened: all detections of the same pairs: what a measurement would meet.
+        kept: (S,) rows of the pairs that remain.
+        solution: the robust adjustment of those.
+        rejected: pairs rejected, and why.
         notes: pairs of which corners were dropped, and how many.
     """
 
     observations: Observations
     unscreened: Observations
     kept: NDArray[np.int64]
-    solution: Solution
-    rejected: tuple[Rejected, ...]
+    solution: BundleSolution
+    rejected: tuple[RejectedPair, ...]
     notes: tuple[str, ...]
 
 
-def noise_px(solution: Solution, observations: Observations, free_count: float) -> float:
+def noise_px(solution: BundleSolution, observations: Observations, free_count: float) -> float:
     """Estimate a detection's standard deviation beyond its image covariance from the residuals, px.
 
     Args:
@@ -72,15 +72,15 @@ def noise_px(solution: Solution, observations: Observations, free_count: float) 
     return float(np.sqrt(max(per_axis - image, 1e-6)))
 
 
-def robust_sigma(solution: Solution) -> float:
+def robust_sigma(solution: BundleSolution) -> float:
     """Standard deviation of a detection by the median of the residuals' distances, px."""
     return float(np.sqrt(np.median((solution.residuals_px**2).sum(axis=1)) / _MEDIAN_CHI2_2))
 
 
 def screen(
-    model: Model, start: State, observations: Observations, names: tuple[str, ...], *, sigma_px: float = 1.0
+    model: BundleModel, start: BundleState, observations: Observations, names: tuple[str, ...], *, sigma_px: float = 1.0
 ) -> Screened:
-    """Adjust robustly and throw out gross corners and bad pairs until nothing more stands out.
+    """Adjust robustly and reject gross corners and bad pairs until no more are found.
 
     Args:
         model: the board.
@@ -90,9 +90,9 @@ def screen(
         sigma_px: standard deviation of a detection to begin with, px.
 
     Returns:
-        What is left.
+        The detections that remain.
     """
-    rejected: list[Rejected] = []
+    rejected: list[RejectedPair] = []
     kept = np.arange(observations.shot_count)
     good = np.ones(len(observations.shot), bool)
     state, sigma = start, sigma_px
@@ -105,7 +105,7 @@ def screen(
         distance[rows] = _whitened(solution, now)
         good &= ~(distance > CORNER_SIGMAS)
         bad = _bad_pairs(observations, kept, distance, good) | _far_moved(model, kept, solution)
-        rejected += [Rejected(names[j], reason) for j, reason in bad.items()]
+        rejected += [RejectedPair(names[j], reason) for j, reason in bad.items()]
         left = np.array([j for j in kept if j not in bad], dtype=np.int64)
         still = np.isin(kept, left)
         state = replace(
@@ -128,13 +128,13 @@ def screen(
     return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))
 
 
-def _of_shots(model: Model, kept: NDArray[np.int64]) -> Model:
+def _of_shots(model: BundleModel, kept: NDArray[np.int64]) -> BundleModel:
     """Return the model of some of the shots."""
     return replace(model, motion_sigmas=model.motion_sigmas[kept]) if len(model.motion_sigmas) else model
 
 
-def _far_moved(model: Model, kept: NDArray[np.int64], solution: Solution) -> dict[int, str]:
-    """Return the pairs whose board is at another place in each image, further than a hand moves it, with the reason."""
+def _far_moved(model: BundleModel, kept: NDArray[np.int64], solution: BundleSolution) -> dict[int, str]:
+    """Return the pairs whose board is at another position in each image, further than a hand moves it, with the reason."""
     bad: dict[int, str] = {}
     for j, motion in zip(kept, solution.state.motions, strict=False):
         ratio = float(np.sqrt(np.mean((motion / model.motion_sigmas[j]) ** 2)))
@@ -155,7 +155,7 @@ def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArr
     )
 
 
-def _whitened(solution: Solution, observations: Observations) -> Array:
+def _whitened(solution: BundleSolution, observations: Observations) -> Array:
     """(N,) distance of every detection in standard deviations of its own camera, one of which may be the noisier."""
     distance = np.linalg.norm(solution.residuals_px, axis=1)
     sigma = [np.sqrt(np.median(distance[observations.camera == side] ** 2) / _MEDIAN_CHI2_2) for side in (0, 1)]
@@ -165,7 +165,7 @@ def _whitened(solution: Solution, observations: Observations) -> Array:
 def _bad_pairs(
     observations: Observations, kept: NDArray[np.int64], distance: Array, good: NDArray[np.bool_]
 ) -> dict[int, str]:
-    """Return the pairs to throw out now, with reasons; the worst ones first, so that they cannot spoil the others."""
+    """Return the pairs to reject now, with reasons; the worst ones first, so that they cannot spoil the others."""
     level = {j: float(np.nanmedian(distance[observations.shot == j])) for j in kept}
     usual = float(np.median(list(level.values())))
     bad: dict[int, str] = {}
@@ -189,17 +189,19 @@ def _bad_pairs(
     return {j: reason for j, reason in bad.items() if level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}
 
 
-def mend_flips(points: Array, state: State, observations: Observations, flips: tuple[Ids, ...]) -> dict[int, Ids]:
+def correct_symmetries(
+    points: Array, state: BundleState, observations: Observations, symmetries: tuple[Ids, ...]
+) -> dict[int, Ids]:
     """Find pairs whose right image names the board's corners in another order than the left one.
 
     Args:
         points: (M, 3) points of the board, m.
         state: cameras and relative pose that most pairs agree on.
         observations: all detections.
-        flips: the orders in which a symmetric board may be named.
+        symmetries: permutations (M,) under which the board looks the same.
 
     Returns:
-        Shot -> the permutation that brings its right detections into the left's order.
+        Shot -> the permutation that sorts its right detections into the left's order.
     """
     found: dict[int, Ids] = {}
     T_right_left = inverse(state.T_left_right)
@@ -210,7 +212,7 @@ def mend_flips(points: Array, state: State, observations: Observations, flips: t
         ids = [observations.point[r] for r in rows]
         candidates = body_poses(points[ids[0]], state.cameras[0], uv[0])
         scores = []
-        for order in (np.arange(len(points)), *flips):
+        for order in (np.arange(len(points)), *symmetries):
             renamed = points[order[ids[1]]]
             errors = [
                 np.median(np.linalg.norm(_project(right, T_right_left @ T, renamed) - uv[1], axis=1))
@@ -219,7 +221,7 @@ def mend_flips(points: Array, state: State, observations: Observations, flips: t
             scores.append(min(errors, default=np.inf))
         best = int(np.argmin(scores))
         if best and scores[best] < 0.2 * scores[0]:
-            found[shot] = flips[best - 1]
+            found[shot] = symmetries[best - 1]
     return found
 
 

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.bundle import Model, Observations, Solution, State, minimise
+from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.pnp import MIN_POINTS, body_poses
 
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)
 _STARTS_KEPT = 3
-#: So many views, spread over all, tell the focal lengths to start from.
-_TELLING_VIEWS = 12
+#: Number of views, spread over all, from which the first focal lengths are estimated.
+_FOCAL_VIEWS = 12
 #: Corners that all fit so well, px RMS, leave no doubt about the minimum: wrong ones are off by whole pixels. So does a
 #: lens that imitates another one, to begin with.
 _FITS_PX, _IMITATES_PX = 0.1, 1.0
@@ -51,7 +51,7 @@ def _focal_candidates(
 ) -> list[float]:
     """Return the focal lengths, px, under which one camera's views fit best, best first."""
     views = [rows for rows in _views(observations, side) if len(rows) >= MIN_POINTS]
-    views = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), _TELLING_VIEWS)).astype(int))]
+    views = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), _FOCAL_VIEWS)).astype(int))]
     scores = []
     for focal in _FOCAL_LADDER * max(size):
         camera = pinhole(size, focal, model)
@@ -117,8 +117,8 @@ def _agreeing_poses(left: list[list[Array]], right: list[list[Array]], T_left_ri
     return chosen
 
 
-def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Observations) -> State | None:
-    """Build a state from two cameras: poses of all shots and the relative pose; None where a shot cannot be placed."""
+def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Observations) -> BundleState | None:
+    """Build a state from two cameras: poses of all shots and the relative pose; None where a shot has no pose."""
     candidates: list[list[list[Array]]] = []
     for side, camera in enumerate(cameras):
         candidates.append(
@@ -132,12 +132,12 @@ def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Obser
     if not hypotheses:
         return None
     poses = _agreeing_poses(candidates[0], candidates[1], hypotheses[0])
-    return None if poses is None else State(cameras, hypotheses[0], np.stack(poses), np.zeros(0))
+    return None if poses is None else BundleState(cameras, hypotheses[0], np.stack(poses), np.zeros(0))
 
 
 def start_board(
     points: Array, sizes: tuple[tuple[int, int], tuple[int, int]], observations: Observations, model: str
-) -> Solution:
+) -> BundleSolution:
     """Calibrate two cameras from nothing, roughly: the start for every later adjustment.
 
     Args:
@@ -153,8 +153,8 @@ def start_board(
         CalibrationError: no start leads anywhere.
     """
     focals = [_focal_candidates(points, sizes[side], observations, side, model) for side in (0, 1)]
-    plain = Model(points, np.zeros((0, len(points), 3)), 1.0, True)
-    best: Solution | None = None
+    plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
+    best: BundleSolution | None = None
     for left, right in zip(*focals, strict=True):
         cameras = (pinhole(sizes[0], left, model), pinhole(sizes[1], right, model))
         state = _assemble(points, cameras, observations)
@@ -170,18 +170,18 @@ def start_board(
     return best
 
 
-def fits(solution: Solution) -> bool:
+def fits(solution: BundleSolution) -> bool:
     """Whether a solution leaves no doubt that it is the right minimum: no other start needs to be tried."""
     return float((solution.residuals_px**2).sum(axis=1).mean()) < _FITS_PX**2
 
 
 def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:
-    """Return the camera of another distortion model that sees as one does, by Gauss-Newton; None where none comes near.
+    """Approximate a camera by another distortion model, by Gauss-Newton; None where none comes near.
 
     Args:
         camera: to be imitated.
         model: the other model.
-        uv: (N, 2) where in the image, raw pixels.
+        uv: (N, 2) raw pixels at which the two are compared.
     """
     rays = camera.unproject(uv)
     seen = np.isfinite(rays).all(axis=1)
@@ -199,7 +199,7 @@ def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:
     return found if off < _IMITATES_PX**2 else None  # NaN is no good either
 
 
-def _staged(model: Model, state: State, observations: Observations) -> Solution | None:
+def _staged(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution | None:
     """Adjust focal lengths first, then everything, each from wide to narrow noise; None where it leads nowhere."""
     sizes = [camera.parameters.size for camera in state.cameras]
     focal = np.zeros(sum(sizes) + 6, bool)

@@ -1,11 +1,11 @@
-"""What is weak in a calibration, in words, and what to do about it."""
+"""The weaknesses of a calibration, as sentences, with advice."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from armsight.data import Array
-from armsight.vision.calibrate.motion import Motion
+from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration
 
 _LEAST_TILT_DEG = 15.0
@@ -19,7 +19,7 @@ _FAR_MOTION = 2.0
 
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
-    """Judge a calibration.
+    """Assess a calibration.
 
     Returns:
         One sentence per weakness: what it is and what to do; empty where nothing stands out.
@@ -102,12 +102,12 @@ def _synchrony(calibration: Calibration) -> str | None:
     if late and usual > 0:
         return (
             f"{len(late)} pairs have an epipolar error over 2.5 times the usual {usual:.2f} px ({', '.join(late[:4])}): "
-            "unsynchronised cameras see a moving board at two places; hold it still, or trigger both cameras together"
+            "unsynchronised cameras see a moving board at two positions; hold it still, or trigger both cameras together"
         )
     return None
 
 
-def _moved(calibration: Calibration, motion: Motion) -> str:
+def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
     state = calibration.solution.state
     distance = float(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1).mean())
     way_px = calibration.rig.right.intrinsics[0] * motion.rms_m / distance
@@ -127,7 +127,7 @@ def _sides(calibration: Calibration) -> str | None:
     x, y, _ = calibration.rig.T_left_right[:3, 3]
     if x < 0 and abs(x) > abs(y):
         return (
-            "the camera given as right stands to the left of the other: are left and right swapped? (the result is "
+            "the camera given as right stands to the left of the other: are left and right exchanged? (the result is "
             "valid for the cameras as they were given)"
         )
     return None
@@ -152,7 +152,7 @@ def _scale(calibration: Calibration) -> str | None:
     if abs(error) > max(0.005, _SCALE_SIGMAS * spread):
         return (
             f"held-out boards come out {100 * error:+.2f}% too {'large' if error > 0 else 'small'}: lens and board do "
-            "not fit each other; is the board flat, and as wide as drawn? (a wrong square size does not show here: it "
+            "not fit each other; is the board flat, and as wide as specified? (a wrong square size does not show here: it "
             "makes baseline and board wrong alike, so measure a square)"
         )
     return None

@@ -34,7 +34,7 @@ from armsight.vision.rigfiles.rigfile import (
 FILES = "one file, camchain.yaml"
 #: Kalibr model -> ours.
 MODELS = {"radtan": "brown4", "equidistant": "fisheye", "none": "none"}
-#: What armsight has no place for.
+#: Keys that armsight cannot represent.
 _LEFT_BEHIND = ("T_cam_imu", "timeshift_cam_imu", "rostopic")
 
 

@@ -114,7 +114,7 @@ def _line(cause: BaseException | None) -> str:
 
 
 def _value(node: cv2.FileNode) -> Foreign:
-    """Turn a node into an array, a number or a text."""
+    """Convert a node to an array, a number or a text."""
     if node.isMap():
         return node.mat()
     if node.isSeq():

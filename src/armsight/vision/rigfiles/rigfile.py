@@ -1,8 +1,8 @@
 """The contract of a foreign rig file: another program's calibration goes in, a StereoRig comes out, and back.
 
 To add a format: write one module with the two functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
-``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the formats share,
-such as reading YAML, checking matrices and OpenCV's rectification, stands here too.
+``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the
+formats share, such as reading YAML, checking matrices and OpenCV's rectification, stands here too.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 
-#: What stands in a foreign file: a number, a text, a list or a mapping, unknown until checked.
+#: A value of a foreign file: a number, a text, a list or a mapping, unknown until checked.
 Foreign: TypeAlias = Any
-#: Assumed where a file does not say how well a detection is placed: what chessboard corners in fair webcam images
-#: reach. A larger value widens every predicted uncertainty in proportion.
+#: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A
+#: larger value widens every predicted uncertainty in proportion.
 ASSUMED_SIGMA_PX = 0.2
 #: A printed rotation may be this far from orthonormal: three digits leave 1e-3, six leave 1e-6.
 LOOSEST_ROTATION = 2e-3
@@ -35,7 +35,7 @@ LOOSEST_ROTATION = 2e-3
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What a person may have to add to a foreign file.
+    """Values that a user may have to add to a foreign file.
 
     Attributes:
         unit_m: length of the file's unit of translation, m; None where the file or the format says it.
@@ -68,9 +68,9 @@ class RigFormat(Protocol):
         ...
 
 
-def count_paths(paths: Sequence[Path], wanted: Sequence[int], names: str) -> None:
+def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> None:
     """Check the number of files given."""
-    if len(paths) not in wanted:
+    if len(paths) not in allowed:
         raise InputError(f"expected {names}, got {len(paths)} file(s): {', '.join(map(str, paths)) or 'none'}")
 
 
@@ -102,7 +102,7 @@ def dump_yaml(document: Mapping[str, Foreign]) -> str:
 
 
 def write_together(paths: Sequence[Path], texts: Sequence[str]) -> None:
-    """Write several text files; none takes its place before all are written out."""
+    """Write several text files; none replaces its old file before all are written out."""
     with contextlib.ExitStack() as stack:
         for path, text in zip(paths, texts, strict=True):
             file = stack.enter_context(replacing(path))
@@ -119,7 +119,7 @@ def need(document: Foreign, key: str) -> Foreign:
 
 @contextlib.contextmanager
 def naming(where: str | Path) -> Iterator[None]:
-    """Put the name of a file, or of a part of it, before any error about what stands there."""
+    """Put the name of a file, or of a part of it, before any error about its content."""
     try:
         yield
     except InputError as error:
@@ -181,7 +181,7 @@ def imported(
     if T_left_right[0, 3] < 0 and abs(T_left_right[0, 3]) > abs(T_left_right[1, 3]):
         notes.append("the second camera stands left of the first; armsight calls the first one left all the same")
     if not np.linalg.norm(T_left_right[:3, 3]) > 0:
-        raise InputError(f"{paths[-1]}: the two cameras stand in one place (baseline 0); this is not a stereo pair")
+        raise InputError(f"{paths[-1]}: the two cameras are at one position (baseline 0); this is not a stereo pair")
     count = left.parameters.size + right.parameters.size + 6
     provenance = {
         "origin": "imported",

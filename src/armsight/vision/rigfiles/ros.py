@@ -1,7 +1,7 @@
 """A ROS camera_info pair: two YAML files as camera_calibration writes them, left and right.
 
 The files hold no relative pose. It follows from both rectification matrices and the last columns of the projection
-matrices, which place the cameras in the rectified frame: P = K' [I | t], t = (-B, 0, 0) for the right one, so
+matrices, which position the cameras in the rectified frame: P = K' [I | t], t = (-B, 0, 0) for the right one, so
 p_left = R_left^T (R_right p_right - K_right'^-1 P_right[:, 3] + K_left'^-1 P_left[:, 3]). Translations are in metres
 (REP 103). Models: plumb_bob, rational_polynomial, equidistant.
 """
@@ -118,7 +118,7 @@ def _read_one(document: Mapping[str, Foreign], options: ImportOptions) -> tuple[
 
 
 def _data(document: Mapping[str, Foreign], key: str, shape: tuple[int, int] | None) -> Array:
-    """Return the numbers of a matrix entry, (n,) where no shape is wanted."""
+    """Return the numbers of a matrix entry, (n,) where no shape is required."""
     data = checked(need(need(document, key), "data"), (None,), f"{key}.data")
     if shape is None:
         return data

@@ -1,6 +1,11 @@
-"""Where shots come from: one file a kind of source, behind the contract in source.py.
+"""Sources of shots: a spec such as ``KIND:...`` or the path of a folder goes in, one shot after another comes out.
 
-``open_source`` turns what a user writes, ``KIND:...`` or the path of a folder, into a source.
+The contract is in ``source.py``; :func:`open_source` opens a spec.
+
+- Recordings: ``folder.py``, ``pairs.py`` (two globs of images), ``video.py``.
+- Live cameras: ``usb.py``, ``url.py``, with ``timing.py`` (pairing by time stamp) and ``capture.py`` (OpenCV's
+  capture).
+- ``v4l2.py``: the attached cameras and their formats, for ``armsight cameras``.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ __all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "open_source"]
 
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
-    "folder": FolderSource,
+    "folder": FolderSource.open,
     "video": open_video,
     "url": open_url,
     "usb": open_usb,
@@ -32,7 +37,7 @@ def open_source(spec: str) -> Source:
 
     Args:
         spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``,
-            ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``; docs/sources.md.
+            ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``; docs/howto/sources.md.
 
     Raises:
         InputError: an unknown kind, or what is named is not there or not usable.
@@ -42,6 +47,6 @@ def open_source(spec: str) -> Source:
     if colon and kind in SOURCES:
         return SOURCES[kind](rest)
     if os.path.isdir(os.path.expanduser(spec)):
-        return FolderSource(spec)
+        return FolderSource.open(spec)
     known = ", ".join(f"{name}:..." for name in SOURCES)
     raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")

@@ -1,11 +1,15 @@
-"""Open OpenCV's video capture so that what goes wrong is said by armsight, in one line, and not by OpenCV on stderr."""
+"""OpenCV's video capture without its log: errors are reported by armsight, in one line, and not by OpenCV on stderr."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 
 import cv2
+
+from armsight.data import Image
 
 #: Read by OpenCV when it first uses them; what the user has set stays.
 _ENVIRONMENT = {
@@ -14,11 +18,70 @@ _ENVIRONMENT = {
 }
 
 
-def open_capture(what: str, api: int = cv2.CAP_ANY, parameters: Sequence[int] = ()) -> cv2.VideoCapture | None:
+class _Silence:
+    """Switches OpenCV's log off while at least one thread is inside; OpenCV has one level for the process."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._level = threading.Lock(), 0, 0
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Keep the log off for a block, unless the user has set its level."""
+        if "OPENCV_LOG_LEVEL" in os.environ:
+            yield
+            return
+        with self._lock:
+            if self._inside == 0:
+                self._level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if self._inside == 0:
+                    cv2.utils.logging.setLogLevel(self._level)
+
+
+_silent = _Silence()
+
+
+class QuietCapture:
+    """A ``cv2.VideoCapture`` whose calls do not log; the log's level is as before after each of them."""
+
+    def __init__(self, capture: cv2.VideoCapture) -> None:
+        self._capture = capture
+
+    def set(self, prop: int, value: float, /) -> bool:
+        """Set a property."""
+        with _silent():
+            return self._capture.set(prop, value)
+
+    def get(self, prop: int, /) -> float:
+        """Read a property."""
+        with _silent():
+            return self._capture.get(prop)
+
+    def grab(self) -> bool:
+        """Take the next frame, undecoded; False when none came."""
+        with _silent():
+            return self._capture.grab()
+
+    def retrieve(self) -> tuple[bool, Image]:
+        """Decode the grabbed frame."""
+        with _silent():
+            return self._capture.retrieve()
+
+    def release(self) -> None:
+        """Close the file, stream or device."""
+        with _silent():
+            self._capture.release()
+
+
+def open_capture(what: str, api: int = cv2.CAP_ANY, parameters: Sequence[int] = ()) -> QuietCapture | None:
     """Open a file, an address or a device; None if OpenCV cannot."""
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    if "OPENCV_LOG_LEVEL" not in os.environ:
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    capture = cv2.VideoCapture(what, api, parameters)
-    return capture if capture.isOpened() else None
+    with _silent():
+        capture = cv2.VideoCapture(what, api, parameters)
+        return QuietCapture(capture) if capture.isOpened() else None

@@ -1,8 +1,8 @@
 """A folder of stored shots: what ``armsight record`` wrote, or just left and right images.
 
-In: a folder. Out: its shots in order. A recording has an index, ``shots.csv``, one line a shot: its name, the time of
-the grab, the two files and, where there are none, why. Without an index the images are left* and right* in the folder,
-or all images in its subfolders left and right, paired by sorted name.
+In: a folder. Out: its shots, in the order of the index. A recording has an index, ``shots.csv``, one line a shot: its
+name, the time of the grab, the two files and, where there are none, why. Without an index the images are left* and
+right* in the folder, or all images in its subfolders left and right, paired by sorted name.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.files import read_text
-from armsight.vision.sources.pairs import Pair, StoredSource, match
+from armsight.vision.sources.pairs import StoredPair, StoredSource, match
 
 #: The index of a recording, and its columns; t_s is empty where the source has no clock, left and right where the shot
 #: has a problem.
@@ -27,7 +27,8 @@ _IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".w
 class FolderSource(StoredSource):
     """The shots stored in a folder."""
 
-    def __init__(self, directory: str | Path) -> None:
+    @staticmethod
+    def open(directory: str | Path) -> FolderSource:
         """Read the index or match the names.
 
         Raises:
@@ -36,10 +37,10 @@ class FolderSource(StoredSource):
         folder = Path(directory).expanduser()
         if not folder.is_dir():
             raise InputError(f"{directory}: no such folder")
-        super().__init__(_indexed(folder) if (folder / INDEX).exists() else _matched(folder))
+        return FolderSource(_indexed(folder) if (folder / INDEX).exists() else _matched(folder))
 
 
-def _matched(folder: Path) -> tuple[Pair, ...]:
+def _matched(folder: Path) -> tuple[StoredPair, ...]:
     """Pair the images of a folder without an index."""
     sides = []
     for side in ("left", "right"):
@@ -59,13 +60,13 @@ def _matched(folder: Path) -> tuple[Pair, ...]:
     return match(left, right, str(said_left), str(said_right))
 
 
-def _indexed(folder: Path) -> list[Pair]:
+def _indexed(folder: Path) -> list[StoredPair]:
     """Read the index of a recording."""
     index = folder / INDEX
     rows = _rows(index)
     if next(rows, ("", []))[1] != list(COLUMNS):
         raise InputError(f"{index}: line 1: expected the columns {','.join(COLUMNS)}")
-    pairs: dict[str, Pair] = {}
+    pairs: dict[str, StoredPair] = {}
     for where, row in rows:
         if len(row) != len(COLUMNS):
             raise InputError(f"{where}: expected {len(COLUMNS)} fields, found {len(row)}")
@@ -75,7 +76,7 @@ def _indexed(folder: Path) -> list[Pair]:
         if not problem and not (left and right):
             raise InputError(f"{where}: shot {name!r} has no images and no reason why")
         files = [folder / file if file and not problem else None for file in (left, right)]
-        pairs[name] = Pair(name, files[0], files[1], _seconds(t_s, where), problem or None)
+        pairs[name] = StoredPair(name, files[0], files[1], _seconds(t_s, where), problem or None)
     if not pairs:
         raise InputError(f"{index}: holds no shots")
     return list(pairs.values())

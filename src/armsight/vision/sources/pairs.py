@@ -20,8 +20,8 @@ from armsight.vision.image import read_image
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Where one shot is stored; left and right are None where the recording says it has no images, and why."""
+class StoredPair:
+    """The files of one shot; left and right are None where the recording has no images, and ``problem`` says why."""
 
     name: str
     left: Path | None
@@ -46,7 +46,7 @@ class StoredSource:
         pairs: all of them, in the order they are read.
     """
 
-    def __init__(self, pairs: Sequence[Pair]) -> None:
+    def __init__(self, pairs: Sequence[StoredPair]) -> None:
         self.pairs = tuple(pairs)
         self._rest = iter(self.pairs)
 
@@ -63,8 +63,14 @@ class StoredSource:
 class PairsSource(StoredSource):
     """The image files that two globs match, paired by sorted name; a shot is called after its left file."""
 
-    def __init__(self, left_glob: str, right_glob: str) -> None:
-        super().__init__(match(_files(left_glob), _files(right_glob), left_glob, right_glob))
+    @staticmethod
+    def open(left_glob: str, right_glob: str) -> PairsSource:
+        """Find the files and pair them.
+
+        Raises:
+            InputError: no files, or files that do not pair up.
+        """
+        return PairsSource(match(_files(left_glob), _files(right_glob), left_glob, right_glob))
 
 
 def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
@@ -72,17 +78,17 @@ def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part)
 
 
-def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_right: str) -> tuple[Pair, ...]:
+def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_right: str) -> tuple[StoredPair, ...]:
     """Pair left and right files by sorted name.
 
     Args:
         lefts: the left files.
         rights: the right files.
-        said_left: what the user wrote for the left files, for the messages.
+        said_left: the user's text for the left files, for the messages.
         said_right: the same for the right files.
 
     Raises:
-        InputError: no file, unequal counts, a file without a partner, or a file that stands on both sides.
+        InputError: no file, unequal counts, a file without a partner, or a file that is on both sides.
     """
     left, right = (sorted(files, key=natural_key) for files in (lefts, rights))
     for files, said in ((left, said_left), (right, said_right)):
@@ -99,7 +105,7 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
             f"{said_left} and {said_right} do not pair up: {len(left)} left and {len(right)} right images; "
             f"first without a partner: {alone or max(left, right, key=len)[min(len(left), len(right))]}"
         )
-    return tuple(Pair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
+    return tuple(StoredPair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
 
 
 def _files(pattern: str) -> list[Path]:
@@ -108,9 +114,9 @@ def _files(pattern: str) -> list[Path]:
 
 
 def _without_partner(left: Sequence[Path], right: Sequence[Path]) -> Path | None:
-    """Return the first file whose numbers appear on its own side alone; None where numbers do not tell.
+    """Return the first file whose numbers appear on its own side alone; None where numbers are ambiguous.
 
-    Only the places where a number varies within a side count: cam0_17 and cam1_17 are partners.
+    Only the positions at which a number varies within a side count: cam0_17 and cam1_17 are partners.
     """
     numbers = [[tuple(map(int, re.findall(r"\d+", file.stem))) for file in side] for side in (left, right)]
     if len({len(n) for side in numbers for n in side}) != 1:

@@ -1,4 +1,4 @@
-"""The contract of a source: something that hands out one :class:`~armsight.data.Shot` after another.
+"""The contract of a source: it returns one :class:`~armsight.data.Shot` after another.
 
 To add a kind of source: write one file with a class that fulfils :class:`Source`, and add one line to the registry in
 ``__init__.py``.
@@ -23,5 +23,5 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of files and devices; harmless when called twice."""
+        """Release files and devices; a second call has no effect."""
         ...

@@ -1,13 +1,11 @@
 """Two live streams: MJPEG over HTTP, or RTSP.
 
-In: two addresses. Out: shots from the newest frames of both, paired by the time of arrival (time.monotonic; the
-network's delay is in it). Each stream has a thread that keeps its newest frame, so a slow user gets fresh shots and not
-a growing lag. Frames that no partner reaches within half a frame period are passed over.
+In: two addresses. Out: shots from the newest frames of both, paired by the time of arrival (time.monotonic; it includes
+the network's delay). Each stream has a thread that keeps its newest frame, so a slow user gets fresh shots and not a
+growing lag. Frames without a partner within half a frame period are skipped.
 
-One live stream of frames: MJPEG over HTTP, or RTSP.
-
-In: an address. Out: the frames with their times of arrival (time.monotonic). MJPEG is multipart/x-mixed-replace (RFC
-2046): a boundary line, a header that may tell the length, a JPEG file, over and over.
+MJPEG is multipart/x-mixed-replace (RFC 2046): a boundary line, a header that may give the length, a JPEG file, and
+again.
 """
 
 from __future__ import annotations
@@ -222,6 +220,9 @@ class UrlSource:
         self._readers = [_Reader(stream, self._changed) for stream in (left, right)]
         self._timeout_s = timeout_s
         self._shots = 0
+
+    def start(self) -> None:
+        """Connect both streams, each in a thread of its own."""
         for reader in self._readers:
             reader.start()
 
@@ -260,7 +261,7 @@ class UrlSource:
                     raise DeviceError(self._why_no_pair())
 
     def _why_no_pair(self) -> str:
-        """Say which stream is silent, or that their frames never come close in time."""
+        """Return which stream is silent, or that their frames never come close in time."""
         silent = [reader.stream.url for reader in self._readers if reader.newest is None]
         if silent:
             return f"{' and '.join(silent)}: no frame for {self._timeout_s:g} s"
@@ -274,7 +275,9 @@ def open_url(rest: str) -> UrlSource:
     if len(urls) != 2:
         raise InputError(f"url:{shown(rest)}: expected url:URL_LEFT,URL_RIGHT")
     left, right = (_stream(url) for url in urls)
-    return UrlSource(left, right)
+    source = UrlSource(left, right)
+    source.start()
+    return source
 
 
 def _stream(url: str) -> Stream:
@@ -290,7 +293,7 @@ def _stream(url: str) -> Stream:
 
 
 def _image(frame: bytes | Image | None) -> Image | None:
-    """Decode a JPEG file; None if it is none or cut short."""
+    """Decode a JPEG file; None if it is not one or is truncated."""
     if not isinstance(frame, bytes):
         return frame
     whole = frame.startswith(b"\xff\xd8") and frame.rstrip(b"\r\n\0").endswith(b"\xff\xd9")

@@ -1,6 +1,6 @@
 """Two USB cameras: V4L2 through OpenCV.
 
-In: two devices and the settings asked for. Out: shots at the cameras' pace. Both cameras are grabbed before either
+In: two devices and the requested settings. Out: shots at the cameras' pace. Both cameras are grabbed before either
 image is decoded. The time stamp is the driver's, taken when the frame arrived (OpenCV hands it on; time.monotonic's
 clock), and where a driver has none, the time after the grab. Drivers queue frames, and not the same number while two
 cameras start: so old frames are passed over, and whichever camera is more than half a frame period behind is grabbed
@@ -29,12 +29,12 @@ _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
 _FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]"
 
-#: OpenCV's property -> its name and value in messages and the value to set; in the order they must be set.
+#: OpenCV's property -> its name and value in messages and the value to set; in the order in which they must be set.
 Settings = dict[int, tuple[str, float]]
 
 
 class Capture(Protocol):
-    """What of cv2.VideoCapture is used; tests bring their own."""
+    """The methods of cv2.VideoCapture that are used; tests bring their own."""
 
     def set(self, prop: int, value: float, /) -> bool:
         """Set a property."""
@@ -60,14 +60,18 @@ class Capture(Protocol):
 class UsbCamera:
     """One camera, set up, with its newest frame's time stamp."""
 
-    def __init__(self, device: str, settings: Settings, capture: Capture) -> None:
-        """Set everything asked for, and read it back.
+    def __init__(self, device: str, capture: Capture, shape: tuple[int, int]) -> None:
+        self.device, self.capture = device, capture
+        self.rhythm, self.t_s = Rhythm(), 0.0
+        self._shape = shape
+
+    @staticmethod
+    def set_up(device: str, settings: Settings, capture: Capture) -> UsbCamera:
+        """Set all properties requested, and read them back.
 
         Raises:
             DeviceError: the camera did not take a value.
         """
-        self.device, self.capture = device, capture
-        self.rhythm, self.t_s = Rhythm(), 0.0
         for key, (_, value) in settings.items():
             capture.set(key, value)
         for key, (name, value) in settings.items():
@@ -77,7 +81,8 @@ class UsbCamera:
                 raise DeviceError(
                     f"{device}: did not take {name}, it says {said}; `armsight cameras` lists what it can do"
                 )
-        self._shape = (int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        shape = (int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        return UsbCamera(device, capture, shape)
 
     def grab(self, stall_s: float) -> None:
         """Take the newest frame and its time stamp, and leave it undecoded.
@@ -153,7 +158,7 @@ class UsbSource:
         return Shot(name, images[0], images[1], t_s)
 
     def close(self) -> None:
-        """Let go of both cameras."""
+        """Release both cameras."""
         self._left.capture.release()
         self._right.capture.release()
 
@@ -175,7 +180,7 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
     try:
         for device in devices:
             opened.append((capture or _v4l2)(device))
-            cameras.append(UsbCamera(device, settings, opened[-1]))
+            cameras.append(UsbCamera.set_up(device, settings, opened[-1]))
     except DeviceError:
         for one in opened:
             one.release()

@@ -1,4 +1,4 @@
-"""Video files: one for each camera, or one with both pictures side by side.
+"""Video files: one for each camera, or one with both images side by side.
 
 In: file names. Out: one shot a frame, with the file's own time stamps. Frames are paired by time stamp, so that a frame
 one recorder dropped costs one shot and does not shift the rest.
@@ -7,6 +7,7 @@ one recorder dropped costs one shot and does not shift the rest.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -14,13 +15,19 @@ import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import InputError
-from armsight.vision.sources.capture import open_capture
+from armsight.vision.sources.capture import QuietCapture, open_capture
 
 
 class VideoSource:
     """Two video files, or one side-by-side file."""
 
-    def __init__(self, left: str | Path, right: str | Path | None = None) -> None:
+    def __init__(self, files: Sequence[_File]) -> None:
+        self._files = list(files)
+        self._shots = 0
+        self._ended = False
+
+    @staticmethod
+    def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
         """Open the files.
 
         Args:
@@ -32,13 +39,12 @@ class VideoSource:
         """
         if right is not None and Path(left).resolve() == Path(right).resolve():
             raise InputError(f"{left}: given as both left and right video; a side-by-side video is video:{left}")
-        self._files = [_File(path) for path in (left, right) if path is not None]
-        width = int(self._files[0].capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        files = [_File.open(path) for path in (left, right) if path is not None]
+        width = int(files[0].capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         if right is None and width % 2:
-            self.close()
+            files[0].capture.release()
             raise InputError(f"{left}: a side-by-side video must have an even width, this one is {width} px wide")
-        self._shots = 0
-        self._ended = False
+        return VideoSource(files)
 
     def read(self) -> Shot | None:
         """Return the next shot, or None where the shorter file ends."""
@@ -75,7 +81,7 @@ class VideoSource:
             file.capture.release()
 
     def _unexpected_end(self, grabbed: list[bool]) -> str | None:
-        """Say what is odd about the end of the files; None where nothing is."""
+        """Return what is wrong with the end of the files; None where nothing is."""
         for file, ok in zip(self._files, grabbed, strict=True):
             if not ok and file.frames < file.promised - 1:  # some containers only estimate the number: one less is fine
                 return f"{file.path} is damaged or cut short: it ends after {file.frames} of {file.promised} frames"
@@ -88,14 +94,22 @@ class VideoSource:
 class _File:
     """One open video file and its current frame."""
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = str(path)
-        if not os.path.isfile(self.path):
+    @staticmethod
+    def open(path: str | Path) -> _File:
+        """Open a file.
+
+        Raises:
+            InputError: it is missing or not a video.
+        """
+        if not os.path.isfile(path):
             raise InputError(f"{path}: no such file")
-        capture = open_capture(self.path)
+        capture = open_capture(str(path))
         if capture is None:
             raise InputError(f"{path}: not a video file that OpenCV can read")
-        self.capture = capture
+        return _File(str(path), capture)
+
+    def __init__(self, path: str, capture: QuietCapture) -> None:
+        self.path, self.capture = path, capture
         fps = self.capture.get(cv2.CAP_PROP_FPS)
         self.period_s = 1 / fps if fps > 0 else np.inf
         self.promised = int(self.capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -124,4 +138,4 @@ def open_video(rest: str) -> VideoSource:
     names = [rest] if os.path.isfile(rest) else rest.split(",")
     if len(names) > 2 or not all(names):
         raise InputError(f"video:{rest}: expected video:LEFT.mp4,RIGHT.mp4 or video:SIDE_BY_SIDE.mp4")
-    return VideoSource(*names)
+    return VideoSource.open(*names)
