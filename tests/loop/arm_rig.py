@@ -1,7 +1,7 @@
 """A world for the tests of the loop: an arm with known errors, its potentiometers, and cameras that see it late.
 
 Nothing here uses the code under test: the true arm is a product of 4x4 matrices by the convention's definition, small
-motions are scipy's matrix exponential, backlash is the play operator stepped at 1 kHz, and seen poses are built from
+motions are scipy's matrix exponential, backlash is the backlash operator stepped at 1 kHz, and seen poses are built from
 true ones.
 """
 
@@ -20,7 +20,7 @@ from armsight.robot.models import MODELS
 
 ARM = MODELS["six_r"]
 TICK_S = 1e-3
-#: The middle of the bench's workspace: the arm bent forwards, no singularity near.
+#: The middle of the test rig's workspace: the arm bent forwards, no singularity near.
 MIDDLE = np.radians([10, -100, 100, -20, -70, 5])
 #: What one shot's noise and a rig's calibration are at 0.8 m: m and rad.
 SHOT = np.repeat([1e-4, np.radians(0.04)], 3)
@@ -86,13 +86,13 @@ class TrueArm:
         half = self.backlash / 2
         if self.held is None:
             self.held, self.last = shaft[0].copy(), shaft[0]
-        slack = np.empty_like(shaft)
+        beyond = np.empty_like(shaft)
         for n, q in enumerate(shaft):
             self.held = np.clip(self.held, q - half, q + half)
-            slack[n] = self.held - q
+            beyond[n] = self.held - q
         travel = self.travelled + np.cumsum(np.abs(np.diff(shaft, axis=0, prepend=self.last[None])), axis=0)
         self.travelled, self.last = travel[-1], shaft[-1]
-        q = shaft + self.linearity(shaft) + slack + self.compliance * loads(shaft) + self.rest(travel)
+        q = shaft + self.linearity(shaft) + beyond + self.compliance * loads(shaft) + self.rest(travel)
         loose = self.loose(travel.sum(axis=1))
         moved = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
         moved[:, :3, :3] = Rotation.from_rotvec(loose[:, 3:]).as_matrix()
@@ -101,14 +101,14 @@ class TrueArm:
 
 
 class Wander:
-    """An Ornstein-Uhlenbeck path over travel, drawn on a fine grid beforehand."""
+    """An Ornstein-Uhlenbeck path over travel, sampled on a fine grid beforehand."""
 
     def __init__(self, rng, sigma, length, width, step=2e-3, most=80.0):
         n = int(most / step)
         keep = np.exp(-step / length)
-        draws = rng.normal(size=(n, width))
-        draws[1:] *= np.sqrt(1 - keep**2)
-        self._grid, self._paths = np.arange(n) * step, lfilter([1.0], [1.0, -keep], draws, axis=0) * sigma
+        samples = rng.normal(size=(n, width))
+        samples[1:] *= np.sqrt(1 - keep**2)
+        self._grid, self._paths = np.arange(n) * step, lfilter([1.0], [1.0, -keep], samples, axis=0) * sigma
 
     def joints(self, travel):
         return np.stack(
@@ -119,8 +119,8 @@ class Wander:
         return np.stack([np.interp(travel, self._grid, path) for path in self._paths.T], axis=1)
 
 
-def drawn(rng, prior=None):
-    """An arm whose errors are drawn from a prior, by its own words."""
+def sampled(rng, prior=None):
+    """An arm whose errors are sampled from a prior, in its own model."""
     p = prior or Prior()
     stand, link = np.repeat([p.stand_m, p.stand_rad], 3), np.repeat([p.link_m, p.link_rad], 3)
     smalls = []
@@ -133,11 +133,11 @@ def drawn(rng, prior=None):
         smalls.append(small(xi))
     gain = rng.normal(size=6) * p.gain
     s, c = (rng.normal(size=(3, 6)) * p.harmonic_rad for _ in "sc")
-    order = np.arange(1, 4)[:, None, None]
+    harmonic = np.arange(1, 4)[:, None, None]
 
     def linearity(q):
-        waves = s[:, None] * np.sin(order * q) + c[:, None] * np.cos(order * q)
-        return gain * q + (waves / order**1.5).sum(axis=0)
+        waves = s[:, None] * np.sin(harmonic * q) + c[:, None] * np.cos(harmonic * q)
+        return gain * q + (waves / harmonic**1.5).sum(axis=0)
 
     rest = Wander(rng, p.rest_rad, p.rest_travel_rad, 6)
     loose = Wander(rng, np.repeat([p.pose_m, p.pose_rad], 3), p.pose_travel_rad, 6)
@@ -152,7 +152,7 @@ def drawn(rng, prior=None):
 
 
 def worn(rng):
-    """An arm as the issue of the workcell describes it, its potentiometers bowed, in other words than the prior's."""
+    """An arm as the issue of the workcell describes it, its potentiometers bowed, in another model than the prior's."""
     smalls = [small(np.repeat([1e-3, np.radians(0.3)], 3) * rng.uniform(-1, 1, 6)) for _ in range(7)]
     zeros = np.radians(0.5) * rng.choice([-1, 1], 6) * rng.uniform(0.5, 1, 6)
     bow, phase = np.radians(0.25) * rng.uniform(0.5, 1, 6), rng.uniform(-np.pi, np.pi, 6)
@@ -165,7 +165,7 @@ def worn(rng):
 
 
 def legs(rng, seconds, speed_m_s=0.5, spread_deg=25.0, pause_s=0.25):
-    """Shaft angles (N, 6) at 1 kHz: from rest to rest between places around the middle, tool at most so fast."""
+    """Shaft angles (N, 6) at 1 kHz: from rest to rest between poses around the middle, tool at most so fast."""
     out, at = [np.repeat(MIDDLE[None], 300, axis=0)], MIDDLE
     while sum(map(len, out)) < seconds / TICK_S:
         to = MIDDLE + np.radians(spread_deg) * rng.uniform(-1, 1, 6)
@@ -202,8 +202,8 @@ def states(t, q):
 def off(T, T_true):
     """Right tangents (..., 6) from estimates to the truth, to first order."""
     D = np.linalg.inv(T) @ T_true
-    turn = Rotation.from_matrix(D[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*D.shape[:-2], 3)
-    return np.concatenate([D[..., :3, 3], turn], axis=-1)
+    rotation = Rotation.from_matrix(D[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*D.shape[:-2], 3)
+    return np.concatenate([D[..., :3, 3], rotation], axis=-1)
 
 
 def distance_mm(T, T_true):
@@ -216,12 +216,12 @@ def rms(values):
 
 
 def run(rng, estimator, arm, shaft, *, rate_hz=60.0, late_s=0.0, jitter_s=0.0, blind=(), mount=None, arrives_s=0.04):
-    """JointBacklash a motion to an estimator as it would come in time; returns what it said at 1 kHz, and the true poses (N, 4, 4).
+    """Give a motion to an estimator as it would come in time; return its track at 1 kHz and the true poses (N, 4, 4).
 
     Args:
         late_s: by how much the camera's stamps are late.
         blind: pairs of times between which vision sees nothing, s.
-        arrives_s: how long after its exposure a sighting comes.
+        arrives_s: how long after its exposure a measurement comes.
     """
     t = np.arange(len(shaft)) * TICK_S
     Ts = arm.tool(shaft)
@@ -253,7 +253,7 @@ def run(rng, estimator, arm, shaft, *, rate_hz=60.0, late_s=0.0, jitter_s=0.0, b
     return Track(*(np.concatenate(part) for part in parts), ages), Ts
 
 
-class Cell:
+class Workcell:
     """A closed loop: joints that lag behind their commands, potentiometers, cameras; time goes on in steps of 1 ms."""
 
     def __init__(self, rng, arm, estimator, *, rate_hz=60.0, delay_s=0.045, response_s=0.05, q=MIDDLE, mount=None):

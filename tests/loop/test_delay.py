@@ -1,10 +1,10 @@
-"""The camera's delay from a sweep: how near, and what is refused."""
+"""The camera's delay from a sweep: how near, and what is rejected."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm_rig import ARM, MIDDLE, TICK_S, drawn, mounts, seen, states, worn
+from arm_rig import ARM, MIDDLE, TICK_S, mounts, sampled, seen, states, worn
 
 from armsight.errors import CalibrationError, InputError
 from armsight.loop.delay import estimate_delay
@@ -24,7 +24,7 @@ def sweep(rng, world, late_s, rate_hz, amplitude_deg=12.0):
     return states(t, shaft + rng.normal(size=shaft.shape) * Prior().reading_rad), measurements
 
 
-@pytest.mark.parametrize(("world", "late_s", "rate_hz"), [(worn, 0.085, 60), (worn, 0.02, 15), (drawn, 0.3, 30)])
+@pytest.mark.parametrize(("world", "late_s", "rate_hz"), [(worn, 0.085, 60), (worn, 0.02, 15), (sampled, 0.3, 30)])
 def test_it_is_found_to_a_fraction_of_a_millisecond(world, late_s, rate_hz):
     joints, measurements = sweep(np.random.default_rng(rate_hz), world, late_s, rate_hz)
     delay = estimate_delay(ARM, joints, measurements)
@@ -32,13 +32,13 @@ def test_it_is_found_to_a_fraction_of_a_millisecond(world, late_s, rate_hz):
     assert delay.delay_s == pytest.approx(late_s, abs=4 * delay.sigma_s)
 
 
-def test_how_far_stamps_scatter_is_told():
+def test_how_far_stamps_scatter_is_reported():
     rng = np.random.default_rng(7)
     joints, measurements = sweep(rng, worn, 0.03, 50)
     jitter_s = 3e-4
     late = [replace(s, t_s=s.t_s + rng.normal() * jitter_s) for s in measurements]
     lost = [s for n, s in enumerate(late) if n % 7]  # a shot that is missed is no jitter
-    # The median of 190 distances tells it to 8 %; with 0.4 ms between the exposures their middle is off by half of that.
+    # The median of 190 distances gives it to 8 %; with 0.4 ms between the exposures their middle is off by half of that.
     assert estimate_delay(ARM, joints, lost).jitter_s == pytest.approx(jitter_s, rel=0.25)
     assert estimate_delay(ARM, joints, late, sync_s=4e-4).jitter_s == pytest.approx(np.hypot(3e-4, 2e-4), rel=0.25)
     assert estimate_delay(ARM, joints, measurements).jitter_s < 1e-9
@@ -52,7 +52,7 @@ def test_its_sigma_is_honest():
     for seed in range(6):
         rng = np.random.default_rng(50 + seed)
         late_s = rng.uniform(0, 0.1)
-        delay = estimate_delay(ARM, *sweep(rng, drawn, late_s, 15))
+        delay = estimate_delay(ARM, *sweep(rng, sampled, late_s, 15))
         scores.append((delay.delay_s - late_s) / delay.sigma_s)
     # A sum of six squares of one sigma is below 24.1 but for 1 in 2000.
     assert np.square(scores).sum() < 24.1
@@ -64,24 +64,24 @@ def test_a_camera_ahead_of_the_joints_clock_is_found_too():
     assert delay.delay_s == pytest.approx(-0.04, abs=4 * delay.sigma_s)
 
 
-def test_an_arm_that_hardly_moves_is_refused():
+def test_an_arm_that_hardly_moves_is_rejected():
     joints, measurements = sweep(np.random.default_rng(3), worn, 0.03, 15, amplitude_deg=0.05)
     with pytest.raises(CalibrationError, match="move all joints to and fro, faster"):
         estimate_delay(ARM, joints, measurements)
 
 
-def test_another_arms_motion_is_refused():
+def test_another_arms_motion_is_rejected():
     joints, _ = sweep(np.random.default_rng(4), worn, 0.03, 30)
     _, measurements = sweep(np.random.default_rng(5), worn, 0.03, 30)
     with pytest.raises(CalibrationError, match="do not describe the same motion"):
         estimate_delay(ARM, joints, measurements)
 
 
-def test_too_little_is_refused():
+def test_too_little_is_rejected():
     joints, measurements = sweep(np.random.default_rng(6), worn, 0.03, 30)
-    with pytest.raises(InputError, match="20 or more sightings in order of time, got 10"):
+    with pytest.raises(InputError, match="20 or more pose measurements in order of time, got 10"):
         estimate_delay(ARM, joints, measurements[:10])
-    with pytest.raises(InputError, match="20 or more sightings in order of time"):
+    with pytest.raises(InputError, match="20 or more pose measurements in order of time"):
         estimate_delay(ARM, joints, measurements[::-1])
-    with pytest.raises(InputError, match="do not cover the sightings"):
+    with pytest.raises(InputError, match="do not cover the pose measurements"):
         estimate_delay(ARM, states(joints.t_s[:2000], joints.q[:2000]), measurements)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from arm_rig import ARM, MIDDLE, TICK_S, Cell, distance_mm, mounts, rms, worn
+from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, worn
 
 from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.estimators import ESTIMATORS, Delay, Mounting
-from armsight.loop.servo import MOST_RAD, RATE_SHARE, Mode, PoseServo, LoopTiming
+from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, LoopTiming, Mode, PoseServo
 from armsight.robot.trajectories import point_to_point
 
 PERIOD_S = 0.016
@@ -19,18 +19,20 @@ def timing(rate_hz, response_s=0.05):
     return LoopTiming(PERIOD_S, 1 / rate_hz, 0.045 + PERIOD_S, response_s)
 
 
-def cell_of(seed, rate_hz, kind="kalman", **more):
-    """A worn arm under cameras whose place is known: what the loop itself leaves is seen."""
+def workcell_of(seed, rate_hz, kind="kalman", **more):
+    """A worn arm under cameras whose pose is known: the error that the loop itself leaves shows."""
     rng = np.random.default_rng(seed)
     true, said = mounts(rng)
     mount = true, Mounting(true[0], true[1], said.cov)
-    cell = Cell(rng, worn(rng), ESTIMATORS[kind](ARM, delay=Delay(0.0, 2e-4)), rate_hz=rate_hz, mount=mount, **more)
-    cell.advance(None, 300)
-    return cell
+    workcell = Workcell(
+        rng, worn(rng), ESTIMATORS[kind](ARM, delay=Delay(0.0, 2e-4)), rate_hz=rate_hz, mount=mount, **more
+    )
+    workcell.advance(None, 300)
+    return workcell
 
 
-def play(cell, motion, servo, seconds, each=lambda step: None):
-    """Run a motion and stay at its end, ``seconds`` in all; returns the distances of the true tool from the wanted, mm."""
+def follow(workcell, motion, servo, seconds, each=lambda step: None):
+    """Run a motion and stay at its end, ``seconds`` in all; return the true tool's distances from the reference, mm."""
     ticks, apart = round(PERIOD_S / TICK_S), []
     for k in range(round(seconds / PERIOD_S)):
         t_s = k * PERIOD_S
@@ -38,11 +40,11 @@ def play(cell, motion, servo, seconds, each=lambda step: None):
             ahead = motion.at(t_s + PERIOD_S)
             command = JointCommand(ahead.q, ahead.qd, np.zeros(6), PERIOD_S)
         else:
-            step = servo.step(servo.aim(motion, t_s), cell.estimator)
+            step = servo.step(servo.aim(motion, t_s), workcell.estimator)
             each(step)
             command = step.command
-        wanted = ARM.forward(motion.at(t_s + np.arange(1, ticks + 1) * TICK_S).q)
-        apart.append(distance_mm(cell.advance(command, ticks), wanted))
+        reference = ARM.forward(motion.at(t_s + np.arange(1, ticks + 1) * TICK_S).q)
+        apart.append(distance_mm(workcell.advance(command, ticks), reference))
     return np.concatenate(apart)
 
 
@@ -50,18 +52,18 @@ def play(cell, motion, servo, seconds, each=lambda step: None):
 def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_without_swinging(rate_hz):
     there, back = point_to_point(ARM, MIDDLE, GOAL), point_to_point(ARM, GOAL, MIDDLE)
     for seed in (21, 31, 32):
-        cell = cell_of(seed, rate_hz)
+        workcell = workcell_of(seed, rate_hz)
         servo = PoseServo(ARM, timing(rate_hz))
         settle_s = 4 * servo.timing.period_s / servo.timing.gain + 1.0
-        alone = play(cell, there, None, there.duration_s + 0.5)
-        closing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, settle_s)
-        path = play(cell, back, servo, back.duration_s + settle_s)
+        alone = follow(workcell, there, None, there.duration_s + 0.5)
+        closing = follow(workcell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, settle_s)
+        path = follow(workcell, back, servo, back.duration_s + settle_s)
         moving = round(back.duration_s / TICK_S)
         before, after = rms(alone[-100:]), rms([rms(closing[-100:]), rms(path[-100:])])
         assert after <= min(0.15, before / 10)
         assert rms(path[:moving]) <= rms(alone[: round(there.duration_s / TICK_S)]) / 3
-        # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, and a play
-        # that is crossed by its learned width, a tenth of a millimetre each.
+        # Swinging would show as a rise after a fall: at rest the error may rise by what vision's noise makes it, and
+        # backlash that is crossed by its learned width, a tenth of a millimetre each.
         for rest in (closing, path[moving + 200 :]):
             assert (rest - np.minimum.accumulate(rest)).max() < 0.2
 
@@ -69,11 +71,11 @@ def test_the_error_at_rest_falls_to_a_tenth_and_that_along_the_path_to_a_third_w
 @pytest.mark.parametrize("loose", [0.0, 1.0], ids=["tight gears", "loose gears"])
 @pytest.mark.parametrize("rate_hz", [4, 60])
 def test_on_bare_vision_it_does_not_swing_either(rate_hz, loose):
-    cell = cell_of(22, rate_hz, "latest", response_s=0.08)  # slower joints than the loop was told
-    cell.arm.backlash = loose * cell.arm.backlash
+    workcell = workcell_of(22, rate_hz, "latest", response_s=0.08)  # slower joints than the loop assumes
+    workcell.arm.backlash = loose * workcell.arm.backlash
     servo = PoseServo(ARM, timing(rate_hz))
-    before = play(cell, point_to_point(ARM, MIDDLE, MIDDLE + 1e-9), None, 0.5)
-    closing = play(cell, point_to_point(ARM, MIDDLE, MIDDLE + 1e-9), servo, 5 * PERIOD_S / servo.timing.gain + 1)
+    before = follow(workcell, point_to_point(ARM, MIDDLE, MIDDLE + 1e-9), None, 0.5)
+    closing = follow(workcell, point_to_point(ARM, MIDDLE, MIDDLE + 1e-9), servo, 5 * PERIOD_S / servo.timing.gain + 1)
     assert rms(closing[-100:]) < before[-1] / 10
     assert np.ptp(closing[-500:]) < 0.15
     # While gears are crossed one after the other the distance need not fall all the way; without them it must.
@@ -103,13 +105,13 @@ def test_the_gain_rule_is_the_edge_of_overshoot_and_far_from_that_of_stability(r
 def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
     left = []
     for seed in (22, 23, 24):
-        cell = cell_of(seed, 60)
+        workcell = workcell_of(seed, 60)
         servo = PoseServo(ARM, timing(60))
         still = point_to_point(ARM, MIDDLE, MIDDLE + 1e-9)
-        play(cell, still, servo, 3.0)
+        follow(workcell, still, servo, 3.0)
         steps = []
-        cell.blind = True
-        apart = play(cell, point_to_point(ARM, MIDDLE, GOAL), servo, 3.0, steps.append)
+        workcell.blind = True
+        apart = follow(workcell, point_to_point(ARM, MIDDLE, GOAL), servo, 3.0, steps.append)
         modes = [step.mode for step in steps]
         assert modes[0] is Mode.VISION
         assert Mode.BRIDGED in modes
@@ -119,8 +121,8 @@ def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
         held = np.array([step.correction for step in steps[lost:]])
         assert len(held) > 100
         assert np.allclose(held, held[0], rtol=0, atol=1e-14)
-        cell.blind = False
-        seeing = play(cell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
+        workcell.blind = False
+        seeing = follow(workcell, point_to_point(ARM, GOAL, GOAL + 1e-9), servo, 3.0, steps.append)
         assert steps[-1].mode is Mode.VISION
         assert seeing[-1] < apart[-1] / 3
         left.append(seeing[-1])
@@ -128,14 +130,14 @@ def test_when_vision_is_lost_it_says_so_holds_and_comes_back():
 
 
 def test_without_any_vision_the_motion_is_commanded_as_it_is():
-    cell = cell_of(24, 60)
-    cell.estimator = ESTIMATORS["kalman"](ARM, delay=Delay(0.0, 2e-4))
-    cell.blind = True
-    cell.coming.clear()
-    cell.advance(None, 100)
+    workcell = workcell_of(24, 60)
+    workcell.estimator = ESTIMATORS["kalman"](ARM, delay=Delay(0.0, 2e-4))
+    workcell.blind = True
+    workcell.coming.clear()
+    workcell.advance(None, 100)
     motion = point_to_point(ARM, MIDDLE, GOAL)
     servo = PoseServo(ARM, timing(60))
-    step = servo.step(servo.aim(motion, 0.3, lambda q: np.full(6, 0.1)), cell.estimator)
+    step = servo.step(servo.aim(motion, 0.3, lambda q: np.full(6, 0.1)), workcell.estimator)
     ahead = motion.at(0.3 + PERIOD_S)
     assert step.mode is Mode.POTENTIOMETERS
     assert np.array_equal(step.command.q_ref, ahead.q)
@@ -145,40 +147,40 @@ def test_without_any_vision_the_motion_is_commanded_as_it_is():
 
 
 def test_commands_stay_within_every_limit_and_do_not_jump():
-    cell = cell_of(25, 60)
+    workcell = workcell_of(25, 60)
     # The arm's foot is knocked: 40 mm to make up for, towards joints that are at their limits already.
-    cell.arm.smalls[0] = cell.arm.smalls[0].copy()
-    cell.arm.smalls[0][:3, 3] += [0.04, 0.03, -0.03]
+    workcell.arm.smalls[0] = workcell.arm.smalls[0].copy()
+    workcell.arm.smalls[0][:3, 3] += [0.04, 0.03, -0.03]
     edge = MIDDLE.copy()
     edge[[1, 2]] = [ARM.q_max[1] - 2.5, ARM.q_max[2] - 0.01]
     for q in (MIDDLE, edge):
-        cell.shaft = cell.reference = q
-        cell.advance(None, 400)
+        workcell.shaft = workcell.reference = q
+        workcell.advance(None, 400)
         servo, steps = PoseServo(ARM, timing(60)), []
-        play(cell, point_to_point(ARM, q, q - 0.3), servo, 3.0, steps.append)
+        follow(workcell, point_to_point(ARM, q, q - 0.3), servo, 3.0, steps.append)
         refs = np.array([step.command.q_ref for step in steps])
         assert (refs >= ARM.q_min).all()
         assert (refs <= ARM.q_max).all()
         assert (np.abs([step.command.qd_ref for step in steps]) <= ARM.qd_max).all()
         assert (np.abs(np.diff(refs, axis=0)) <= ARM.qd_max * PERIOD_S * (1 + 1e-9)).all()
         corrections = np.array([step.correction for step in steps])
-        assert (np.abs(corrections) <= MOST_RAD + 1e-12).all()
+        assert (np.abs(corrections) <= MAX_CORRECTION_RAD + 1e-12).all()
         moved = np.abs(np.diff(corrections, axis=0))
         free = [not step.limited for step in steps[1:]]
         assert (moved[free] <= RATE_SHARE * ARM.qd_max * PERIOD_S * (1 + 1e-9)).all()
     assert any("largest correction" in text or "limit of its angle" in text for step in steps for text in step.limited)
 
 
-@pytest.mark.parametrize("q", [ARM.home, np.radians([10, -100, 100, -20, 0, 5])], ids=["stretched", "wrist"])
-def test_singular_places_do_not_make_it_wild(q):
+@pytest.mark.parametrize("q", [ARM.home, np.radians([10, -100, 100, -20, 0, 5])], ids=["extended", "wrist"])
+def test_singular_poses_do_not_make_it_wild(q):
     rng = np.random.default_rng(26)
     true, said = mounts(rng)
-    cell = Cell(rng, worn(rng), ESTIMATORS["kalman"](ARM, delay=Delay(0.0, 2e-4)), q=q, mount=(true, said))
-    cell.advance(None, 300)
+    workcell = Workcell(rng, worn(rng), ESTIMATORS["kalman"](ARM, delay=Delay(0.0, 2e-4)), q=q, mount=(true, said))
+    workcell.advance(None, 300)
     servo, steps = PoseServo(ARM, timing(60)), []
-    apart = play(cell, point_to_point(ARM, q, q + 1e-9), servo, 3.0, steps.append)
+    apart = follow(workcell, point_to_point(ARM, q, q + 1e-9), servo, 3.0, steps.append)
     assert apart[-1] <= apart[0] + 0.3
-    assert np.abs(steps[-1].correction).max() < MOST_RAD
+    assert np.abs(steps[-1].correction).max() < MAX_CORRECTION_RAD
 
 
 def test_times_must_be_positive():

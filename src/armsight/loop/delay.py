@@ -23,11 +23,11 @@ from armsight.robot.arm import Arm
 #: Lags that are tried, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
 LAGS_S = np.arange(-0.1, 0.6, 2e-3)
 #: Fewest measurements.
-LEAST = 20
+MIN_MEASUREMENTS = 20
 #: How far the first step may be off, s, and how often the filter is run from its own answer.
 FIRST_SIGMA_S, PASSES = 5e-3, 2
 #: A delay worse known than this, s, is none: at 0.5 m/s it is 1 mm.
-MOST_SIGMA_S = 2e-3
+MAX_SIGMA_S = 2e-3
 #: What the sides of the backlash, which the filter sees change a little late, leave of error; found on simulated sweeps, s.
 SYSTEMATIC_S = 1.5e-4
 #: The median deviation of normal samples, in sigma.
@@ -61,8 +61,10 @@ def estimate_delay(
     """
     t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), 6), "states.q")
     stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
-    if len(stamps) < LEAST or not (np.diff(stamps) > 0).all():
-        raise InputError(f"a delay needs {LEAST} or more pose measurements in order of time, got {len(stamps)}")
+    if len(stamps) < MIN_MEASUREMENTS or not (np.diff(stamps) > 0).all():
+        raise InputError(
+            f"a delay needs {MIN_MEASUREMENTS} or more pose measurements in order of time, got {len(stamps)}"
+        )
     inside = LAGS_S[(stamps[0] - LAGS_S >= t[0]) & (stamps[-1] - LAGS_S <= t[-1])] if len(t) else LAGS_S[:0]
     if len(inside) < 3:
         raise InputError(
@@ -72,9 +74,9 @@ def estimate_delay(
     delay = Delay(_coarse(arm, t, q, measurements, inside), FIRST_SIGMA_S, jitter_s)
     for _ in range(PASSES):
         delay = _filtered(arm, states, measurements, Delay(delay.delay_s, FIRST_SIGMA_S, jitter_s), prior)
-    if delay.sigma_s > MOST_SIGMA_S:
+    if delay.sigma_s > MAX_SIGMA_S:
         raise CalibrationError(
-            f"the sweep determines the camera's delay to {1e3 * delay.sigma_s:.1f} ms only, {1e3 * MOST_SIGMA_S:.0f} are "
+            f"the sweep determines the camera's delay to {1e3 * delay.sigma_s:.1f} ms only, {1e3 * MAX_SIGMA_S:.0f} are "
             "needed: move all joints to and fro, faster and with changing speed"
         )
     return Delay(delay.delay_s, float(np.hypot(delay.sigma_s, SYSTEMATIC_S)), jitter_s)

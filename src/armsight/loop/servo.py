@@ -26,7 +26,7 @@ from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.lookahead import behind
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
-MOST_SIGMA_M = 1e-3
+MAX_SIGMA_M = 1e-3
 #: How long the correction is carried on without vision, s; then it is held.
 BRIDGE_S = 0.75
 #: The correction moves no faster than this share of each joint's speed limit, so that nothing jumps.
@@ -42,7 +42,7 @@ FOLLOW_S = 0.08
 #: from that.
 UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
 #: The correction is at most this, rad: an arm that needs more is not the arm of the table.
-MOST_RAD = np.deg2rad(5.0)
+MAX_CORRECTION_RAD = np.deg2rad(5.0)
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
@@ -196,10 +196,10 @@ class PoseServo:
         cov = estimate.cov_own[:3, :3]
         # The greatest variance is not above the sum of three; only where that is too much is it worth looking for.
         sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
-        if sigma_m > MOST_SIGMA_M:
+        if sigma_m > MAX_SIGMA_M:
             sigma_m = math.sqrt(np.linalg.eigvalsh(cov)[-1])
         usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one measurement may be missed
-        if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MOST_SIGMA_M:
+        if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MAX_SIGMA_M:
             return Mode.POTENTIOMETERS
         return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
 
@@ -239,13 +239,13 @@ class PoseServo:
         arm, period_s, ahead = self._arm, self.timing.period_s, aim.ahead
         step = ahead.q - aim.goal.q
         most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
-        wished = _within(-MOST_RAD, self._correction + _within(-most, change, most), MOST_RAD)
+        wished = _within(-MAX_CORRECTION_RAD, self._correction + _within(-most, change, most), MAX_CORRECTION_RAD)
         q_ref = _within(arm.q_min, ahead.q + wished, arm.q_max)
         held = q_ref != ahead.q + wished
         correction = q_ref - ahead.q
         qd_ref = _within(-arm.qd_max, ahead.qd + (correction - self._correction) / period_s, arm.qd_max)
         self._correction, self._goal = correction, ahead
-        far = np.abs(wished) >= MOST_RAD
+        far = np.abs(wished) >= MAX_CORRECTION_RAD
         said: tuple[str, ...] = ()
         if held.any() or far.any():
             said = (

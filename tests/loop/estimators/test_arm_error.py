@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from arm_rig import ARM, MIDDLE, drawn, loads, product, small
+from arm_rig import ARM, MIDDLE, loads, product, sampled, small
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
@@ -91,7 +91,7 @@ def test_it_is_a_slow_arm_with_the_same_errors():
     joints += x[COMPLIANCE:REST] * (loads(q[None])[0] + unseen[2]) + x[REST:READING] + x[READING:POSE]
     T = product(joints[None], [small(x[6 * i : 6 * i + 6]) for i in range(7)])[0] @ small(x[POSE : POSE + 6])
     found, _ = evaluated(ARM, x, q, unseen)
-    # Half the product of the last motion's turn (3 sigma: 5e-4) and shift (3e-4) is left out; nothing else is.
+    # Half the product of the last motion's rotation (3 sigma: 5e-4) and translation (3e-4) is left out; nothing else is.
     assert np.abs(found - T).max() < 7.5e-8
 
 
@@ -102,32 +102,32 @@ def test_offsets_are_what_the_joints_are_beyond_their_readings():
     armerror.offsets_by(ARM.table, q, unseen, B)
     moved = x.copy()
     moved[LINEARITY:POSE] = 0
-    moved[REST:READING] = B @ x  # all of it told as rest instead
+    moved[REST:READING] = B @ x  # all of it given as rest instead
     assert np.allclose(evaluated(ARM, moved, q, unseen)[0], evaluated(ARM, x, q, unseen)[0], atol=1e-14)
 
 
-def test_the_prior_is_what_arms_are_drawn_from():
+def test_the_prior_is_what_arms_are_sampled_from():
     rng = np.random.default_rng(6)
     q = MIDDLE[None]
     T, H = evaluated(ARM, np.zeros(SIZE), MIDDLE, np.zeros((3, 6)))
     cov = H @ np.diag(Prior().sigmas(0.0) ** 2) @ H.T
-    draws = np.array([log_se3(inverse(T) @ drawn(rng).tool(q)[0]) for _ in range(120)])
+    samples = np.array([log_se3(inverse(T) @ sampled(rng).tool(q)[0]) for _ in range(120)])
     # 720 squares, normalised: 5 sigma of their mean, and 3 % for what is not linear.
-    squares = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(cov), draws)
+    squares = np.einsum("ni,ij,nj->n", samples, np.linalg.inv(cov), samples)
     assert squares.mean() == pytest.approx(6, rel=5 * np.sqrt(2 / 720) + 0.03)
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, 1e-9, 1e-3, 0.3, 2.9])
-def test_a_tangent_leads_from_one_pose_to_the_other(turn_rad):
+@pytest.mark.parametrize("rotation_rad", [0.0, 1e-9, 1e-3, 0.3, 2.9])
+def test_a_tangent_leads_from_one_pose_to_the_other(rotation_rad):
     rng = np.random.default_rng(11)
     for _ in range(20):
         T, axis = small(rng.normal(size=6)), rng.normal(size=3)
-        xi, found = np.concatenate([rng.normal(size=3), turn_rad * axis / np.linalg.norm(axis)]), np.empty(6)
+        xi, found = np.concatenate([rng.normal(size=3), rotation_rad * axis / np.linalg.norm(axis)]), np.empty(6)
         armerror.tangent(T, T @ small(xi), found)
-        assert found == pytest.approx(xi, abs=1e-13 * (1 + 10 * turn_rad))
+        assert found == pytest.approx(xi, abs=1e-13 * (1 + 10 * rotation_rad))
 
 
-def test_half_a_turn_is_not_taken_for_none():
+def test_half_a_revolution_is_not_taken_for_none():
     found = np.empty(6)
     armerror.tangent(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), found)
     assert np.linalg.norm(found[3:]) == pytest.approx(np.pi)
@@ -151,8 +151,8 @@ def test_covariances_are_those_of_the_matrices():
     _, Hs = model.poses(state.x, joints.q, joints.unseen)
     for n, own in enumerate(model.covariances(state, step, Hs)):
         moved = np.diag(step.kept[n]) @ state.P @ np.diag(step.kept[n]) + np.diag(step.added[n])
-        wanted = Hs[n] @ moved @ Hs[n].T
-        assert np.abs(own - wanted).max() < 1e-13 * np.abs(wanted).max()
+        expected = Hs[n] @ moved @ Hs[n].T
+        assert np.abs(own - expected).max() < 1e-13 * np.abs(expected).max()
 
 
 def test_chi_square_is_that_of_the_inverse():

@@ -12,19 +12,19 @@ from armsight.robot.models import MODELS
 OTHERS = np.arange(6) != 0
 
 
-def places(points, q):
+def positions(points, q):
     """Where the points are, (K, 3), by products of 4x4 matrices."""
-    T, turned = np.eye(4), []
+    T, frames = np.eye(4), []
     for i in range(6):
         c, s = np.cos(q[i]), np.sin(q[i])
-        turned.append(T @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, ARM.d[i]], [0, 0, 0, 1.0]]))
+        frames.append(T @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, ARM.d[i]], [0, 0, 0, 1.0]]))
         T = T @ link_motion(i, q[i : i + 1])[0]
-    return np.array([(turned[int(p[0])] @ np.append(p[2:], 1.0))[:3] for p in points])
+    return np.array([(frames[int(p[0])] @ np.append(p[2:], 1.0))[:3] for p in points])
 
 
 def columns(points, q, step=1e-6):
     ways = np.eye(6) * step
-    return np.stack([(places(points, q + w) - places(points, q - w)) / (2 * step) for w in ways], axis=2)
+    return np.stack([(positions(points, q + w) - positions(points, q - w)) / (2 * step) for w in ways], axis=2)
 
 
 def test_inertia_and_torques_are_those_of_points_that_weigh_and_resist():
@@ -38,7 +38,7 @@ def test_inertia_and_torques_are_those_of_points_that_weigh_and_resist():
         assert np.allclose(M, np.einsum("k,kai,kaj->ij", mass, J, J) + np.diag(own), atol=1e-8)
         assert np.allclose(tau[0], np.einsum("k,ki->i", mass * 9.81, J[:, 2]), atol=1e-7)
         h = 1e-4
-        before, now, after = (places(points, q + qd * t + qdd * t**2 / 2) for t in (-h, 0.0, h))
+        before, now, after = (positions(points, q + qd * t + qdd * t**2 / 2) for t in (-h, 0.0, h))
         push = (before - 2 * now + after) / h**2
         # The path's fourth derivative, at most some 100 m/s^4, over 12 h^-2; rounding 1e-16 h^-2.
         assert np.allclose(tau[1], np.einsum("k,ka,kai->i", mass, push, J) + own * qdd, atol=1e-6)
@@ -83,7 +83,7 @@ def side_of(shaft, rows):
     return readings.at(rows * TICK_S).unseen[:, 1, 0]
 
 
-def test_a_link_without_weight_changes_sides_when_its_shaft_slows_down():
+def test_a_link_without_gravity_changes_sides_when_its_shaft_slows_down():
     t = np.arange(1900) * TICK_S
     shaft = 0.3 * np.sin(4 * t)
     points, beside = floating.masses(ARM)
@@ -93,7 +93,7 @@ def test_a_link_without_weight_changes_sides_when_its_shaft_slows_down():
     side = side_of(shaft, rows)
     # It leaves and comes at the same times, but for what links 5 and 6 do meanwhile: it is elsewhere for few of the rows.
     assert np.mean(np.abs(side + 2 * true[rows] / GAP_RAD) > 0.5) < 0.05
-    # While it slows down the play operator has it on the other side.
+    # While it slows down the backlash operator has it on the other side.
     slows = (4 * t[rows] % np.pi > np.pi / 4) & (4 * t[rows] % np.pi < np.pi / 2)
     assert (side[slows] * np.sign(np.cos(4 * t[rows])[slows]) < -0.9).all()
 
@@ -115,7 +115,7 @@ def test_a_loose_link_stays_where_it_is_while_its_shaft_creeps(way):
     assert after - before == pytest.approx(way * 2 * far / GAP_RAD, abs=0.02)
 
 
-def test_loose_is_what_no_weight_turns():
+def test_loose_is_what_gravity_does_not_move():
     readings = Readings(1e-9, ARM)
     loose = readings.loose(MIDDLE)
     assert loose[0]  # upright
@@ -138,7 +138,7 @@ def test_through_half_a_second_without_vision_it_knows_where_a_floating_link_is(
     for name, prior in (("known", Prior()), ("not known", Prior(float_rad=1e-9))):
         estimator = KalmanEstimator(ARM, prior=prior, delay=Delay(0.0, 2e-4))
         track, Ts = run(np.random.default_rng(22), estimator, Floating(), shaft, blind=hidden)
-        # A sighting comes 40 ms late.
+        # A measurement comes 40 ms late.
         gone = np.any([(track.t_s > a + 0.04) & (track.t_s < b + 0.04) for a, b in hidden], axis=0)
         blind[name] = rms(distance_mm(track.Ts_base_tool, Ts)[gone])
     assert blind["known"] <= 0.5

@@ -1,4 +1,4 @@
-"""What every estimator promises, and what a sighting is."""
+"""What every estimator promises, and what a measurement is."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ from arm_rig import ARM, MIDDLE, MOUNT, SHOT, TICK_S, mounts, off, seen, small, 
 
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse
-from armsight.loop.estimators import ESTIMATORS, Delay, Mounting, PoseMeasurement, Outcome
+from armsight.loop.estimators import ESTIMATORS, Delay, Mounting, Outcome, PoseMeasurement
 
 EXACT = Delay(0.0, 1e-6)
 
@@ -26,7 +26,7 @@ def still(estimator, seconds, q=MIDDLE, start_s=0.0):
 
 
 def plain(t_s, T=None, shift_m=0.0):
-    """A sighting of the tool where the table says it is, but for a shift along base x."""
+    """A measurement of the tool where the table says it is, but for a shift along base x."""
     T = ARM.forward(MIDDLE).copy() if T is None else T.copy()
     T[0, 3] += shift_m
     return PoseMeasurement(t_s, T, np.diag(SHOT**2), np.diag(MOUNT**2))
@@ -47,7 +47,7 @@ def test_without_vision_the_potentiometers_stand_alone_and_know_how_little(estim
     assert 4e-3 < np.sqrt(np.trace(estimate.cov[:3, :3])) < 40e-3
 
 
-def test_a_sighting_brings_it_there_and_its_age_is_told(estimator):
+def test_a_measurement_brings_it_there_and_its_age_is_reported(estimator):
     t = still(estimator, 0.5)
     assert estimator.vision(plain(0.4, shift_m=3e-3)) is Outcome.USED
     estimate = estimator.estimate()
@@ -84,7 +84,7 @@ def test_the_tool_is_where_the_estimate_says_at_the_readings_of_now(estimator):
     assert np.allclose(T[0], estimator.estimate().T_base_tool, atol=1e-9)
 
 
-def test_times_that_do_not_rise_or_are_not_kept_are_refused(estimator):
+def test_times_that_do_not_rise_or_are_not_kept_are_rejected(estimator):
     still(estimator, 0.2, start_s=10.0)
     with pytest.raises(InputError, match="order of time"):
         estimator.joints(states([10.1], MIDDLE[None]))
@@ -94,16 +94,16 @@ def test_times_that_do_not_rise_or_are_not_kept_are_refused(estimator):
         estimator.joints(states([11.0], np.zeros((1, 5))))
 
 
-def test_a_sighting_is_the_measurement_carried_to_the_tool_with_its_covariance():
+def test_a_measurement_is_the_measurement_carried_to_the_tool_with_its_covariance():
     rng = np.random.default_rng(4)
     T_tool = ARM.forward(MIDDLE)
-    draws = []
+    samples = []
     for _ in range(4000):
         true, mounting = mounts(rng)
-        draws.append(off(mounting.pose_measurement(seen(rng, T_tool, true), 0.0).T_base_tool, T_tool))
+        samples.append(off(mounting.pose_measurement(seen(rng, T_tool, true), 0.0).T_base_tool, T_tool))
     pose_measurement = mounting.pose_measurement(seen(rng, T_tool, true), 0.0)
-    claimed, found = pose_measurement.cov_noise + pose_measurement.cov_common, np.cov(np.array(draws).T)
-    # An element of the covariance of N draws is off by at most 5 / sqrt(N) of the root of its diagonals, 1 in 1e6.
+    claimed, found = pose_measurement.cov_noise + pose_measurement.cov_common, np.cov(np.array(samples).T)
+    # An element of the covariance of N samples is off by at most 5 / sqrt(N) of the root of its diagonals, 1 in 1e6.
     scale = np.sqrt(np.diag(claimed))
     assert (np.abs(found - claimed) <= 5 * np.sqrt(2 / 4000) * np.outer(scale, scale)).all()
 
@@ -119,7 +119,7 @@ def test_a_mounting_comes_from_a_hand_eye_calibration():
     assert np.array_equal(mounting.cov, cov)
 
 
-def test_a_sighting_needs_its_time():
+def test_a_measurement_needs_its_time():
     rng = np.random.default_rng(0)
     true, mounting = mounts(rng)
     with pytest.raises(InputError, match="needs the time of its exposure"):

@@ -11,12 +11,12 @@ from arm_rig import (
     TICK_S,
     Wander,
     distance_mm,
-    drawn,
     legs,
     mounts,
     off,
     rms,
     run,
+    sampled,
     seen,
     small,
     states,
@@ -24,7 +24,7 @@ from arm_rig import (
 )
 from scipy.stats import chi2
 
-from armsight.loop.estimators import Delay, KalmanEstimator, Mounting, PoseMeasurement, Prior, Outcome
+from armsight.loop.estimators import Delay, KalmanEstimator, Mounting, Outcome, PoseMeasurement, Prior
 
 #: Chance with which a consistent filter fails a test of consistency here.
 CHANCE = 1e-4
@@ -40,8 +40,8 @@ def kalman(delay_s=0.0, sigma_s=2e-4, jitter_s=0.0, prior=None):
 
 @pytest.mark.parametrize(
     ("world", "prior"),
-    [(worn, None), (worn, QUIET), (lambda rng: drawn(rng, QUIET), QUIET)],
-    ids=["worn", "worn quiet", "drawn quiet"],
+    [(worn, None), (worn, QUIET), (lambda rng: sampled(rng, QUIET), QUIET)],
+    ids=["worn", "worn quiet", "sampled quiet"],
 )
 def test_in_motion_and_through_half_a_second_without_vision_it_is_as_near_as_it_must(world, prior):
     fused, blind, alone = [], [], []
@@ -51,7 +51,7 @@ def test_in_motion_and_through_half_a_second_without_vision_it_is_as_near_as_it_
         track, Ts = run(rng, kalman(prior=prior), world(rng), shaft, blind=[(8.0, 8.5), (9.3, 9.8)])
         apart, t = distance_mm(track.Ts_base_tool, Ts), track.t_s
         fused.append(apart[(t > 3.0) & (track.vision_age_s < 0.1)])
-        # A sighting comes 40 ms late, so it is without news from 8.04 to 8.54.
+        # A measurement comes 40 ms late, so it is without news from 8.04 to 8.54.
         blind.append(apart[((t > 8.04) & (t < 8.54)) | ((t > 9.34) & (t < 9.84))])
         alone.append(distance_mm(ARM.forward(shaft), Ts))
     # What the hand-eye calibration is off is in these, 0.12 mm.
@@ -71,7 +71,7 @@ def test_it_is_consistent_in_motion_and_without_vision():
         late_s = rng.normal() * 1e-3
         estimator = kalman(0.03, 1e-3, 2e-4)
         track, Ts = run(
-            rng, estimator, drawn(rng), legs(rng, 3.5), late_s=0.03 + late_s, jitter_s=2e-4, blind=[(3.0, 9.0)]
+            rng, estimator, sampled(rng), legs(rng, 3.5), late_s=0.03 + late_s, jitter_s=2e-4, blind=[(3.0, 9.0)]
         )
         for name, row in (("seeing", 2999), ("blind", 3499)):
             errors[name].append(off(track.Ts_base_tool[row], Ts[row]))
@@ -137,7 +137,7 @@ def test_order_of_arrival_does_not_matter():
 
 
 @pytest.mark.parametrize("period_s", [0.1, TICK_S])
-def test_readings_far_apart_and_sightings_of_one_time_leave_numbers(period_s):
+def test_readings_far_apart_and_measurements_of_one_time_leave_numbers(period_s):
     estimator, T = kalman(), ARM.forward(MIDDLE)
     estimator.joints(states(np.arange(12) * period_s, np.tile(MIDDLE, (12, 1))))
     pose_measurement = PoseMeasurement(10 * period_s, T, 1e-8 * np.eye(6), np.zeros((6, 6)))
@@ -148,7 +148,7 @@ def test_readings_far_apart_and_sightings_of_one_time_leave_numbers(period_s):
     assert np.isfinite(estimator.smoothed(np.array([10.0 * period_s])).covs).all()
 
 
-def test_a_sighting_older_than_what_is_kept_comes_too_late_and_one_from_the_future_waits():
+def test_a_measurement_older_than_what_is_kept_comes_too_late_and_one_from_the_future_waits():
     shaft, seen_all, _ = measurements(np.random.default_rng(4))
     estimator = kalman()
     half = len(shaft) // 2
@@ -183,7 +183,7 @@ def test_mistaken_poses_are_left_out_and_do_no_harm():
     assert distance_mm(estimator.estimate().T_base_tool, Ts[-1]) < 1.0
 
 
-def test_when_vision_insists_it_believes_again():
+def test_when_vision_insists_it_is_used_again():
     shaft, seen_all, Ts = measurements(np.random.default_rng(6))
     estimator, bump = fed(shaft), small([0.006, -0.004, 0.005, 0.01, 0.005, -0.008])
     outcomes = []
@@ -219,14 +219,14 @@ def test_long_rest_leaves_a_covariance_that_is_one():
     )
 
 
-def test_the_bench_wanders_as_it_says():
+def test_the_test_rig_wanders_as_it_says():
     rng = np.random.default_rng(9)
     at = np.arange(0, 70, 3.0)
     values = np.array([Wander(rng, 2.0, 0.5, 4).pose(at) for _ in range(20)])
     assert values.std() == pytest.approx(2.0, rel=5 / np.sqrt(2 * values.size))
 
 
-def test_for_the_record_the_sightings_that_follow_are_heard_too():
+def test_for_the_record_the_measurements_that_follow_are_heard_too():
     rng = np.random.default_rng(14)
     shaft, seen_all, Ts = measurements(rng, seconds=1.9)
     estimator, now, later, noted = fed(shaft), [], [], []
@@ -234,7 +234,7 @@ def test_for_the_record_the_sightings_that_follow_are_heard_too():
     for a, b in pairwise(seen_all):
         t_s = np.arange(round(a.t_s / TICK_S) + 1, round(b.t_s / TICK_S)) * TICK_S
         now.append(estimator.track(t_s))
-        noted += estimator.intervals(t_s[:3])  # as no sighting came after them yet
+        noted += estimator.intervals(t_s[:3])  # as no measurement came after them yet
         estimator.vision(b)
         later.append(estimator.smoothed(t_s))
         noted += estimator.intervals(t_s[3:])
@@ -251,7 +251,7 @@ def test_for_the_record_the_sightings_that_follow_are_heard_too():
 
 
 def standing(seed, seconds=3.0):
-    """An arm that trembles slowly at rest, noisy readings of it, and sharp sightings: readings, sightings, true poses."""
+    """Readings, measurements and true poses of an arm that trembles slowly at rest, with noisy readings."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds * 1000)) * TICK_S
     shaft = MIDDLE + 6e-5 * np.sin(2 * np.pi * rng.uniform(3, 7, 6) * t[:, None] + rng.uniform(0, 6, 6))
@@ -281,7 +281,7 @@ def test_what_cameras_see_better_is_not_spoilt_by_the_readings_noise():
         assert rms(apart) < 1.1e3 * np.sqrt(3) * 1e-5
 
 
-def test_what_a_sighting_told_stays_as_its_readings_are_smoothed_anew():
+def test_what_a_measurement_taught_stays_as_its_readings_are_smoothed_anew():
     shaft, seen_all, _ = measurements(np.random.default_rng(15))
     seen_all = [
         replace(pose_measurement, t_s=pose_measurement.t_s + 0.5 * TICK_S) for pose_measurement in seen_all
@@ -297,7 +297,8 @@ def test_what_a_sighting_told_stays_as_its_readings_are_smoothed_anew():
         then = estimator.track(at)
         estimator.joints(states(t[upto : upto + 60], said.q[upto : upto + 60]))
         now = estimator.track(at)
-        # Joints are where they were but for the slope of linearity and sag, some 0.01, over what smoothing moved them by.
+        # Joints are where they were but for the slope of linearity and compliance, some 0.01, over what smoothing moved
+        # them by.
         moved_mm = distance_mm(then.Ts_base_tool, now.Ts_base_tool)[0]
         assert moved_mm < 0.01 * np.abs(now.q - then.q).sum() * 1e3
 

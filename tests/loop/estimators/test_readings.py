@@ -42,7 +42,7 @@ def test_the_variance_left_is_what_is_left(back_s, speed):
     still = said < 2 / (STILL_SPAN_S * 1000)
     assert still.mean() == 0 if speed else still.mean() > 0.99 - 3 * np.sqrt(0.01 / 1800)
     counted = still if speed == 0 else ~still
-    # The variance of 1800 draws is within 5 sqrt(2 / 1800) of itself.
+    # The variance of 1800 samples is within 5 sqrt(2 / 1800) of itself.
     assert np.var(off[counted]) == pytest.approx(SIGMA**2 * said[counted].mean(), rel=5 * np.sqrt(2 / 1800))
     # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2); a mean of M has 1/M.
     assert said.max() < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
@@ -62,7 +62,7 @@ def test_what_is_left_of_the_noise_lasts_as_long_as_is_said(speed, at_s):
         products += off @ off[len(lags) // 2]
         said.append(out.lasts_s[len(lags) // 2])
     whole = products.sum() * 1e-3 / products[len(lags) // 2]
-    # A sum over 0.8 s of 360 draws that last for L: their mean product scatters by sqrt(0.8 / 2 L / 360) of the integral.
+    # A sum over 0.8 s of 360 samples that last for L: their mean product scatters by sqrt(0.8 / 2 L / 360) of the integral.
     lasts = float(np.mean(said))
     assert whole / 2 == pytest.approx(lasts, rel=4 * np.sqrt(0.8 / (2 * lasts) / 360) + 0.05)
     assert lasts == pytest.approx(
@@ -87,7 +87,7 @@ def test_a_joint_that_begins_to_move_is_not_averaged_over_its_rest():
     assert out.qd[0] == pytest.approx(np.full(6, 0.5), abs=1e-6)
 
 
-def test_the_side_is_the_play_operators():
+def test_the_side_is_the_backlash_operators():
     def q_of_t(t):
         return 0.2 * np.sin(3 * t) + 0.05 * np.sin(11 * t)
 

@@ -15,19 +15,19 @@ pytestmark = pytest.mark.opencv
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
 def test_the_covariance_holds_the_error_and_the_arms_share_is_found(eye):
-    squares, place, turn = [], [], []
+    squares, position, rotation = [], [], []
     for seed in range(16):
         A, B, cov, Z, X = recording(seed, eye, gross=seed % 4)
         h = calibrate_handeye(A, B, cov, eye=eye, folds=2, shares=("flange",))
         assert (h.used == (np.arange(len(A)) >= seed % 4)).all()
         e = error(h, Z, X)
         squares.append(e @ np.linalg.solve(h.cov, e))
-        place.append(h.sigma_flange_m)
-        turn.append(h.sigma_flange_rad)
+        position.append(h.sigma_flange_m)
+        rotation.append(h.sigma_flange_rad)
     # Chance 1e-3 at either end; the sigmas themselves are estimated from 180 numbers, which widens the upper end by 10 %.
     assert chi2.ppf(1e-3, 12 * 16) < sum(squares) < 1.1 * chi2.isf(1e-3, 12 * 16)
-    assert np.mean(place) == pytest.approx(SIGMA_FLANGE_M, rel=0.1)
-    assert np.mean(turn) == pytest.approx(SIGMA_FLANGE_RAD, rel=0.1)
+    assert np.mean(position) == pytest.approx(SIGMA_FLANGE_M, rel=0.1)
+    assert np.mean(rotation) == pytest.approx(SIGMA_FLANGE_RAD, rel=0.1)
 
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
@@ -74,17 +74,17 @@ def test_the_own_start_is_as_good_as_opencvs():
         assert np.abs(own[1] - Z_cv).max() < 0.02
 
 
-def test_turns_about_one_axis_are_refused():
+def test_rotations_about_one_axis_are_rejected():
     A, _, _, Z, X = recording(3)
-    turn = exp_se3(np.array([0, 0, 0, 0, 0, 1.0])[None] * np.linspace(-1, 1, 20)[:, None])
-    A = turn @ A[0]
+    rotation = exp_se3(np.array([0, 0, 0, 0, 0, 1.0])[None] * np.linspace(-1, 1, 20)[:, None])
+    A = rotation @ A[0]
     with pytest.raises(CalibrationError, match="two axes that are not parallel"):
         calibrate_handeye(A, inverse(Z) @ A @ X)
 
 
-def test_poses_all_alike_are_refused():
+def test_poses_all_alike_are_rejected():
     A, B, cov, _, _ = recording(3, still=True)
-    with pytest.raises(CalibrationError, match="turn the wrist"):
+    with pytest.raises(CalibrationError, match="rotate the wrist"):
         calibrate_handeye(A, B, cov)
 
 
@@ -97,13 +97,13 @@ def test_poses_all_alike_are_refused():
         (lambda A, B: (A, B * 2), "pose 0 is no rigid motion"),
     ],
 )
-def test_what_is_no_recording_is_refused(change, said):
+def test_what_is_no_recording_is_rejected(change, said):
     A, B, _, _, _ = recording(3)
     with pytest.raises(InputError, match=said):
         calibrate_handeye(*change(A, B))
 
 
-def test_an_unknown_mounting_and_a_transform_of_the_other_one_are_refused():
+def test_an_unknown_mounting_and_a_transform_of_the_other_one_are_rejected():
     A, B, cov, _, _ = recording(3)
     with pytest.raises(InputError, match="to_hand, in_hand"):
         calibrate_handeye(A, B, cov, eye="on_foot")

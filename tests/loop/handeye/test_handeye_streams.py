@@ -55,17 +55,17 @@ def test_the_coarse_offset_is_within_a_sample():
     assert coarse_offset(hand, seen) == pytest.approx(OFFSET_S, abs=1.5 / 30)
 
 
-def test_streams_that_stand_still_or_do_not_overlap_are_refused():
+def test_streams_that_stand_still_or_do_not_overlap_are_rejected():
     hand, seen, _, _ = streams(3)
     still = PoseStream(hand.t_s, np.repeat(hand.Ts[:1], len(hand.t_s), axis=0))
-    with pytest.raises(CalibrationError, match="nothing turns"):
+    with pytest.raises(CalibrationError, match="nothing rotates"):
         calibrate_streams(still, PoseStream(seen.t_s, np.repeat(seen.Ts[:1], len(seen.t_s), axis=0)))
     with pytest.raises(InputError, match="20 and more"):
         PoseStream.of(seen.t_s[:10], seen.Ts[:10], "eye")
 
 
-def test_a_direction_that_only_a_part_of_the_recording_tells_is_refused():
-    """The hand turns about one axis but for two seconds: no other part says how well the rest is known."""
+def test_a_direction_that_only_a_part_of_the_recording_shows_is_rejected():
+    """The hand rotates about one axis but for two seconds: no other part says how well the rest is known."""
     t_hand, t_eye = np.arange(0, 20, 0.01), np.arange(0.5, 19.5, 1 / 30)
 
     def hand(t):
@@ -77,7 +77,7 @@ def test_a_direction_that_only_a_part_of_the_recording_tells_is_refused():
     slow = 1e-4 * np.sin(t_eye[:, None] * [0.9, 1.1, 0.7, 0.8, 1.0, 1.2] + np.arange(6))  # it makes the blocks long
     X, Z = exp_se3(np.array([0.05, -0.02, 0.1, 0.3, -0.2, 0.4])), exp_se3(np.array([0.5, 0.1, 0.3, 0.2, 0.9, -0.4]))
     seen = PoseStream.of(t_eye, inverse(Z) @ hand(t_eye) @ X @ exp_se3(slow), "eye")
-    with pytest.raises(CalibrationError, match=r"from \d+\.\d\d s to 1.* alone.*turn about two axes"):
+    with pytest.raises(CalibrationError, match=r"only the poses from \d+\.\d\d s to 1.*rotate about two axes"):
         calibrate_streams(PoseStream.of(t_hand, hand(t_hand), "hand"), seen)
 
 
@@ -103,8 +103,8 @@ def test_a_pivot_is_found_within_its_sigma():
     assert np.nanmean(found.held_out_m) == pytest.approx(1e-4 * np.sqrt(8 / np.pi), rel=0.3)
 
 
-def test_a_tool_that_hardly_turns_is_refused():
-    with pytest.raises(CalibrationError, match="turned too little"):
+def test_a_tool_that_hardly_rotates_is_rejected():
+    with pytest.raises(CalibrationError, match="rotated too little"):
         calibrate_pivot(pivoting(1, spread=0.01)[0])
     with pytest.raises(InputError, match="4 or more"):
         calibrate_pivot(pivoting(1)[0][:3])

@@ -17,8 +17,8 @@ def attained(seed, n, arm=ARM_M, noise=0.0, off=(0, 0, 0)):
     rng = np.random.default_rng(seed)
     command = exp_se3(np.array([0.3, 0.2, 0.5, 0.1, 0.2, 0.3]))
     p = command[:3, 3] + off + rng.normal(0, arm, (n, 3)) + rng.normal(0, noise, (n, 3))
-    turns = exp_se3(rng.normal(0, [0, 0, 0, 1e-3, 1e-3, 1e-3], (n, 6)))[:, :3, :3]
-    Ts = np.array([pose(command[:3, :3] @ R, at) for R, at in zip(turns, p, strict=True)])
+    reversals = exp_se3(rng.normal(0, [0, 0, 0, 1e-3, 1e-3, 1e-3], (n, 6)))[:, :3, :3]
+    Ts = np.array([pose(command[:3, :3] @ R, at) for R, at in zip(reversals, p, strict=True)])
     return Ts, command, np.repeat(np.eye(3)[None] * noise**2, n, axis=0)
 
 
@@ -30,40 +30,40 @@ def by_the_book(p):
     return mean + 3 * (sum((at - mean) ** 2 for at in lengths) / (len(p) - 1)) ** 0.5
 
 
-def test_without_noise_the_figures_are_the_standards():
+def test_without_noise_the_metrics_are_the_standards():
     Ts, command, cov = attained(1, 30, off=(1e-3, 0, 0))
-    figures = iso9283.pose_metrics(Ts, command, cov)
-    assert figures.repeatability.raw == pytest.approx(by_the_book(Ts[:, :3, 3]), rel=1e-12)
-    assert figures.repeatability.clean == pytest.approx(figures.repeatability.raw, rel=1e-9)
-    assert figures.accuracy.raw == pytest.approx(np.linalg.norm(Ts[:, :3, 3].mean(axis=0) - command[:3, 3]), rel=1e-12)
-    assert np.linalg.norm(figures.accuracy_xyz - [1e-3, 0, 0]) < 4 * np.linalg.norm(ARM_M) / np.sqrt(30)
-    np.testing.assert_allclose(figures.repeatability_rotation, 3e-3, rtol=0.5)  # 30 numbers: 13 % sigma
+    metrics = iso9283.pose_metrics(Ts, command, cov)
+    assert metrics.repeatability.raw == pytest.approx(by_the_book(Ts[:, :3, 3]), rel=1e-12)
+    assert metrics.repeatability.clean == pytest.approx(metrics.repeatability.raw, rel=1e-9)
+    assert metrics.accuracy.raw == pytest.approx(np.linalg.norm(Ts[:, :3, 3].mean(axis=0) - command[:3, 3]), rel=1e-12)
+    assert np.linalg.norm(metrics.accuracy_xyz - [1e-3, 0, 0]) < 4 * np.linalg.norm(ARM_M) / np.sqrt(30)
+    np.testing.assert_allclose(metrics.repeatability_rotation, 3e-3, rtol=0.5)  # 30 numbers: 13 % sigma
 
 
 @pytest.mark.parametrize("n", [3, 5, 30])
 def test_the_best_value_lies_within_its_interval(n):
-    figures = [iso9283.pose_metrics(*attained(seed, n, noise=1e-4)).repeatability for seed in range(40)]
-    told = [figure for figure in figures if figure.clean is not None]
-    assert len(told) > 5
-    for figure in told:
-        assert figure.low <= figure.clean <= figure.high
+    metrics = [iso9283.pose_metrics(*attained(seed, n, noise=1e-4)).repeatability for seed in range(40)]
+    resolved = [metric for metric in metrics if metric.clean is not None]
+    assert len(resolved) > 5
+    for metric in resolved:
+        assert metric.low <= metric.clean <= metric.high
 
 
 def population(cov):
-    """RP of a normal scatter, by very many places."""
+    """RP of a normal scatter, by very many positions."""
     at = np.random.default_rng(0).multivariate_normal(np.zeros(3), cov, 400_000)
     length = np.linalg.norm(at, axis=1)
     return length.mean() + 3 * length.std()
 
 
-def covers(figures, true, widest):
+def covers(metrics, true, widest):
     """Hold intervals to what they say: 95 % of them, a binomial of so many, hold the truth; not less by its 4 sigmas.
 
     Half of them are no wider than what is given.
     """
-    share = np.mean([figure.low <= true <= figure.high for figure in figures])
-    assert share > 0.95 - 4 * np.sqrt(0.95 * 0.05 / len(figures)), share
-    width = np.median([figure.high - figure.low for figure in figures])
+    share = np.mean([metric.low <= true <= metric.high for metric in metrics])
+    assert share > 0.95 - 4 * np.sqrt(0.95 * 0.05 / len(metrics)), share
+    width = np.median([metric.high - metric.low for metric in metrics])
     assert width < widest, (width, widest)
 
 
@@ -83,18 +83,18 @@ def test_the_instruments_noise_is_taken_off_and_the_interval_holds(shape, n, noi
     arm = np.diag(np.square(shape))
     true, rng = population(arm), np.random.default_rng(7)
     C = np.eye(3) * noise**2 * np.trace(arm) / 3
-    figures = []
+    metrics = []
     for _ in range(80):
         p = rng.multivariate_normal(np.zeros(3), arm + C, n)
-        figures.append(iso9283.repeatability(p, np.broadcast_to(C, (n, 3, 3))))
+        metrics.append(iso9283.repeatability(p, np.broadcast_to(C, (n, 3, 3))))
     # No wider than that of a deviation of a needle-like scatter, which is known least; the noise is added to it.
-    covers(figures, true, 1.25 * (1 + noise**2) * chi_width(n) * true)
-    clean = [f.clean for f in figures if f.clean is not None]
+    covers(metrics, true, 1.25 * (1 + noise**2) * chi_width(n) * true)
+    clean = [f.clean for f in metrics if f.clean is not None]
     if n == 30 and noise < 1:  # all are resolved: none is left out, which would take the smallest
         assert len(clean) == 80
-        # The standard's figure is 1 / n too small itself, and scatters by 17 % at most, the mean of 80 by 2 %.
+        # The standard's metric is 1 / n too small itself, and scatters by 17 % at most, the mean of 80 by 2 %.
         assert np.mean(clean) == pytest.approx(true, rel=0.1)
-        assert np.mean([f.raw for f in figures]) == pytest.approx(population(arm + C), rel=0.1)
+        assert np.mean([f.raw for f in metrics]) == pytest.approx(population(arm + C), rel=0.1)
 
 
 def test_limit_of_distances_is_that_of_very_many():
@@ -110,45 +110,45 @@ def test_limit_of_distances_is_that_of_very_many():
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-6])
 def test_what_is_below_the_noise_is_not_resolvable(noise):
-    told = 0
+    resolved = 0
     for seed in range(100):
         Ts, _, cov = attained(seed, 30, arm=np.zeros(3), noise=noise)
-        figure = iso9283.repeatability(Ts[:, :3, 3], cov)
-        told += figure.clean is not None
-        assert 0 < figure.resolvable < figure.raw
-        assert figure.low == 0 or figure.clean is not None
-        assert figure.high >= figure.resolvable or figure.clean is not None
-    assert told <= 8  # 2.5 % by chance, a binomial of 100 stays below 8 with 0.1 %
+        metric = iso9283.repeatability(Ts[:, :3, 3], cov)
+        resolved += metric.clean is not None
+        assert 0 < metric.resolvable < metric.raw
+        assert metric.low == 0 or metric.clean is not None
+        assert metric.high >= metric.resolvable or metric.clean is not None
+    assert resolved <= 8  # 2.5 % by chance, a binomial of 100 stays below 8 with 0.1 %
 
 
 def test_what_could_be_resolved_is_resolved_about_half_the_time():
-    told = 0
+    resolved = 0
     cov = np.broadcast_to(np.eye(3) * 1e-8, (30, 3, 3))
     least = iso9283.repeatability(np.random.default_rng(0).normal(0, 1e-4, (30, 3)), cov).resolvable
     unit = float(iso9283.distance_limit(np.eye(3)))
     rng = np.random.default_rng(1)
     for _ in range(100):
         p = rng.normal(0, np.hypot(least / unit, 1e-4), (30, 3))
-        told += iso9283.repeatability(p, cov).clean is not None
-    assert 25 < told < 75  # the trace is as often above its mean as below it; the freedom is found by trial
+        resolved += iso9283.repeatability(p, cov).clean is not None
+    assert 25 < resolved < 75  # the trace is as often above its mean as below it; the freedom is found by trial
 
 
 @pytest.mark.parametrize(("n", "off", "common"), [(5, 1e-3, 0.0), (30, 0.0, 0.0), (30, 5e-5, 2e-5), (30, 1e-3, 1e-4)])
 def test_accuracy_and_distance_hold_their_intervals(n, off, common):
     rng = np.random.default_rng(11)
-    figures, errors, scatters = [], [], []
+    metrics, errors, scatters = [], [], []
     command = np.eye(4)
     for _ in range(80):
         p = rng.normal(0, ARM_M, (n, 3)) + off * np.array([0.8, 0.6, 0]) + rng.normal(0, common, 3)
         Ts = np.array([pose(np.eye(3), at) for at in p])
         cov = np.zeros((n, 3, 3))
-        figures.append(iso9283.pose_metrics(Ts, command, cov, np.eye(3) * common**2).accuracy)
+        metrics.append(iso9283.pose_metrics(Ts, command, cov, np.eye(3) * common**2).accuracy)
         to = rng.normal([0.5, 0, 0], ARM_M[0], (n, 3))
         AD, RD = iso9283.distance_metrics(rng.normal(0, ARM_M[0], (n, 3)), to, 0.5 - off, cov)
         errors.append(AD)
         scatters.append(RD)
     # A length of three parts reaches no further than its largest part's interval by half, and from 0 on.
-    covers(figures, off, 1.5 * np.hypot(mean_width(ARM_M[0], n), 4 * common))
+    covers(metrics, off, 1.5 * np.hypot(mean_width(ARM_M[0], n), 4 * common))
     covers(errors, off, 1.25 * mean_width(ARM_M[0] * np.sqrt(2), n))
     covers(scatters, 3 * ARM_M[0] * np.sqrt(2), (1.25 + 2.5 / n) * chi_width(n) * 3 * ARM_M[0] * np.sqrt(2))
 
@@ -164,9 +164,9 @@ def test_accuracy_over_the_workspace():
     ]
     covers([f[0] for f in found], mean, 4 * np.hypot(2e-4 / 10, 3e-4))
     covers([f[1] for f in found], largest, 1.25 * 4 * np.hypot(2e-4, 3e-4))
-    for figure, its in zip(iso9283.anywhere(true, 0 * cov, common), (mean, largest), strict=True):
-        assert figure.raw == figure.clean == pytest.approx(its)
-        assert figure.low is figure.high is figure.sigma is None  # attained once, and no sigma: the noise is not known
+    for metric, its in zip(iso9283.anywhere(true, 0 * cov, common), (mean, largest), strict=True):
+        assert metric.raw == metric.clean == pytest.approx(its)
+        assert metric.low is metric.high is metric.sigma is None  # attained once, and no sigma: the noise is not known
 
 
 def test_accuracy_below_its_own_scatter_is_not_resolvable():
@@ -208,10 +208,10 @@ def test_a_path():
     bow = np.stack([0 * s, 1e-3 * np.sin(np.pi * s / 0.4), 0 * s], axis=1)
     ahead = np.array([2e-3, 0, 0])  # along the path: is no error of the path
     paths = command + bow + ahead + rng.normal(0, 1e-5, (10, 40, 3))
-    figures = path_metrics(paths, command, np.zeros((10, 40, 3, 3)))
-    assert figures.accuracy.clean == pytest.approx(1e-3, abs=4 * 1e-5 / np.sqrt(10))
+    metrics = path_metrics(paths, command, np.zeros((10, 40, 3, 3)))
+    assert metrics.accuracy.clean == pytest.approx(1e-3, abs=4 * 1e-5 / np.sqrt(10))
     # Square to the path two directions of 10 um scatter: RP 3.2 times that, the largest of 40 at most twice as much.
-    assert 2e-5 < figures.repeatability.raw < 7e-5
+    assert 2e-5 < metrics.repeatability.raw < 7e-5
     with pytest.raises(InputError, match="followed 2 times"):
         path_metrics(paths[:2], command, np.zeros((2, 40, 3, 3)))
 
@@ -221,56 +221,58 @@ def test_a_path_holds_its_interval():
     s = np.linspace(0, 0.4, 40)
     command = np.stack([s, 0 * s, 0 * s], axis=1)
     bow = np.stack([0 * s, 1e-3 * np.sin(np.pi * s / 0.4), 0 * s], axis=1)
-    figures = []
+    metrics = []
     for _ in range(60):
         common = rng.normal(0, 1e-4, 3)
         paths = command + bow + common + rng.normal(0, 5e-5, (10, 1, 3)) + rng.normal(0, 1e-5, (10, 40, 3))
-        figures.append(path_metrics(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8))
-    covers([f.accuracy for f in figures], 1e-3, 1.5 * np.hypot(mean_width(np.hypot(5e-5, 1e-5), 10), 4e-4))
+        metrics.append(path_metrics(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8))
+    covers([f.accuracy for f in metrics], 1e-3, 1.5 * np.hypot(mean_width(np.hypot(5e-5, 1e-5), 10), 4e-4))
     true = population(np.diag([0, 1, 1]) * (5e-5**2 + 1e-5**2))
-    covers([f.repeatability for f in figures], true, 1.5 * chi_width(10) * true)
+    covers([f.repeatability for f in metrics], true, 1.5 * chi_width(10) * true)
 
 
 def test_a_path_goes_on():
     command = np.array([[0.1, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
-    with pytest.raises(InputError, match="station 3 the command does not go on"):
+    with pytest.raises(InputError, match="point 3 the commanded path does not advance"):
         path_metrics(np.repeat(command[None], 3, axis=0), command, np.zeros((3, 5, 3, 3)))
 
 
 def test_rows_all_alike_show_less_than_the_noise():
     cov = np.broadcast_to(np.eye(3) * 1e-8, (30, 3, 3))
-    figure = iso9283.repeatability(np.zeros((30, 3)), cov)
-    assert figure.clean is None
-    assert figure.sigma is None
-    # The trace of 30 places is known to 1 / sqrt(2 * 87), its 97.5 % is 2 sigmas up.
+    metric = iso9283.repeatability(np.zeros((30, 3)), cov)
+    assert metric.clean is None
+    assert metric.sigma is None
+    # The trace of 30 positions is known to 1 / sqrt(2 * 87), its 97.5 % is 2 sigmas up.
     least = float(iso9283.distance_limit(np.eye(3) * 1e-8)) * np.sqrt(1.96 * np.sqrt(2 / 87))
-    assert figure.high == figure.resolvable == pytest.approx(least, rel=0.05)
+    assert metric.high == metric.resolvable == pytest.approx(least, rel=0.05)
     assert iso9283.repeatability(np.zeros((30, 3)), 0 * cov).clean == 0  # known without noise
     RD = iso9283.distance_metrics(np.zeros((30, 3)), np.ones((30, 3)), 1.0, cov)[1]
     assert RD.clean is None
     assert RD.high > 0
 
 
-@pytest.mark.parametrize("play", [(0.0, 0.0), (3e-4, 1e-4)])
-def test_play_is_read_off_the_quadrants(play):
+@pytest.mark.parametrize("backlash", [(0.0, 0.0), (3e-4, 1e-4)])
+def test_backlash_shows_at_the_quadrants(backlash):
     rng = np.random.default_rng(7)
     angle = np.linspace(0, 2 * np.pi, 720, endpoint=False) + 0.004
     ways = []
     for way in (1.0, -1.0):
         p = np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0 * angle], axis=1)
         speed = way * np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-        ways.append(p - 0.5 * np.array([*play, 0]) * np.sign(speed) + rng.normal(0, 1e-5, p.shape) + [0.4, 0.1, 0.3])
-    figures = circle_metrics(*ways, np.eye(3)[:2])
-    for found, true in zip(figures.backlash, play, strict=True):
+        ways.append(
+            p - 0.5 * np.array([*backlash, 0]) * np.sign(speed) + rng.normal(0, 1e-5, p.shape) + [0.4, 0.1, 0.3]
+        )
+    metrics = circle_metrics(*ways, np.eye(3)[:2])
+    for found, true in zip(metrics.backlash, backlash, strict=True):
         sigma = (found.high - found.low) / (2 * 1.96)
         assert abs(found.raw - true) < 5 * sigma
         assert sigma < 1e-5
         assert found.sigma == (pytest.approx(sigma, rel=1e-4) if true else None)
         assert (found.clean is not None) == (true > 0)
-    # At the jumps both ways differ by the play, elsewhere by its share along the radius.
-    assert figures.hysteresis.raw == pytest.approx(np.hypot(*play), abs=6e-5 if any(play) else 3e-5)
-    np.testing.assert_allclose(figures.centre, [0.4, 0.1, 0.3], atol=5e-6)
-    with pytest.raises(InputError, match=r"300 places, up to 210\.5 degrees apart"):
+    # At the jumps both ways differ by the backlash, elsewhere by its share along the radius.
+    assert metrics.hysteresis.raw == pytest.approx(np.hypot(*backlash), abs=6e-5 if any(backlash) else 3e-5)
+    np.testing.assert_allclose(metrics.centre, [0.4, 0.1, 0.3], atol=5e-6)
+    with pytest.raises(InputError, match=r"300 positions, up to 210\.5 degrees apart"):
         circle_metrics(ways[0][:300], ways[1], np.eye(3)[:2])
 
 
@@ -279,51 +281,53 @@ def ring(angle_deg):
     return np.stack([0.1 * np.cos(a), 0.1 * np.sin(a), 0 * a], axis=1)
 
 
-def test_a_reversal_needs_places_beside_it():
+def test_a_reversal_needs_positions_beside_it():
     whole = ring(np.arange(0.5, 360, 1.0))
     asked = ring(np.arange(1.0, 361, 4.0))  # what the message asks for
     circle_metrics(asked, asked, np.eye(3)[:2])
     angle = np.arange(0.5, 360, 1.0)
     few = angle[(angle < 8) | (angle > 32) | (np.abs(angle - 20) < 2)]
-    one_place = np.sort(np.append(np.repeat(20.0, 9), angle[(angle < 8) | (angle > 32)]))
-    for places, count in ((few, 4), (one_place, 9)):
-        with pytest.raises(InputError, match=f"clockwise has {count} places between 8 and 32 degrees .* of 0 degrees"):
-            circle_metrics(ring(places), whole, np.eye(3)[:2])
+    one_position = np.sort(np.append(np.repeat(20.0, 9), angle[(angle < 8) | (angle > 32)]))
+    for positions, count in ((few, 4), (one_position, 9)):
+        with pytest.raises(
+            InputError, match=f"clockwise has {count} positions between 8 and 32 degrees .* of 0 degrees"
+        ):
+            circle_metrics(ring(positions), whole, np.eye(3)[:2])
 
 
 @pytest.mark.parametrize("times", [1, 3])
 def test_circularity_holds_its_interval_without_a_sigma(times):
-    rng, figures = np.random.default_rng(8), []
+    rng, metrics = np.random.default_rng(8), []
     angle = np.tile(np.arange(0, 360, 0.5), times)
     true = ring(angle) * (1 + 2e-3 * np.cos(2 * np.radians(angle)))[:, None]  # an oval, 0.4 mm of circularity
     for _ in range(60):
         ways = [true + rng.normal(0, 1e-4, true.shape) for _ in range(2)]
-        figures.append(circle_metrics(*ways, np.eye(3)[:2]).circularity)
-    # 8 places a bin. Below the error's own largest, of two ways of 90, 2 * 3.3 sigmas; above the interval of two means.
-    covers(figures, 4e-4, (2 * 3.3 + 2 * np.sqrt(2)) * 1e-4 / np.sqrt(8 * times))
+        metrics.append(circle_metrics(*ways, np.eye(3)[:2]).circularity)
+    # 8 positions a bin. Below the error's own largest, of two ways of 90, 2 * 3.3 sigmas; above the interval of two means.
+    covers(metrics, 4e-4, (2 * 3.3 + 2 * np.sqrt(2)) * 1e-4 / np.sqrt(8 * times))
 
 
-def test_jumps_that_do_not_agree_are_no_play():
+def test_jumps_that_do_not_agree_are_no_backlash():
     angle = np.linspace(0, 2 * np.pi, 720, endpoint=False) + 0.004
     ways = []
-    for kink in (1.0, -1.0):  # a radius that jumps up at 0 degrees one way and down the other: no play does that
+    for kink in (1.0, -1.0):  # a radius that jumps up at 0 degrees one way and down the other: no backlash does that
         r = 0.1 + 5e-4 * kink * (angle < np.pi) * np.cos(angle / 2)
         r = r + np.random.default_rng(1).normal(0, 1e-5, r.shape)
         ways.append(np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], axis=1))
-    play = circle_metrics(*ways, np.eye(3)[:2]).backlash[0]
-    assert play.clean is None
-    assert play.resolvable > 3e-4
+    backlash = circle_metrics(*ways, np.eye(3)[:2]).backlash[0]
+    assert backlash.clean is None
+    assert backlash.resolvable > 3e-4
 
 
 @pytest.mark.parametrize("cov", [None, np.eye(3) * 9e-10])
 def test_noise_alone_makes_no_circularity(cov):
-    rng, angle, told = np.random.default_rng(3), np.linspace(0, 2 * np.pi, 720, endpoint=False), 0
+    rng, angle, resolved = np.random.default_rng(3), np.linspace(0, 2 * np.pi, 720, endpoint=False), 0
     for _ in range(40):
         ways = [np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0 * angle], axis=1) for _ in range(2)]
         ways = [p + rng.normal(0, 3e-5, p.shape) for p in ways]
-        figures = circle_metrics(*ways, np.eye(3)[:2], cov)
-        told += (figures.circularity.clean is not None) + (figures.hysteresis.clean is not None)
-    assert told <= 8  # of 80; 2.5 % by chance
+        metrics = circle_metrics(*ways, np.eye(3)[:2], cov)
+        resolved += (metrics.circularity.clean is not None) + (metrics.hysteresis.clean is not None)
+    assert resolved <= 8  # of 80; 2.5 % by chance
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0, -0.8)])
@@ -346,7 +350,7 @@ def test_the_plan_is_within_reach(name):
         arm.inverse(T, near=q).signs[np.argmin(np.abs(arm.inverse(T, near=q).q - q).sum(axis=1))].tolist()
         for T, q in zip(plan.Ts_base_tool, plan.q, strict=True)
     ]
-    assert all(sign == signs[0] for sign in signs)  # no elbow turns over on the way
+    assert all(sign == signs[0] for sign in signs)  # no elbow flips on the way
     off = (plan.Ts_base_tool[1:, :3, 3] - plan.centre) / (plan.side_m / 2)
     np.testing.assert_allclose(np.abs(off), 0.8, atol=1e-9)
     np.testing.assert_allclose(off[:, 0], off[:, 2], atol=1e-9)  # the standard's diagonal plane

@@ -41,7 +41,7 @@ SIZE = DELAY + 1
 #: Zeros of the joints: the rotation about z of the frame before each.
 ZEROS = np.arange(6) * 6 + 5
 #: The trace of a rotation by 3 rad.
-_LEAST_TRACE = 1.0 + 2.0 * math.cos(3.0)
+_MIN_TRACE = 1.0 + 2.0 * math.cos(3.0)
 
 _kernel = numba.njit(cache=True, error_model="numpy")
 
@@ -256,7 +256,7 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
             d[row] += T[k, row] * (T_to[k, 3] - T[k, 3])
         for col in range(3):
             R[row, col] = T[0, row] * T_to[0, col] + T[1, row] * T_to[1, col] + T[2, row] * T_to[2, col]
-    if R[0, 0] + R[1, 1] + R[2, 2] < _LEAST_TRACE:
+    if R[0, 0] + R[1, 1] + R[2, 2] < _MIN_TRACE:
         xi[0], xi[1], xi[2], xi[3], xi[4], xi[5] = d[0], d[1], d[2], math.pi, 0.0, 0.0
         return
     w = 0.5 * math.sqrt(1.0 + R[0, 0] + R[1, 1] + R[2, 2])

@@ -29,7 +29,7 @@ LEARNING = 6.0
 OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 #: Of the vector the noise that smoothing left in the readings (6,).
 NOISE = slice(READING, POSE)
-_LEAST = 1e-9  # of a share
+_MIN_SHARE = 1e-9  # of a share
 
 
 class ErrorState(NamedTuple):
@@ -85,7 +85,7 @@ def bridged(before: Array, after: Array, ahead: Propagation, back: Propagation) 
     both ends.
     """
     near, far = ahead.kept[:, NOISE] ** 2, back.kept[:, NOISE] ** 2
-    whole = np.maximum(1.0 - near * far, _LEAST)
+    whole = np.maximum(1.0 - near * far, _MIN_SHARE)
     noise = (before * ahead.kept)[:, NOISE] * (1.0 - far) + (after * back.kept)[:, NOISE] * (1.0 - near)
     bridge = np.minimum(ahead.added, back.added)
     bridge[:, NOISE] = np.maximum(ahead.added, back.added)[:, NOISE] * (1.0 - np.maximum(near, far)) / whole

@@ -41,7 +41,7 @@ STUBBORN = 6
 #: States kept for late measurements, s.
 HISTORY_S = 1.0
 #: Most measurements newer than the readings that are kept waiting.
-MOST_WAITING = 16
+MAX_WAITING = 16
 #: Linearisations per measurement at most, and the change (m, rad) that ends them: it leaves about its square.
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
@@ -106,7 +106,7 @@ class KalmanEstimator:
         before = self._states[row - 1]
         seen_s = self._seen_s(pose_measurement, before)
         if seen_s > newest:
-            self._waiting = [*self._waiting, pose_measurement][-MOST_WAITING:]
+            self._waiting = [*self._waiting, pose_measurement][-MAX_WAITING:]
             return Outcome.WAITING
         if seen_s < oldest or (
             row == 1 and before.pose_measurement is not None and self._after(before, pose_measurement)

@@ -39,13 +39,13 @@ _SETTLE_S = 0.3
 #: Travel over which a joint changes the side of its backlash until that is known, rad: the middle of what gears have.
 GAP_RAD = np.deg2rad(0.2)
 #: The least of it, rad: narrower, noise would change it.
-LEAST_GAP_RAD = np.deg2rad(0.05)
+MIN_GAP_RAD = np.deg2rad(0.05)
 #: What counts as motion of an arm, in standard deviations of a speed; while it stands, its links do.
 _STILL = 4.0
 #: So often links float anew through the rows that are not settled yet, s.
 _AGAIN_S = 0.012
 #: The period that counts where a reading stands alone, s.
-_LEAST_PERIOD_S = 1e-3
+_MIN_PERIOD_S = 1e-3
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
@@ -152,7 +152,7 @@ def _smooth(
         if high - low > 4 * PARABOLA:
             _rest(t, q, low, high, at[n], sigma, qs[n], qds[n], variance[n])
         # The correlation's integral over all lags is, of any weights w that sum to one, the period over the sum of w^2.
-        lasts[n] = 0.5 * max(period, _LEAST_PERIOD_S) / variance[n]
+        lasts[n] = 0.5 * max(period, _MIN_PERIOD_S) / variance[n]
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
         for i in range(6):
             unseen[n, 0, i], unseen[n, 1, i], unseen[n, 2, i] = memory[k, 2, i], -memory[k, 4, i], memory[k, 7, i]
@@ -235,7 +235,7 @@ class Readings:
 
     def set_backlash(self, width_rad: Array) -> None:
         """Set the width of each joint's backlash (6,), rad, for the readings from here on."""
-        self._gap = np.maximum(width_rad, LEAST_GAP_RAD)
+        self._gap = np.maximum(width_rad, MIN_GAP_RAD)
 
     def add(self, states: JointStates) -> None:
         """Take readings.

@@ -3,22 +3,17 @@
 In: poses of the flange in the base (from the joints) and of the body in the rig (from vision, with covariance), pairwise.
 Out: :class:`HandEye` with both unknown transforms, their covariance, and the error on poses left out of the fit. Eye to
 hand, T_base_flange T_flange_body = T_base_rig T_rig_body; eye in hand, T_base_flange T_flange_rig T_rig_body =
-T_base_body. Closed-form starts, then maximum likelihood; equations in docs/handeye.md.
+T_base_body. Both are A_i X = Z B_i. Equations: docs/handeye.md. The file in order:
 
-Maximum likelihood of a hand-eye calibration: poses with covariance, an arm and a vision that are off by unknown amounts.
-
-In: poses of the flange and of what is seen, with covariance, and a start. Out: both unknown transforms, their covariance,
-and how far arm and vision are off. The residual of a pose is the tangent, in the axes of what the camera measured, of the
-motion left over. Its covariance is what is given, plus that of an unknown share (``SHARES``): of the flange, about the
-flange, or of what is seen, about its middle, carried over by the adjoint. Its sigmas of place and turn are those of the
-greatest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971).
-
-Closed-form starts for hand-eye calibration: A_i X = Z B_i, from all poses and from small parts of them.
-
-In: poses of the flange in the base and of what is seen. Out: candidates for (X, Z), best first. Own: rotations by the
-leading singular vectors of the Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/
-hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried
-beside it where the installed OpenCV has them (5.0 has not).
+1. Maximum likelihood (:func:`fit`). The residual of a pose is the tangent of the motion left over, in the axes of what the
+   camera measured. Its covariance is the one given, plus that of an unknown share (``SHARES``): of the flange, about the
+   flange, or of the measured body, about its middle, mapped by the adjoint. The sigmas of position and rotation are those
+   of the greatest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971).
+2. Closed-form starts (:func:`starts`), from all poses and from small parts of them: rotations by the leading singular
+   vectors of the Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/hand-eye calibration
+   problem using the Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried beside it where the
+   installed OpenCV has them (5.0 has not).
+3. The calibration (:func:`calibrate_handeye`): input checks, starts, fits, held-out errors.
 """
 
 from __future__ import annotations
@@ -45,17 +40,18 @@ CHANCE = 1e-5
 #: Gauss-Newton steps at most, and the step (m, rad) below which it has converged.
 STEPS, CONVERGED = 30, 1e-10
 #: Poses that the sigmas are estimated from at most, spread evenly.
-MOST = 200
+MAX_SIGMA_POSES = 200
 #: The sigmas are looked for between these, m and rad: beyond, they are zero, or no arm.
-LEAST_SIGMA, MOST_SIGMA = 1e-7, 0.1
+MIN_SIGMA, MAX_SIGMA = 1e-7, 0.1
 
 
 Sigmas = tuple[float, float, float, float]
-Share = Literal["flange", "seen", "places"]
-#: Who has the share of the error that nobody gave: the flange (its joints), what is seen, or what is seen with its turns
-#: hardly believed: an arm's turns and its places may contradict each other by more than either scatters.
-SHARES: tuple[Share, ...] = ("flange", "seen", "places")
-#: Sigma of turns that are hardly believed, rad: enough to determine what places leave open.
+Share = Literal["flange", "seen", "positions"]
+#: What the error beyond the covariance given is attributed to: the flange (its joints); the measured body ("seen"); or the
+#: measured body's positions, with hardly any weight on its rotations: an arm's rotations and its positions may contradict
+#: each other by more than either scatters.
+SHARES: tuple[Share, ...] = ("flange", "seen", "positions")
+#: Sigma of rotations that have hardly any weight, rad: enough to determine what positions leave open.
 HARDLY = 0.005
 
 
@@ -82,8 +78,8 @@ class Poses(Record):
         return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre)
 
     @property
-    def turned(self) -> Array:
-        """(N, 4, 4) the poses that stand for B in A_i X = Z B_i."""
+    def right_side(self) -> Array:
+        """(N, 4, 4) the poses B of A_i X = Z B_i."""
         return inverse(self.B) if self.in_hand else self.B
 
 
@@ -95,8 +91,8 @@ class Fit(Record):
         Z: (4, 4) what stands still, in the base.
         X: (4, 4) what the flange carries, in the flange.
         cov: (12, 12) covariance of the right tangents of Z and X, in this order.
-        sigma: sigmas along or about one axis: the flange's place, m, and turn, rad; the body's middle's, and turn, beyond
-            the covariance given.
+        sigma: sigmas along or about one axis: the flange's position, m, and rotation, rad; those of the body's middle,
+            beyond the covariance given.
         used: (N,) whether a pose was used.
     """
 
@@ -108,7 +104,7 @@ class Fit(Record):
 
 
 def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
-    """Return what is left over, its derivative, and the adjoints that carry an error of the flange over to it.
+    """Return residuals, their derivative, and the adjoints that map an error of the flange to them.
 
     Returns:
         (N, 6) residuals e in the axes of the body, (N, 6, 12) their derivative by the right tangents of Z and X, exact to
@@ -122,7 +118,7 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
         M = np.broadcast_to(X, poses.A.shape)  # E = B^-1 Z^-1 A X
         E = inverse(Z @ poses.B) @ poses.A @ M
         by_x = np.broadcast_to(np.eye(6), (len(poses.A), 6, 6))
-    # A change of Z comes in from the left of what follows it.
+    # A change of Z acts from the left of what follows it.
     by_z = -adjoint(inverse(E) if poses.in_hand else inverse(poses.A @ M) @ Z)
     e = log_se3(E)
     bend = np.eye(6) + 0.5 * small_adjoint(e)  # the right Jacobian's inverse, to first order
@@ -133,7 +129,7 @@ def covariances(poses: Poses, carry: Array, sigma: Sigmas) -> Array:
     """Return the covariance (N, 6, 6) of residuals: what is given, the flange's carried over, and the body's."""
     flange, body = np.repeat(np.square(sigma[:2]), 3), np.repeat(np.square(sigma[2:]), 3)
     about = np.eye(6)
-    about[:3, 3:] = skew(poses.centre)  # the adjoint of the shift from the body's origin to its middle
+    about[:3, 3:] = skew(poses.centre)  # the adjoint of the translation from the body's origin to its middle
     return np.asarray(poses.cov + (carry * flange) @ np.swapaxes(carry, 1, 2) + (about * body) @ about.T)
 
 
@@ -178,19 +174,19 @@ def _squares(e: Array, cov: Array) -> Array:
     return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(cov, e[..., None])[..., 0]))
 
 
-def _shared(place: float, turn: float, share: Share) -> Sigmas:
+def _shared(position: float, rotation: float, share: Share) -> Sigmas:
     """Return the four sigmas of a share."""
     if share == "flange":
-        return place, turn, 0.0, 0.0
-    return 0.0, 0.0, place, turn if share == "seen" else HARDLY
+        return position, rotation, 0.0, 0.0
+    return 0.0, 0.0, position, rotation if share == "seen" else HARDLY
 
 
 def _robust_sigma(poses: Poses, Z: Array, X: Array, share: Share) -> Sigmas:
     """Return sigmas along one axis from the median residual, which mistakes do not reach."""
     e, _, _ = residuals(poses, Z, X)
     middle = np.sqrt(chdtri(3, 0.5))
-    place, turn = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
-    return _shared(max(place, LEAST_SIGMA), max(turn, LEAST_SIGMA), share)
+    position, rotation = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
+    return _shared(max(position, MIN_SIGMA), max(rotation, MIN_SIGMA), share)
 
 
 def _newton(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> tuple[Array, Array]:
@@ -207,21 +203,21 @@ def _newton(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> tuple[Array, Arr
 
 def _variance(poses: Poses, Z: Array, X: Array, sigma: Sigmas, share: Share) -> Sigmas:
     """Return the sigmas of the greatest restricted likelihood."""
-    if len(poses.A) > MOST:
-        poses = poses.rows(np.linspace(0, len(poses.A) - 1, MOST).astype(np.int64))
+    if len(poses.A) > MAX_SIGMA_POSES:
+        poses = poses.rows(np.linspace(0, len(poses.A) - 1, MAX_SIGMA_POSES).astype(np.int64))
     e, _, carry = residuals(poses, Z, X)
     freedom = max(1 - 12 / e.size, 1 / e.size)  # what the fit has left of the residuals'
-    low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
+    low, high = np.log(MIN_SIGMA), np.log(MAX_SIGMA)
 
     def shared(logs: Array) -> Sigmas:
-        place, turn = np.exp(np.clip(logs, low, high))
-        return _shared(float(place), float(turn), share)
+        position, rotation = np.exp(np.clip(logs, low, high))
+        return _shared(float(position), float(rotation), share)
 
     def cost(logs: Array) -> float:
         C = covariances(poses, carry, shared(logs))
         return float(freedom * np.linalg.slogdet(C)[1].sum() + _squares(e, C).sum())
 
-    start = np.log(np.maximum(sigma[:2] if share == "flange" else sigma[2:], LEAST_SIGMA))
+    start = np.log(np.maximum(sigma[:2] if share == "flange" else sigma[2:], MIN_SIGMA))
     best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-3})
     return shared(best.x)
 
@@ -232,7 +228,7 @@ _CV: Any = cv2
 PART = 6
 #: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
 PARTS = 24
-#: What a turn counts in the score, m: 1 mrad as much as 0.3 mm, as it does at a tool 0.3 m from the wrist.
+#: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
 LEVER_M = 0.3
 #: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
 _OPENCV = ("CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "CALIB_ROBOT_WORLD_HAND_EYE_LI")
@@ -259,7 +255,9 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
         for _ in range(PARTS):
             rows = rng.choice(len(A), PART, replace=False)
             found.append(kronecker(A[rows], B[rows]))
-    found = [(X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _turns(X) and _turns(Z)]
+    found = [
+        (X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _is_rigid(X) and _is_rigid(Z)
+    ]
     return sorted(found, key=lambda XZ: _score(A, B, *XZ))
 
 
@@ -289,7 +287,7 @@ def _rotation(M: Array) -> Array:
 
 
 def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield what OpenCV's solvers find, where it has them and they take what they are given."""
+    """Yield what OpenCV's solvers find, where it has them and they accept the poses."""
     back = inverse(B)
     for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
         with contextlib.suppress(cv2.error):
@@ -306,8 +304,8 @@ def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
     return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
 
 
-def _turns(T: Array) -> bool:
-    """Say whether a solver's answer is a rigid motion at all."""
+def _is_rigid(T: Array) -> bool:
+    """Return whether a solver's answer is a rigid motion at all."""
     return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
 
 
@@ -321,7 +319,7 @@ Eye = Literal["to_hand", "in_hand"]
 #: Parts into which the poses are cut for the held-out error.
 FOLDS = 10
 #: Fewest poses: three determine both transforms, and what is left out must leave three.
-LEAST = 4
+MIN_POSES = 4
 #: Starts that are refined; the best of them by likelihood is kept.
 REFINED = 3
 #: Another share than the first must lower the held-out error by this factor: less is chance with tens of poses.
@@ -332,11 +330,11 @@ UNDETERMINED = 1.0
 
 @dataclass(frozen=True, eq=False)
 class HeldOut(Record):
-    """How far poses left out of the fit were predicted wrong.
+    """Prediction errors of poses left out of the fit.
 
     Attributes:
-        position_m: (N,) distance between the body's middle seen and predicted; NaN where a pose was not used.
-        angle_rad: (N,) angle between the body's turns seen and predicted.
+        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
+        angle_rad: (N,) angle between the body's rotations measured and predicted.
     """
 
     position_m: Array
@@ -364,11 +362,11 @@ class HandEye(Record):
         T_base_still: (4, 4) what stands still, in the base: the rig, or in_hand the body.
         T_flange_held: (4, 4) what the flange carries: the body, or in_hand the rig.
         cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, in this order, m and rad.
-        sigma_flange_m: how far the flange is off what the joints say, sigma along one axis, m.
-        sigma_flange_rad: the same of its turn about one axis, rad.
-        sigma_seen_m: how far what is seen is off beyond its covariance, sigma of the body's middle along one axis, m.
-        sigma_seen_rad: the same of its turn about one axis, rad.
-        share: who was found to have the share of the error that was not given, one of ``handeye_fit.SHARES``.
+        sigma_flange_m: error of the flange by the joints, sigma along one axis, m.
+        sigma_flange_rad: the same of its rotation about one axis, rad.
+        sigma_seen_m: error of the measured body beyond its covariance, sigma of its middle along one axis, m.
+        sigma_seen_rad: the same of its rotation about one axis, rad.
+        share: what the error beyond the covariance given was attributed to, one of ``SHARES``.
         held_out: the error on poses left out of the fit.
         used: (N,) whether a pose was used, and not taken for a mistake.
     """
@@ -428,18 +426,18 @@ def calibrate_handeye(
     shares: tuple[Share, ...] = SHARES,
     progress: Callable[[str], None] = lambda line: None,
 ) -> HandEye:
-    """Find where the rig is to the arm.
+    """Calibrate the two constant transforms of rig, body and arm.
 
     Args:
-        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m; the turns must differ about two axes at least.
+        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m; it must rotate about two axes at least.
         Ts_rig_body: (N, 4, 4) the body in the rig at the same instants, m (``PoseEstimate.T_left_body``).
         covs: (N, 6, 6) covariance of the latter, right tangent (``PoseEstimate.cov``); None: not known.
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
-        centre: (3,) the middle of the body's points, body frame, m: what is seen turns about it where vision is off.
+        centre: (3,) the middle of the body's points, body frame, m: errors of vision rotate the body about it.
             None: the body's origin.
         folds: parts for the held-out error; each is predicted by a fit to the others.
-        shares: who may have the share of the error that is not given; the held-out error of place chooses.
-        progress: is told what is being done.
+        shares: what the error beyond the covariance given may be attributed to; the held-out position error decides.
+        progress: called with the name of each step as it begins.
 
     Raises:
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
@@ -447,7 +445,7 @@ def calibrate_handeye(
     """
     poses = _poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
     progress("hand-eye: fitting")
-    candidates = starts(poses.A, poses.turned)[:REFINED]
+    candidates = starts(poses.A, poses.right_side)[:REFINED]
     found: list[HandEye] = []
     for share in shares:
         result = _best(poses, candidates, share)
@@ -459,7 +457,7 @@ def calibrate_handeye(
 
 
 def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
-    """Check what is given once."""
+    """Check the input, once."""
     if eye not in ("to_hand", "in_hand"):
         raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
     Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")
@@ -471,8 +469,8 @@ def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre:
         if bad.any():
             raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
     n = len(Ts_base_flange)
-    if n < LEAST:
-        raise InputError(f"hand-eye calibration needs {LEAST} or more poses, got {n}; 15 and more are advised")
+    if n < MIN_POSES:
+        raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
     cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
     return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
 
@@ -484,7 +482,7 @@ def _best(poses: Poses, candidates: list[tuple[Array, Array]], share: Share) -> 
 
 
 def _require_determined(poses: Poses, result: Fit) -> None:
-    """Refuse motions that leave a direction of the twelve open."""
+    """Reject motions that leave a direction of the twelve undetermined."""
     H = information(poses.rows(result.used), result.Z, result.X, (1e-3, 1e-3, 0.0, 0.0))
     values, vectors = np.linalg.eigh(H)
     if values[0] > 1 / UNDETERMINED**2:
@@ -492,13 +490,13 @@ def _require_determined(poses: Poses, result: Fit) -> None:
     names = [
         f"{what} {kind} {axis}"
         for what in (_still(poses), _held(poses))
-        for kind in ("shift", "turn")
+        for kind in ("translation", "rotation")
         for axis in "xyz"
     ]
     most = ", ".join(names[i] for i in np.argsort(-np.abs(vectors[:, 0]))[:2])
     raise CalibrationError(
-        f"the motions do not determine the hand-eye calibration ({most} can be anything): the flange must turn about two "
-        "axes that are not parallel, by 20 degrees and more; turn the wrist between poses"
+        f"the motions do not determine the hand-eye calibration ({most} can be anything): the flange must rotate about "
+        "two axes that are not parallel, by 20 degrees and more; rotate the wrist between poses"
     )
 
 
@@ -520,7 +518,7 @@ def _held_out(poses: Poses, result: Fit, folds: int, share: Share) -> HeldOut:
         f = fit(poses.rows(others), (result.X, result.Z), share)
         A, B = poses.A[part], poses.B[part]
         seen = A @ f.X @ B if poses.in_hand else A @ f.X
-        wanted = np.broadcast_to(f.Z, B.shape) if poses.in_hand else f.Z @ B
-        position[part] = np.linalg.norm(transform(seen, poses.centre) - transform(wanted, poses.centre), axis=1)
-        angle[part] = np.linalg.norm(log_se3(inverse(wanted) @ seen)[:, 3:], axis=1)
+        predicted = np.broadcast_to(f.Z, B.shape) if poses.in_hand else f.Z @ B
+        position[part] = np.linalg.norm(transform(seen, poses.centre) - transform(predicted, poses.centre), axis=1)
+        angle[part] = np.linalg.norm(log_se3(inverse(predicted) @ seen)[:, 3:], axis=1)
     return HeldOut(position, angle)

@@ -1,4 +1,4 @@
-"""Pivot calibration: where a tool's tip is, from turning the tool about the tip while it stands in one place.
+"""Pivot calibration: where a tool's tip is, from rotating the tool about the tip while the tip stands still.
 
 In: poses of what is tracked (the flange in the base, or the body in the rig). Out: :class:`Pivot`. R_i p_tip + t_i =
 p_pivot is linear in both unknown points (Yaniv, "Which pivot calibration?", SPIE Medical Imaging 2015).
@@ -17,9 +17,9 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 
 #: Fewest poses, and the chance below which one is taken for a mistake.
-LEAST, CHANCE = 4, 1e-4
-#: Largest share of the scatter with which the tip may be known, along its worst axis: the tool must turn for more.
-MOST_AMPLIFIED = 20.0
+MIN_POSES, CHANCE = 4, 1e-4
+#: Largest share of the scatter with which the tip may be known, along its worst axis: more rotation lowers it.
+MAX_AMPLIFICATION = 20.0
 #: Rounds of leaving out mistakes.
 ROUNDS = 10
 
@@ -47,22 +47,24 @@ def calibrate_pivot(Ts: ArrayLike) -> Pivot:
     """Find a tool's tip.
 
     Args:
-        Ts: (N, 4, 4) poses of what is tracked while the tip stands still, m; turned by 30 degrees and more, all ways.
+        Ts: (N, 4, 4) poses of what is tracked while the tip stands still, m; rotated by 30 degrees and more, all ways.
 
     Raises:
         InputError: wrong shape, NaN, fewer than four poses.
-        CalibrationError: the tool turned too little to tell.
+        CalibrationError: the tool was rotated too little.
     """
     poses = checked(Ts, (None, 4, 4), "Ts")
-    if len(poses) < LEAST:
-        raise InputError(f"pivot calibration needs {LEAST} or more poses, got {len(poses)}; 30 and more are advised")
+    if len(poses) < MIN_POSES:
+        raise InputError(
+            f"pivot calibration needs {MIN_POSES} or more poses, got {len(poses)}; 30 and more are advised"
+        )
     used = np.ones(len(poses), bool)
     for _ in range(ROUNDS):
         x, H = _solved(poses[used])
         e = _residuals(poses, x)
         scale = float(np.median(np.sum(e**2, axis=1)) / chdtri(3, 0.5))
         sane = np.sum(e**2, axis=1) <= chdtri(3, CHANCE) * max(scale, 1e-18)
-        if (sane == used).all() or sane.sum() < LEAST:
+        if (sane == used).all() or sane.sum() < MIN_POSES:
             break
         used = sane
     x, H = _solved(poses[used])
@@ -75,10 +77,10 @@ def _solved(Ts: Array) -> tuple[Array, Array]:
     """Return tip and pivot (6,), and the normal matrix (6, 6)."""
     M = np.concatenate([Ts[:, :3, :3], np.broadcast_to(-np.eye(3), (len(Ts), 3, 3))], axis=2).reshape(-1, 6)
     H = M.T @ M
-    if np.sqrt(len(Ts) / max(float(np.linalg.eigvalsh(H)[0]), 1e-300)) > MOST_AMPLIFIED:
+    if np.sqrt(len(Ts) / max(float(np.linalg.eigvalsh(H)[0]), 1e-300)) > MAX_AMPLIFICATION:
         raise CalibrationError(
-            "the tool turned too little, or about one axis only, to tell where its tip is: turn it by 30 degrees and more "
-            "to all sides while the tip stands still"
+            "the tool was rotated too little, or about one axis only, to determine its tip: rotate it by 30 degrees and "
+            "more to all sides while the tip stands still"
         )
     return np.asarray(np.linalg.solve(H, -M.T @ Ts[:, :3, 3].ravel())), H
 

@@ -1,6 +1,6 @@
 """Hand-eye calibration of two streams of poses whose clocks differ by an unknown amount.
 
-In: times and poses of the flange, times and poses of what is seen. Out: :class:`StreamHandEye` with the offset and its
+In: times and poses of the flange, times and poses of the measured body. Out: :class:`StreamHandEye` with the offset and its
 sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all offsets that
 leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: the covariance is that
 of blocks longer than the residuals' correlation (jackknife), not of single poses.
@@ -22,19 +22,20 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.handeye.handeye import Eye, HandEye, Poses, calibrate_handeye, covariances, residuals
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
-MOST = 600
+MAX_POSES = 600
 #: A gap in the flange's stream longer than this, s, is not interpolated over.
 GAP_S = 0.25
-#: Poses that turn by less than this a second, rad/s, say nothing about time; half of them must turn faster somewhere.
-LEAST_TURN = 0.02
+#: Rotation slower than this, rad/s, does not determine the time offset.
+MIN_SPEED_RAD_S = 0.02
 #: Rounds of offset and transforms, and the change of the offset, s, below which it has settled.
 ROUNDS, SETTLED_S = 12, 1e-6
 #: Over this time the speed of the flange is measured, s.
 SPEED_S = 0.02
-#: Blocks at least: fewer cannot tell a variance.
-LEAST_BLOCKS = 8
-#: Of what is known in a direction, less than this part without one block is nothing: sigma a thousand times as large.
-LEAST_LEFT = 1e-6
+#: Blocks at least: fewer do not determine a variance.
+MIN_BLOCKS = 8
+#: Less than this part of a direction's information without one block counts as none: its sigma is a thousand times as
+#: large.
+MIN_LEFT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +77,10 @@ class PoseStream(Record):
         return T, good
 
     def angular_speed(self, t_s: Array, over_s: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Return angular speeds (M,), rad/s, about times, and whether they could be told."""
+        """Return angular speeds (M,), rad/s, about times, and whether the stream covers them."""
         (early, first), (late, last) = self.at(t_s - over_s / 2), self.at(t_s + over_s / 2)
-        turn = Rotation.from_matrix(early[:, :3, :3]).inv() * Rotation.from_matrix(late[:, :3, :3])
-        return np.asarray(turn.magnitude() / over_s), first & last
+        rotation = Rotation.from_matrix(early[:, :3, :3]).inv() * Rotation.from_matrix(late[:, :3, :3])
+        return np.asarray(rotation.magnitude() / over_s), first & last
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +113,14 @@ def calibrate_streams(
         hand: T_base_flange over time.
         eye_stream: T_rig_body over time, on another clock.
         eye: as in :func:`calibrate_handeye`.
-        progress: is told what is being done.
+        progress: called with the name of each step as it begins.
 
     Raises:
-        CalibrationError: the streams do not overlap, nothing turns, or the motions leave a direction undetermined.
+        CalibrationError: the streams do not overlap, nothing rotates, or the motions leave a direction undetermined.
     """
     progress("time offset")
     offset = coarse_offset(hand, eye_stream)
-    rows = np.linspace(0, len(eye_stream.t_s) - 1, min(MOST, len(eye_stream.t_s))).astype(int)
+    rows = np.linspace(0, len(eye_stream.t_s) - 1, min(MAX_POSES, len(eye_stream.t_s))).astype(int)
     t_eye, B = eye_stream.t_s[rows], eye_stream.Ts[rows]
     h = _calibrated(hand, t_eye, B, offset, eye)
     for _ in range(ROUNDS):
@@ -142,7 +143,7 @@ def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
     """Return the offset, s, at which the two angular speeds agree best: to be added to the eye's times.
 
     Raises:
-        CalibrationError: nothing turns.
+        CalibrationError: nothing rotates.
     """
     step = float(np.clip(np.median(np.diff(eye.t_s)), 0.005, 0.05))
     over = 4 * step
@@ -152,8 +153,10 @@ def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
         speed, good = stream.angular_speed(grid, over)
         speeds.append((grid[0], np.where(good, speed, 0.0), good.astype(float)))
     (t_hand, a, in_a), (t_eye, b, in_b) = speeds
-    if max(np.quantile(a, 0.9), np.quantile(b, 0.9)) < LEAST_TURN:
-        raise CalibrationError("nothing turns in these streams: turn the flange, about two axes, at 10 deg/s and more")
+    if max(np.quantile(a, 0.9), np.quantile(b, 0.9)) < MIN_SPEED_RAD_S:
+        raise CalibrationError(
+            "nothing rotates in these streams: rotate the flange, about two axes, at 10 deg/s and more"
+        )
     both = _correlation(in_a, in_b)
     enough = both > 0.3 * both.max()
     squares = _correlation(a**2 * in_a, in_b) + _correlation(in_a, b**2 * in_b) - 2 * _correlation(a, b)
@@ -217,10 +220,10 @@ def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h
     whole = H.sum(axis=0)
     pulls = np.einsum("nki,nk->ni", WJ, e)
     whitened = (np.linalg.inv(np.linalg.cholesky(C)) @ e[..., None])[..., 0]
-    length = int(np.clip(2 * _correlation_length(whitened), 1, max(len(e) // LEAST_BLOCKS, 1)))
+    length = int(np.clip(2 * _correlation_length(whitened), 1, max(len(e) // MIN_BLOCKS, 1)))
     blocks = np.array_split(np.arange(len(e)), max(len(e) // length, 2))
     rests = whole - np.array([H[block].sum(axis=0) for block in blocks])
-    _require_told_twice(whole, rests, [(t[block[0]], t[block[-1]]) for block in blocks])
+    _require_two_blocks(whole, rests, [(t[block[0]], t[block[-1]]) for block in blocks])
     moved = np.linalg.solve(rests, np.array([pulls[block].sum(axis=0) for block in blocks])[..., None])[..., 0]
     robust = moved.T @ moved * (len(blocks) - 1) / len(blocks)
     # Few blocks can scatter less than single poses would by chance: never claim more than independent poses allow.
@@ -229,25 +232,25 @@ def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h
     return np.asarray(robust * np.outer(grow, grow))
 
 
-def _require_told_twice(whole: Array, rests: Array, spans: list[tuple[float, float]]) -> None:
-    """Refuse streams of which one block alone tells a direction.
+def _require_two_blocks(whole: Array, rests: Array, spans: list[tuple[float, float]]) -> None:
+    """Reject streams of which one block alone determines a direction.
 
     Args:
         whole: (13, 13) information of all blocks.
         rests: (B, 13, 13) that without each.
         spans: first and last time of each block, s.
     """
-    advice = "turn about two axes, at changing speed, several times over the recording"
+    advice = "rotate about two axes, at changing speed, several times over the recording"
     unit = 1 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # m, rad and s side by side
     values, vectors = np.linalg.eigh(unit[:, None] * whole * unit)
     if values[0] < np.finfo(float).eps * len(values) * values[-1]:
-        raise CalibrationError(f"these motions do not tell the time offset and the mounting apart: {advice}")
+        raise CalibrationError(f"these motions do not distinguish the time offset from the mounting: {advice}")
     white = unit[:, None] * vectors / np.sqrt(values)  # makes the whole the unit matrix
     left = np.linalg.eigvalsh(white.T @ rests @ white)[:, 0]
-    if left.min() < LEAST_LEFT:
+    if left.min() < MIN_LEFT:
         first, last = spans[int(np.argmin(left))]
         raise CalibrationError(
-            f"a direction of the mounting is told by the poses from {first:.2f} s to {last:.2f} s (eye's clock) alone, "
+            f"only the poses from {first:.2f} s to {last:.2f} s (eye's clock) determine one direction of the mounting, "
             f"and nothing says how well: {advice}"
         )
 

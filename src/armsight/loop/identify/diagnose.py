@@ -51,7 +51,7 @@ _ANGLES = (
     (180 / np.pi, "radians; name the columns q1_rad .. q6_rad"),
 )
 #: Orders whose signs are tried, best first.
-MOST_JOINT_ORDERS = 40
+MAX_JOINT_ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
 _GIVEN = tuple(range(6))
 
@@ -209,7 +209,7 @@ def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
     )
     found = _fitting(arm, q, p, [*tried, *joint_orders], limit)
     if not found:
-        best = list(dict.fromkeys(m.joint_order for m in joint_orders))[:MOST_JOINT_ORDERS]
+        best = list(dict.fromkeys(m.joint_order for m in joint_orders))[:MAX_JOINT_ORDERS]
         found = _fitting(arm, q, p, _tried(arm, q[few], p[few], itertools.product(best, signs)), limit)
     return found
 

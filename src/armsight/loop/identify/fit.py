@@ -76,11 +76,11 @@ STEPS, SMALL_STEP = 25, 1e-3
 #: Rounds of leaving out gross errors and estimating the noise.
 ROUNDS = 6
 #: Where a fit has left less than this part of the residuals' degrees of freedom, they do not determine their noise.
-LEAST_FREEDOM = 0.1
+MIN_FREEDOM = 0.1
 #: Added to a normal matrix of unit diagonal, so that rounding leaves it positive: far below what the data determine.
 ROUNDING = 1e-12
 #: Noise below this, m or rad, is none: what rounding of a printed file leaves.
-LEAST_NOISE = 1e-9
+MIN_NOISE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,10 +155,10 @@ def fit(
         x, H = _newton(model, x, part, part_phi, free, prior, noise, history)
         e = model.residuals(x, measured, phi)
         taken, before = _taken(H, free, prior), noise
-        if e[keep].size - taken >= LEAST_FREEDOM * e[keep].size:
+        if e[keep].size - taken >= MIN_FREEDOM * e[keep].size:
             noise = _noise(part, e[keep], taken)
         kept, keep = keep, (_sane(measured, e, noise) if used is None else keep)
-        if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=LEAST_NOISE):
+        if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=MIN_NOISE):
             break
     part = measured.rows(keep)
     x, H = _newton(model, x, part, phi[keep], free, prior, noise, history)
@@ -245,7 +245,7 @@ def _robust_noise(e: Array) -> tuple[float, float]:
     middle = np.sqrt(chdtri(3, 0.5))
     positions = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
     angle = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0
-    return max(float(np.median(np.linalg.norm(positions, axis=1)) / middle), LEAST_NOISE), max(angle, LEAST_NOISE)
+    return max(float(np.median(np.linalg.norm(positions, axis=1)) / middle), MIN_NOISE), max(angle, MIN_NOISE)
 
 
 def _noise(measured: Measured, e: Array, taken: float) -> tuple[float, float]:
@@ -261,16 +261,16 @@ def _extra(e: Array, cov: Array | None, share: float) -> float:
     """Return sigma with sum e^T (cov + sigma^2)^-1 e = share x their number; the least where cov is already enough."""
     whole = float(np.sqrt(np.mean(e**2) / share))
     if cov is None:
-        return max(whole, LEAST_NOISE)
+        return max(whole, MIN_NOISE)
     values, vectors = np.linalg.eigh(cov)
     squares = np.einsum("nji,nj->ni", vectors, e) ** 2
 
     def over(sigma: float) -> float:
         return float((squares / (np.maximum(values, 0) + sigma**2)).sum() - share * e.size)
 
-    if over(LEAST_NOISE) <= 0 or whole <= LEAST_NOISE:
-        return LEAST_NOISE
-    return float(brentq(over, LEAST_NOISE, whole * 1.01))
+    if over(MIN_NOISE) <= 0 or whole <= MIN_NOISE:
+        return MIN_NOISE
+    return float(brentq(over, MIN_NOISE, whole * 1.01))
 
 
 def squares(measured: Measured, e: Array, noise: tuple[float, float]) -> Array:

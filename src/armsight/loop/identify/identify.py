@@ -26,11 +26,11 @@ from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep,
 from armsight.robot.arm import Arm
 
 #: Fewest poses: what base and tool need, with some to spare.
-LEAST = 6
+MIN_POSES = 6
 #: Joints that move less than this, rad, do not move.
 ALIKE = 0.02
 #: Most poses that the error sources are selected on; the final fit is to all of them.
-MOST = 4000
+MAX_SELECTION_POSES = 4000
 #: Rounds of fitting everything and attributing what is left to the joints.
 ROUNDS = 3
 #: Correlations larger than this are reported.
@@ -150,7 +150,7 @@ def _identified(
     model: Model, start: Solution, measured: Measured, prior: Array, placement: Mask, progress: Callable[[str], None]
 ) -> Identified:
     """Identify everything, from base and tool fitted."""
-    rows = np.linspace(0, len(measured) - 1, min(MOST, len(measured))).astype(np.int64)
+    rows = np.linspace(0, len(measured) - 1, min(MAX_SELECTION_POSES, len(measured))).astype(np.int64)
     part = measured.rows(rows)
     progress("lengths, angles and zeros")
     table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
@@ -214,9 +214,9 @@ def _first(model: Model, x: Array, measured: Measured, prior: Array) -> Solution
 
 
 def _require_enough(measured: Measured) -> None:
-    if len(measured) < LEAST:
+    if len(measured) < MIN_POSES:
         raise InputError(
-            f"{len(measured)} poses are fewer than {LEAST}, which base and tool alone need; 50 and more are advised"
+            f"{len(measured)} poses are fewer than {MIN_POSES}, which base and tool alone need; 50 and more are advised"
         )
     if np.ptp(measured.q, axis=0).max() < ALIKE:
         raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")

@@ -31,7 +31,7 @@ NAMED = 0.02
 #: Poses over the joints' whole range that reveal which ties no poses can resolve.
 PROBES = 300
 #: Poses looked at; more change nothing.
-MOST_POSES = 3000
+MAX_POSES = 3000
 #: Kinds that belong to no row of the table.
 ERROR_SOURCES = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
 _PREFERENCE = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURCES)
@@ -117,8 +117,8 @@ def _preference(model: Model, x: Array) -> Array:
 
 def _triangle(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Array:
     """Return the triangle (P, P) of the whitened Jacobian, columns in units of the prior sigma."""
-    if len(measured) > MOST_POSES:
-        measured = measured.rows(np.linspace(0, len(measured) - 1, MOST_POSES).astype(int))
+    if len(measured) > MAX_POSES:
+        measured = measured.rows(np.linspace(0, len(measured) - 1, MAX_POSES).astype(int))
     phi = model.feature_values(measured.q, measured.approach)
     _, J = weighted(model, x, measured, phi, noise)
     unit = np.where(np.isfinite(prior), prior, 1.0)

@@ -32,7 +32,7 @@ from armsight.loop.identify.selection import SCALED
 #: Candidates compared at once: bounds the memory.
 _BATCH = 250
 #: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
-LEVELS, SWEEPS, LEAST_WON = 7, 3, 0.01
+LEVELS, SWEEPS, MIN_GAIN = 7, 3, 0.01
 
 #: Returns the whitened Jacobians (N, M, F) of poses q (N, 6) approached from sides (N, 6), and which of them are allowed.
 #: Those of poses that are not allowed do not count, except the first.
@@ -116,7 +116,7 @@ def exchanged(
             q[k], approach[k], J[k] = _best(q[k], approach[k], information, np.linalg.inv(others), W, limits, rng)
             H = others + J[k].T @ J[k]
         before, reached = reached, rms(np.linalg.inv(H), W, len(requested))
-        if reached > (1 - LEAST_WON) * before:
+        if reached > (1 - MIN_GAIN) * before:
             break
     return q, approach
 
@@ -156,7 +156,7 @@ UNKNOWN = 0.1
 #: Poses keep this far from the joints' limits, rad: a joint must have room to come from either side.
 ROOM_RAD = 0.03
 #: A prior sigma of an error source says how large it may be (a data sheet's limit); it mostly is this part of it.
-MOSTLY = 1 / 3
+TYPICAL_SHARE = 1 / 3
 #: Joints scatter by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Without it an
 #: instrument of 0.03 mm would seem to learn everything from a few poses.
 CHANCE_RAD = 1e-4
@@ -220,7 +220,7 @@ def plan_poses(
     q, approach, seen = _candidates(scene, rng)
     if len(q) < n:
         raise InputError(f"only {len(q)} poses that can be reached and seen were found; {n} were asked for")
-    prior = np.where([p.kind in SCALED for p in model.parameters], MOSTLY * prior, prior)
+    prior = np.where([p.kind in SCALED for p in model.parameters], TYPICAL_SHARE * prior, prior)
     free = observed(model, x, seen, prior, noise).possible
     P = _prior_covariance(prior, free)
     if done is not None:

@@ -31,7 +31,7 @@ from armsight.loop.identify.model import Model
 #: The kinds whose priors are scaled: they differ most from arm to arm.
 SCALED = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
-LEAST, MOST = 0.01, 1.0
+MIN_FACTOR, MAX_FACTOR = 0.01, 1.0
 #: The factor is itself determined by a handful of numbers; it is taken at the upper end of what they allow, where twice
 #: the log of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The
 #: other kinds are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they
@@ -76,7 +76,7 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
     """Return the logs of the factors at the upper end of what the evidence allows, each with the others at their best."""
     out, allowed = best.copy(), cost(best) + FALLEN
     for k in range(len(best)):
-        for log in np.arange(np.log(MOST), max(best[k], np.log(LEAST)), -0.2):
+        for log in np.arange(np.log(MAX_FACTOR), max(best[k], np.log(MIN_FACTOR)), -0.2):
             tried = best.copy()
             tried[k] = log
             if cost(tried) <= allowed:
@@ -88,7 +88,7 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
 
 def _factors(of: Array, logs: Array) -> Array:
     """Return the factor of every parameter; ``of`` is the kind's number, -1 for what is not scaled."""
-    return np.where(of < 0, 1.0, np.exp(np.clip(logs, np.log(LEAST), np.log(MOST)))[of])
+    return np.where(of < 0, 1.0, np.exp(np.clip(logs, np.log(MIN_FACTOR), np.log(MAX_FACTOR)))[of])
 
 
 def _normal(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> tuple[Array, Array]:
@@ -104,7 +104,7 @@ def _normal(model: Model, start: Solution, measured: Measured, free: Mask, prior
 #: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
 FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 #: An error source is added where it lowers the held-out squares by this many standard errors of the fall over the folds.
-LEAST_GAIN = 1.0
+MIN_GAIN = 1.0
 #: Parameters further from nominal than this many sigmas are kept without trying their removal.
 SURE = 8.0
 #: A fall by less than this part is rounding's.
@@ -307,7 +307,7 @@ def _rms(losses: Array, folds: _Folds) -> float:
 def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
     """Return whether the fall of the held-out squares' logarithms is more than chance over the folds."""
     fall = np.log((without + _NONE) / (with_it + _NONE)) * folds.numbers
-    return bool(fall.sum() > max(LEAST_GAIN * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
+    return bool(fall.sum() > max(MIN_GAIN * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
 
 
 def _pruned(

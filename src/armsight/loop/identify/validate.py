@@ -25,7 +25,7 @@ OTHER = 5.0
 #: and this far, m: no arm moves so far by itself between two recordings of one set-up.
 OTHER_M = 0.02
 #: Poses needed to fit base and tool again.
-LEAST = 10
+MIN_POSES = 10
 
 
 class Errors(NamedTuple):
@@ -90,7 +90,7 @@ def validate(found: Identified, measured: Measured) -> Validation:
         )
     kept = [errors(model, x, measured) for x in (found.nominal, found.solution.x)]
     kept_m = float(np.median(kept[1].position_m))
-    if len(measured) < LEAST or kept_m < OTHER_M:
+    if len(measured) < MIN_POSES or kept_m < OTHER_M:
         return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
     new_model, nominal, x = placement_refitted(found, measured)
     new = [errors(new_model, nominal, measured), errors(new_model, x, measured)]

@@ -1,4 +1,8 @@
-"""Paths (ISO 9283, 8) and circles (ISO 230-4): how far off a path is, how it scatters, how it reverses."""
+"""Metrics of paths (ISO 9283, clause 8) and circles (ISO 230-4): accuracy, repeatability, reversals.
+
+In: positions attained along a path that is followed several times, or a circle both ways, and the instrument's covariance.
+Out: :class:`PathMetrics`, :class:`CircleMetrics`.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,23 @@ from scipy.special import chdtri, stdtrit
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283.poses import repeatability
-from armsight.loop.iso9283.statistic import DRAWS, HIGH, WIDE, Figure, beyond_noise, drawn, lengths, mean_errors
+from armsight.loop.iso9283.statistic import (
+    HIGH,
+    SAMPLES,
+    WIDE,
+    Metric,
+    beyond_noise,
+    lengths,
+    mean_errors,
+    sampled_errors,
+)
 
-#: Degrees on either side of a reversal that are left out, and that are used, where its step is read off. Until play is
-#: taken up the axis stands still: on the first 8 degrees play of up to 1 % of the radius is, 1 - cos 8 degrees.
+#: Degrees on either side of a reversal that are left out, and that its step is estimated from. The axis stands still until
+#: its backlash is taken up: within the first 8 degrees for backlash of up to 1 % of the radius, 1 - cos 8 degrees.
 NEAR_DEG, FAR_DEG = 8.0, 32.0
-#: So many places must lie on either side of a reversal; a whole way has so many, and none further apart, deg.
-_SIDE, _PLACES, _GAP_DEG = 5, 72, 15.0
-#: Places of a circle this close are averaged, deg.
+#: Fewest positions on either side of a reversal; fewest of a whole circle; and the largest gap between them, deg.
+_SIDE, _MIN_POINTS, _GAP_DEG = 5, 72, 15.0
+#: Positions of a circle this close are averaged, deg.
 _BIN_DEG = 4.0
 #: How often a scatter is tried again.
 _TRIALS = 200
@@ -30,36 +43,36 @@ class PathMetrics(NamedTuple):
 
     Attributes:
         accuracy: AT: the largest distance of the mean path from the commanded one.
-        repeatability: RT: that of the station with the largest as measured.
-        off: (S,) distance of the mean path from the commanded one at every station, m.
+        repeatability: RT: that of the path point with the largest as measured.
+        off: (S,) distance of the mean path from the commanded one at every path point, m.
     """
 
-    accuracy: Figure
-    repeatability: Figure
+    accuracy: Metric
+    repeatability: Metric
     off: Array
 
 
 def path_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathMetrics:
-    """Judge a path (8.2, 8.3).
+    """Evaluate a path (8.2, 8.3).
 
     Args:
-        attained: (n, S, 3) places, n times along the path, base, m.
-        command: (S, 3) commanded places, in their order.
-        cov: (n, S, 3, 3) covariance by the instrument, m^2: what differs from place to place.
+        attained: (n, S, 3) positions at S points of the path, n times, base, m.
+        command: (S, 3) commanded positions, in their order.
+        cov: (n, S, 3, 3) covariance by the instrument, m^2: what differs from position to position.
         common: (3, 3) that of its constant error; none of it where it is not given.
 
     Raises:
-        InputError: fewer than three times or stations, or the path does not go on between stations.
+        InputError: fewer than three times or points, or two points of the path in a row are equal.
     """
-    n, stations = attained.shape[:2]
-    if n < 3 or stations < 3:
-        raise InputError(f"a path followed {n} times at {stations} stations; 3 of both are needed, 10 times are usual")
+    n, points = attained.shape[:2]
+    if n < 3 or points < 3:
+        raise InputError(f"a path followed {n} times at {points} points; 3 of both are needed, 10 times are usual")
     across = square_to(command)
     seen = (across @ (attained - command)[..., None])[..., 0]
     middle, rng = seen.mean(axis=0), np.random.default_rng(0)
     errors = mean_errors(seen, rng)
     if common is not None:
-        errors = errors + (across @ drawn(common[None], rng)[..., None])[..., 0]
+        errors = errors + (across @ sampled_errors(common[None], rng)[..., None])[..., 0]
     limits = _limits(seen - middle)
     worst = int(np.argmax(limits))
     RT = repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst])
@@ -71,29 +84,29 @@ def path_metrics(attained: Array, command: Array, cov: Array, common: Array | No
 
 
 def square_to(command: Array) -> Array:
-    """Return what takes out of offsets at stations (S, 3) of a path their part along it: (S, 3, 3).
+    """Return projections (S, 3, 3) onto the planes square to a path at its points (S, 3).
 
     Raises:
-        InputError: the path does not go on between stations.
+        InputError: two points of the path in a row are equal.
     """
     along = np.gradient(command, axis=0)
     length = np.linalg.norm(along, axis=1)
     if not length.all():
         raise InputError(
-            f"at its station {np.argmin(length) + 1} the command does not go on: stations must follow each other along it"
+            f"at its point {np.argmin(length) + 1} the commanded path does not advance: its points must follow each other"
         )
     along /= length[:, None]
     return np.asarray(np.eye(3) - along[:, :, None] * along[:, None])
 
 
 def _limits(off: Array) -> Array:
-    """Return RP (..., S) at every station, of offsets (..., n, S, 3) from the mean path."""
+    """Return RP (..., S) at every path point, of offsets (..., n, S, 3) from the mean path."""
     length = np.linalg.norm(off, axis=-1)
     return np.asarray(length.mean(axis=-2) + 3 * length.std(axis=-2, ddof=1))
 
 
 def _chosen(off: Array, rng: np.random.Generator) -> float:
-    """Return by how much the largest of all stations' RP is too large for being picked, by trial with the same scatter."""
+    """Return the factor by which the largest RP of all path points is biased, by trial with the same scatter."""
     n = len(off)
     largest = float(_limits(off).max())
     weights = rng.normal(0, 1 / np.sqrt(n - 1), (_TRIALS, n, n))
@@ -102,11 +115,11 @@ def _chosen(off: Array, rng: np.random.Generator) -> float:
     return max(float(tried.mean()) / largest, 1.0) if largest > 0 else 1.0
 
 
-def _picked(figure: Figure, factor: float) -> Figure:
-    """Return a figure that was picked as the largest, by so much too large for that; its upper end stays."""
-    clean = None if figure.clean is None else figure.clean / factor
-    low = None if figure.low is None else figure.low / factor
-    return replace(figure, clean=clean, low=low)
+def _picked(metric: Metric, factor: float) -> Metric:
+    """Return a metric that was picked as the largest, divided by its bias; the upper end stays."""
+    clean = None if metric.clean is None else metric.clean / factor
+    low = None if metric.low is None else metric.low / factor
+    return replace(metric, clean=clean, low=low)
 
 
 class CircleMetrics(NamedTuple):
@@ -118,64 +131,64 @@ class CircleMetrics(NamedTuple):
         circularity: G, the largest less the smallest radius of either way, the larger of the two.
         hysteresis: H, the largest difference of the radii of the two ways at one angle.
         steps_m: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive.
-        backlash: play along the circle's first and second axis: the mean of the four jumps where it turns back.
-        jumps: of the radius at each of the turns asked for.
+        backlash: along the circle's first and second axis: the mean of the four jumps where that axis reverses.
+        jumps: of the radius at each of the reversals asked for.
         angle_deg: (B,) angles of the curves.
         radii_m: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise.
     """
 
     centre: Array
     radius_m: float
-    circularity: Figure
-    hysteresis: Figure
+    circularity: Metric
+    hysteresis: Metric
     steps_m: Array
-    backlash: tuple[Figure, Figure]
-    jumps: tuple[Figure, ...]
+    backlash: tuple[Metric, Metric]
+    jumps: tuple[Metric, ...]
     angle_deg: Array
     radii_m: Array
 
 
 def circle_metrics(
-    ccw: Array, cw: Array, axes: Array, cov: Array | None = None, turns: Sequence[tuple[float, float]] = ()
+    ccw: Array, cw: Array, axes: Array, cov: Array | None = None, reversals: Sequence[tuple[float, float]] = ()
 ) -> CircleMetrics:
-    """Judge a circle, and read play off where an axis turns back.
+    """Evaluate a circle, and estimate backlash where an axis reverses.
 
-    Where the path crosses an axis of the circle, the motion along that axis turns back: it lagged by half the play before,
-    and lags by half of it the other way after, so the radius jumps outwards by the play.
+    Where the path crosses an axis of the circle, the motion along that axis reverses: it lagged by half the backlash
+    before, and lags by half of it the other way after, so the radius jumps outwards by the backlash.
 
     Args:
-        ccw: (N, 3) places counter-clockwise, m.
-        cw: (M, 3) clockwise.
+        ccw: (N, 3) positions counter-clockwise, base, m.
+        cw: (M, 3) positions clockwise, base, m.
         axes: (2, 3) unit vectors of the circle's plane along which angles count from the first to the second.
-        cov: (3, 3) covariance of a place by the instrument, m^2. The scatter from place to place tells the noise; where
-            this is more, this does.
-        turns: where else the radius may jump: angles, deg, and the way, 1 counter-clockwise, -1 clockwise.
+        cov: (3, 3) covariance of a position by the instrument, m^2. The noise is that of the scatter from position to
+            position, or this where it is more.
+        reversals: where else the radius may jump: angles, deg, and the way, 1 counter-clockwise, -1 clockwise.
 
     Raises:
-        InputError: a way does not go all around, or a reversal has too few places beside it.
+        InputError: a way does not go all around, or a reversal has too few positions beside it.
     """
     flat = [p @ axes.T for p in (ccw, cw)]
     centre, radius = _fitted(np.concatenate(flat))
     ways = [(np.degrees(np.arctan2(*(p - centre).T[::-1])) % 360, np.linalg.norm(p - centre, axis=1)) for p in flat]
     for (angle, _), name in zip(ways, ("counter-clockwise", "clockwise"), strict=True):
         gap = float(np.diff(np.sort(np.append(angle, angle.min() + 360))).max())
-        if len(angle) < _PLACES or gap > _GAP_DEG:
+        if len(angle) < _MIN_POINTS or gap > _GAP_DEG:
             raise InputError(
-                f"the circle {name} has {len(angle)} places, up to {gap:.1f} degrees apart: {_PLACES} places and more are "
-                f"needed, all around, none further apart than {_GAP_DEG:.0f} degrees"
+                f"the circle {name} has {len(angle)} positions, up to {gap:.1f} degrees apart: {_MIN_POINTS} are "
+                f"needed at least, all around, none further apart than {_GAP_DEG:.0f} degrees"
             )
     steps, variances = np.zeros((2, 4)), np.zeros((2, 4))
     for w, (angle, r) in enumerate(ways):
         for k in range(4):
             steps[w, k], variances[w, k] = _step(angle, r, 90.0 * k, 1.0 if w == 0 else -1.0)
-    # At 0 and 180 degrees the motion along the second axis is fastest and that along the first turns back.
-    x, y = (_play(steps[:, k::2], variances[:, k::2]) for k in (0, 1))
+    # At 0 and 180 degrees the motion along the second axis is fastest and that along the first reverses.
+    x, y = (_backlash(steps[:, k::2], variances[:, k::2]) for k in (0, 1))
     grid, radii, counts = _binned(ways)
     along = np.stack([np.cos(np.radians(grid)), np.sin(np.radians(grid))], axis=1) @ axes
     known = np.zeros(len(grid)) if cov is None else np.einsum("ki,ij,kj->k", along, cov, along)
-    seen = np.array([[_place_to_place(angle, r)] for angle, r in ways])
+    seen = np.array([[_neighbour_variance(angle, r)] for angle, r in ways])
     sigma = np.sqrt(np.maximum(seen, known) / counts)
-    errors = sigma * np.random.default_rng(0).normal(size=(DRAWS, *sigma.shape))
+    errors = sigma * np.random.default_rng(0).normal(size=(SAMPLES, *sigma.shape))
     return CircleMetrics(
         axes.T @ centre + (np.eye(3) - axes.T @ axes) @ np.concatenate([ccw, cw]).mean(axis=0),
         radius,
@@ -183,23 +196,23 @@ def circle_metrics(
         _widest(lambda r: np.asarray(np.abs(r[:, 0] - r[:, 1]).max(axis=-1)), radii, errors),
         steps,
         (x, y),
-        tuple(_play(*(np.array([v]) for v in _step(*ways[int(way < 0)], at, way))) for at, way in turns),
+        tuple(_backlash(*(np.array([v]) for v in _step(*ways[int(way < 0)], at, way))) for at, way in reversals),
         grid,
         radii - radius,
     )
 
 
-def _widest(statistic: Callable[[Array], Array], radii: Array, errors: Array) -> Figure:
-    """Return a largest difference of radii (2, B), with draws (D, 2, B) of their errors.
+def _widest(statistic: Callable[[Array], Array], radii: Array, errors: Array) -> Metric:
+    """Return a largest difference of radii (2, B), with samples (D, 2, B) of their errors.
 
     The largest of many is picked where the error is large too, more than adding errors once more shows. But no error makes
     it larger by more than that error's own largest difference: that bounds its lower end.
     """
-    figure = beyond_noise(statistic, radii, errors)
-    return figure if figure.clean is None else replace(figure, low=figure.raw - float(figure.resolvable or 0.0))
+    metric = beyond_noise(statistic, radii, errors)
+    return metric if metric.clean is None else replace(metric, low=metric.raw - float(metric.resolvable or 0.0))
 
 
-def _place_to_place(angle: Array, r: Array) -> float:
+def _neighbour_variance(angle: Array, r: Array) -> float:
     """Return the variance of radii (N,) at angles (N,), deg, m^2: how far each is off the line through its neighbours.
 
     Whichever time round those are of: what comes slowly along the way is its form (Gasser, Sroka and Jennen-Steinmetz,
@@ -217,7 +230,7 @@ def _place_to_place(angle: Array, r: Array) -> float:
 def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     """Return of angles (N,), deg, and radii (N,), m, of both ways: angles (B,), mean radii (2, B) about them, and counts.
 
-    The counts (2, B) are of places; bins of no place are filled in.
+    The counts (2, B) are of positions; empty bins are interpolated.
     """
     grid = np.arange(0, 360, _BIN_DEG)
     radii, counts = np.zeros((2, len(grid))), np.ones((2, len(grid)))
@@ -230,13 +243,13 @@ def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     return grid, radii, counts
 
 
-def _play(steps: Array, variances: Array) -> Figure:
+def _backlash(steps: Array, variances: Array) -> Metric:
     """Return the mean of jumps (1, k) of variances (1, k) with its interval; negative where the radius falls.
 
-    JointBacklash cannot make it fall: its interval has a sign, and can reach below 0.
+    Backlash cannot make the radius fall, but the interval has a sign and can reach below 0.
 
     Where the jumps differ by more than their sigmas allow, the interval is that of their own scatter (Birge, Phys. Rev. 40,
-    1932): then something else than the play of that axis is at work, on arms of turning joints the usual case.
+    1932): then something else than the backlash of that axis contributes, as is usual on arms of revolute joints.
     """
     value, freedom = float(steps.mean()), steps.size - 1
     apart = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
@@ -245,12 +258,12 @@ def _play(steps: Array, variances: Array) -> Figure:
     else:
         sigma, wide = float(np.sqrt(variances.sum())) / steps.size, WIDE
     resolvable = wide * sigma
-    told = abs(value) > resolvable
-    return Figure(value, value if told else None, value - resolvable, value + resolvable, resolvable)
+    resolved = abs(value) > resolvable
+    return Metric(value, value if resolved else None, value - resolvable, value + resolvable, resolvable)
 
 
 def _fitted(p: Array) -> tuple[Array, float]:
-    """Return centre and radius of the circle through places (N, 2) in algebraic least squares, enough for a full circle."""
+    """Return centre and radius of the circle through positions (N, 2), by algebraic least squares: enough if full."""
     A = np.column_stack([2 * p, np.ones(len(p))])
     x = np.linalg.lstsq(A, (p**2).sum(axis=1), rcond=None)[0]
     return x[:2], float(np.sqrt(x[2] + x[:2] @ x[:2]))
@@ -259,7 +272,7 @@ def _fitted(p: Array) -> tuple[Array, float]:
 def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
     """Return the jump of the radius at an angle, in the sense of motion, m, and its variance: two lines through its sides.
 
-    ``angle`` and ``r`` (N,) are the places, deg and m.
+    ``angle`` and ``r`` (N,) are the polar coordinates of the positions, deg and m.
     """
     from_it = way * ((angle - at + 180) % 360 - 180)
     sides = []
@@ -267,9 +280,9 @@ def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
         rows = (side * from_it > NEAR_DEG) & (side * from_it < FAR_DEG)
         if rows.sum() < _SIDE or np.ptp(from_it[rows]) < _SIDE:
             raise InputError(
-                f"the circle {'counter-clockwise' if way > 0 else 'clockwise'} has {rows.sum()} places between "
+                f"the circle {'counter-clockwise' if way > 0 else 'clockwise'} has {rows.sum()} positions between "
                 f"{NEAR_DEG:.0f} and {FAR_DEG:.0f} degrees to one side of {at:.0f} degrees: {_SIDE} and more are needed, "
-                f"over {_SIDE} degrees and more, as places every 4 degrees have"
+                f"over {_SIDE} degrees and more, as positions every 4 degrees have"
             )
         A = np.column_stack([np.ones(rows.sum()), from_it[rows] / FAR_DEG])
         x = np.linalg.lstsq(A, r[rows], rcond=None)[0]

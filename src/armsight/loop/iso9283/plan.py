@@ -12,10 +12,12 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.servo import SINGULAR
 from armsight.robot.arm import Arm
 
-#: The poses sit this part of the diagonal from the cube's corners (6.8.1).
+#: Smallest singular value of the Jacobian (linear rows over the arm's size) at a pose of the test. ISO 9283 sets no number:
+#: this one keeps the test where the outer loop still corrects every direction (``servo.UNCORRECTED_BELOW``).
+MIN_SINGULAR_VALUE = 0.02
+#: The poses are this part of the diagonal from the cube's corners (6.8.1).
 INSIDE = 0.1
 #: Sizes of cubes that are tried, m, largest first: the standard's, and smaller ones for small arms (6.8.2).
 CUBES_M = (1.0, 0.63, 0.4, 0.25, 0.16, 0.1)
@@ -25,8 +27,8 @@ MANY = 100
 AWAY, ABOVE = np.arange(0.35, 0.86, 0.05), np.arange(-0.1, 0.61, 0.05)
 #: How far joints stay from their limits, rad.
 CLEAR_RAD = float(np.radians(5.0))
-#: How far the tool turns from its turn at home in the wider test, rad.
-TURNED = 0.3
+#: Largest rotation of the tool about each axis from its orientation at home in the wider test, rad.
+MAX_ROTATION_RAD = 0.3
 
 
 class CheckPlan(NamedTuple):
@@ -48,7 +50,7 @@ class CheckPlan(NamedTuple):
 
 
 def everywhere(Ts_base_tool: Array) -> NDArray[np.bool_]:
-    """Say of all poses (N, 4, 4) that they are allowed."""
+    """Allow all poses (N, 4, 4)."""
     return np.ones(len(Ts_base_tool), bool)
 
 
@@ -66,10 +68,10 @@ def plan_check(
     Args:
         arm: the arm.
         centre: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
-        wide: a hundred poses all over the cube, turned too, instead of the standard's five.
+        wide: a hundred poses all over the cube, rotated too, instead of the standard's five.
         seed: of the hundred.
-        allowed: says which poses (N, 4, 4) may be gone to, such as those that are seen.
-        feasible: says whether what is to be done in a cube can be; the next one is tried where it cannot.
+        allowed: returns which poses (N, 4, 4) may be used, such as those that the cameras see.
+        feasible: returns whether a plan can be carried out; if not, the next cube is tried.
 
     Raises:
         InputError: not even the smallest cube will do.
@@ -105,7 +107,7 @@ def _centres(arm: Arm, p_home: Array) -> Array:
 
 
 def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]]) -> Iterator[Array]:
-    """Give joint angles (N, 6) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
+    """Yield joint angles (N, 6) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
 
     NaN where a pose is not reached in it, not clear or not allowed.
     """
@@ -121,22 +123,22 @@ def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]])
             found = arm.inverse(Ts[k], near=start)
             clear = (found.signs == signs).all(axis=1) & ((found.q >= low) & (found.q <= high)).all(axis=1)
             for angles in found.q[clear][:1]:
-                if np.linalg.svd(arm.jacobian(angles) / rows_m, compute_uv=False)[-1] > SINGULAR:
+                if np.linalg.svd(arm.jacobian(angles) / rows_m, compute_uv=False)[-1] > MIN_SINGULAR_VALUE:
                     q[k] = angles
         yield q
 
 
 def _five(home: Array, middle: Array, side: float) -> Array:
-    """Return poses (5, 4, 4): the centre (3,) and four places in a diagonal plane, all with the turn of home (4, 4)."""
+    """Return poses (5, 4, 4): the centre (3,) and four points of a diagonal plane, all oriented as home (4, 4)."""
     far = side / 2 * (1 - 2 * INSIDE)
     corners = np.array([[0, 0, 0], [1, -1, 1], [1, 1, 1], [-1, 1, -1], [-1, -1, -1]])  # of the plane x = z
     return np.array([pose(home[:3, :3], middle + far * corner) for corner in corners])
 
 
 def _wide(home: Array, middle: Array, side: float, seed: int) -> Array:
-    """Return twice as many poses (N, 4, 4) as are wanted, at random over the cube about its middle (3,), and turned so."""
+    """Return twice as many random poses (N, 4, 4) as are needed, over the cube about its middle (3,), and rotated so."""
     rng = np.random.default_rng(seed)
-    places = middle + rng.uniform(-side / 2, side / 2, (2 * MANY, 3))
-    places[0] = middle  # tells the configuration that all are in
-    turns = exp_so3(rng.uniform(-TURNED, TURNED, (2 * MANY, 3)))
-    return np.array([pose(home[:3, :3] @ R, p) for R, p in zip(turns, places, strict=True)])
+    positions = middle + rng.uniform(-side / 2, side / 2, (2 * MANY, 3))
+    positions[0] = middle  # sets the configuration of all
+    rotations = exp_so3(rng.uniform(-MAX_ROTATION_RAD, MAX_ROTATION_RAD, (2 * MANY, 3)))
+    return np.array([pose(home[:3, :3] @ R, p) for R, p in zip(rotations, positions, strict=True)])

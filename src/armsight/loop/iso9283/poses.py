@@ -1,8 +1,8 @@
-"""What robots are judged by (ISO 9283): pose accuracy and repeatability, several directions, distance, drift.
+"""Metrics of poses (ISO 9283): accuracy and repeatability, several directions, distance, drift.
 
-In: poses attained again and again at a few commanded ones, and the instrument's covariance. Out: the standard's figures,
-and beside each the figure without the instrument's own noise, with its uncertainty; what cannot be told from the noise is
-called not resolvable, with the figure that could be. Clauses are those of ISO 9283:1998.
+In: poses attained again and again at a few commanded ones, and the instrument's covariance. Out: the standard's metrics,
+and beside each the metric without the instrument's own noise, with its uncertainty; one that cannot be distinguished from
+the noise is called not resolvable, with the smallest that could be. Clauses are those of ISO 9283:1998.
 """
 
 from __future__ import annotations
@@ -15,10 +15,18 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
-from armsight.loop.iso9283.statistic import Figure, beyond_noise, drawn, group_errors, lengths, mean_errors, scatter
+from armsight.loop.iso9283.statistic import (
+    Metric,
+    beyond_noise,
+    group_errors,
+    lengths,
+    mean_errors,
+    sampled_errors,
+    scatter,
+)
 
-#: Fewest attained poses of which a scatter is told.
-LEAST = 3
+#: Fewest attained poses for a scatter.
+MIN_POSES = 3
 #: Where an integral is summed: beyond its ends lie 1e-6 of it.
 _U = np.linspace(-28.0, 28.0, 113)
 
@@ -29,59 +37,59 @@ class PoseMetrics(Record):
 
     Attributes:
         count: how many attained poses.
-        accuracy: AP of the place, m: distance of the attained poses' barycentre from the command.
+        accuracy: AP of the position, m: distance of the attained poses' barycentre from the command.
         accuracy_xyz: (3,) its parts, m.
-        accuracy_rotation: (3,) the turn from the command to the mean, rad, about the command's axes.
-        repeatability: RP of the place, m: mean distance from the barycentre plus three of its standard deviations.
-        repeatability_rotation: (3,) RP of the turn about the command's axes, rad: three standard deviations.
+        accuracy_rotation: (3,) the rotation from the command to the mean, rad, about the command's axes.
+        repeatability: RP of the position, m: mean distance from the barycentre plus three of its standard deviations.
+        repeatability_rotation: (3,) RP of the rotation about the command's axes, rad: three standard deviations.
     """
 
     count: int
-    accuracy: Figure
+    accuracy: Metric
     accuracy_xyz: Array
     accuracy_rotation: Array
-    repeatability: Figure
+    repeatability: Metric
     repeatability_rotation: Array
 
 
 def pose_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PoseMetrics:
-    """Judge one commanded pose (7.2.1 and 7.2.2).
+    """Evaluate one commanded pose (7.2.1 and 7.2.2).
 
     Args:
         attained: (n, 4, 4) poses, base.
         command: (4, 4) the pose commanded.
-        cov: (n, 3, 3) covariance of the attained places by the instrument, base's axes, m^2: what differs between them.
+        cov: (n, 3, 3) covariance of the attained positions by the instrument, base's axes, m^2: what differs between them.
         common: (3, 3) that of the instrument's constant error; none of it where it is not given.
 
     Raises:
         InputError: fewer than three poses.
     """
     n = len(attained)
-    if n < LEAST:
-        raise InputError(f"a pose was attained {n} times; {LEAST} times and more are needed, 30 are the standard's")
+    if n < MIN_POSES:
+        raise InputError(f"a pose was attained {n} times; {MIN_POSES} times and more are needed, 30 are the standard's")
     p = attained[:, :3, 3]
     off = p.mean(axis=0) - command[:3, 3]
     mean = mean_pose(attained)
-    turns = log_so3(np.ascontiguousarray(mean[:3, :3].T @ attained[:, :3, :3]))
-    rng = np.random.default_rng(0)  # the same test, the same figures
+    rotations = log_so3(np.ascontiguousarray(mean[:3, :3].T @ attained[:, :3, :3]))
+    rng = np.random.default_rng(0)  # the same test gives the same metrics
     errors = mean_errors(p[:, None], rng)
     if common is not None:
-        errors = errors + drawn(common[None], rng)
+        errors = errors + sampled_errors(common[None], rng)
     return PoseMetrics(
         n,
         beyond_noise(lengths, off[None], errors),
         off,
         log_so3(command[:3, :3].T @ mean[:3, :3]),
         repeatability(p, cov),
-        3 * turns.std(axis=0, ddof=1),
+        3 * rotations.std(axis=0, ddof=1),
     )
 
 
-def repeatability(p: Array, cov: Array) -> Figure:
-    """Return RP of places (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
+def repeatability(p: Array, cov: Array) -> Metric:
+    """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
 
     Args:
-        p: (n, 3) places attained, m.
+        p: (n, 3) positions attained, m.
         cov: (n, 3, 3) their covariance by the instrument, m^2.
     """
     distance = np.linalg.norm(p - p.mean(axis=0), axis=1)
@@ -103,30 +111,30 @@ def distance_limit(S: Array) -> Array:
     return np.asarray(mean + 3 * np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
-def anywhere(off: Array, cov: Array, common: Array) -> tuple[Figure, Figure]:
+def anywhere(off: Array, cov: Array, common: Array) -> tuple[Metric, Metric]:
     """Return the mean and the largest error over many poses, each attained once or twice: accuracy over the workspace.
 
     Args:
-        off: (N, 3) attained places less the commanded ones, m.
+        off: (N, 3) attained positions less the commanded ones, m.
         cov: (N, 3, 3) covariance by the instrument, m^2: what differs from pose to pose. Where it is zero it is not
-            known, and what was attained once does not show it: the figures have no interval.
+            known, and what was attained once does not show it: the metrics have no interval.
         common: (3, 3) that of its constant error.
     """
     if not np.any(cov):
         each = np.linalg.norm(off, axis=1)
-        mean, largest = (Figure(raw, raw, None, None, None) for raw in (float(each.mean()), float(each.max())))
+        mean, largest = (Metric(raw, raw, None, None, None) for raw in (float(each.mean()), float(each.max())))
         return mean, largest
     rng = np.random.default_rng(0)
-    errors = drawn(cov, rng) + drawn(common[None], rng)
+    errors = sampled_errors(cov, rng) + sampled_errors(common[None], rng)
     mean = beyond_noise(lambda x: np.asarray(np.linalg.norm(x, axis=-1).mean(axis=-1)), off, errors)
     return mean, beyond_noise(lengths, off, errors)
 
 
-def multi_directional(attained: list[Array]) -> Figure:
+def multi_directional(attained: list[Array]) -> Metric:
     """Return vAP (7.2.3): the largest distance between the barycentres of one pose come to from several directions.
 
     Args:
-        attained: (n, 3) places for every direction.
+        attained: (n, 3) positions for every direction.
 
     Raises:
         InputError: fewer than two directions.
@@ -140,19 +148,19 @@ def multi_directional(attained: list[Array]) -> Figure:
 
 
 def _errors_of_means(groups: list[Array]) -> Array:
-    """Draw errors (B, k, 3) of the barycentres of k groups of places (n, 3)."""
+    """Sample errors (B, k, 3) of the barycentres of k groups of positions (n, 3)."""
     rng = np.random.default_rng(0)
     return np.stack([mean_errors(p, rng) for p in groups], axis=1)
 
 
-def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Figure, Figure]:
+def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Metric, Metric]:
     """Return AD and RD (7.3): error of the mean distance between two poses, and three deviations of it.
 
     Args:
-        from_m: (n, 3) places attained at the first pose.
+        from_m: (n, 3) positions attained at the first pose.
         to_m: (n, 3) at the second, in the same cycles.
         commanded_m: distance of the commands, m.
-        cov: (n, 3, 3) covariance of either place by the instrument, m^2.
+        cov: (n, 3, 3) covariance of either position by the instrument, m^2.
     """
     along = to_m - from_m
     d = np.linalg.norm(along, axis=1)
@@ -164,12 +172,12 @@ def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array)
     return AD, scatter(S, np.atleast_2d(noise), len(d), lambda S: 3 * np.sqrt(S[..., 0, 0]), 1.0)
 
 
-def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Figure]:
-    """Return how the place of one pose wanders (7.5).
+def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Metric]:
+    """Return the drift of one pose's position (7.5).
 
     Args:
         t_s: (n,) times, s.
-        p: (n, 3) places attained, m.
+        p: (n, 3) positions attained, m.
         groups: parts of equal count in order of time.
 
     Returns:
@@ -182,5 +190,5 @@ def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Figure]:
     counts = np.array([len(rows) for rows in order])
     errors = group_errors(within, counts, np.random.default_rng(0))
     off = middles - middles[0]
-    figure = beyond_noise(lengths, off, errors - errors[:, :1])
-    return times, np.linalg.norm(off, axis=1), figure
+    metric = beyond_noise(lengths, off, errors - errors[:, :1])
+    return times, np.linalg.norm(off, axis=1), metric
