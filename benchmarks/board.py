@@ -96,14 +96,14 @@ def figure_1():
             print(f"{name:9}{what:24}{clock:16.0f}{clock / 1000:8.1f}x{processor:20.0f}{processor / 1000:8.1f}x")
 
 
-class CountingMachine(UnicornEmulator):
+class CountingEmulator(UnicornEmulator):
     """Runs a tick's three parts one after the other and counts the instructions of each."""
 
-    def __init__(self, image):
+    def __init__(self, elf):
         import unicorn
 
         self.counted, self.counts = 0, []
-        super().__init__(image)
+        super().__init__(elf)
         self.uc.hook_add(unicorn.UC_HOOK_CODE, self._count)
 
     def _count(self, *_):
@@ -128,13 +128,13 @@ def figure_2():
             image = build.build_board("pil", Path(folder) / f"{name}.elf", compiler)
             counts = []
             for scenario in ("nominal", "gain_change"):
-                machine = CountingMachine(image)
+                emulator = CountingEmulator.open(image)
                 plant = JointPlant()
-                link = EmulatedLink(machine, plant)
+                link = EmulatedLink(emulator, plant)
                 configured(link)
-                machine.counts.clear()
+                emulator.counts.clear()
                 DRIVEN[scenario](Bench(link, plant, []))
-                counts += machine.counts
+                counts += emulator.counts
                 link.close()
             begin, control, end = np.array(counts).T
             rest, per_ms = begin + end, CLOCK_HZ / TICKS_PER_S
