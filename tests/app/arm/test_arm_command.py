@@ -1,4 +1,4 @@
-"""``armsight arm``: its answers against the library's own, its words, and every kind of bad input one by one."""
+"""``armsight arm``: its answers against the library's own, its text, and every kind of bad input one by one."""
 
 import struct
 
@@ -17,7 +17,7 @@ Q_DEG = (10, -20, 30, 0, -90, 5)
 HOME = (657.8, 0, 438, -90, 0, -90)
 
 
-def words(text):
+def on_one_line(text):
     return " ".join(text.split())
 
 
@@ -25,14 +25,13 @@ def test_forward_kinematics_with_negative_angles_as_plain_arguments(armsight):
     said = armsight("arm", "fk", "six_r", *Q_DEG)
     assert said.code == 0
     assert (
-        said.out.splitlines()[0]
-        == "tool at (627.337, 110.616, 459.803) mm, roll pitch yaw (-80.870, 4.924, -100.037) deg"
+        said.out.splitlines()[0] == "tool at (627.337, 110.616, 459.803) mm, euler zyx (-80.870, 4.924, -100.037) deg"
     )
-    (facts,) = armsight("arm", "fk", "six_r", *Q_DEG, "--json").lines
-    np.testing.assert_array_equal(facts["T_base_tool"], SIX_R.forward(np.radians(Q_DEG)))
-    np.testing.assert_allclose(facts["q_deg"], Q_DEG, atol=1e-13)
-    np.testing.assert_allclose(facts["q_rad"], np.radians(Q_DEG))
-    assert facts["within_limits"] is True
+    (found,) = armsight("arm", "fk", "six_r", *Q_DEG, "--json").lines
+    np.testing.assert_array_equal(found["T_base_tool"], SIX_R.forward(np.radians(Q_DEG)))
+    np.testing.assert_allclose(found["q_deg"], Q_DEG, atol=1e-13)
+    np.testing.assert_allclose(found["q_rad"], np.radians(Q_DEG))
+    assert found["within_limits"] is True
 
 
 @pytest.mark.parametrize(
@@ -43,7 +42,7 @@ def test_numbers_are_read_however_they_are_written(angles, armsight):
     assert said.code == 0, said
 
 
-def test_the_home_pose_is_the_chapters(armsight):
+def test_the_home_pose_is_the_sources(armsight):
     said = armsight("arm", "fk", "six_r", 0, 0, 0, 0, -90, 0, "--json")
     want = [[0, 0, 1, 0.6578], [-1, 0, 0, 0], [0, -1, 0, 0.438], [0, 0, 0, 1]]
     np.testing.assert_allclose(said.lines[0]["T_base_tool"], want, atol=1e-15)
@@ -51,10 +50,10 @@ def test_the_home_pose_is_the_chapters(armsight):
 
 
 def test_the_jacobian(armsight):
-    (facts,) = armsight("arm", "jacobian", "six_r", *Q_DEG, "--json").lines
+    (found,) = armsight("arm", "jacobian", "six_r", *Q_DEG, "--json").lines
     q = np.radians(Q_DEG)
-    np.testing.assert_array_equal(facts["J_base"], SIX_R.jacobian(q))
-    assert facts["manipulability"] == pytest.approx(abs(np.linalg.det(SIX_R.jacobian(q))))
+    np.testing.assert_array_equal(found["J_base"], SIX_R.jacobian(q))
+    assert found["manipulability"] == pytest.approx(abs(np.linalg.det(SIX_R.jacobian(q))))
     text = armsight("arm", "jacobian", "six_r", *Q_DEG).out.splitlines()
     printed = np.array([line.split() for line in text[1:7]], float)
     np.testing.assert_allclose(printed, SIX_R.jacobian(q), atol=5.1e-7)
@@ -64,20 +63,20 @@ def test_inverse_kinematics_gives_every_solution_with_its_configuration(armsight
     pose_of = (300, 120, 550, -30, 40, 20)
     said = armsight("arm", "ik", "ur5", *pose_of, "--json")
     assert said.code == 0
-    (facts,) = said.lines
+    (found,) = said.lines
     T = pose(from_euler_zyx(*np.radians(pose_of[3:])), np.array(pose_of[:3]) / 1e3)
-    np.testing.assert_allclose(facts["T_base_tool"], T, atol=1e-15)
-    assert facts["reachable"]
-    assert facts["reason"] is None
-    assert facts["nearest"] is None
-    assert len(facts["solutions"]) == 8
-    for solution in facts["solutions"]:
+    np.testing.assert_allclose(found["T_base_tool"], T, atol=1e-15)
+    assert found["reachable"]
+    assert found["reason"] is None
+    assert found["nearest"] is None
+    assert len(found["solutions"]) == 8
+    for solution in found["solutions"]:
         np.testing.assert_allclose(MODELS["ur5"].forward(solution["q_rad"]), T, atol=1e-9)
         np.testing.assert_allclose(np.radians(solution["q_deg"]), solution["q_rad"])
         assert solution["within_limits"]
-    seen = {tuple(solution["configuration"].values()) for solution in facts["solutions"]}
+    seen = {tuple(solution["configuration"].values()) for solution in found["solutions"]}
     assert len(seen) == 8
-    assert set(facts["solutions"][0]["configuration"]) == {"shoulder", "elbow", "wrist"}
+    assert set(found["solutions"][0]["configuration"]) == {"shoulder", "elbow", "wrist"}
 
 
 def test_what_ik_prints_leads_back_to_the_pose(armsight):
@@ -97,10 +96,10 @@ def test_a_pose_out_of_reach_is_an_answer_with_exit_code_1(armsight):
     assert said.err == ""
     assert "unreachable: upper arm and forearm are too short" in said.out
     assert "nearest pose within limits: (65" in said.out
-    (facts,) = armsight("arm", "ik", "six_r", 900, 0, 500, 0, 90, 0, "--json").lines
-    assert not facts["reachable"]
-    assert facts["solutions"] == []
-    nearest = facts["nearest"]
+    (found,) = armsight("arm", "ik", "six_r", 900, 0, 500, 0, 90, 0, "--json").lines
+    assert not found["reachable"]
+    assert found["solutions"] == []
+    nearest = found["nearest"]
     np.testing.assert_allclose(SIX_R.forward(nearest["q_rad"]), nearest["T_base_tool"], atol=1e-12)
     off = np.linalg.norm(np.array(nearest["T_base_tool"])[:3, 3] - [0.9, 0, 0.5])
     assert nearest["off_m"] == pytest.approx(off)
@@ -110,18 +109,18 @@ def test_a_pose_out_of_reach_is_an_answer_with_exit_code_1(armsight):
 def test_a_pose_that_only_joints_beyond_their_limits_reach_has_exit_code_1(armsight):
     said = armsight("arm", "ik", "six_r", *_behind(), "--json")
     assert said.code == 1
-    (facts,) = said.lines
-    assert facts["solutions"]
-    assert not any(solution["within_limits"] for solution in facts["solutions"])
-    assert facts["reason"].startswith("outside limits")
-    assert facts["nearest"] is not None
+    (found,) = said.lines
+    assert found["solutions"]
+    assert not any(solution["within_limits"] for solution in found["solutions"])
+    assert found["reason"].startswith("outside limits")
+    assert found["nearest"] is not None
 
 
 def _behind():
     """A pose that needs joint 1 at 176 degrees, six degrees beyond its limit, and reaching over does not help."""
     T = SIX_R.forward(np.radians([176, 20, 60, 0, -90, 0]))
-    roll, pitch, yaw = np.degrees([np.arctan2(T[1, 0], T[0, 0]), np.arcsin(-T[2, 0]), np.arctan2(T[2, 1], T[2, 2])])
-    return (*(1e3 * T[:3, 3]), roll, pitch, yaw)
+    z, y, x = np.degrees([np.arctan2(T[1, 0], T[0, 0]), np.arcsin(-T[2, 0]), np.arctan2(T[2, 1], T[2, 2])])
+    return (*(1e3 * T[:3, 3]), z, y, x)
 
 
 def test_angles_beyond_the_limits_are_noted(armsight):
@@ -133,16 +132,16 @@ def test_angles_beyond_the_limits_are_noted(armsight):
 def test_the_list_and_the_numbers_of_an_arm(armsight):
     listed = armsight("arm", "list")
     assert [line.split()[0] for line in listed.out.splitlines()] == list(MODELS)
-    (models,) = armsight("arm", "list", "--json").lines
-    assert [model["model"] for model in models] == list(MODELS)
-    text = words(armsight("arm", "show", "six_r").out)
+    (arms,) = armsight("arm", "list", "--json").lines
+    assert [arm["arm"] for arm in arms] == list(MODELS)
+    text = on_one_line(armsight("arm", "show", "six_r").out)
     assert "joint2 251.500 0.000 0 0 +1 -180 45 90 360 3600 0" in text
     assert "tool at home: (657.800, 0.000, 438.000) mm" in text
     assert "reach of the tool: 657.8 mm from joint 1's axis" in text
     assert "limits are chosen" in text
-    (facts,) = armsight("arm", "show", "six_r", "--json").lines
-    assert [joint["a_m"] for joint in facts["joints"]] == SIX_R.a.tolist()
-    assert [joint["qd_max_rad_s"] for joint in facts["joints"]] == SIX_R.qd_max.tolist()
+    (found,) = armsight("arm", "show", "six_r", "--json").lines
+    assert [joint["a_m"] for joint in found["joints"]] == SIX_R.a.tolist()
+    assert [joint["qd_max_rad_s"] for joint in found["joints"]] == SIX_R.qd_max.tolist()
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -158,8 +157,8 @@ def test_reach_is_what_no_pose_goes_beyond(name):
         assert far > 0.9 * most - 0.05  # random poses come near it
 
 
-def test_the_reach_of_the_chapters_arm_is_all_its_links_in_one_line():
-    # Axis 5 turns the tool into the line: a1 + a2 + a3 + a4 + d6; upwards from joint 2, without a1, on d1.
+def test_the_reach_of_six_r_is_all_its_links_in_one_line():
+    # Axis 5 rotates the tool into the line: a1 + a2 + a3 + a4 + d6; upwards from joint 2, without a1, on d1.
     extent = reach(SIX_R)
     assert extent.radius_m == pytest.approx(0.0365 + 0.2515 + 0.125 + 0.092 + 0.1528, abs=1e-8)
     assert extent.high_m == pytest.approx(0.438 + 0.2515 + 0.125 + 0.092 + 0.1528, abs=1e-8)
@@ -181,7 +180,22 @@ def test_an_arm_goes_out_as_urdf_and_answers_from_there(tmp_path, armsight):
     (here,) = armsight("arm", "fk", path, *Q_DEG, "--json").lines
     (there,) = armsight("arm", "fk", "irb120", *Q_DEG, "--json").lines
     np.testing.assert_allclose(here["T_base_tool"], there["T_base_tool"], atol=1e-12)
-    assert here["model"] == "irb120"
+    assert here["arm"] == "irb120"
+
+
+def test_a_toml_file_is_an_arm_as_well(tmp_path, armsight):
+    path = tmp_path / "arm.toml"
+    rows = [
+        f"[[joint]]\na_m = {float(SIX_R.a[i])!r}\nd_m = {float(SIX_R.d[i])!r}\nalpha_rad = {float(SIX_R.alpha[i])!r}\n"
+        f"offset_rad = {float(SIX_R.offset[i])!r}\n"
+        for i in range(6)
+    ]
+    path.write_text(f'name = "mine"\nconvention = "{SIX_R.convention}"\n' + "".join(rows))
+    said = armsight("arm", "show", path)
+    assert said.code == 0
+    assert said.out.startswith("mine: ")
+    (here,) = armsight("arm", "fk", path, *Q_DEG, "--json").lines
+    np.testing.assert_allclose(here["T_base_tool"], SIX_R.forward(np.radians(Q_DEG)), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -194,12 +208,12 @@ def test_an_arm_goes_out_as_urdf_and_answers_from_there(tmp_path, armsight):
         (("fk", "six_r", 1, 2, 3, 4, 5, "nan"), ("q6 is nan", "finite")),
         (("fk", "six_r", "-inf", 2, 3, 4, 5, 6), ("q1 is -inf", "finite")),
         (("fk", "six_r", 1, 2, "elbow", 4, 5, 6), ("q3 is 'elbow'", "must be a number")),
-        (("fk", "six_r", 1, 2, 3, 4, 5, 5000), ("q6 is 5000 degrees", "no joint turns further")),
+        (("fk", "six_r", 1, 2, 3, 4, 5, 5000), ("q6 is 5000 degrees", "no joint rotates further")),
         (("fk", "seven_r", 1, 2, 3, 4, 5, 6), ("'seven_r' is unknown", "six_r, puma560, ur5, ur10, irb120")),
         (("show", "seven_r"), ("'seven_r' is unknown", "six_r")),
-        (("ik", "six_r", 1, 2, 3), ("six numbers, x y z roll pitch yaw", "3 were given")),
+        (("ik", "six_r", 1, 2, 3), ("six numbers, x y z euler_z euler_y euler_x", "3 were given")),
         (("ik", "six_r", 400, 0, "far", 0, 0, 0), ("z is 'far'",)),
-        (("ik", "six_r", 400, 0, 500, 0, "nan", 0), ("pitch is nan",)),
+        (("ik", "six_r", 400, 0, 500, 0, "nan", 0), ("euler_y is nan",)),
         (("ik", "seven_r", 400, 0, 500, 0, 0, 0), ("'seven_r' is unknown",)),
         (("fk", "six_r", 1, 2, 3, 4, 5, 6, "--jsn"), ("no such option: --jsn",)),
         (("fk", "none.urdf", 1, 2, 3, 4, 5, 6), ("none.urdf: no such file",)),

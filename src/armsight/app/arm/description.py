@@ -1,4 +1,11 @@
-"""What ``armsight arm`` says, as JSON objects and as text: mm and degrees for people, units in the keys of JSON."""
+"""What ``armsight arm`` answers, as JSON objects (units in the keys) and as text (mm and degrees).
+
+In: an arm, joint angles (6,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
+NAME_json and a function NAME_text of the same records.
+
+Angles of a rotation are Euler angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x). Robot
+sources that call them roll, pitch, yaw put roll about z; ROS puts roll about x.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +19,24 @@ from armsight.data import Array
 from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm import Arm
 from armsight.robot.reach import reach
+from armsight.robot.solutions import Solutions
 
-Facts = dict[str, Any]
 
-
-def listed(models: Mapping[str, Arm]) -> list[Facts]:
+def list_json(models: Mapping[str, Arm]) -> list[dict[str, Any]]:
     """Return each arm's name, reach and source."""
-    return [{"model": name, "radius_m": reach(arm).radius_m, "source": arm.source} for name, arm in models.items()]
+    return [{"arm": name, "radius_m": reach(arm).radius_m, "source": arm.source} for name, arm in models.items()]
 
 
 def list_text(models: Mapping[str, Arm]) -> str:
     """Return the arms as lines."""
     wide = max(map(len, models))
-    return "\n".join(f"{f['model']:{wide}}  reach {1e3 * f['radius_m']:6.0f} mm  {f['source']}" for f in listed(models))
+    return "\n".join(
+        f"{name:{wide}}  reach {1e3 * reach(arm).radius_m:6.0f} mm  {arm.source}" for name, arm in models.items()
+    )
 
 
-def shown(arm: Arm) -> Facts:
-    """Return an arm's numbers."""
-    extent = reach(arm)
+def show_json(arm: Arm) -> dict[str, Any]:
+    """Return an arm's table, limits and reach."""
     joints = [
         {
             "name": arm.joint_names[i],
@@ -48,19 +55,19 @@ def shown(arm: Arm) -> Facts:
         for i in range(6)
     ]
     return {
-        "model": arm.name,
+        "arm": arm.name,
         "convention": arm.convention,
         "joints": joints,
         "T_base_0": arm.T_base_0.tolist(),
         "T_flange_tool": arm.T_flange_tool.tolist(),
         "T_base_tool_home": arm.forward(arm.home).tolist(),
-        "reach_m": extent._asdict(),
+        "reach_m": reach(arm)._asdict(),
         "source": arm.source,
     }
 
 
-def show_text(arm: Arm, facts: Facts) -> str:
-    """Return an arm's numbers as a table and lines."""
+def show_text(arm: Arm) -> str:
+    """Return an arm's table, limits and reach as a table and lines."""
     deg = np.degrees
     head = ("joint", "a mm", "d mm", "alpha", "offset", "dir", "from", "to", "speed", "accel.", "jerk", "home")
     rows = [
@@ -74,59 +81,59 @@ def show_text(arm: Arm, facts: Facts) -> str:
         )
         for i in range(6)
     ]
-    extent = {key: 1e3 * value for key, value in facts["reach_m"].items()}
+    extent = reach(arm)
     lines = [f"{arm.name}: {arm.convention} Denavit-Hartenberg table; angles in deg, speeds in deg/s, deg/s^2, deg/s^3"]
     lines += _table((head, *rows))
     for name, T in (("T_base_0", arm.T_base_0), ("T_flange_tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
-            lines.append(f"{name}: {_where(T)}")
-    lines.append(f"tool at home: {_where(arm.forward(arm.home))}")
+            lines.append(f"{name}: {_pose_text(T)}")
+    lines.append(f"tool at home: {_pose_text(arm.forward(arm.home))}")
     lines.append(
-        f"reach of the tool: {extent['radius_m']:.1f} mm from joint 1's axis, from {extent['low_m']:.1f} to "
-        f"{extent['high_m']:.1f} mm along it"
+        f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
+        f"{1e3 * extent.high_m:.1f} mm along it"
     )
     return "\n".join([*lines, f"source: {arm.source}"])
 
 
-def forward(arm: Arm, q: Array) -> Facts:
-    """Return where the tool is at joint angles (6,)."""
-    T = arm.forward(q)
-    return {"model": arm.name, **_angles(q), "within_limits": bool(arm.within_limits(q)), **_pose(T)}
-
-
-def forward_text(facts: Facts) -> str:
-    """Return where the tool is as lines."""
-    T = np.array(facts["T_base_tool"])
-    return "\n".join([f"tool at {_where(T)}", "T_base_tool, m:", *_matrix(T)])
-
-
-def jacobian(arm: Arm, q: Array) -> Facts:
-    """Return the Jacobian in base axes at joint angles (6,)."""
+def forward_json(arm: Arm, q: Array) -> dict[str, Any]:
+    """Return the pose of the tool at joint angles (6,), rad."""
     return {
-        "model": arm.name,
-        **_angles(q),
+        "arm": arm.name,
+        **_angles_json(q),
+        "within_limits": bool(arm.within_limits(q)),
+        **_pose_json(arm.forward(q)),
+    }
+
+
+def forward_text(arm: Arm, q: Array) -> str:
+    """Return the pose of the tool at joint angles (6,), rad, as lines."""
+    T = arm.forward(q)
+    return "\n".join([f"tool at {_pose_text(T)}", "T_base_tool, m:", *_matrix(T)])
+
+
+def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
+    """Return the Jacobian in base axes at joint angles (6,), rad."""
+    return {
+        "arm": arm.name,
+        **_angles_json(q),
         "within_limits": bool(arm.within_limits(q)),
         "J_base": arm.jacobian(q).tolist(),
         "manipulability": float(arm.manipulability(q)),
     }
 
 
-def jacobian_text(facts: Facts) -> str:
-    """Return the Jacobian as lines."""
-    lines = [
-        "J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint",
-        *_matrix(np.array(facts["J_base"])),
-    ]
-    return "\n".join([*lines, f"manipulability: {facts['manipulability']:.6g} (0 is singular)"])
+def jacobian_text(arm: Arm, q: Array) -> str:
+    """Return the Jacobian in base axes at joint angles (6,), rad, as lines."""
+    lines = ["J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint", *_matrix(arm.jacobian(q))]
+    return "\n".join([*lines, f"manipulability: {float(arm.manipulability(q)):.6g} (0 is singular)"])
 
 
-def inverse(arm: Arm, T_base_tool: Array) -> Facts:
-    """Return every set of joint angles that brings the tool to a pose (4, 4), or why there is none."""
-    found = arm.inverse(T_base_tool)
+def inverse_json(arm: Arm, T_base_tool: Array, found: Solutions) -> dict[str, Any]:
+    """Return the inverse solutions of a pose (4, 4), or why there is none."""
     solutions = [
         {
             "configuration": None if configuration is None else dataclasses.asdict(configuration),
-            **_angles(found.q[i]),
+            **_angles_json(found.q[i]),
             "within_limits": bool(found.within_limits[i]),
             "outside": beyond(arm, found.q[i]),
             "singular": bool(found.singular[i]),
@@ -138,10 +145,10 @@ def inverse(arm: Arm, T_base_tool: Array) -> Facts:
     nearest = None
     if found.nearest is not None:
         off = {"off_m": found.nearest.off_m, "off_rad": found.nearest.off_rad}
-        nearest = {**_angles(found.nearest.q), **_pose(found.nearest.T_base_tool), **off}
+        nearest = {**_angles_json(found.nearest.q), **_pose_json(found.nearest.T_base_tool), **off}
     return {
-        "model": arm.name,
-        **_pose(T_base_tool),
+        "arm": arm.name,
+        **_pose_json(T_base_tool),
         "reachable": bool(found.within_limits.any()),
         "reason": found.reason,
         "solutions": solutions,
@@ -149,34 +156,33 @@ def inverse(arm: Arm, T_base_tool: Array) -> Facts:
     }
 
 
-def inverse_text(facts: Facts) -> str:
-    """Return the joint angles of a pose as a table and lines."""
-    lines = [f"{facts['model']}: tool at {_where(np.array(facts['T_base_tool']))}"]
-    if facts["solutions"]:
-        head = ("", *(f"q{i}" for i in range(1, 7)), "configuration", "")
-        rows = [
-            (
-                f"{number}",
-                *map(_fixed, solution["q_deg"]),
-                " ".join((solution["configuration"] or {"": "-"}).values()),
-                _remark(solution),
-            )
-            for number, solution in enumerate(facts["solutions"], start=1)
-        ]
-        lines += _table((head, *rows))
-    if facts["reason"] is not None:
-        lines.append(facts["reason"])
-    if (nearest := facts["nearest"]) is not None:
-        lines.append(f"nearest pose within limits: {_where(np.array(nearest['T_base_tool']))}")
+def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
+    """Return the inverse solutions of a pose (4, 4) as a table and lines."""
+    lines = [f"{arm.name}: tool at {_pose_text(T_base_tool)}"]
+    rows = [
+        (
+            f"{i + 1}",
+            *(_fixed(angle) for angle in np.degrees(found.q[i])),
+            "-" if configuration is None else " ".join(dataclasses.asdict(configuration).values()),
+            _remark(arm, found.q[i], singular=bool(found.singular[i])),
+        )
+        for i, configuration in enumerate(found.configurations)
+    ]
+    if rows:
+        lines += _table((("", *(f"q{i}" for i in range(1, 7)), "configuration", ""), *rows))
+    if found.reason is not None:
+        lines.append(found.reason)
+    if (nearest := found.nearest) is not None:
+        lines.append(f"nearest pose within limits: {_pose_text(nearest.T_base_tool)}")
         lines.append(
-            f"  {1e3 * nearest['off_m']:.3f} mm and {np.degrees(nearest['off_rad']):.3f} deg away, at q "
-            + " ".join(map(_fixed, nearest["q_deg"]))
+            f"  {1e3 * nearest.off_m:.3f} mm and {np.degrees(nearest.off_rad):.3f} deg away, at q "
+            + " ".join(_fixed(angle) for angle in np.degrees(nearest.q))
         )
     return "\n".join(lines)
 
 
 def beyond(arm: Arm, q: Array) -> list[str]:
-    """Return which of the joint angles (6,) are beyond the arm's limits, in words."""
+    """Return which of the joint angles (6,), rad, are beyond the arm's limits, as text."""
     return [
         f"{arm.joint_names[i]} at {np.degrees(q[i]):.3f} deg is outside its limits "
         f"{np.degrees(arm.q_min[i]):.3f} to {np.degrees(arm.q_max[i]):.3f} deg"
@@ -185,34 +191,34 @@ def beyond(arm: Arm, q: Array) -> list[str]:
     ]
 
 
-def _angles(q: Array) -> Facts:
+def _angles_json(q: Array) -> dict[str, Any]:
     return {"q_deg": np.degrees(q).tolist(), "q_rad": q.tolist()}
 
 
-def _pose(T: Array) -> Facts:
+def _pose_json(T: Array) -> dict[str, Any]:
     """Return a pose: the matrix, and mm and degrees."""
     angles, singular = euler_zyx(T[:3, :3])
     return {
         "T_base_tool": T.tolist(),
         "position_mm": (1e3 * T[:3, 3]).tolist(),
-        "roll_pitch_yaw_deg": np.degrees(angles).tolist(),
+        "euler_zyx_deg": np.degrees(angles).tolist(),
         "pitch_singular": singular,
     }
 
 
-def _where(T: Array) -> str:
-    """Return a pose in words."""
+def _pose_text(T: Array) -> str:
+    """Return a pose as text: position and Euler angles."""
     angles, singular = euler_zyx(T[:3, :3])
-    xyz, rpy = (", ".join(map(_fixed, values)) for values in (1e3 * T[:3, 3], np.degrees(angles)))
-    note = " (pitch singular: only roll and yaw together are determined)" if singular else ""
-    return f"({xyz}) mm, roll pitch yaw ({rpy}) deg{note}"
+    xyz, zyx = (", ".join(map(_fixed, values)) for values in (1e3 * T[:3, 3], np.degrees(angles)))
+    note = " (singular: of the angles about z and x only both together are determined)" if singular else ""
+    return f"({xyz}) mm, euler zyx ({zyx}) deg{note}"
 
 
-def _remark(solution: Facts) -> str:
+def _remark(arm: Arm, q: Array, *, singular: bool) -> str:
     """Return what is special about a solution."""
-    if solution["outside"]:
-        return "outside limits: " + " ".join(text.split(" at ")[0] for text in solution["outside"])
-    return "singular" if solution["singular"] else ""
+    if outside := beyond(arm, q):
+        return "outside limits: " + " ".join(text.split(" at ")[0] for text in outside)
+    return "singular" if singular else ""
 
 
 def _fixed(value: float) -> str:
@@ -231,10 +237,10 @@ def _short(value: float) -> str:
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Return rows of cells as lines with aligned columns, the first to the left."""
-    cells = list(rows)
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    """Return rows as lines with aligned columns, the first to the left."""
+    lines = list(rows)
+    widths = [max(len(row[i]) for row in lines) for i in range(len(lines[0]))]
     return [
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
-        for row in cells
+        "  ".join([row[0].ljust(widths[0]), *(entry.rjust(w) for entry, w in zip(row[1:], widths[1:], strict=True))])
+        for row in lines
     ]

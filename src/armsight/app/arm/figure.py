@@ -24,7 +24,7 @@ VIEWS = {"from the side": (0, 2), "from above": (0, 1)}
 
 
 def write_arm_figure(arm: Arm, path: Path) -> None:
-    """Draw an arm at home and write it as a PNG.
+    """Plot an arm at home and write it as a PNG.
 
     Raises:
         InputError: matplotlib is missing, or the file cannot be written.
@@ -81,7 +81,7 @@ def _figure(arm: Arm) -> Figure:
 
 
 def _view(axes: Any, title: str, across: int, up: int, points: Array, Ts: Array, size: float) -> None:  # noqa: ANN401
-    """Draw the arm as seen along one axis of the base."""
+    """Plot the arm as seen along one axis of the base."""
     axes.plot(points[:, across], points[:, up], color=INK, lw=3, solid_capstyle="round", solid_joinstyle="round")
     for T in Ts:
         for axis, colour in enumerate(AXES):
@@ -97,13 +97,13 @@ def _view(axes: Any, title: str, across: int, up: int, points: Array, Ts: Array,
 
 
 def _names(origins: Array, size: float) -> list[tuple[str, Array]]:
-    """Return a label for each place where frames sit, those that share a place in one."""
-    places: list[tuple[list[str], Array]] = []
+    """Return a label and a position (3,), mm, for each group of frames at about one position."""
+    labels: list[tuple[list[str], Array]] = []
     for name, origin in zip(["0", *"123456", "tool"], origins, strict=True):
-        for names, place in places:
-            if np.linalg.norm(place - origin) < 0.3 * size:
+        for names, position in labels:
+            if np.linalg.norm(position - origin) < 0.3 * size:
                 names.append(name)
                 break
         else:
-            places.append(([name], origin))
-    return [(" ".join(names), place) for names, place in places]
+            labels.append(([name], origin))
+    return [(" ".join(names), position) for names, position in labels]
