@@ -2,10 +2,11 @@
 
     python benchmarks/identify_workcell.py [seeds]
 
-Each pose is come to over its last 0.6 degrees in 1.5 s, from a side drawn for each joint, so that friction says where a
-joint without weight lies in its play. What is seen is the true pose with the noise that the cell's cameras have (0.03 mm,
-0.004 degrees); the images themselves are not drawn here. Random poses are drawn evenly over a box about home; planned ones
-are from the same box, nothing being known but the nominal arm, and judged at the same unseen poses.
+Each pose is come to over its last 0.6 degrees in 1.5 s, from a random side for each joint, so that friction decides where a
+joint that gravity does not load lies in its backlash. What is seen is the true pose with the noise that the workcell's
+cameras have (0.03 mm, 0.004 degrees); the images themselves are not rendered here. Random poses are sampled uniformly
+over a box about home; planned ones are from the same box, nothing being known but the nominal arm, and evaluated at the
+same unseen poses.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import plan_poses
 from armsight.robot.arm import Arm
+from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
-from armsight.robot.arm_file import open_arm
 from armsight.robot.trajectories import point_to_point
-from armsight.sim.workcell.arm import drawn, imperfections
+from armsight.sim.workcell.arm import imperfections, sample_arm
 from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import ArmPlant
@@ -38,7 +39,7 @@ BACK_RAD, CREEP_S, SETTLE_S, LOOK_S, PERIOD_S = np.radians(0.6), 1.5, 0.3, 0.1, 
 SIGMA = np.repeat([3e-5, 7e-5], 3)
 
 
-def drawn_poses(model: Arm, seed: int) -> list:
+def random_poses(model: Arm, seed: int) -> list:
     """Return goals and sides, evenly over the box where the links stay above the table."""
     rng, found = np.random.default_rng([seed, 5]), []
     while len(found) < POSES + UNSEEN:
@@ -63,7 +64,7 @@ def visited(seed: int, goals: list) -> tuple:
     """Drive the arm to every pose; returns the truth, and joints as read, of the shafts, of the links, and sides."""
     model = open_arm("six_r")
     parts = solids(model)
-    motors, true = chosen(model, parts), drawn(model, imperfections("worn"), seed)
+    motors, true = chosen(model, parts), sample_arm(model, imperfections("worn"), seed)
     plant = ArmPlant(model, true, seed)
     board = configured(EmulatedLink(open_emulator("host"), plant), configuration(model, parts, motors))
     board.enable()
@@ -101,16 +102,16 @@ def looked_at(true, q: np.ndarray, link: np.ndarray, side: np.ndarray, seed: int
     return T, Measured(q, B[:, None, :3, 3], B[:, :3, :3], cov, side)
 
 
-def one(seed: int, goals: list, told) -> tuple[float, ...]:
-    """Identify one arm, and the same without play in joint 1: what that costs is the ablation.
+def one(seed: int, goals: list, report) -> tuple[float, ...]:
+    """Identify one arm, and the same without backlash in joint 1: what that costs is the ablation.
 
     Returns mean errors, mm: of planned poses, and of as many and of all random ones.
     """
-    model, true, q, shaft, link, side = visited(seed, drawn_poses(open_arm("six_r"), seed))
+    model, true, q, shaft, link, side = visited(seed, random_poses(open_arm("six_r"), seed))
     reached: list[float] = []
     still = link.copy()
     still[:, 0] = shaft[:, 0]
-    for name, at in (("", link), (", joint 1 without play", still)):
+    for name, at in (("", link), (", joint 1 without backlash", still)):
         T, m = looked_at(true, q, at, side, seed)
         found = identify(model, m.rows(np.arange(POSES)))
         rest = slice(POSES, None)
@@ -120,8 +121,8 @@ def one(seed: int, goals: list, told) -> tuple[float, ...]:
             return float(np.linalg.norm((inverse(T[rest]) @ T_hat)[:, :3, 3], axis=1).mean())
 
         before, after = error(found, found.nominal), error(found, found.solution.x)
-        told(f"workcell {seed}, {POSES} poses: mean on {UNSEEN} unseen{name}", 1e3 * after, 0.25)
-        told("  one over the times that it falls", after / before, 1 / 8, "")
+        report(f"workcell {seed}, {POSES} poses: mean on {UNSEEN} unseen{name}", 1e3 * after, 0.25)
+        report("  one over the times that it falls", after / before, 1 / 8, "")
         if name:
             continue
         offset = true.arm.offset - true.pot_offset_rad
@@ -131,13 +132,13 @@ def one(seed: int, goals: list, told) -> tuple[float, ...]:
             for i in range(6)
             if found.value(f"{key}{i + 1}")[1] > 0 and f"{key}{i + 1}" not in found.reasons
         ]
-        told(f"  furthest of {len(off)} parameters", max(off), 3.0, "sigma")
-        for play in joint_backlashes(found, m.rows(np.arange(POSES))):
-            if np.isfinite(play.value_rad):
-                wrong = abs(np.degrees(play.value_rad - true.backlash_rad[play.joint]))
-                told(f"  play of joint {play.joint + 1}", wrong, 0.02, "deg", f" ({play.how})")
+        report(f"  furthest of {len(off)} parameters", max(off), 3.0, "sigma")
+        for backlash in joint_backlashes(found, m.rows(np.arange(POSES))):
+            if np.isfinite(backlash.value_rad):
+                wrong = abs(np.degrees(backlash.value_rad - true.backlash_rad[backlash.joint]))
+                report(f"  backlash of joint {backlash.joint + 1}", wrong, 0.02, "deg", f" ({backlash.how})")
             else:
-                print(f"     play of joint {play.joint + 1} {play.how}", flush=True)
+                print(f"     backlash of joint {backlash.joint + 1} {backlash.how}", flush=True)
         _, _, q_plan, _, link_plan, side_plan = visited(seed, goals)
         few = [looked_at(true, q_plan, link_plan, side_plan, 1000 + seed)[1], m.rows(np.arange(PLANNED))]
         reached = [1e3 * error(other, other.solution.x) for other in (identify(model, part) for part in few)]
@@ -146,12 +147,12 @@ def one(seed: int, goals: list, told) -> tuple[float, ...]:
 
 
 if __name__ == "__main__":
-    from identify import told as tell
+    from identify import report
 
     chosen_goals = planned_poses(open_arm("six_r"))
     seeds = range(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
-    planned, as_many, all_random = np.mean([one(seed, chosen_goals, tell) for seed in seeds], axis=0)
-    tell(
+    planned, as_many, all_random = np.mean([one(seed, chosen_goals, report) for seed in seeds], axis=0)
+    report(
         f"{PLANNED} planned poses, error over that of {POSES} random",
         planned / all_random,
         1.0,

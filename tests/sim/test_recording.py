@@ -47,7 +47,7 @@ def test_truth_comes_back(recording):
 
 def test_a_recording_is_a_source(recording):
     folder, truth = recording
-    source = FolderSource(folder)
+    source = FolderSource.open(folder)
     shots = [source.read() for _ in truth.shots]
     assert source.read() is None
     assert [shot.name for shot in shots] == list(truth.shots)

@@ -8,7 +8,7 @@ import pytest
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import inverse
-from armsight.robot.boards.codes import State
+from armsight.robot.boards.codes import BoardState
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.markers.board import open_board
@@ -43,7 +43,7 @@ def test_the_arm_follows_and_comes_to_rest(workcell):
     workcell.board.receive()
     q = workcell.poses[0]
     times, readings = go(workcell, workcell.model.home, q)
-    assert workcell.board.status.state == State.ENABLED
+    assert workcell.board.status.state == BoardState.ENABLED
     assert workcell.board.status.faults == ()
     # At rest the potentiometers say what was asked for, but for their noise and what friction holds.
     assert np.abs(readings[-100:].mean(axis=0) - q).max() < np.deg2rad(0.15)
@@ -154,7 +154,7 @@ def test_the_button_stops_the_arm(workcell):
     workcell.board.enable()
     workcell.plant.stop_pressed = True
     workcell.board.receive(0.05)
-    assert workcell.board.status.state == State.STOPPED
+    assert workcell.board.status.state == BoardState.STOPPED
     before = workcell.truth.shaft[-1]
     workcell.advance(0.3)
     assert np.abs(workcell.truth.shaft[-1] - before).max() < 1e-5
