@@ -1,10 +1,10 @@
-"""The board's five figures: speed, cost of a tick, the fault campaign, the control law against float64, static checks.
+"""The board's five metrics: speed, cost of a tick, the fault campaign, the control law against float64, static checks.
 
     python benchmarks/board.py             all of them, 10,000 faults: about a quarter of an hour
     python benchmarks/board.py 1000        fewer faults
 
-Speed is told by the clock and, beside it, by the processors' own time (this process and the emulator's), as a loaded
-machine shows too little by the clock. Most of the campaign runs on the host build, whose bits are the ARM image's (the
+Speed is measured by the clock and, beside it, by the processors' own time (this process and the emulator's), as a loaded
+computer shows too little by the clock. Most of the campaign runs on the host build, whose bits are the ARM image's (the
 tests hold that); a sample of it runs on the image itself, on Unicorn and on QEMU. qemu-system-arm and arm-none-eabi-gcc
 are used where they are installed.
 """
@@ -48,11 +48,11 @@ from board_faults import LINK_TICKS, Campaign, limits  # noqa: E402
 
 SEED = 2026
 CLOCK_HZ, TICKS_PER_S = 100e6, 1000
-SPEED_WANTED = {"unicorn": 5, "qemu": 10}
+REQUIRED_SPEED = {"unicorn": 5, "qemu": 10}
 SAMPLE = 300
 
 
-def machines():
+def emulators():
     return [name for name in ("unicorn", "qemu", "host") if name != "qemu" or shutil.which(PROGRAM)]
 
 
@@ -83,14 +83,14 @@ def swinging(link):
     return bench
 
 
-def figure_1():
-    print("figure 1: lock-step with the joints' plant, ticks/s and times real time; wanted: unicorn 5, qemu 10")
+def metric_1():
+    print("metric 1: lock-step with the joints' plant, ticks/s and times real time; required: unicorn 5, qemu 10")
     print(f"{'':9}{'':24}{'by the clock':>16}{'':9}{'by processor time':>20}")
     kinds = {
         "at rest": (10_000, configured, lambda _, link, n: link.step(n)),
         "driven, telemetry read": (5_000, swinging, lambda bench, _, n: bench.swing(n * 1e-3)),
     }
-    for name in machines():
+    for name in emulators():
         for what, (ticks, prepare, run) in kinds.items():
             clock, processor = paced(name, ticks, prepare, run)
             print(f"{name:9}{what:24}{clock:16.0f}{clock / 1000:8.1f}x{processor:20.0f}{processor / 1000:8.1f}x")
@@ -120,8 +120,8 @@ class CountingEmulator(UnicornEmulator):
         return self._ram[self._answer]
 
 
-def figure_2():
-    print("\nfigure 2: instructions for six joints, memory; wanted: a tick below 5 % of 100 MHz at 1 kHz")
+def metric_2():
+    print("\nmetric 2: instructions for six joints, memory; required: a tick below 5 % of 100 MHz at 1 kHz")
     print(f"{'':10}{'tick mean':>11}{'max':>7}{'share':>8}{'rest mean':>11}{'max':>7}{'ms mean':>9}{'share':>8}")
     with tempfile.TemporaryDirectory() as folder:
         for name, compiler in build.compilers().items():
@@ -163,9 +163,11 @@ def figure_2():
                 )
 
 
-def figure_3(faults):
-    print(f"\nfigure 3: faults under motion, seed {SEED}; wanted: nothing violated, link again within {LINK_TICKS} ms")
-    for name in machines():
+def metric_3(faults):
+    print(
+        f"\nmetric 3: faults under motion, seed {SEED}; required: nothing violated, link again within {LINK_TICKS} ms"
+    )
+    for name in emulators():
         count = faults if name == "host" else min(SAMPLE, faults)
         begun = time.process_time()
         found = Campaign(open_emulator(name), SEED, limits()).run(count)
@@ -175,7 +177,7 @@ def figure_3(faults):
         for violation in found.violations[:20]:
             print(f"    {violation}")
         print(f"    struck: {listed(found.faults)}")
-        print(f"    told by the right code: {listed(found.told)}")
+        print(f"    reported by the right code: {listed(found.reported)}")
         print(f"    fastest joint, of its limit: {max(found.fastest.values()):.3f} ({listed(top(found.fastest))})")
         print(f"    link again, ms after the last bad byte, at most: {listed(found.slowest_link_ticks)}")
         print(
@@ -193,9 +195,9 @@ def top(values):
     return dict(Counter(values).most_common(3))
 
 
-def figure_4():
+def metric_4():
     print(
-        "\nfigure 4: against the same law in float64, of full scale (1 of duty, 5.2 rad of angle); wanted: below 1e-4"
+        "\nmetric 4: against the same law in float64, of full scale (1 of duty, 5.2 rad of angle); required: below 1e-4"
     )
     library = firmware_arm.declare(ctypes.CDLL(str(firmware.host_library())))
     for reference, aim in pid_tests.REFERENCES.items():
@@ -233,19 +235,19 @@ def replayed():
     angles = -2.6 + 5.2 * (counts.astype(float) - 3277) / (62258 - 3277)
     worst, driven = 0.0, False
     law.measured = angles[0]
-    for angle, told in zip(angles, outputs, strict=True):
-        if not told["drives_on"]:  # only the filter of the speed runs on
+    for angle, output in zip(angles, outputs, strict=True):
+        if not output["drives_on"]:  # only the filter of the speed runs on
             law.step(angle, 0.0, 0.0, angle)
             law.integral = law.duty = 0.0
             continue
         driven = True
-        duty = law.step(float(told["reference_rad"][0]), float(told["reference_rad_s"][0]), 0.0, angle)
-        worst = max(worst, abs(duty - float(told["duty"][0])))
+        duty = law.step(float(output["reference_rad"][0]), float(output["reference_rad_s"][0]), 0.0, angle)
+        worst = max(worst, abs(duty - float(output["duty"][0])))
     return worst if driven else float("nan")
 
 
-def figure_5():
-    print("\nfigure 5: static checks, sanitizers, fuzzer, branch coverage (tests/firmware/test_firmware_static.py)")
+def metric_5():
+    print("\nmetric 5: static checks, sanitizers, fuzzer, branch coverage (tests/firmware/test_firmware_static.py)")
     command = [sys.executable, "-m", "pytest", "-q", "-rA", "--no-header", "tests/firmware/test_firmware_static.py"]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     lines = [line for line in ran.stdout.splitlines() if line.startswith(("PASSED", "FAILED", "SKIPPED", "ERROR"))]
@@ -255,11 +257,11 @@ def figure_5():
 
 def main():
     faults = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
-    figure_1()
-    figure_2()
-    figure_3(faults)
-    figure_4()
-    figure_5()
+    metric_1()
+    metric_2()
+    metric_3(faults)
+    metric_4()
+    metric_5()
 
 
 if __name__ == "__main__":

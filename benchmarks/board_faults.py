@@ -1,6 +1,6 @@
 """The fault campaign: seeded faults on an emulated board whose arm is in motion, each held against what must come of it.
 
-A host of 250 Hz, or of 62.5 Hz, swings all joints; once they move, one fault strikes, most of them for a time drawn
+A host of 250 Hz, or of 62.5 Hz, swings all joints; once they move, one fault strikes, most of them for a random time
 log-uniformly (bytes are spoiled with the faster host only, so that it can see how soon the link is usable again):
 
     flip, drop, burst    bytes to the board or to the host: one bit changed; 1 to 20 bytes missing; noise for 1 to 30 ms
@@ -12,15 +12,15 @@ log-uniformly (bytes are spoiled with the faster host only, so that it can see h
     tick                 the control loop misses 1 to 20 ticks, or overruns one
     jump                 set points anywhere, any speed, to be reached within 1 to 50 ms
 
-What must hold, with the configuration's own times (no figure of this file's):
+What must hold, with the configuration's own times (no number of this file's):
 
     speed      no reference is ever faster than its speed limit, and no joint (its true speed, not the measured one)
-               faster than that by more than a tenth: a joint that is told to move at its limit catches up with it
+               faster than that by more than a tenth: a joint that is commanded to move at its limit catches up with it
     stop       a fault that releases switches the drives off; one that holds brings the reference to rest within
                speed limit / deceleration; half a second later nothing moves at a twentieth of its limit
-    code       a fault that lasts long enough is told by its own code and joint, a shorter one is not told at all
+    code       a fault that lasts long enough is reported by its own code and joint, a shorter one is not reported at all
     link       a command sent after the last bad byte is acknowledged, and telemetry read, within 20 ms of it
-    known      afterwards the host's last acknowledged and refused numbers are the board's
+    known      afterwards the host's last acknowledged and rejected numbers are the board's
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ POT_CODES = {
     PotFault.JUMP: Fault.POT_JUMP,
     PotFault.INVERTED: Fault.POT_INVERTED,
 }
-#: Faults that hold the arm in place of switching its drives off.
+#: Faults that hold the arm instead of switching its drives off.
 HELD = (Fault.HOST_SILENT, Fault.TICK_MISSED, Fault.TICK_OVERRUN)
 
 
 class Noise:
-    """What the wire does to bytes: nothing until it is told to strike."""
+    """What the wire does to bytes: nothing until it is set to strike."""
 
     def __init__(self, rng):
         self.rng, self.kind, self.to_host_side, self.until, self.last_bad = rng, None, False, 0, None
@@ -95,7 +95,7 @@ class Outcome:
 
     faults: Counter = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
-    told: Counter = field(default_factory=Counter)
+    reported: Counter = field(default_factory=Counter)
     fastest: dict = field(default_factory=dict)  # by kind, share of the speed limit
     slowest_link_ticks: dict = field(default_factory=dict)  # by kind and side
     slowest_stop_s: float = 0.0
@@ -105,12 +105,12 @@ class Outcome:
 class Campaign:
     """A host, a board and an arm, and a fault at a time."""
 
-    def __init__(self, machine, seed, limits):
+    def __init__(self, emulator, seed, limits):
         self.rng = np.random.default_rng(seed)
         self.limits = limits
         self.plant = JointPlant(seed=seed)
         self.noise = Noise(self.rng)
-        self.link = EmulatedLink(machine, self.plant, faults=self.noise, watch=self._watch)
+        self.link = EmulatedLink(emulator, self.plant, faults=self.noise, watch=self._watch)
         self.out = Outcome()
         self.kind = "none"
         self.reference, self.rate = np.zeros(6), np.zeros(6)
@@ -118,7 +118,7 @@ class Campaign:
         self.fault_tick = None  # when one latched
         self.fault_was = 0
         self.rest_tick = None
-        self.obeyed_after = None  # (sequence that counts, tick in which one was acknowledged)
+        self.acknowledged_after = None  # (sequence that counts, tick in which one was acknowledged)
         self.outputs = None
         self.period_ticks = PERIODS[0]
         self.sent = 0  # number of the last motion command
@@ -142,19 +142,19 @@ class Campaign:
             self.out.fastest[self.kind] = fastest
             if fastest > CATCHING_UP:
                 self.violate(f"a joint moves at {fastest:.3f} of its limit")
-        told = float(np.abs(outputs["reference_rad_s"]).max()) / self.limits.speed_rad_s
-        self.out.fastest["reference"] = max(told, self.out.fastest.get("reference", 0.0))
-        if told > 1.0 + 1e-6:
-            self.violate(f"a reference moves at {told:.3f} of its limit")
+        speed = float(np.abs(outputs["reference_rad_s"]).max()) / self.limits.speed_rad_s
+        self.out.fastest["reference"] = max(speed, self.out.fastest.get("reference", 0.0))
+        if speed > 1.0 + 1e-6:
+            self.violate(f"a reference moves at {speed:.3f} of its limit")
         tick = int(outputs["tick"])
         if outputs["faults"] and not self.fault_was:
             self.fault_tick, self.rest_tick = tick, None
         self.fault_was = int(outputs["faults"])
         if self.fault_was and self.rest_tick is None and not np.any(outputs["reference_rad_s"]):
             self.rest_tick = tick
-        waiting = self.obeyed_after is not None and self.obeyed_after[1] is None
-        if waiting and int(outputs["acknowledged_sequence"]) > self.obeyed_after[0]:
-            self.obeyed_after = (self.obeyed_after[0], tick)
+        waiting = self.acknowledged_after is not None and self.acknowledged_after[1] is None
+        if waiting and int(outputs["acknowledged_sequence"]) > self.acknowledged_after[0]:
+            self.acknowledged_after = (self.acknowledged_after[0], tick)
 
     # The host.
 
@@ -162,8 +162,8 @@ class Campaign:
         """Return the next command on the way to a swing of all joints, 1.5 rad/s at most, without a jolt."""
         self.phase_s += self.period_s
         target = 0.6 * np.sin(2 * math.pi * (0.4 * self.phase_s + np.arange(6) / 6))
-        wanted = np.clip((target - self.reference) / 0.1, -1.5, 1.5)
-        self.rate = self.rate + np.clip(wanted - self.rate, -10.0 * self.period_s, 10.0 * self.period_s)
+        speed_ref = np.clip((target - self.reference) / 0.1, -1.5, 1.5)
+        self.rate = self.rate + np.clip(speed_ref - self.rate, -10.0 * self.period_s, 10.0 * self.period_s)
         self.reference = self.reference + self.rate * self.period_s
         return JointCommand(self.reference, self.rate, np.zeros(6), self.period_s)
 
@@ -238,17 +238,17 @@ class Campaign:
         while self.noise.kind is not None:
             self.period()
         bad = self.noise.last_bad
-        self.obeyed_after = (self.sent, None)
+        self.acknowledged_after = (self.sent, None)
         heard_tick = None
         for _ in range(12):
             states = self.period()
             newest = round(states.t_s[-1] * 1000) if len(states.t_s) else 0
             if heard_tick is None and newest > bad:
                 heard_tick = int(self.outputs["tick"])
-        obeyed_tick = self.obeyed_after[1]
-        self.obeyed_after = None
+        acknowledged_tick = self.acknowledged_after[1]
+        self.acknowledged_after = None
         side = "to host" if to_host_side else "to board"
-        found = heard_tick if to_host_side else obeyed_tick
+        found = heard_tick if to_host_side else acknowledged_tick
         late = (found - bad) if found is not None else 999
         key = f"{self.kind} {side}"
         self.out.slowest_link_ticks[key] = max(self.out.slowest_link_ticks.get(key, 0), late)
@@ -299,9 +299,11 @@ class Campaign:
             if self.fault_was:
                 break
         self.plant.break_pot(joint, PotFault.NONE)
-        told_at_once = broken in (PotFault.OPEN, PotFault.SHORT, PotFault.JUMP)
+        reported_at_once = broken in (PotFault.OPEN, PotFault.SHORT, PotFault.JUMP)
         far_enough = broken == PotFault.FROZEN and travel_rad > 1.1 * self.config["joint"]["pot"]["frozen_rad"][joint]
-        must = broken == PotFault.INVERTED or far_enough or (told_at_once and ticks >= int(self.config["pot_ticks"]))
+        must = (
+            broken == PotFault.INVERTED or far_enough or (reported_at_once and ticks >= int(self.config["pot_ticks"]))
+        )
         if self.fault_was or must:
             self.expect_fault(POT_CODES[broken], joint)
             self.periods(500, send=False)
@@ -338,12 +340,12 @@ class Campaign:
         watchdog = bool(self.rng.integers(2))
         self.kind = "cut by watchdog" if watchdog else "cut"
         self.link.restart(watchdog=watchdog)
-        told = None
+        rejection = None
         try:
             self.periods(1200)
         except DeviceError as error:
-            told = error
-        if told is None:
+            rejection = error
+        if rejection is None:
             self.violate("a board that started anew is not noticed")
         on = bool(self.outputs["drives_on"])
         self.link.step(500)
@@ -386,7 +388,7 @@ class Campaign:
         if first is None or (first.fault, first.joint) != (fault, joint):
             self.violate(f"{fault.name} of joint {joint} is reported as {first}")
         else:
-            self.out.told[fault.name] += 1
+            self.out.reported[fault.name] += 1
         if fault not in HELD and self.outputs["drives_on"]:
             self.violate(f"{fault.name} leaves the drives on")
 
@@ -411,9 +413,11 @@ class Campaign:
             self.violate(
                 f"host knows {status.acknowledged_sequence} as acknowledged last, the core {core['acknowledged_sequence']}"
             )
-        of_core = status.rejection != Rejection.NO_HELLO  # the wire refuses those by itself
+        of_core = status.rejection != Rejection.NO_HELLO  # the wire rejects those by itself
         if of_core and status.rejected_sequence != int(core["rejected_sequence"]):
-            self.violate(f"host knows {status.rejected_sequence} as refused last, the core {core['rejected_sequence']}")
+            self.violate(
+                f"host knows {status.rejected_sequence} as rejected last, the core {core['rejected_sequence']}"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Calibration and measurement beside OpenCV, on the same pairs, in one run.
 
-    python benchmarks/calibration.py            all figures
+    python benchmarks/calibration.py            all metrics
     python benchmarks/calibration.py 1 4        only these
 
-Figures: 1 held-out errors on real sets, 2 half-subsets, 3 uncertainty, 4 the Motoman arm and its laser tracker,
+Metrics: 1 held-out errors on real sets, 2 half-subsets, 3 uncertainty, 4 the Motoman arm and its laser tracker,
 5 coverage of the pose's covariance, 6 time. Real recordings are looked for at ARMSIGHT_DATA or ../shared/data.
 """
 
@@ -17,7 +17,7 @@ import motoman
 import real_sets
 import rendered
 
-FIGURES = {
+METRICS = {
     "1": real_sets.heldout_beside_opencv,
     "2": real_sets.half_subsets,
     "3": lambda: (rendered.point_sigma(), real_sets.normalised_residuals()),
@@ -28,10 +28,10 @@ FIGURES = {
 
 
 def main() -> None:
-    wanted = sys.argv[1:] or list(FIGURES)
+    options = sys.argv[1:] or list(METRICS)
     print(f"OpenCV {cv2.__version__}")
-    for name in wanted:
-        FIGURES[name]()
+    for name in options:
+        METRICS[name]()
 
 
 if __name__ == "__main__":

@@ -85,9 +85,9 @@ def errors(folder: Path) -> dict[str, Any]:
         print(f"    block better than StereoBM: {'; '.join(said)}")
         if scene.name == "tsukuba":
             reached = rows["scanline"]["all"]["bad_1_percent"]
-            verdict = "held" if reached <= BIRCHFIELD_TOMASI else "MISSED"
+            assessment = "held" if reached <= BIRCHFIELD_TOMASI else "MISSED"
             print(
-                f"    scanline {reached:.2f} over all pixels, at most {BIRCHFIELD_TOMASI} (theirs: both-seen): {verdict}"
+                f"    scanline {reached:.2f} over all pixels, at most {BIRCHFIELD_TOMASI} (theirs: both-seen): {assessment}"
             )
     return found
 
@@ -111,11 +111,11 @@ def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np
         z = focal * baseline / rng.uniform(14, 52)
         shape = z * rng.uniform((0.1, 0.1, 0.05), (0.5, 0.5, 0.3))
         prepare_planes = {"grain_m": z * rng.uniform(0.02, 0.08), "contrast": rng.uniform(4, 40)}
-        place = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
+        position = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
         solids.append(
             (
                 box(shape, **prepare_planes, seed=int(rng.integers(10**6))),
-                pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), place),
+                pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), position),
             )
         )
     left, depth, _ = see(camera, solids)
@@ -146,7 +146,7 @@ def coverage(folder: Path) -> dict[str, Any]:
         rendered = [v for k, v in inside.items() if k != "cones"]
         cones = f"cones {inside['cones']:.1f}%, " if "cones" in inside else ""
         spread = f"({min(rendered):.1f} to {max(rendered):.1f})"
-        print(f"  {name:<14}{cones}rendered {np.mean(rendered):.1f}% {spread}; wanted 90 to 97", flush=True)
+        print(f"  {name:<14}{cones}rendered {np.mean(rendered):.1f}% {spread}; required 90 to 97", flush=True)
         found[name] = inside
     return found
 
@@ -178,18 +178,18 @@ def tool(folder: Path) -> dict[str, Any]:
         v, u = np.nonzero(chosen)
         points = form.points(np.column_stack([u, v]).astype(float), result.disparity[chosen].astype(float))
         start = T @ exp_se3(np.concatenate([rng.uniform(-0.008, 0.008, 3), np.radians(rng.uniform(-3, 3, 3))]))
-        found.append(told(locate_cloud(surface, points, depth.sigma_m[chosen], start), T))
+        found.append(errors_of(locate_cloud(surface, points, depth.sigma_m[chosen], start), T))
     return summed_up(np.array(found))
 
 
-def told(at: CloudPose | Missed, T: np.ndarray) -> tuple[float, float, float]:
+def errors_of(at: CloudPose | Missed, T: np.ndarray) -> tuple[float, float, float]:
     """mm, degrees, and the error's squared length in claimed sigmas; NaN where the body was not found."""
     if isinstance(at, Missed):
         print(f"  missed: {at.reason}")
         return np.nan, np.nan, np.nan
     off = log_se3(inverse(at.T_left_body) @ T)
     mm, degrees = 1e3 * float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:])))
-    print(f"  {mm:.2f} mm, {degrees:.3f} deg (wanted 1, 0.5)", flush=True)
+    print(f"  {mm:.2f} mm, {degrees:.3f} deg (required 1, 0.5)", flush=True)
     return mm, degrees, float(off @ np.linalg.solve(at.cov, off))
 
 

@@ -1,4 +1,4 @@
-"""Figures of dense.py about time and memory."""
+"""Metrics of dense.py about time and memory."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def times(folder: Path) -> dict[str, Any]:
     for job in jobs.values():
         job()  # compiled, and its memory touched
     spent: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(ROUNDS):  # side by side, so that what else runs on the machine meets all alike
+    for _ in range(ROUNDS):  # side by side, so that what else runs on the computer meets all alike
         for name, job in jobs.items():
             begun = time.process_time()
             job()
@@ -72,12 +72,12 @@ def times(folder: Path) -> dict[str, Any]:
         print(
             f"  {name:<28}{ms:>8.1f} ms{cells / ms / 1e3:>8.0f} Mpx*d/s{1e6 * ms / cells:>8.2f} ns a px and disparity"
         )
-    wanted = {
+    required = {
         "block over StereoBM": (found["block"] / found["StereoBM"], 1.0),
         "semiglobal 5 over SGBM-3WAY": (found["semiglobal 5"] / found["SGBM-3WAY"], 1.3),
         "scanline, ns a px and disparity": (1e6 * found["scanline"] / cells, 3.0),
     }
-    for name, (value, limit) in wanted.items():
+    for name, (value, limit) in required.items():
         print(f"  {name}: {value:.2f}, at most {limit}: {'held' if value <= limit else 'MISSED'}")
     return found
 
@@ -87,14 +87,14 @@ def peak_mb(arguments: list[str], settings: dict[str, str]) -> float:
     code = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL); "
     code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
     line = [sys.executable, "-c", code, *arguments]
-    told = subprocess.run(line, env={**os.environ, **settings}, capture_output=True, text=True, check=True).stdout
-    return int(told) * (1024 if sys.platform == "linux" else 1) / 1e6
+    printed = subprocess.run(line, env={**os.environ, **settings}, capture_output=True, text=True, check=True).stdout
+    return int(printed) * (1024 if sys.platform == "linux" else 1) / 1e6
 
 
 def memory(folder: Path) -> dict[str, Any]:
     """Peak of the whole command on two threads: with an empty cache, so that it compiles, and from the cache."""
     if sys.platform == "win32":
-        print("  not told by this system")
+        print("  not reported by this system")
         return {}
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as room:
@@ -109,9 +109,9 @@ def memory(folder: Path) -> dict[str, Any]:
             settings = {"NUMBA_CACHE_DIR": str(Path(room) / name), "NUMBA_NUM_THREADS": "2"}
             first, again = peak_mb(line, settings), peak_mb(line, settings)
             found[name] = {"first_mb": first, "cached_mb": again}
-            verdict = "held" if max(first, again) < LIMIT_MB else "MISSED"
+            assessment = "held" if max(first, again) < LIMIT_MB else "MISSED"
             print(
-                f"  {name:<12}{first:>6.0f} MB the first time, {again:.0f} after; below {LIMIT_MB}: {verdict}",
+                f"  {name:<12}{first:>6.0f} MB the first time, {again:.0f} after; below {LIMIT_MB}: {assessment}",
                 flush=True,
             )
     return found

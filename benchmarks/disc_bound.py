@@ -1,8 +1,8 @@
-"""The Cramer-Rao bound of a disc's centre: how well any unbiased finder can place it, given the noise.
+"""The Cramer-Rao bound of a disc's centre: how well any unbiased finder can locate it, given the noise.
 
 The model is the generator's own noise-free image of one disc, over all pixels of the ellipse's box, four blur sigmas and
 four pixels more on every side. Ten parameters are free: the centre, the ellipse (S11, S12, S22), the blur, the levels
-inside and outside and the slope of the surround (of the light, where the light is uneven). The derivatives by place,
+inside and outside and the slope of the surround (of the light, where the light is uneven). The derivatives by position,
 ellipse and blur are central differences of the image; by the rest it is linear. A pixel's variance is what was
 simulated plus 1/12 for rounding. The bound returned is the centre's 2 x 2 block of the inverted information.
 """

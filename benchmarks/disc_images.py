@@ -91,7 +91,7 @@ def cover(
 def ellipse_border(
     u: float, v: float, a: float, b: float, angle: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nodes x, y and weights dy (N,) of an ellipse's border; ``angle`` turns its axis a from u towards v, rad."""
+    """Return nodes x, y and weights dy (N,) of an ellipse's border; ``angle`` rotates its axis a from u towards v, rad."""
     count = max(64, math.ceil(2 * math.pi * max(a, b) / (SPACING * sigma)))
     x, y, dy = np.empty(count), np.empty(count), np.empty(count)
     c, s, step = math.cos(angle), math.sin(angle), 2 * math.pi / count
@@ -145,7 +145,7 @@ def add_region(
     slope: np.ndarray | None = None,
     about: np.ndarray | None = None,
 ) -> None:
-    """Add ``step`` + ``slope`` . (x - about) inside a border to a linear image (HEIGHT, WIDTH), blurred, in place."""
+    """Add ``step`` + ``slope`` . (x - about) inside a border to a linear image (HEIGHT, WIDTH), blurred, in-place."""
     x, y, dy = border
     u0, v0, w, h = window(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]), _REACH * sigma + 1)
     about = np.array([x.mean(), y.mean()]) if about is None else about
@@ -201,14 +201,14 @@ def exposed(light: np.ndarray, noise: float, shot: float, rng: np.random.Generat
 
 
 def scatter(radius: np.ndarray, gap: float, rng: np.random.Generator, tries: int = 60) -> np.ndarray:
-    """Return which discs found a place and where, (N, 2) with NaN for those that did not: no two nearer than ``gap``."""
+    """Return which discs found room and where, (N, 2) with NaN for those that did not: no two nearer than ``gap``."""
     uv = np.full((len(radius), 2), np.nan)
     for i in np.argsort(-radius):
         margin = radius[i] + gap / 2 + 2
-        for place in rng.uniform((margin, margin), (WIDTH - 1 - margin, HEIGHT - 1 - margin), (tries, 2)):
-            distance = np.hypot(uv[:, 0] - place[0], uv[:, 1] - place[1])
+        for spot in rng.uniform((margin, margin), (WIDTH - 1 - margin, HEIGHT - 1 - margin), (tries, 2)):
+            distance = np.hypot(uv[:, 0] - spot[0], uv[:, 1] - spot[1])
             if not (distance < radius + radius[i] + gap).any():
-                uv[i] = place
+                uv[i] = spot
                 break
     return uv
 
@@ -232,13 +232,13 @@ def disc_picture(
     Args:
         rng: source of everything.
         count: how many discs at the most.
-        radius: of the longer half axis, drawn evenly.
-        contrast: inside against outside, drawn evenly as far as 8 bits leave room.
+        radius: of the longer half axis, sampled uniformly.
+        contrast: inside against outside, sampled uniformly as far as 8 bits leave room.
         tilt_deg: the shorter half axis is the longer one's cosine of it.
-        blur: sigma, or drawn from 0.5 to 1.5.
-        noise: sigma, or drawn from 1 to 4.
+        blur: sigma, or sampled from 0.5 to 1.5.
+        noise: sigma, or sampled from 1 to 4.
         shot: variance of shot noise per level.
-        bright: bright or dark discs, or drawn.
+        bright: bright or dark discs, or random.
         kind: of the surround: plain, gradient (the surround's own; discs are flat), light (uneven light: surround and
             discs in proportion), or one of TEXTURES.
         amplitude: standard deviation of a texture after the blur, levels; 3 to 8 by default.
@@ -248,8 +248,8 @@ def disc_picture(
     bright = bool(rng.random() < 0.5) if bright is None else bright
     r = rng.uniform(*radius, count)
     uv = scatter(r, 8 * blur + 8, rng)
-    placed = np.isfinite(uv[:, 0])
-    uv, r = uv[placed], r[placed]
+    found = np.isfinite(uv[:, 0])
+    uv, r = uv[found], r[found]
     n = len(uv)
     axes = np.stack([r, r * np.cos(np.radians(rng.uniform(*tilt_deg, n)))], axis=1)
     angle = rng.uniform(0, np.pi, n)

@@ -23,13 +23,13 @@ def plaster(rng: np.random.Generator, blur: float) -> np.ndarray:
 def wood(rng: np.random.Generator, blur: float) -> np.ndarray:
     """Return grain: stripes that wander, with fibres along them."""
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-    turn = rng.uniform(0, np.pi)
-    along, across = u * np.cos(turn) + v * np.sin(turn), v * np.cos(turn) - u * np.sin(turn)
+    angle = rng.uniform(0, np.pi)
+    along, across = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
     bend = 40 * np.sin(along / rng.uniform(150, 400) + rng.uniform(0, 6)) + 12 * np.sin(along / 61.0)
     rings = np.sin(2 * np.pi * (across + bend) / rng.uniform(18, 45)) ** 3
     fibres = rng.standard_normal((HEIGHT, WIDTH), dtype=np.float32)
     kernel = np.zeros((31, 31), np.float32)
-    end = (round(15 + 14 * np.cos(turn)), round(15 + 14 * np.sin(turn)))
+    end = (round(15 + 14 * np.cos(angle)), round(15 + 14 * np.sin(angle)))
     cv2.line(kernel, (30 - end[0], 30 - end[1]), end, 1.0)
     fibres = cv2.filter2D(fibres, cv2.CV_32F, kernel / kernel.sum())
     return _through_lens((rings + 1.5 * fibres / fibres.std() * 0.4).astype(np.float32), blur)
@@ -64,7 +64,7 @@ def clutter(
     discs: int = 0,
     radius: float = 9.0,
 ) -> np.ndarray:
-    """Return the light (HEIGHT, width) of things that are no discs, drawn at twice the size and averaged.
+    """Return the light (HEIGHT, width) of things that are no discs, rendered at twice the size and averaged.
 
     Text, lines, boxes, squares, half and cut discs, rings, merged and touching discs, glints, chessboard corners; and on
     top so many loose bright discs of a radius, for those who ask for them.
@@ -86,13 +86,13 @@ def one_kind(kind: int, rng: np.random.Generator, blur: float = 0.8) -> tuple[np
     """Return the light of things of one kind, apart from each other, 5 to 25 px in radius, and how many there are."""
     pitch = 120
     canvas = np.full((2 * HEIGHT, 2 * WIDTH), 130, np.uint8)
-    places = [(u, v) for v in range(pitch // 2, HEIGHT, pitch) for u in range(pitch // 2, WIDTH, pitch)]
-    for u, v in places:
+    spots = [(u, v) for v in range(pitch // 2, HEIGHT, pitch) for u in range(pitch // 2, WIDTH, pitch)]
+    for u, v in spots:
         grey = 130.0 + (1 if rng.random() < 0.5 else -1) * rng.uniform(50, 115)
         middle = 2 * (np.array([u, v]) + rng.uniform(-5, 5, 2))
         ITEMS[kind](canvas, middle, 2 * np.exp(rng.uniform(np.log(5), np.log(25))), grey, rng)
     image = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return cv2.GaussianBlur(image, (0, 0), blur), len(places)
+    return cv2.GaussianBlur(image, (0, 0), blur), len(spots)
 
 
 def _fill(canvas: np.ndarray, points: np.ndarray, grey: float) -> None:
@@ -103,9 +103,9 @@ def _circle(
     middle: np.ndarray, radius: float, rng: np.random.Generator, start: float = 0.0, end: float = 2 * np.pi
 ) -> np.ndarray:
     """Return points along a tilted disc's rim."""
-    t, turn, flat = np.linspace(start, end, 90), rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)
+    t, angle, flat = np.linspace(start, end, 90), rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)
     p, q = radius * np.cos(t), radius * flat * np.sin(t)
-    return middle + np.stack([p * np.cos(turn) - q * np.sin(turn), p * np.sin(turn) + q * np.cos(turn)], axis=1)
+    return middle + np.stack([p * np.cos(angle) - q * np.sin(angle), p * np.sin(angle) + q * np.cos(angle)], axis=1)
 
 
 def _text(canvas, middle, radius, grey, rng) -> None:
@@ -154,9 +154,9 @@ def _ring(canvas, middle, radius, grey, rng) -> None:
 def _merged(canvas, middle, radius, grey, rng) -> None:
     """Two discs that touch or overlap."""
     way = radius * rng.uniform(0.8, 1.9)
-    turn = rng.uniform(0, 2 * np.pi)
+    angle = rng.uniform(0, 2 * np.pi)
     _fill(canvas, _circle(middle, radius, rng), grey)
-    other = middle + way * np.array([np.cos(turn), np.sin(turn)])
+    other = middle + way * np.array([np.cos(angle), np.sin(angle)])
     _fill(canvas, _circle(other, radius * rng.uniform(0.6, 1.0), rng), grey)
 
 
@@ -168,17 +168,17 @@ def _glint(canvas, middle, radius, grey, rng) -> None:
             canvas, _circle(middle + rng.normal(0, 0.3 * radius, 2), radius * rng.uniform(0.3, 0.5), rng), 255.0 - grey
         )
     else:
-        turn = rng.uniform(0, np.pi)
+        angle = rng.uniform(0, np.pi)
         t = np.linspace(0, 2 * np.pi, 60)
         p, q = 2.5 * radius * np.cos(t) ** 3, 0.5 * radius * np.sin(t) ** 3
-        points = np.stack([p * np.cos(turn) - q * np.sin(turn), p * np.sin(turn) + q * np.cos(turn)], axis=1)
+        points = np.stack([p * np.cos(angle) - q * np.sin(angle), p * np.sin(angle) + q * np.cos(angle)], axis=1)
         _fill(canvas, middle + points, 255.0)
 
 
 def _checker(canvas, middle, radius, grey, rng) -> None:
     """A piece of a chessboard."""
-    turn, side = rng.uniform(0, np.pi), radius * rng.uniform(0.6, 2.0)
-    across, down = side * np.array([np.cos(turn), np.sin(turn)]), side * np.array([-np.sin(turn), np.cos(turn)])
+    angle, side = rng.uniform(0, np.pi), radius * rng.uniform(0.6, 2.0)
+    across, down = side * np.array([np.cos(angle), np.sin(angle)]), side * np.array([-np.sin(angle), np.cos(angle)])
     for i in range(4):
         for j in range(3):
             corner = middle + i * across + j * down

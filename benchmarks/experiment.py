@@ -1,4 +1,4 @@
-"""The experiment's figures over seeds: every one of them, none hidden.
+"""The experiment's metrics over seeds: every one of them, none hidden.
 
 python experiment.py            ten seeds, worn arm, the ARM binary under Unicorn: about half an hour idle
 python experiment.py 3          three of them
@@ -13,10 +13,10 @@ import numpy as np
 
 from armsight.app.demo.demo import Demo, run_demo
 
-#: Figure -> where it stands in the summary, its factor and unit, and what it must be at most (None: told only).
-FIGURES = {
+#: Metric -> where it stands in the summary, its factor and unit, and what it must be at most (None: reported only).
+METRICS = {
     "vision, moving, RMS": ("vision", "position_rms_m", 1e3, "mm", 0.20),
-    "vision, turn RMS": ("vision", "orientation_rms_rad", float(np.degrees(1)), "deg", 0.15),
+    "vision, rotation RMS": ("vision", "orientation_rms_rad", float(np.degrees(1)), "deg", 0.15),
     "vision, at rest, RMS": ("vision", "rest_position_rms_m", 1e3, "mm", None),
     "potentiometers, moving, RMS": ("potentiometers", "position_rms_m", 1e3, "mm", None),
     "fused (0.6 s later), moving, RMS": ("fused", "position_rms_m", 1e3, "mm", 0.25),
@@ -38,22 +38,22 @@ FIGURES = {
 def main(seeds: int, quick: bool) -> None:
     """Run and print."""
     found: dict[str, list[float]] = {
-        name: [] for name in (*FIGURES, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
+        name: [] for name in (*METRICS, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
     }
     for seed in range(seeds):
         began = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
             s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).to_json()
-        for name, (part, key, factor, _, _) in FIGURES.items():
+        for name, (part, key, factor, _, _) in METRICS.items():
             found[name].append(factor * s[part][key])
         c = s["closed_loop"]
         found["vision, RMS over sigma"].append(s["vision"]["position_rms_m"] / s["vision"]["position_sigma_rms_m"])
         found["rest, times smaller"].append(c["rest_error_before_m"] / c["rest_error_after_m"])
         found["path, times smaller"].append(c["path_error_before_m"] / c["path_error_after_m"])
         print(f"seed {seed}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
-    print(f"{'':34s} {'median':>8s} {'least':>8s} {'most':>8s}  wanted at most")
+    print(f"{'':34s} {'median':>8s} {'least':>8s} {'most':>8s}  required at most")
     for name, values in found.items():
-        unit, most = FIGURES[name][3:] if name in FIGURES else ("", None)
+        unit, most = METRICS[name][3:] if name in METRICS else ("", None)
         bar = "" if most is None else f"{most:g} {unit}: {sum(v <= most for v in values)} of {len(values)}"
         print(f"{name:34s} {np.median(values):8.3f} {min(values):8.3f} {max(values):8.3f}  {bar}")
 

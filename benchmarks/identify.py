@@ -19,9 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "loop"
 
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
-from armsight.robot.arm_file import open_arm
 from armsight.loop.identify.read import read_poses
 from armsight.loop.identify.validate import validate
+from armsight.robot.arm_file import open_arm
 from identify_handeye import eth_pairs, kuka2
 from identify_worn import worn_arms
 
@@ -43,8 +43,8 @@ convention = "modified"
 )
 
 
-def told(name: str, value: float, most: float, unit: str = "mm", more: str = "") -> None:
-    """Print one figure beside what was asked for."""
+def report(name: str, value: float, most: float, unit: str = "mm", more: str = "") -> None:
+    """Print one metric beside what was asked for."""
     print(f"{'ok  ' if value <= most else 'MISS'} {name:<44} {value:8.3f} {unit} (at most {most:g}){more}", flush=True)
 
 
@@ -55,7 +55,7 @@ def held_out(arm, fit: Measured, other: Measured) -> tuple[float, float]:
 
 
 def robots() -> None:
-    """Figure 1."""
+    """Metric 1."""
     read = {
         name: read_poses(DATA / "robots" / f"{name}.csv").measured for name in ("ur10_a", "ur10_b", "ur5_grid", "rokae")
     }
@@ -66,15 +66,17 @@ def robots() -> None:
             rows = np.random.default_rng(seed).permutation(len(read[name]))
             done.append(held_out(ur10, read[name].rows(rows[::2]), read[name].rows(rows[1::2])))
         mean, ratio = np.max(done, axis=0)
-        told(f"{name}, half to half, worst of {SEEDS} seeds", mean, most, more=f", residual over predicted {ratio:.2f}")
+        report(
+            f"{name}, half to half, worst of {SEEDS} seeds", mean, most, more=f", residual over predicted {ratio:.2f}"
+        )
     mean, ratio = held_out(ur10, read["ur10_a"], read["ur10_b"])
-    told("ur10_a to ur10_b", mean, 0.50, more=f", residual over predicted {ratio:.2f}")
+    report("ur10_a to ur10_b", mean, 0.50, more=f", residual over predicted {ratio:.2f}")
     grid = read["ur5_grid"]
     rows = np.random.default_rng(0).permutation(len(grid))
     done = [
         held_out(open_arm("ur5"), grid.rows(np.setdiff1d(rows, rows[k::5])), grid.rows(rows[k::5])) for k in range(5)
     ]
-    told(
+    report(
         "ur5_grid, five-fold",
         *np.mean(done, axis=0)[:1],
         0.11,
@@ -86,32 +88,32 @@ def robots() -> None:
     path.unlink()
     done = [held_out(arm, few.rows(np.delete(np.arange(30), k)), few.rows(np.array([k]))) for k in range(30)]
     ratio = float(np.sqrt(np.mean(np.square(done), axis=0)[1]))
-    told("rokae, leave one out", np.mean(done, axis=0)[0], 0.16, more=f", residual over predicted {ratio:.2f}")
+    report("rokae, leave one out", np.mean(done, axis=0)[0], 0.16, more=f", residual over predicted {ratio:.2f}")
 
 
 def many_poses() -> None:
-    """Figure 4."""
+    """Metric 4."""
     a = read_poses(DATA / "robots" / "ur10_a.csv").measured
     many = a.rows(np.arange(12_000) % len(a))
     start, cpu = time.perf_counter(), time.process_time()
     identify(open_arm("ur10"), many)
     wall, cpu = time.perf_counter() - start, time.process_time() - cpu
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    told("12,000 poses, CPU time", cpu, 20, "s", f", {wall:.1f} s by the clock")
-    told("12,000 poses, memory of this process so far", memory, 1.0, "GB")
+    report("12,000 poses, CPU time", cpu, 20, "s", f", {wall:.1f} s by the clock")
+    report("12,000 poses, memory of this process so far", memory, 1.0, "GB")
 
 
 def main() -> None:
-    """Print every figure."""
+    """Print every metric."""
     quick = "--quick" in sys.argv[1:]
     if (DATA / "robots").is_dir():
         many_poses()
         robots()
-        kuka2(DATA / "handeye" / "kuka2", told)
-        eth_pairs(DATA / "handeye" / "eth_posepairs" / "datasets", told)
+        kuka2(DATA / "handeye" / "kuka2", report)
+        eth_pairs(DATA / "handeye" / "eth_posepairs" / "datasets", report)
     else:
         print(f"no real recordings at {DATA}: set ARMSIGHT_DATA to their folder")
-    worn_arms(told, 2 if quick else 6)
+    worn_arms(report, 2 if quick else 6)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ PAIRS = {
 BLOCK = 30
 
 
-def kuka2(folder: Path, told) -> None:
+def kuka2(folder: Path, report) -> None:
     """Fit on even poses, the camera's own numbers too; the board's middle in the base on odd ones."""
     if not folder.is_dir():
         return
@@ -36,8 +36,8 @@ def kuka2(folder: Path, told) -> None:
     p, middle = board.body.points, board.body.points.mean(axis=0)
     even, odd = np.arange(0, len(A), 2), np.arange(1, len(A), 2)
     points = [p[seen[i].ids].astype(np.float32) for i in even]
-    places = [seen[i].uv.astype(np.float32) for i in even]
-    _, K, k, _, _ = cv2.calibrateCamera(points, places, (1920, 1200), None, None)
+    positions = [seen[i].uv.astype(np.float32) for i in even]
+    _, K, k, _, _ = cv2.calibrateCamera(points, positions, (1920, 1200), None, None)
     B = []
     for d in seen:
         _, r, t = cv2.solvePnP(p[d.ids], d.uv, K, k)
@@ -45,7 +45,7 @@ def kuka2(folder: Path, told) -> None:
     B = np.array(B)
     h = calibrate_handeye(A[even], B[even], eye="in_hand", centre=middle)
     off = transform(A[odd] @ h.T_flange_rig @ B[odd], middle) - transform(h.T_base_body, middle)
-    told(
+    report(
         "kuka2, board's middle, even to odd", 1e3 * float(np.linalg.norm(off, axis=1).mean()), 0.55, more=f", {h.share}"
     )
 
@@ -66,7 +66,7 @@ def pair(folder: Path, name: str) -> tuple[PoseStream, np.ndarray, np.ndarray]:
         return PoseStream.of(*stream(archive, hand_end), "hand"), t, inverse(T)
 
 
-def eth_pairs(folder: Path, told) -> None:
+def eth_pairs(folder: Path, report) -> None:
     """The time offset of both halves of each recording."""
     if not folder.is_dir():
         return
@@ -77,21 +77,21 @@ def eth_pairs(folder: Path, told) -> None:
         a, b = (f.offset_s for f in found)
         sigma = float(np.hypot(*(f.sigma_offset_s for f in found)))
         more = f": {1e3 * a:.2f} and {1e3 * b:.2f} ms, sigma of the difference {1e3 * sigma:.2f}"
-        told(f"{name}, halves apart", 1e3 * abs(a - b), 2.0, "ms", more)
-    simulated(folder, told)
+        report(f"{name}, halves apart", 1e3 * abs(a - b), 2.0, "ms", more)
+    simulated(folder, report)
 
 
-def simulated(folder: Path, told, seeds: int = 4) -> None:
+def simulated(folder: Path, report, seeds: int = 4) -> None:
     """The simulated arm: one clock, so no offset; and its own motion and residuals with a mounting that is known.
 
     The mounting that its authors simulated is in no file of theirs. What the hand did is taken from the recording, what the
-    eye saw of it is made from the mounting found, and the residuals of the recording are put on it in blocks of 1 s drawn
+    eye saw of it is made from the mounting found, and the residuals of the recording are put on it in blocks of 1 s sampled
     anew: their size and how neighbours hang together are the recording's, and the answer is known.
     """
     hand, t, B = pair(folder, "robot_arm_w_color_camera_sim")
     found = calibrate_streams(hand, PoseStream.of(t, B, "eye"), eye="in_hand")
     more = f": {1e3 * found.offset_s:.2f} ms, sigma {1e3 * found.sigma_offset_s:.2f}; stamps are whole milliseconds"
-    told(
+    report(
         "simulated arm, offset from its one clock's zero",
         abs(found.offset_s) / found.sigma_offset_s,
         3.0,
@@ -105,8 +105,8 @@ def simulated(folder: Path, told, seeds: int = 4) -> None:
     off = []
     for seed in range(seeds):
         starts = np.random.default_rng(seed).integers(0, len(t) - BLOCK, len(t) // BLOCK + 1)
-        drawn = np.concatenate([left[s : s + BLOCK] for s in starts])[: len(t)]
-        again = calibrate_streams(hand, PoseStream.of(t, seen @ exp_se3(drawn), "eye"), eye="in_hand")
+        sampled = np.concatenate([left[s : s + BLOCK] for s in starts])[: len(t)]
+        again = calibrate_streams(hand, PoseStream.of(t, seen @ exp_se3(sampled), "eye"), eye="in_hand")
         h, true = again.handeye, found.handeye
         e = np.concatenate(
             [
@@ -116,7 +116,7 @@ def simulated(folder: Path, told, seeds: int = 4) -> None:
         )
         off += [*(e / np.sqrt(np.diag(h.cov))), (again.offset_s - found.offset_s) / again.sigma_offset_s]
     rms = float(np.sqrt(np.mean(np.square(off))))
-    told(
+    report(
         f"simulated arm, known answer, furthest of {len(off)}",
         float(np.abs(off).max()),
         3.5,

@@ -8,7 +8,7 @@ from worn_arm import distance_m, poses, worn
 from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.placement import placed
+from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.plan import free_of_collision, plan_poses
 
 POSES, UNSEEN, FIRST = 60, 200, 15
@@ -28,9 +28,9 @@ def truth_of(w) -> dict[str, float]:
     return out
 
 
-def worn_arms(told, seeds: int) -> None:
-    """Figure 3, on a stand-in for the workcell."""
-    after, fall, off, play = [], [], [], []
+def worn_arms(report, seeds: int) -> None:
+    """Metric 3, on a stand-in for the workcell."""
+    after, fall, off, backlash = [], [], [], []
     for seed in range(seeds):
         rng, w = np.random.default_rng(100 + seed), worn(seed)
         found = identify(w.nominal, w.seen(*poses(w.nominal, POSES, rng), rng))
@@ -44,23 +44,25 @@ def worn_arms(told, seeds: int) -> None:
             if sigma > 0 and name not in found.reasons:
                 off.append(abs(value - true) / sigma)
             if name.startswith("backlash"):
-                play.append(abs(np.degrees(value - true)))
-    told(f"worn arm, {POSES} poses: mean on {UNSEEN} unseen, worst of {seeds}", max(after), 0.25)
-    told("  one over the times that it falls, least", 1 / min(fall), 1 / 8, "")
-    told(f"  furthest of {len(off)} parameters from the truth", max(off), 3.0, "sigma")
-    told(f"  share of them over 3 sigma: {sum(o > 3 for o in off)} of {len(off)}", np.mean(np.array(off) > 3), 0.01, "")
-    told("  backlash, furthest", max(play), 0.02, "deg")
-    planned(told, seeds)
+                backlash.append(abs(np.degrees(value - true)))
+    report(f"worn arm, {POSES} poses: mean on {UNSEEN} unseen, worst of {seeds}", max(after), 0.25)
+    report("  one over the times that it falls, least", 1 / min(fall), 1 / 8, "")
+    report(f"  furthest of {len(off)} parameters from the truth", max(off), 3.0, "sigma")
+    report(
+        f"  share of them over 3 sigma: {sum(o > 3 for o in off)} of {len(off)}", np.mean(np.array(off) > 3), 0.01, ""
+    )
+    report("  backlash, furthest", max(backlash), 0.02, "deg")
+    planned(report, seeds)
 
 
-def planned(told, seeds: int) -> None:
-    """Poses that random choice needs for what planned ones reach, after a first few: drawn all over, and about home."""
+def planned(report, seeds: int) -> None:
+    """Poses that random choice needs for what planned ones reach, after a first few: sampled all over, and about home."""
     counts, more = np.array([15, 20, 25, 30, 40, 60]), 15
     reached, all_over, home = [], [], []
     for seed in range(seeds):
         rng, w = np.random.default_rng(200 + seed), worn(seed)
         first = w.seen(*poses(w.nominal, FIRST, rng), rng)
-        model, x = placed(Model.of(w.nominal, first, backlash=True), first)
+        model, x = with_placement(Model.of(w.nominal, first, backlash=True), first)
         plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), more, done=first, seed=seed)
         q = rng.uniform(np.maximum(w.nominal.q_min, -np.pi), np.minimum(w.nominal.q_max, np.pi), (4000, 6))
         q = q[free_of_collision(model, q)]
@@ -81,7 +83,9 @@ def planned(told, seeds: int) -> None:
         )
     for name, errors in (("all over", all_over), ("about home", home)):
         mean = np.mean(errors, axis=0)
-        told_mm = ", ".join(f"{n}: {1e3 * e:.3f}" for n, e in zip(counts, mean, strict=True))
+        reached_mm = ", ".join(f"{n}: {1e3 * e:.3f}" for n, e in zip(counts, mean, strict=True))
         # Where the mean error of random ones falls to that of the planned; they are as many as were tried at most.
         needed = float(np.interp(-np.log(np.mean(reached)), -np.log(np.minimum.accumulate(mean)), counts))
-        told(f"  planned poses, of the random ones {name}", more / needed, 0.5, "", f", {needed:.0f} ({told_mm} mm)")
+        report(
+            f"  planned poses, of the random ones {name}", more / needed, 0.5, "", f", {needed:.0f} ({reached_mm} mm)"
+        )

@@ -1,14 +1,14 @@
 """Kinematics beside pinocchio, EAIK and roboticstoolbox in one run, one thread.
 
-    python benchmarks/kinematics.py            both figures, 1,000,000 poses
-    python benchmarks/kinematics.py 100000     both figures, fewer poses
+    python benchmarks/kinematics.py            both metrics, 1,000,000 poses
+    python benchmarks/kinematics.py 100000     both metrics, fewer poses
 
-Figure 1, time: forward kinematics, Jacobian and all solutions of the inverse. "kernel" is the compiled function called
+Metric 1, time: forward kinematics, Jacobian and all solutions of the inverse. "kernel" is the compiled function called
 from compiled code, "call" is the public method called from Python, "batch" is the public method on 100,000 at once.
-pinocchio's and EAIK's C++ is called from Python, as their users do: their figures hold that call's share. Least of
-several runs of the processor's own time, so that other work on the machine counts little.
+pinocchio's and EAIK's C++ is called from Python, as their users do: their metrics hold that call's share. Least of
+several runs of the processor's own time, so that other work on the computer counts little.
 
-Figure 2, exactness: over seeded random poses, as many near singularities as elsewhere, the errors of every solution
+Metric 2, exactness: over seeded random poses, as many near singularities as elsewhere, the errors of every solution
 returned (measured anew through ``forward``), doubles, NaN, and what EAIK finds and armsight does not.
 
 Peers are optional: pip install pin EAIK roboticstoolbox-python.
@@ -76,8 +76,8 @@ def inverses(table, closed, limits, Ts, near, rows, scratch, n, rounds):
             inverse.inverse(table, closed, limits, T, near, False, rows, scratch, n)
 
 
-def figure_1(rng):
-    print("figure 1: time, us; wanted: forward 0.4 kernel, 6 call, 0.08 batch; jacobian 0.6 kernel; inverse 3, 15, 2")
+def metric_1(rng):
+    print("metric 1: time, us; required: forward 0.4 kernel, 6 call, 0.08 batch; jacobian 0.6 kernel; inverse 3, 15, 2")
     print(f"{'':19}{'kernel':>8}{'call':>8}{'batch':>8}   peers, called from Python")
     for arm in MODELS.values():
         q = rng.uniform(-np.pi, np.pi, (1000, 6))
@@ -136,11 +136,13 @@ def peer_times(arm, each, eachT, Ts):
         out["forward"].append(f"roboticstoolbox {least(lambda: toolbox.forward(next(each)), 300):.2f}")
         out["jacobian"].append(f"roboticstoolbox {least(lambda: toolbox.jacobian(next(each)), 300):.2f}")
         out["inverse"].append(f"roboticstoolbox {least(lambda: toolbox.inverse(next(eachT)), 5, 3):.0f} (one solution)")
-    return {name: ", ".join(told) or "none installed" for name, told in out.items()}
+    return {name: ", ".join(names) or "none installed" for name, names in out.items()}
 
 
-def figure_2(rng, poses):
-    print(f"\nfigure 2: {poses} poses, half of them near singularities; wanted: below 1e-9 m and rad, 0 of the others")
+def metric_2(rng, poses):
+    print(
+        f"\nmetric 2: {poses} poses, half of them near singularities; required: below 1e-9 m and rad, 0 of the others"
+    )
     print(
         f"{'':9}{'poses':>8}{'solutions':>11}{'worst m':>10}{'worst rad':>10}{'NaN':>5}{'twice':>6}"
         f"{'none':>6}{'EAIK finds':>12}{'of a family':>13}{'undetermined':>14}{'missed':>8}"
@@ -165,7 +167,7 @@ def one_chunk(arm, Ts):
     many = arm.inverse_batch(Ts)
     width = many.q.shape[1]
     there = np.arange(width) < many.count[:, None]
-    far, turned = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
+    far, rotated = arms.off(arm.forward(many.q[there]), np.repeat(Ts, many.count, axis=0))
     twice = sum(
         (arms.apart(many.q[:, i], many.q[:, j]) < 1e-7)[there[:, i] & there[:, j]].sum()
         for i in range(width)
@@ -174,7 +176,7 @@ def one_chunk(arm, Ts):
     counts = [len(Ts), many.count.sum(), np.isnan(many.q).sum(), twice, (many.count == 0).sum(), 0, 0, 0, 0]
     if have("eaik"):
         counts[5:] = beside_eaik(arm, Ts, many, there)
-    return np.array(counts), (far.max(), turned.max())
+    return np.array(counts), (far.max(), rotated.max())
 
 
 def beside_eaik(arm, Ts, many, there):
@@ -212,8 +214,8 @@ def beside_eaik(arm, Ts, many, there):
 
 def main() -> None:
     rng = np.random.default_rng(20)
-    figure_1(rng)
-    figure_2(rng, int(sys.argv[1]) if len(sys.argv) > 1 else POSES)
+    metric_1(rng)
+    metric_2(rng, int(sys.argv[1]) if len(sys.argv) > 1 else POSES)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Figure 1: centres against the Cramer-Rao bound, on textures, and what clutter passes for a disc."""
+"""Metric 1: centres against the Cramer-Rao bound, on textures, and what clutter passes for a disc."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ def pair_up(picture: Picture, discs: Discs) -> tuple[np.ndarray, np.ndarray]:
 def why_not(picture: Picture, discs: Discs, found: np.ndarray) -> Counter:
     """Count the reasons given for true discs that were not found."""
     reasons: Counter = Counter()
-    places = np.array([r.uv for r in discs.rejected]).reshape(-1, 2)
+    positions = np.array([r.uv for r in discs.rejected]).reshape(-1, 2)
     for i in np.setdiff1d(np.arange(len(picture.uv)), found):
-        distance = np.linalg.norm(places - picture.uv[i], axis=1)
+        distance = np.linalg.norm(positions - picture.uv[i], axis=1)
         near = distance.argmin() if len(distance) else -1
         seen = near >= 0 and distance[near] < picture.axes[i, 0]
         reasons[without_numbers(discs.rejected[near].reason) if seen else "not seen by the search"] += 1
@@ -134,14 +134,14 @@ def bias(errors: Errors, direction: np.ndarray, size: np.ndarray | float = 1.0) 
 def biases(errors: Errors, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
     """Return the bias along every direction in which a finder may pull."""
     n = len(errors.e)
-    turn = rng.uniform(0, 2 * np.pi, n)
+    angle = rng.uniform(0, 2 * np.pi, n)
     u, v = np.tile([1.0, 0.0], (n, 1)), np.tile([0.0, 1.0], (n, 1))
     out = {
         "along u": bias(errors, u),
         "along v": bias(errors, v),
-        "along random directions": bias(errors, np.stack([np.cos(turn), np.sin(turn)], axis=1)),
-        "with the place in the pixel, u": bias(errors, u, np.sin(2 * np.pi * errors.uv[:, 0])),
-        "with the place in the pixel, v": bias(errors, v, np.sin(2 * np.pi * errors.uv[:, 1])),
+        "along random directions": bias(errors, np.stack([np.cos(angle), np.sin(angle)], axis=1)),
+        "with the position in the pixel, u": bias(errors, u, np.sin(2 * np.pi * errors.uv[:, 0])),
+        "with the position in the pixel, v": bias(errors, v, np.sin(2 * np.pi * errors.uv[:, 1])),
     }
     if np.abs(errors.slope).max() > 0:
         way = errors.slope / np.linalg.norm(errors.slope, axis=1, keepdims=True)
@@ -167,7 +167,7 @@ def plain(seed: int, report: Report, images: int = 60, count: int = 65) -> None:
         if not len(errors.e):
             continue
         ratio = over_bound(errors.e, errors.bound)
-        report.figure(f"{label}: RMS of the centre over its bound", ratio, "<= 1.3", good=ratio <= 1.3)
+        report.metric(f"{label}: RMS of the centre over its bound", ratio, "<= 1.3", good=ratio <= 1.3)
         rms, limit = (
             np.sqrt((errors.e**2).sum(axis=1).mean() / 2),
             np.sqrt(np.trace(errors.bound, axis1=1, axis2=2).mean() / 2),
@@ -176,10 +176,10 @@ def plain(seed: int, report: Report, images: int = 60, count: int = 65) -> None:
             f"  {'the same in px, an axis':62s} {rms:.4f} px, bound {limit:.4f} px; largest {np.abs(errors.e).max():.3f} px"
         )
         nees = np.einsum("ni,nij,nj->n", errors.e, np.linalg.inv(errors.cov), errors.e)
-        report.figure(f"{label}: NEES of cov_uv (2 is honest)", nees.mean(), form=".2f")
-        report.figure(f"{label}: 95% ellipse holds", 100 * (nees <= chi2.ppf(0.95, 2)).mean(), form=".1f", unit="%")
+        report.metric(f"{label}: NEES of cov_uv (2 is honest)", nees.mean(), form=".2f")
+        report.metric(f"{label}: 95% ellipse holds", 100 * (nees <= chi2.ppf(0.95, 2)).mean(), form=".1f", unit="%")
         for name, (mean, sigma) in biases(errors, rng).items():
-            report.figure(
+            report.metric(
                 f"{label}: bias {name}",
                 mean,
                 "under 0.003",
@@ -219,11 +219,11 @@ def textured(seed: int, report: Report, images: int = 12, count: int = 80) -> No
     e = np.concatenate(size)
     if len(e):
         median, rms, kept = np.median(e), np.sqrt((e**2).mean()), 100 * len(e) / number
-        report.figure("textured: median error", median, "<= 0.03", form=".4f", unit="px", good=median <= 0.03)
-        report.figure(
+        report.metric("textured: median error", median, "<= 0.03", form=".4f", unit="px", good=median <= 0.03)
+        report.metric(
             "textured: RMS error after the residual test", rms, "<= 0.05", form=".4f", unit="px", good=rms <= 0.05
         )
-        report.figure("textured: kept", kept, ">= 90", form=".1f", unit="%", good=kept >= 90)
+        report.metric("textured: kept", kept, ">= 90", form=".1f", unit="%", good=kept >= 90)
 
 
 def by_kind(seed: int, report: Report, images: int = 6) -> None:
@@ -237,8 +237,8 @@ def by_kind(seed: int, report: Report, images: int = 6) -> None:
             image = exposed(light, 2.0, 0.0, rng)
             accepted, count = accepted + sum(len(t.find(image).uv) for t in targets), count + things
         shares[item.__name__.strip("_").replace("_", " ")] = accepted / count
-    told = ", ".join(f"{name} {share:.2f}" for name, share in sorted(shares.items(), key=lambda pair: -pair[1]))
-    report.say(f"  discs accepted for one thing alone, by its kind: {told}")
+    listed = ", ".join(f"{name} {share:.2f}" for name, share in sorted(shares.items(), key=lambda pair: -pair[1]))
+    report.say(f"  discs accepted for one thing alone, by its kind: {listed}")
 
 
 def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
@@ -266,10 +266,10 @@ def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
         if no_identify is not None:
             report.say(f"  accepted into a pose: {no_identify}")
         else:
-            report.figure(f"{said}: poses", poses, "0", form="d", good=poses == 0)
+            report.metric(f"{said}: poses", poses, "0", form="d", good=poses == 0)
 
 
-def figure(seed: int, report: Report) -> None:
+def metric(seed: int, report: Report) -> None:
     missing = lacking("find")
     if missing is not None:
         report.say(f"  {missing}")

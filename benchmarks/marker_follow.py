@@ -1,4 +1,4 @@
-"""Figure 5: following the plate along a path with occlusions, and the one place that knows how armsight follows."""
+"""Metric 5: following the plate along a path with occlusions, and the one file that knows how armsight follows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, para
 from marker_report import Report, disc_target, lacking, opened, without_numbers
 
 RATE_HZ, SPEED, NOISE = 60.0, 0.5, 2.0
-#: A pose is wrong where its squared distance from truth in sigmas is beyond chance, or it is turned by so much.
+#: A pose is wrong where its squared distance from truth in sigmas is beyond chance, or it is rotated by so much.
 WRONG_QUANTILE, WRONG_RAD = 1 - 1e-7, np.radians(5.0)
 
 
@@ -66,7 +66,7 @@ class Moment:
 
 
 def path(shots: int) -> list[np.ndarray]:
-    """Return poses along a closed way at constant speed, turning as it goes."""
+    """Return poses along a closed way at constant speed, rotating as it goes."""
     t = np.linspace(0, 2 * np.pi, 4000)
     way = np.stack([0.11 + 0.2 * np.sin(t), 0.1 * np.sin(2 * t), 0.85 + 0.15 * np.cos(t)], axis=1)
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))]
@@ -103,23 +103,23 @@ def moments(rig: StereoRig, target: DiscTarget, shots: int, rng: np.random.Gener
         for side, (camera, at) in enumerate(zip(rig.cameras, views(rig, T), strict=True)):
             light = light_of(camera, target, at)
             uv, shape = ellipses(camera, target, at)
-            turn = rng.uniform(0, 2 * np.pi)
-            across, down = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+            angle = rng.uniform(0, 2 * np.pi)
+            across, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
             for disc, share in enumerate(covered[k, side]):
                 if share == 0:
                     continue
                 middle = uv[disc] if disc < 3 else uv.mean(axis=0)
                 size = 1.8 * np.sqrt(shape.max()) if disc < 3 else np.abs(uv - middle).max() + 4 * np.sqrt(shape.max())
                 # A square that stands over the disc, moved off so that it covers about its share.
-                place = middle + (2 * (1 - share) * size if disc < 3 else 0.0) * across
-                corners = np.array([across + down, down - across, -across - down, across - down]) * size + place
+                centre = middle + (2 * (1 - share) * size if disc < 3 else 0.0) * across
+                corners = np.array([across + down, down - across, -across - down, across - down]) * size + centre
                 cover_up(light, corners, BLUR)
             images.append(exposed(light, NOISE, 0.0, rng))
         hidden = int((covered[k, :, :3] > 0).sum()) if not covered[k, :, 3].any() else 6
         yield Moment(T, (images[0], images[1]), hidden == 0, hidden)
 
 
-def figure(seed: int, report: Report, shots: int = 900) -> None:
+def metric(seed: int, report: Report, shots: int = 900) -> None:
     missing = lacking("find", "identify")
     if missing is not None:
         report.say(f"  {missing}")
@@ -158,14 +158,14 @@ def figure(seed: int, report: Report, shots: int = 900) -> None:
         f"{missed_whole} of them missed; of {in_part} with something covered {measured_in_part} measured; {losses} losses"
     )
     report.say(f"  {', '.join(f'{times} {way}' for way, times in ways.most_common())}")
-    report.figure("wrong poses", wrong, "0", form="d", good=wrong == 0)
+    report.metric("wrong poses", wrong, "0", form="d", good=wrong == 0)
     if regained:
         most = max(regained)
-        report.figure(
+        report.metric(
             "shots to regain once the whole plate shows again, at most", most, "<= 2", form="d", good=most <= 2
         )
     if nees:
-        report.figure("mean NEES (6 is honest)", np.mean(nees), form=".2f")
+        report.metric("mean NEES (6 is honest)", np.mean(nees), form=".2f")
     if reasons:
         for reason, times in reasons.most_common(5):
             report.say(f"    missed {times} times: {reason}")

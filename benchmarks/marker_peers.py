@@ -1,7 +1,7 @@
-"""Figure 3: other finders on the same noise, blur and contrast: ms an image (cold, one thread) and px.
+"""Metric 3: other finders on the same noise, blur and contrast: ms an image (cold, one thread) and px.
 
 Discs are dark on bright, as OpenCV's blob detector wants them by default. Tags are squares as wide as the discs, the white
-rim not counted, tilted alike; a tag's place is the crossing of its diagonals, beside the error of a single corner.
+rim not counted, tilted alike; a tag's position is the crossing of its diagonals, beside the error of a single corner.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ FAMILY = "tag36h11"
 
 
 def squares(rng: np.random.Generator, radius: float, count: int = TARGETS) -> np.ndarray:
-    """Return maps (N, 2, 3) from [-1, 1]^2 to squares as wide as discs of a radius, tilted and turned, apart."""
+    """Return maps (N, 2, 3) from [-1, 1]^2 to squares as wide as discs of a radius, tilted and rotated, apart."""
     uv = scatter(np.full(count, 2.2 * radius), 20.0, rng)
     out = []
-    for place in uv[np.isfinite(uv[:, 0])]:
+    for position in uv[np.isfinite(uv[:, 0])]:
         a, b, c = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi), np.cos(np.radians(rng.uniform(0, 45)))
-        turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        R = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         tilt = np.array([[np.cos(b), -np.sin(b)], [np.sin(b), np.cos(b)]])
-        out.append(np.column_stack([radius * tilt @ np.diag([1.0, c]) @ turn, place]))
+        out.append(np.column_stack([radius * tilt @ np.diag([1.0, c]) @ R, position]))
     return np.array(out)
 
 
@@ -39,7 +39,7 @@ def tag_picture(rng: np.random.Generator, radius: float) -> tuple[np.ndarray, np
         bits = cv2.aruco.generateImageMarker(known, int(rng.integers(0, 587)), 8, borderBits=1) > 127
         edges = np.linspace(-1, 1, 9)
         for j, row in enumerate(bits):
-            dark = np.flatnonzero(np.diff(np.r_[True, row, True].astype(int)))  # a run's start and end in turn
+            dark = np.flatnonzero(np.diff(np.r_[True, row, True].astype(int)))  # a run's start and end alternately
             for start, end in dark.reshape(-1, 2):
                 x, y = edges[[start, end]], edges[[j, j + 1]]
                 cell = np.array([[x[0], y[0], 1], [x[1], y[0], 1], [x[1], y[1], 1], [x[0], y[1], 1]])
@@ -113,7 +113,7 @@ def apriltags(decimate: float) -> Callable | None:
 
 
 def nearest(found: np.ndarray, true: np.ndarray, within: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (M, 2) of the true places that were found, and which they are."""
+    """Return errors (M, 2) of the true positions that were found, and which they are."""
     if not len(found):
         return np.zeros((0, 2)), np.zeros(0, int)
     distance = np.linalg.norm(true[:, None] - found[None], axis=2)
@@ -134,7 +134,7 @@ def row(report: Report, name: str, radius: int, way: Callable, frames: list, tru
         report: where to.
         name: of the row.
         radius: of the targets, px.
-        way: image -> places (N, 2) or corners (N, 4, 2).
+        way: image -> positions (N, 2) or corners (N, 4, 2).
         frames: a ring of the images.
         truth: for each image its centres (N, 2), for tags with the corners (N, 4, 2).
     """
@@ -156,7 +156,7 @@ def row(report: Report, name: str, radius: int, way: Callable, frames: list, tru
     report.found[f"{name}, {2 * radius} px"] = {"ms": ms, "px": rms(errors), "found": len(errors), "of": count}
 
 
-def figure(seed: int, report: Report, images: int = 60) -> None:
+def metric(seed: int, report: Report, images: int = 60) -> None:
     for radius in (20, 10):
         rng = np.random.default_rng(seed + radius)
         report.say(

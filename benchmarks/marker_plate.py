@@ -28,16 +28,16 @@ LENS = np.array([-0.21, 0.06, 0.0007, -0.0005, 0.004])
 
 
 def parallel_rig(distortion: np.ndarray | None = None, toe_deg: float = 0.0) -> StereoRig:
-    """Return two HD cameras 220 mm apart, each turned inwards by ``toe_deg``; exactly known."""
+    """Return two HD cameras 220 mm apart, each rotated inwards by ``toe_deg``; exactly known."""
     d = np.zeros(0) if distortion is None else distortion
     model = "none" if distortion is None else "brown5"
     cameras = [
         Camera((WIDTH, HEIGHT), model, np.array([FOCAL, FOCAL, WIDTH / 2 + du, HEIGHT / 2 + dv]), d * s)
         for du, dv, s in ((-0.5, -0.5, 1.0), (-0.5, -0.5, 1.03))
     ]
-    turn = np.radians(toe_deg)
+    angle = np.radians(toe_deg)
     T_left_right = pose(
-        exp_so3(np.array([0.0, -2 * turn, 0.0])), BASELINE * np.array([np.cos(turn), 0.0, np.sin(turn)])
+        exp_so3(np.array([0.0, -2 * angle, 0.0])), BASELINE * np.array([np.cos(angle), 0.0, np.sin(angle)])
     )
     n = 14 + 2 * d.size
     return StereoRig(cameras[0], cameras[1], T_left_right, np.zeros((n, n)), 0.0)
@@ -99,7 +99,7 @@ def light_of(
 
 
 def cover_up(light: np.ndarray, polygon: np.ndarray, blur: float) -> None:
-    """Lay a polygon (M, 2) of the background's level over an image, in place."""
+    """Lay a polygon (M, 2) of the background's level over an image, in-place."""
     share = np.zeros_like(light)
     add_region(share, polygon_border(polygon, blur), blur, 1.0)
     light += share * (BACKGROUND - light)
@@ -137,7 +137,7 @@ def poses(
     z: tuple[float, float] = (0.6, 1.2),
     tilt_deg: float = 50.0,
 ) -> list[np.ndarray]:
-    """Return poses T_left_body: turned anyhow about the normal, tilted up to an angle, in full view of both."""
+    """Return poses T_left_body: rotated anyhow about the normal, tilted up to an angle, in full view of both."""
     out = []
     while len(out) < count:
         axis = rng.uniform(0, 2 * np.pi)

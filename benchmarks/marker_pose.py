@@ -1,4 +1,4 @@
-"""Figures 4 and 6: the pose of the plate against what the bound predicts, and the bias of perspective."""
+"""Metrics 4 and 6: the pose of the plate against what the bound predicts, and the bias of perspective."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def rendered(rig: StereoRig, target: DiscTarget, T: np.ndarray, rng: np.random.G
     )
 
 
-def judge(
+def evaluate(
     label: str, rig: StereoRig, target: DiscTarget, shots: Iterator[tuple[np.ndarray, Images]], report: Report
 ) -> None:
     """Measure shots and print errors over the bound, NEES and coverage."""
@@ -79,7 +79,7 @@ def judge(
         return
     e, b, d2 = np.array(xi), np.array(bound), np.array(nees)
     wrong = (np.linalg.norm(e[:, 3:], axis=1) > np.radians(5)).sum()
-    report.figure(f"{label}: poses turned by more than 5 degrees", wrong, "0", form="d", good=wrong == 0)
+    report.metric(f"{label}: poses rotated by more than 5 degrees", wrong, "0", form="d", good=wrong == 0)
     for name, part, unit, scale in (
         ("position", slice(0, 3), "mm", 1e3),
         ("orientation", slice(3, 6), "deg", np.degrees(1)),
@@ -87,17 +87,17 @@ def judge(
         rms = np.sqrt((e[:, part] ** 2).sum(axis=1).mean())
         said = np.sqrt(np.trace(b[:, part, part], axis1=1, axis2=2).mean())
         report.say(f"  {f'{name} RMS':62s} {scale * rms:.4f} {unit}, the bound {scale * said:.4f}")
-        report.figure(f"{label}: {name} RMS over the bound's", rms / said, "<= 1.2", form=".3f", good=rms <= 1.2 * said)
+        report.metric(f"{label}: {name} RMS over the bound's", rms / said, "<= 1.2", form=".3f", good=rms <= 1.2 * said)
     low, high = chi2.ppf((0.025, 0.975), 6 * n) / n
     inside = 100 * (d2 <= chi2.ppf(0.95, 6)).mean()
-    report.figure(
+    report.metric(
         f"{label}: mean NEES", d2.mean(), f"{low:.2f} to {high:.2f}", form=".2f", good=low <= d2.mean() <= high
     )
-    wanted, good = ("93 to 97", 93 <= inside <= 97) if n >= ENOUGH else ("", None)
-    report.figure(f"{label}: 95% ellipsoid holds", inside, wanted, form=".1f", unit="%", good=good)
+    required, good = ("93 to 97", 93 <= inside <= 97) if n >= ENOUGH else ("", None)
+    report.metric(f"{label}: 95% ellipsoid holds", inside, required, form=".1f", unit="%", good=good)
 
 
-def figure(seed: int, report: Report, count: int = 1000) -> None:
+def metric(seed: int, report: Report, count: int = 1000) -> None:
     missing = lacking("find", "identify")
     if missing is not None:
         report.say(f"  {missing}")
@@ -112,7 +112,7 @@ def figure(seed: int, report: Report, count: int = 1000) -> None:
         rig = parallel_rig(lens, 3.0)
         Ts = poses(rig, target, number, rng)
         paint = rendered if by_renderer else lambda rig, target, T, rng: shot(rig, target, T, NOISE, rng)
-        judge(label, rig, target, ((T, paint(rig, target, T, rng)) for T in Ts), report)
+        evaluate(label, rig, target, ((T, paint(rig, target, T, rng)) for T in Ts), report)
 
 
 def perspective(seed: int, report: Report, count: int = 300) -> None:
@@ -155,8 +155,8 @@ def perspective(seed: int, report: Report, count: int = 300) -> None:
         report.say(f"  {label}: found in {len(after)} of {count} images")
         if len(after):
             mean, sigma = after.mean(axis=0), after.std(axis=0) / np.sqrt(len(after))
-            report.figure(f"{label}: bias without correction", before[:, 0].mean(), "about 0.3", unit="px")
-            report.figure(
+            report.metric(f"{label}: bias without correction", before[:, 0].mean(), "about 0.3", unit="px")
+            report.metric(
                 f"{label}: bias with correction, along",
                 mean[0],
                 "under 0.005",
@@ -164,7 +164,7 @@ def perspective(seed: int, report: Report, count: int = 300) -> None:
                 unit=f"+- {sigma[0]:.4f} px",
                 good=abs(mean[0]) < 0.005,
             )
-            report.figure(
+            report.metric(
                 f"{label}: bias with correction, across",
                 mean[1],
                 "under 0.005",
@@ -189,7 +189,7 @@ def plate_at_half_a_metre(seed: int, report: Report, count: int = 200) -> None:
         T = pose(R, np.array([0.11, 0.0, 0.5]) - R @ target.body.points.mean(axis=0))
         result = measure(rig, whole, Shot("", *shot(rig, target, T, 1.0, rng)))
         if not isinstance(result, Missed):
-            # Perspective moves centres along the tilt: the error in the frame of the cameras, turned to it.
+            # Perspective moves centres along the tilt: the error in the frame of the cameras, rotated to it.
             e = R @ log_se3(inverse(result.T_left_body) @ T)[:3]
             bound = R @ pose_bound(rig, target, T, 1.0)[:3, :3] @ R.T
             along = np.array([-np.sin(around), np.cos(around), 0.0])
@@ -201,7 +201,7 @@ def plate_at_half_a_metre(seed: int, report: Report, count: int = 200) -> None:
     sigma = e[:, :2].std(axis=0) / np.sqrt(len(e))
     report.say(f"  plate of such discs: {len(e)} of {count} measured")
     for i, name in enumerate(("along the tilt", "in depth")):
-        report.figure(
+        report.metric(
             f"mean error of its position {name}", 1e3 * e[:, i].mean(), form="+.4f", unit=f"+- {1e3 * sigma[i]:.4f} mm"
         )
         rms, bound = (1e3 * np.sqrt((e[:, k] ** 2).mean()) for k in (i, 2 + i))

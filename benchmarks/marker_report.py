@@ -30,17 +30,24 @@ class Report:
     def say(self, text: str) -> None:
         print(text, flush=True)
 
-    def figure(
-        self, name: str, value: float, wanted: str = "", *, form: str = ".3f", unit: str = "", good: bool | None = None
+    def metric(
+        self,
+        name: str,
+        value: float,
+        required: str = "",
+        *,
+        form: str = ".3f",
+        unit: str = "",
+        good: bool | None = None,
     ) -> None:
-        """Print a figure, what was wanted of it and whether it is so; keep it."""
+        """Print a metric, what is required of it and whether it is so; keep it."""
         mark = "" if good is None else "  yes" if good else "  NO"
-        beside = f"   (wanted {wanted}{mark})" if wanted else ""
+        beside = f"   (required {required}{mark})" if required else ""
         self.say(f"  {name:62s} {value:{form}}{' ' + unit if unit else ''}{beside}")
         self.found[name] = {
             "value": float(value),
             "unit": unit,
-            "wanted": wanted,
+            "required": required,
             "good": None if good is None else bool(good),
         }
 
@@ -98,7 +105,7 @@ def last_level_cache_bytes() -> int:
 
 
 def ring(images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Copy images round and round until together they are 2.5 times the largest cache: each is cold when its turn comes."""
+    """Copy images round and round until together they are 2.5 times the largest cache: each is cold when it comes again."""
     count = max(len(images), -(-5 * last_level_cache_bytes() // (2 * images[0].nbytes)))
     return [images[i % len(images)].copy() for i in range(count)]
 
@@ -106,7 +113,7 @@ def ring(images: Sequence[np.ndarray]) -> list[np.ndarray]:
 def timed(
     function: Callable[[np.ndarray], object], frames: Sequence[np.ndarray], repeats: int = 0, limit_s: float = 10.0
 ) -> tuple[np.ndarray, list]:
-    """Run a function on frames in turn, once around at least unless that takes too long.
+    """Run a function on frames one after the other, once around at least unless that takes too long.
 
     Args:
         function: what to time; it is run three times first.
@@ -115,7 +122,7 @@ def timed(
         limit_s: no further run is begun after so long, but there are 20.
 
     Returns:
-        Times, us, and what each run returned. Time is the processor's that this process used: on an idle machine the
+        Times, us, and what each run returned. Time is the processor's that this process used: on an idle computer the
         clock's, and on a busy one not that of others.
     """
     for frame in frames[-3:]:

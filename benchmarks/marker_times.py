@@ -1,4 +1,4 @@
-"""Figure 2: reading an image, searching it, fitting a disc, following, a pair to a pose. Medians over cold frames, us."""
+"""Metric 2: reading an image, searching it, fitting a disc, following, a pair to a pose. Medians over cold frames, us."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marker_follow import Following
 from marker_plate import LENS, parallel_rig, poses, project, shot, views
 from marker_report import Report, disc_target, lacking, last_level_cache_bytes, read_us, ring, timed
 
-#: Discs on the images between which the time of one more disc is told.
+#: Discs on the images between which the time of one more disc is measured.
 COUNTS = (0, 4, 16, 48, 96)
 HALF = 20  # of a window about a predicted disc, px
 
@@ -35,7 +35,7 @@ def whole_image(seed: int, report: Report) -> None:
         for n in COUNTS
     }
     read = read_us(ring(images[4]))
-    report.figure("reading an HD image once, cold", read, form=".1f", unit="us")
+    report.metric("reading an HD image once, cold", read, form=".1f", unit="us")
     missing = lacking("find")
     if missing is not None:
         report.say(f"  search and fit: {missing}")
@@ -52,17 +52,17 @@ def whole_image(seed: int, report: Report) -> None:
         )
     slope, start = np.polyfit(COUNTS, medians, 1)
     read = min(read, read_us(ring(images[4])))
-    report.figure(
+    report.metric(
         "the search of an image without discs, over reading it",
         medians[0] / read,
         "<= 2.0",
         form=".2f",
         good=medians[0] <= 2 * read,
     )
-    report.figure(
+    report.metric(
         "the search as the line over disc counts has it", start / read, "<= 2.0", form=".2f", good=start <= 2 * read
     )
-    report.figure("one disc more", slope, "<= 15", form=".1f", unit="us", good=slope <= 15)
+    report.metric("one disc more", slope, "<= 15", form=".1f", unit="us", good=slope <= 15)
 
 
 def kabsch(p_b: np.ndarray, p_a: np.ndarray) -> np.ndarray:
@@ -99,8 +99,8 @@ class LibraryRoute:
 
 def accuracy(xi: np.ndarray) -> str:
     """Say the RMS of pose errors (N, 6)."""
-    position, turn = (np.sqrt((part**2).sum(axis=1).mean()) for part in (xi[:, :3], xi[:, 3:]))
-    return f"{1e3 * position:.3f} mm, {np.degrees(turn):.3f} deg RMS"
+    position, rotation = (np.sqrt((part**2).sum(axis=1).mean()) for part in (xi[:, :3], xi[:, 3:]))
+    return f"{1e3 * position:.3f} mm, {np.degrees(rotation):.3f} deg RMS"
 
 
 def pairs(seed: int, report: Report, count: int = 24) -> None:
@@ -120,7 +120,7 @@ def pairs(seed: int, report: Report, count: int = 24) -> None:
     times, results = timed(route, cases, 300)
     xi = np.array([log_se3(inverse(T_hat) @ Ts[i % count]) for i, T_hat in enumerate(results)])
     library = float(np.median(times))
-    report.figure("library route, windows known, pair to pose", library, form=".0f", unit="us")
+    report.metric("library route, windows known, pair to pose", library, form=".0f", unit="us")
     report.say(f"  {'its error':62s} {accuracy(xi)}")
     missing = lacking("find", "identify", "follow")
     if missing is not None:
@@ -141,11 +141,11 @@ def pairs(seed: int, report: Report, count: int = 24) -> None:
     if not (way == "followed").any():
         return
     ours = float(np.median(us[way == "followed"]))
-    report.figure(
+    report.metric(
         "following four discs, pair to pose with covariance", ours, "<= 200", form=".0f", unit="us", good=ours <= 200
     )
-    report.figure("following four discs in one image", one_image(follow, still), "<= 60", form=".0f", unit="us")
-    report.figure("the same over the library route", ours / library, "<= 1", form=".2f", good=ours <= library)
+    report.metric("following four discs in one image", one_image(follow, still), "<= 60", form=".0f", unit="us")
+    report.metric("the same over the library route", ours / library, "<= 1", form=".2f", good=ours <= library)
     report.say(f"  {'its error':62s} {accuracy(np.array(xi).reshape(-1, 6))}")
 
 
@@ -161,6 +161,6 @@ def one_image(follow: Following, still: list) -> float:
     return float(np.median(timed(left_only, still, 60)[0]))
 
 
-def figure(seed: int, report: Report) -> None:
+def metric(seed: int, report: Report) -> None:
     whole_image(seed, report)
     pairs(seed, report)

@@ -1,4 +1,4 @@
-"""Figure 3 of the arm: straight lines of 300 mm in 1 s, and what planning and evaluating motions costs.
+"""Metric 3 of the arm: straight lines of 300 mm in 1 s, and what planning and evaluating motions costs.
 
     python benchmarks/motions.py
 
@@ -47,11 +47,11 @@ def used(arm: Arm, motion: Trajectory) -> tuple[float, float, float, str]:
 
 
 def deviation(arm: Arm, motion: Trajectory, T: np.ndarray, along: np.ndarray) -> tuple[float, float]:
-    """Furthest distance from the line, m, and turn from its orientation, rad."""
+    """Furthest distance from the line, m, and rotation from its orientation, rad."""
     Ts = arm.forward(motion.at(np.arange(0, motion.duration_s, 1 / RATE_HZ)).q)
     p = Ts[:, :3, 3] - T[:3, 3]
-    turned = np.linalg.norm(log_so3(T[:3, :3].T @ Ts[:, :3, :3]), axis=1)
-    return float(np.linalg.norm(p - np.outer(p @ along, along), axis=1).max()), float(turned.max())
+    rotation = np.linalg.norm(log_so3(T[:3, :3].T @ Ts[:, :3, :3]), axis=1)
+    return float(np.linalg.norm(p - np.outer(p @ along, along), axis=1).max()), float(rotation.max())
 
 
 def report(name: str, kind: str, arm: Arm, motion: Trajectory, T: np.ndarray, along: np.ndarray, made_s: float) -> None:
@@ -68,7 +68,9 @@ def report(name: str, kind: str, arm: Arm, motion: Trajectory, T: np.ndarray, al
 
 
 def main() -> None:
-    print(f"lines of {1e3 * LENGTH_M:.0f} mm, orientation kept; wanted: 1 s, off by at most 0.01 mm, inside all limits")
+    print(
+        f"lines of {1e3 * LENGTH_M:.0f} mm, orientation kept; required: 1 s, off by at most 0.01 mm, inside all limits"
+    )
     for name, (degrees, direction) in LINES.items():
         arm, q = MODELS[name], np.radians(degrees)
         along = np.array(direction) / np.linalg.norm(direction)
@@ -76,7 +78,7 @@ def main() -> None:
         goal = T.copy()
         goal[:3, 3] += LENGTH_M * along
         for kind, make in (
-            ("line, 1 s", lambda: line(arm, q, goal, duration_s=1.0)),  # noqa: B023 - used within the turn
+            ("line, 1 s", lambda: line(arm, q, goal, duration_s=1.0)),  # noqa: B023 - used within the round
             ("line, fastest", lambda: line(arm, q, goal)),  # noqa: B023
             ("resolved rate", lambda: resolved_rate(arm, q, LinePath.between(T, goal))),  # noqa: B023
         ):

@@ -1,4 +1,4 @@
-"""Figure 4: the Motoman arm, its ball of markers, and the laser tracker that watched it."""
+"""Metric 4: the Motoman arm, its ball of markers, and the laser tracker that watched it."""
 
 from __future__ import annotations
 
@@ -57,34 +57,34 @@ def spread(e) -> str:
 def tracker() -> None:
     print("\n4. Motoman right_hand_6x6x6: even shots fitted and registered to the tracker, odd ones of the 43 measured")
     print(
-        "  (where the reflector sits on the body is not known. The arm holds the orientation, so its place is told by the "
-        "scatter of the measured orientations alone, and leans towards the point of the body that is measured best)"
+        "  (where the reflector sits on the body is not known. The arm holds the orientation, so its position follows "
+        "from the scatter of the measured orientations alone, and leans towards the point of the body that is measured best)"
     )
     body, shots, cameras, truth = read("right_hand_6x6x6")
-    judged = [s for s in shots if common(s) >= 3]
+    measurable = [s for s in shots if common(s) >= 3]
     for label, train in (
-        ("even of the 43", [s for s in judged if int(s.name) % 2 == 0]),
+        ("even of the 43", [s for s in measurable if int(s.name) % 2 == 0]),
         ("all even shots", [s for s in shots if int(s.name) % 2 == 0]),
     ):
         for refine in (False, True):
             c = calibrate_bodies(body, train, cameras, refine_body=refine)
-            results = {s.name: measure_seen(c.rig, c.body, s) for s in judged}
+            results = {s.name: measure_seen(c.rig, c.body, s) for s in measurable}
             missed = [name for name, r in results.items() if isinstance(r, Missed)]
             Ts = {name: r.T_left_body for name, r in results.items() if not isinstance(r, Missed)}
             even, odd = ([n for n in Ts if int(n) % 2 == k] for k in (0, 1))
             # tracker.csv is a reflector somewhere on the end-effector; taking it for the body's origin is the other way.
-            seen, told = [Ts[n] for n in even], np.array([truth[n] for n in even])
-            T, reflector = register(seen, told)
+            seen, tracked = [Ts[n] for n in even], np.array([truth[n] for n in even])
+            T, reflector = register(seen, tracked)
             e = off_mm(T, reflector, [Ts[n] for n in odd], [truth[n] for n in odd])
-            at_origin = fit_rigid(np.array([t[:3, 3] for t in seen]), told)
+            at_origin = fit_rigid(np.array([t[:3, 3] for t in seen]), tracked)
             e_origin = off_mm(at_origin, np.zeros(3), [Ts[n] for n in odd], [truth[n] for n in odd])
-            tips, place_mm = np.array([transform(t, reflector) for t in Ts.values()]), 1e3 * np.linalg.norm(reflector)
+            tips, offset_mm = np.array([transform(t, reflector) for t in Ts.values()]), 1e3 * np.linalg.norm(reflector)
             scale = fit_scale(np.array([truth[n] for n in Ts]), tips)
             predicted = [np.degrees(np.sqrt(np.trace(results[n].cov[3:, 3:]))) for n in odd]
             print(
                 f"  {label}, {'refined' if refine else 'nominal'} body: {len(odd)} odd shots measured, missed "
-                f"{missed or 'none'}; reflector's place on the body fitted on even shots (found {place_mm:.0f} mm from the "
-                f"origin): {spread(e)}; reflector taken for the body's origin: {spread(e_origin)}; "
+                f"{missed or 'none'}; reflector's position on the body fitted on even shots (found {offset_mm:.0f} mm "
+                f"from the origin): {spread(e)}; reflector taken for the body's origin: {spread(e_origin)}; "
                 f"orientation scatter {scatter_deg([Ts[n] for n in odd]):.3f} deg RMS (predicted "
                 f"{np.sqrt(np.mean(np.square(predicted))):.3f}); "
                 f"scale against the tracker {100 * (scale - 1):+.2f}%; epipolar {c.epipolar_rms_px:.2f} px; "
@@ -108,14 +108,14 @@ def bodies_in(shot, body, rig):
 
 
 def register(Ts, p):
-    """Tracker pose and reflector place that fit best: p ~ T (R reflector + t)."""
+    """Tracker pose and reflector position that fit best: p ~ T (R reflector + t)."""
     start = fit_rigid(np.array([T[:3, 3] for T in Ts]), p)
 
-    def place(x):
+    def predicted(x):
         reflector = np.array([T[:3, :3] @ x[6:] + T[:3, 3] for T in Ts])
         return transform(start @ exp_se3(x[:6]), reflector)
 
-    x = least_squares(lambda x: np.r_[(place(x) - p).ravel() / 1e-3, x[6:] / 0.3], np.zeros(9)).x
+    x = least_squares(lambda x: np.r_[(predicted(x) - p).ravel() / 1e-3, x[6:] / 0.3], np.zeros(9)).x
     return start @ exp_se3(x[:6]), x[6:]
 
 

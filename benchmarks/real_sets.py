@@ -1,4 +1,4 @@
-"""Figures 1 to 3 on the chessboard recordings: ours beside cv2.calibrateCamera + cv2.stereoCalibrate."""
+"""Metrics 1 to 3 on the chessboard recordings: ours beside cv2.calibrateCamera + cv2.stereoCalibrate."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def heldout_beside_opencv() -> None:
         h = errors_on(ours.rig, points, list(odd.values()))
         print(line(f"armsight ({ours.rig.left.model}, {len(ours.pairs)} pairs fitted)", len(odd), h))
         gain = [100 * (1 - getattr(h, key) / best[key]) for key in ("epipolar_rms_px", "rigid_rms_m")]
-        print(f"  better than the better finder's figure by {gain[0]:.0f}% (epipolar), {gain[1]:.0f}% (board)")
+        print(f"  better than the better finder's metric by {gain[0]:.0f}% (epipolar), {gain[1]:.0f}% (board)")
         everything = calibrate_boards(s.board, s.pairs, (s.size, s.size))
         chosen = calibrate_boards(s.board, [p for p in s.pairs if p.name not in s.bad], (s.size, s.size))
         good = [c for k, c in ours_of(s.pairs).items() if k not in s.bad]
@@ -201,5 +201,5 @@ def normalised_residuals() -> None:
 def said(ours) -> str:
     if ours.motion is None:
         return "; boards found to stand still between the exposures"
-    way, turn = 1e3 * ours.motion.rms_m, 1e3 * ours.motion.rms_rad
-    return f"; boards found to move by {way:.3f} mm and {turn:.2f} mrad RMS an axis between the exposures"
+    way, angle = 1e3 * ours.motion.rms_m, 1e3 * ours.motion.rms_rad
+    return f"; boards found to move by {way:.3f} mm and {angle:.2f} mrad RMS an axis between the exposures"

@@ -1,4 +1,4 @@
-"""Figures 3a, 5 and 6 on rendered chessboards with truth."""
+"""Metrics 3a, 5 and 6 on rendered chessboards with truth."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def point_sigma(trials: int = 100, pairs: int = 14) -> None:
     pattern = chessboard(COLUMNS, ROWS, SQUARE)
     light = []
     for T in board_poses(rig, pairs, rng):
-        placed = PosedBody((pattern,), T)
-        views = (placed, placed.seen_from(inverse(rig.T_left_right)))
+        posed = PosedBody((pattern,), T)
+        views = (posed, posed.seen_from(inverse(rig.T_left_right)))
         light.append([radiance(camera, [view], 0.4) for camera, view in zip(rig.cameras, views, strict=True)])
     grid = np.stack(np.meshgrid([-0.05, 0.1, 0.25], [-0.1, 0.1], [0.5, 0.7, 0.9]), axis=-1).reshape(-1, 3)
     T_right_left = inverse(rig.T_left_right)
@@ -126,7 +126,7 @@ def calibrated(rig: StereoRig, rng: np.random.Generator, pairs: int = 14) -> Ste
 def pose_coverage(count: int = 2000) -> None:
     """Share of rendered shots whose true pose lies in the predicted 95% ellipsoid.
 
-    Every shot is measured with another rig, drawn from the calibration's own covariance about the true one, so that both
+    Every shot is measured with another rig, sampled from the calibration's own covariance about the true one, so that both
     shares of the covariance are put to the test.
     """
     truth, rng = true_rig(), np.random.default_rng(5)
@@ -136,8 +136,8 @@ def pose_coverage(count: int = 2000) -> None:
     d2, missed = [], 0
     for T in board_poses(truth, count, rng):
         images = render_pair(truth.cameras, truth.T_left_right, [PosedBody((pattern,), T)], sensor=SENSOR, rng=rng)
-        drawn = truth.perturbed(root @ rng.normal(size=len(root)))
-        rig = StereoRig(drawn.left, drawn.right, drawn.T_left_right, result.cov, result.sigma_px)
+        sampled = truth.perturbed(root @ rng.normal(size=len(root)))
+        rig = StereoRig(sampled.left, sampled.right, sampled.T_left_right, result.cov, result.sigma_px)
         estimate = measure(rig, board, Shot("", *images))
         if isinstance(estimate, Missed):
             missed += 1
@@ -145,7 +145,7 @@ def pose_coverage(count: int = 2000) -> None:
         xi = log_se3(inverse(estimate.T_left_body) @ T)
         d2.append(xi @ np.linalg.solve(estimate.cov, xi))
     d2 = np.array(d2)
-    print(f"\n5. {count} rendered shots, the rig drawn anew from its covariance for each ({missed} missed)")
+    print(f"\n5. {count} rendered shots, the rig sampled anew from its covariance for each ({missed} missed)")
     print(
         f"  95% ellipsoid holds {100 * (d2 <= chi2.ppf(0.95, 6)).mean():.1f}%, 50% ellipsoid "
         f"{100 * (d2 <= chi2.ppf(0.5, 6)).mean():.1f}%, mean NEES {d2.mean():.2f} (6 is honest)"
@@ -184,7 +184,7 @@ def time_beside_opencv(count: int = 200) -> None:
         begin = time.perf_counter()
         found = [board.detect(image) for image in pairs[i % len(pairs)]]
         detecting += time.perf_counter() - begin
-        assert not isinstance(measure_detections(rig, board.body, *found, flips=board.flips), Missed)
+        assert not isinstance(measure_detections(rig, board.body, *found, symmetries=board.symmetries), Missed)
     total = time.perf_counter() - start
     for name, function in originals.items():
         setattr(cv2, name, function)
