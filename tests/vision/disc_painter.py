@@ -8,11 +8,12 @@ from armsight.geometry.pose import inverse
 SAMPLES = 16
 
 
-def outline(c, a, b, turn, points=720):
+def outline(c, a, b, rotation, points=720):
     """Rim (points, 2) of an ellipse."""
     t = 2 * np.pi * np.arange(points) / points
     u, v = a * np.cos(t), b * np.sin(t)
-    return np.column_stack([c[0] + u * np.cos(turn) - v * np.sin(turn), c[1] + u * np.sin(turn) + v * np.cos(turn)])
+    cosine, sine = np.cos(rotation), np.sin(rotation)
+    return np.column_stack([c[0] + u * cosine - v * sine, c[1] + u * sine + v * cosine])
 
 
 def share(rims, blur, corner, size):

@@ -12,8 +12,8 @@ SIGMA = 0.2
 
 def ball(n=14):
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    return 0.04 * np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    z, rotation = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    return 0.04 * np.column_stack([np.sqrt(1 - z**2) * np.cos(rotation), np.sqrt(1 - z**2) * np.sin(rotation), z])
 
 
 def shot_of(rig, points, Ts, rng):
@@ -22,8 +22,8 @@ def shot_of(rig, points, Ts, rng):
     ids = np.tile(np.arange(len(points)), len(Ts))
     owner = np.repeat(np.arange(len(Ts)), len(points))
     orders = [rng.permutation(len(ids)) for _ in "lr"]
-    places = [np.concatenate([u[:, side] for u in uv]) for side in (0, 1)]
-    shot = SeenShot("1", tuple(ids[o] for o in orders), tuple(p[o] for p, o in zip(places, orders, strict=True)))
+    positions = [np.concatenate([u[:, side] for u in uv]) for side in (0, 1)]
+    shot = SeenShot("1", tuple(ids[o] for o in orders), tuple(p[o] for p, o in zip(positions, orders, strict=True)))
     return shot, [owner[o] for o in orders]
 
 

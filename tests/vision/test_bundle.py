@@ -11,7 +11,16 @@ from scipy.optimize import least_squares
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3, log_se3
 from armsight.vision import bundle
-from armsight.vision.bundle import CAUCHY_SCALE, Model, Observations, State, minimise, moved, predict, whiteners
+from armsight.vision.bundle import (
+    CAUCHY_SCALE,
+    BundleModel,
+    BundleState,
+    Observations,
+    minimise,
+    moved,
+    predict,
+    whiteners,
+)
 from armsight.vision.projection import smooth
 from asserts import assert_jacobian
 from strategies import CAMERAS, ordinary_rig
@@ -25,8 +34,8 @@ def problem(model="brown4", *, degree=0, shots=6, free_cameras=True, sigma=SIGMA
     rng, rig, points = np.random.default_rng(seed), ordinary_rig(model), board()
     modes = smooth(points, degree) if degree else np.zeros((0, len(points), 3))
     shape = 1e-3 * rng.normal(size=len(modes))
-    problem = Model(points, modes, 1e-3, free_cameras)
-    truth = State(rig.cameras, rig.T_left_right, np.array([somewhere(rng) for _ in range(shots)]), shape)
+    problem = BundleModel(points, modes, 1e-3, free_cameras)
+    truth = BundleState(rig.cameras, rig.T_left_right, np.array([somewhere(rng) for _ in range(shots)]), shape)
     bent = points + np.einsum("k,kmi->mi", shape, modes)
     return (
         problem,
@@ -109,12 +118,12 @@ def test_jacobian_by_the_poses(name):
 
 
 def moving(model, truth, seed=3, sigma=(2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02)):
-    """Let the body move between the exposures of every shot, far enough to tell a derivative from its linear part."""
+    """Let the body move between the exposures of every shot, far enough to show errors of a derivative."""
     motions = np.random.default_rng(seed).normal(size=(len(truth.Ts_left_body), 6)) * sigma
     return replace(model, motion_sigmas=np.tile(sigma, (len(motions), 1))), replace(truth, motions=motions)
 
 
-def test_a_motion_is_a_turn_about_the_bodys_middle_and_a_way_in_the_right_image_alone():
+def test_a_motion_is_a_rotation_about_the_bodys_middle_and_a_way_in_the_right_image_alone():
     model, truth, observations = problem("brown4", degree=2, shots=3)
     model, moved_on = moving(model, truth)
     uv, there = (predict(model, state, observations)[0] for state in (truth, moved_on))
@@ -314,7 +323,7 @@ def test_covariance_is_that_of_the_dense_jacobian():
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_where_the_images_tell_nothing_the_prior_is_the_covariance(robust):
+def test_where_the_images_show_nothing_the_prior_is_the_covariance(robust):
     model, truth, observations = problem("brown4", degree=2, free_cameras=False)
     solution = minimise(model, truth, observations, 1e7, robust=robust)
     k = len(model.modes)
@@ -387,13 +396,13 @@ def test_a_curved_valley_is_followed_to_its_end():
         assert solution.cost == pytest.approx(near.cost, rel=1e-5)
 
 
-def test_a_step_to_a_focal_length_below_zero_is_refused(monkeypatch):
+def test_a_step_to_a_focal_length_below_zero_is_rejected(monkeypatch):
     model, truth, observations = problem("none", shots=3)
-    real, refused = bundle._trial, []
+    real, rejected = bundle._trial, []
 
     def trial(state, shared, poses):
         result = real(state, shared, poses)
-        refused.append(result is None)
+        rejected.append(result is None)
         assert result is None or all((camera.intrinsics[:2] > 0).all() for camera in result.cameras)
         return result
 
@@ -403,12 +412,12 @@ def test_a_step_to_a_focal_length_below_zero_is_refused(monkeypatch):
     T = truth.Ts_left_body.copy()
     T[:, :3, 3] *= 4
     solution = minimise(model, replace(truth, cameras=wrong, Ts_left_body=T), observations, SIGMA_PX, robust=False)
-    assert any(refused)
+    assert any(rejected)
     near = minimise(model, truth, observations, SIGMA_PX, robust=False)
     assert solution.cost == pytest.approx(near.cost, rel=1e-6)
 
 
-def test_a_start_behind_a_camera_is_refused():
+def test_a_start_behind_a_camera_is_rejected():
     model, truth, observations = problem("brown4")
     T = truth.Ts_left_body.copy()
     T[2, 2, 3] = -0.6
@@ -416,7 +425,7 @@ def test_a_start_behind_a_camera_is_refused():
         minimise(model, replace(truth, Ts_left_body=T), observations, SIGMA_PX)
 
 
-def test_a_shot_without_detections_is_told():
+def test_a_shot_without_detections_is_reported():
     model, truth, observations = problem("brown4")
     with pytest.raises(CalibrationError, match="shot 2 of 6 in the adjustment has no detections"):
         minimise(model, truth, observations.select(observations.shot != 2), SIGMA_PX)

@@ -71,8 +71,8 @@ def test_fisheye_sees_past_ninety_degrees():
 def test_fisheye_straight_behind_is_right_or_nothing(off, z):
     """The image of the backward direction is a circle: near it the side counts, on it there is no image."""
     camera = CAMERAS["fisheye"]
-    turns = np.radians([0.0, 90, 200, 315])
-    sides = np.column_stack([np.cos(turns), np.sin(turns)])
+    rotations = np.radians([0.0, 90, 200, 315])
+    sides = np.column_stack([np.cos(rotations), np.sin(rotations)])
     uv, J_p, J_k = camera.project_jacobians(np.column_stack([off * abs(z) * sides, np.full(4, z)]))
     if off <= 1e-10:
         assert np.isnan(uv).all()
@@ -82,7 +82,7 @@ def test_fisheye_straight_behind_is_right_or_nothing(off, z):
     theta, k = np.pi - np.arctan(off), camera.distortion
     radius = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
     expected = camera.intrinsics[2:] + camera.intrinsics[:2] * radius * sides
-    # The coordinates of about 1e4 px turn with the direction off * (cos, sin), which holds 16 digits.
+    # The coordinates of about 1e4 px rotate with the direction off * (cos, sin), which holds 16 digits.
     np.testing.assert_allclose(uv, expected, rtol=0, atol=1e-10)
     assert np.isfinite(J_p).all()
     assert np.isfinite(J_k).all()
@@ -165,6 +165,6 @@ def test_refusals(model, intrinsics, distortion, message):
 
 
 @pytest.mark.parametrize("size", [(0, 480), (640, 0), (-640, 480), (float("nan"), 480)])
-def test_an_impossible_image_size_is_refused(size):
+def test_an_impossible_image_size_is_rejected(size):
     with pytest.raises(InputError, match=f"the image size must be positive, got {size[0]} x {size[1]} px"):
         Camera(size, "none", np.ones(4), np.zeros(0))

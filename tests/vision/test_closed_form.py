@@ -16,7 +16,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.geometry.rotation import euler_zyx, exp_so3
-from armsight.vision import closed_form as chapter
+from armsight.vision import closed_form
 from armsight.vision.closed_form import (
     T_world_camera,
     VergingRig,
@@ -43,10 +43,10 @@ def see(rig, P):
     out = []
     for side in (1, -1):
         beta, F = (rig.beta1, rig.F1) if side == 1 else (rig.beta2, rig.F2)
-        place = [-rig.X01, -rig.Y01, rig.Z01] if side == 1 else [rig.X02, -rig.Y02, rig.Z02]
+        position = [-rig.X01, -rig.Y01, rig.Z01] if side == 1 else [rig.X02, -rig.Y02, rig.Z02]
         a = side * beta
         x_axis, z_axis = np.array([np.cos(a), 0, -np.sin(a)]), np.array([np.sin(a), 0, np.cos(a)])
-        d = P - np.array(place)
+        d = P - np.array(position)
         x, y, z = d @ x_axis, d[1], d @ z_axis
         assert z - F > 0.05, "the strategies keep every point in front of both cameras"
         out += [-x * F / (z - F), -y * F / (z - F)]
@@ -154,13 +154,13 @@ def test_both_cameras_look_inward_for_positive_angles():
     assert T_world_camera(rig, "left")[0, 2] > 0 > T_world_camera(rig, "right")[0, 2]
     general = stereo_rig(rig, pitch=PITCH, image_size_px=SIZE)
     assert general.convergence_deg == pytest.approx(np.degrees(0.6))
-    # The projection centres lie a focal length in front of the image planes, turned inward with them.
+    # The projection centres lie a focal length in front of the image planes, rotated inward with them.
     assert general.baseline_m == pytest.approx(0.2 - 2 * 4e-3 * np.sin(0.3), abs=1e-15)
 
 
 @pytest.mark.parametrize("fields", [{"F1": 0.0}, {"F2": -1e-3}, {"beta1": 1.6}, {"beta2": np.nan}])
-def test_impossible_rigs_are_refused(fields):
-    with pytest.raises(InputError, match=r"focal lengths|turns by less"):
+def test_impossible_rigs_are_rejected(fields):
+    with pytest.raises(InputError, match=r"focal lengths|rotated by less"):
         VergingRig(**{"F1": 4e-3, "F2": 4e-3, "beta1": 0.1, "beta2": 0.1, "X01": 0.1, "X02": 0.1, **fields})
 
 
@@ -263,7 +263,7 @@ def test_angles_in_every_quadrant(degrees):
 
 
 @pytest.mark.parametrize("pitch", [90, -90])
-def test_singular_pitch_is_told(pitch):
+def test_singular_pitch_is_reported(pitch):
     found = orientation(*(PLATE @ rotation_from_angles(*np.radians([40, pitch, 15])).T))
     assert found.singular_pitch
     np.testing.assert_allclose(np.degrees(found.euler_zyx), [40 - np.sign(pitch) * 15, pitch, 0], atol=1e-6)
@@ -343,5 +343,5 @@ def test_the_page_lists_every_number_and_names_what_stands():
         assert name in globals() or f"def {name}(" in of_the_arm, (
             f"docs/concepts/method.md names {name}, which is no test"
         )
-    for name in re.findall(r"`chapter\.([\w.]+)`", page):
-        assert operator.attrgetter(name)(chapter)
+    for name in re.findall(r"`(?:chapter|closed_form)\.([\w.]+)`", page):
+        assert operator.attrgetter(name)(closed_form)

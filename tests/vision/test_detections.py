@@ -38,7 +38,7 @@ def test_columns_may_stand_anywhere_and_a_marker_twice(read):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "texts"),
     [
         ("", "empty; expected a header shot,camera,marker,u_px,v_px"),
         (HEADER, "no detections below the header"),
@@ -52,11 +52,11 @@ def test_columns_may_stand_anywhere_and_a_marker_twice(read):
         (HEADER + "1,left,9,-inf,2\n", "line 2: u_px is -inf"),
     ],
 )
-def test_what_a_table_may_not_hold(read, tmp_path, text, words):
+def test_what_a_table_may_not_hold(read, tmp_path, text, texts):
     with pytest.raises(InputError) as error:
         read(text)
     assert str(error.value).startswith(f"{tmp_path / 'd.csv'}: ")
-    assert words in str(error.value)
+    assert texts in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -118,7 +118,7 @@ def test_the_count_of_coefficients_is_the_model(cameras, count, model):
 
 
 @pytest.mark.parametrize(
-    ("left", "words"),
+    ("left", "texts"),
     [
         ({"distortion": []}, "camera left has no 'K'"),
         ({"K": K}, "camera left has no 'distortion'"),
@@ -135,16 +135,16 @@ def test_the_count_of_coefficients_is_the_model(cameras, count, model):
         ({"K": K, "distortion": [], "image_size_px": [0, 720]}, "camera left"),
     ],
 )
-def test_what_a_camera_may_not_be(cameras, tmp_path, left, words):
+def test_what_a_camera_may_not_be(cameras, tmp_path, left, texts):
     with pytest.raises(InputError) as error:
         cameras({**CAMERAS, "left": left})
     assert str(error.value).startswith(f"{tmp_path / 'c.json'}: ")
-    assert words in str(error.value)
+    assert texts in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("document", "words"),
+    ("document", "texts"),
     [
         ("{", "line 1: not JSON"),
         ("", "line 1: not JSON"),
@@ -154,6 +154,6 @@ def test_what_a_camera_may_not_be(cameras, tmp_path, left, words):
         ("[" * 100_000, "c.json"),
     ],
 )
-def test_what_a_camera_file_may_not_be(cameras, document, words):
-    with pytest.raises(InputError, match=words):
+def test_what_a_camera_file_may_not_be(cameras, document, texts):
+    with pytest.raises(InputError, match=texts):
         cameras(document)

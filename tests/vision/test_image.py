@@ -1,4 +1,4 @@
-"""Reading image files: what is whole is read as stored, what is damaged is refused with the file's name."""
+"""Reading image files: what is whole is read as stored, what is damaged is rejected with the file's name."""
 
 import struct
 import zlib
@@ -38,7 +38,7 @@ def test_sixteen_bits_and_colour_come_back_as_they_were(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
-def test_a_truncated_file_is_refused(tmp_path, suffix, share, capfd):
+def test_a_truncated_file_is_rejected(tmp_path, suffix, share, capfd):
     path = stored(tmp_path, f"a.{suffix}", COLOUR)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
@@ -79,14 +79,14 @@ def test_a_thumbnail_end_is_not_the_end(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"shot,camera,marker\n", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"])
-def test_what_is_no_image_is_refused(tmp_path, data):
+def test_what_is_no_image_is_rejected(tmp_path, data):
     path = tmp_path / "a.png"
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"a\.png: "):
         read_image(path)
 
 
-def test_damaged_png_data_is_refused(tmp_path, capfd):
+def test_damaged_png_data_is_rejected(tmp_path, capfd):
     chunk = b"IDAT" + b"not deflated"
     path = tmp_path / "a.png"
     data = stored(tmp_path, "b.png", GREY).read_bytes()
@@ -121,6 +121,6 @@ def test_grey_of_every_kind_of_image():
 @pytest.mark.parametrize(
     "image", [GREY.astype(float), np.zeros((3, 4, 5), np.uint8), np.zeros((0, 4), np.uint8), GREY[0]]
 )
-def test_grey_of_anything_else_is_refused(image):
+def test_grey_of_anything_else_is_rejected(image):
     with pytest.raises(InputError, match="image"):
         grey(image)

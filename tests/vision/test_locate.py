@@ -101,14 +101,14 @@ def test_it_is_the_minimum_and_the_covariance_of_a_slow_solver(model):
 
 
 def draws(points, n, seed, share):
-    """Measure shots that rigs drawn from the covariance see with noise, with the one rig we believe in."""
-    believed, rng = rig_of(known=False), np.random.default_rng(seed)
-    believed = replace(believed, cov=share**2 * believed.cov)
-    root = np.linalg.cholesky(believed.cov)
+    """Measure shots that rigs sampled from the covariance see with noise, with the one rig we assume."""
+    assumed, rng = rig_of(known=False), np.random.default_rng(seed)
+    assumed = replace(assumed, cov=share**2 * assumed.cov)
+    root = np.linalg.cholesky(assumed.cov)
     for _ in range(n):
-        true = believed.perturbed(root @ rng.normal(size=len(root)))
+        true = assumed.perturbed(root @ rng.normal(size=len(root)))
         T = somewhere(rng, tilt=(0.4, 0.4, 1.0))
-        yield located(believed, points, seen(true, points, T, sigma=SIGMA_PX, rng=rng)), T
+        yield located(assumed, points, seen(true, points, T, sigma=SIGMA_PX, rng=rng)), T
 
 
 def assert_covers(values):
@@ -180,7 +180,7 @@ def test_no_error_along_the_epipolar_line_leads_to_a_wrong_minimum(count, off):
 
 
 def small_body_rig():
-    """Two cameras of 8000 px focal length, 0.35 m apart, that look at one place 1.7 m away; 0.5 px of noise."""
+    """Two cameras of 8000 px focal length, 0.35 m apart, that look at one position 1.7 m away; 0.5 px of noise."""
     camera = Camera((2000, 1500), "none", np.array([8000.0, 8000.0, 999.5, 749.5]), np.zeros(0))
     half = np.arcsin(0.175 / 1.7)
     T = pose(exp_so3(np.array([0.0, -2 * half, 0.0])), 0.35 * np.array([np.cos(half), 0.0, np.sin(half)]))
@@ -257,12 +257,12 @@ def test_points_left_on_one_line_by_an_outlier_are_missed():
     for _ in range(20):
         shot = seen(rig, points, somewhere(rng, tilt=(0.2, 0.2, 0.2)), sigma=SIGMA_PX, rng=rng)
         uv = shot.uv.copy()
-        uv[5, :, 1] += 250.0  # off in both images, and farther from the line than any turn about it leads
+        uv[5, :, 1] += 250.0  # off in both images, and farther from the line than any rotation about it leads
         found = located(rig, points, replace(shot, uv=uv))
         assert found == Missed("the points that agree with one pose of the body lie on one line")
 
 
-def test_what_is_not_the_body_is_missed_and_a_bad_print_is_told():
+def test_what_is_not_the_body_is_missed_and_a_bad_print_is_reported():
     rig, rng, points = rig_of(), np.random.default_rng(11), board(6, 4)
     for _ in range(10):
         T = somewhere(rng)
@@ -273,9 +273,9 @@ def test_what_is_not_the_body_is_missed_and_a_bad_print_is_told():
         doubled = located(rig, 2 * points, shot)
         assert isinstance(doubled, Missed)
         assert "0.50 times as far apart as its points" in doubled.reason
-        stretched = located(rig, 1.01 * points, shot)
+        scaled = located(rig, 1.01 * points, shot)
         # A hundredth of an apparent size of about 60 px is three times the noise, and the covariance says so.
-        assert stretched.misfit > 1.5
-        sharp = located(replace(rig, sigma_px=stretched.misfit * SIGMA_PX), 1.01 * points, shot)
+        assert scaled.misfit > 1.5
+        sharp = located(replace(rig, sigma_px=scaled.misfit * SIGMA_PX), 1.01 * points, shot)
         assert sharp.misfit == 1
-        np.testing.assert_allclose(stretched.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())
+        np.testing.assert_allclose(scaled.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())

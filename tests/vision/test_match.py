@@ -14,7 +14,7 @@ from views import board, body_of, both_pixels, pixels, seen, somewhere
 
 
 def some_detections(rng, n=30):
-    """Detections of a random part of n points, each with its own place and covariance."""
+    """Detections of a random part of n points, each with its own position and covariance."""
     ids = np.sort(rng.choice(n, rng.integers(0, n + 1), replace=False))
     root = rng.normal(size=(len(ids), 2, 2))
     return Detections(ids, rng.uniform(0, 700, (len(ids), 2)), root @ root.transpose(0, 2, 1))
@@ -34,18 +34,18 @@ def test_joining_is_by_identity(seed):
     rng = np.random.default_rng(seed)
     sides = [some_detections(rng), some_detections(rng)]
     joined = join(*sides)
-    places = [dict(zip(d.ids.tolist(), zip(d.uv, d.cov_uv, strict=True), strict=True)) for d in sides]
-    assert joined.ids.tolist() == sorted({*places[0], *places[1]})
+    positions = [dict(zip(d.ids.tolist(), zip(d.uv, d.cov_uv, strict=True), strict=True)) for d in sides]
+    assert joined.ids.tolist() == sorted({*positions[0], *positions[1]})
     for i, uv, cov, found in zip(joined.ids.tolist(), joined.uv, joined.cov_uv, joined.seen, strict=True):
         for c in (0, 1):
-            assert found[c] == (i in places[c])
+            assert found[c] == (i in positions[c])
             if found[c]:
-                np.testing.assert_array_equal(uv[c], places[c][i][0])
-                np.testing.assert_array_equal(cov[c], places[c][i][1])
+                np.testing.assert_array_equal(uv[c], positions[c][i][0])
+                np.testing.assert_array_equal(cov[c], positions[c][i][1])
             else:
                 assert np.isnan(uv[c]).all()
                 assert not cov[c].any()
-    assert joined.paired.tolist() == [i in places[0] and i in places[1] for i in joined.ids.tolist()]
+    assert joined.paired.tolist() == [i in positions[0] and i in positions[1] for i in joined.ids.tolist()]
     assert joined.dropped == ()
 
 
@@ -116,8 +116,8 @@ def test_a_board_named_in_reverse_is_put_right(seed, hidden):
     lost = [(i, c) for c in (0, 1) for i in rng.choice(63, hidden, replace=False)]
     shot = seen(rig, points, somewhere(rng), sigma=rig.sigma_px, rng=rng, hidden=lost)
     left, right = split(shot)
-    named = match(rig, body_of(points), left, right, flips=(reverse,))
-    mended = match(rig, body_of(points), left, renamed(right, reverse), flips=(reverse,))
+    named = match(rig, body_of(points), left, right, symmetries=(reverse,))
+    mended = match(rig, body_of(points), left, renamed(right, reverse), symmetries=(reverse,))
     for found in (named, mended):
         assert found.dropped == ()
         np.testing.assert_array_equal(found.ids, shot.ids[shot.seen.any(axis=1)])
@@ -136,7 +136,7 @@ def test_a_middle_that_keeps_its_name_does_not_outvote_the_board(sigma):
     )
     left, right = split(shot)
     for given in (right, renamed(right, reverse)):
-        found = match(rig, body_of(points), left, given, flips=(reverse,))
+        found = match(rig, body_of(points), left, given, symmetries=(reverse,))
         assert found.ids.tolist() == list(range(32))
         assert found.paired.all()
 
@@ -156,12 +156,12 @@ def test_pixels_without_a_ray_are_dropped_without_a_word_from_numpy():
     rig = StereoRig(camera, camera, T, np.zeros((22, 22)), 0.1)
     far = Detections(np.arange(3), np.array([[1000.0, 360], [1010, 360], [1020, 360]]), np.zeros((3, 2, 2)))
     near = Detections(np.arange(3), np.array([[600.0, 360], [610, 360], [620, 360]]), np.zeros((3, 2, 2)))
-    found = match(rig, body_of(board(3, 1)), far, near, flips=(np.arange(2, -1, -1),))
+    found = match(rig, body_of(board(3, 1)), far, near, symmetries=(np.arange(2, -1, -1),))
     assert len(found.ids) == 0
     assert [d.point for d in found.dropped] == ["P0", "P1", "P2"]
 
 
-def test_flips_are_judged_by_what_has_a_ray():
+def test_flips_are_evaluated_by_what_has_a_ray():
     camera = Camera(SIZE, "brown4", np.array([500.0, 500, 640, 360]), np.array([-0.3, 0.0, 0.0, 0.0]))
     T = np.eye(4)
     T[0, 3] = 0.1
@@ -172,16 +172,16 @@ def test_flips_are_judged_by_what_has_a_ray():
     right = Detections(np.arange(3), np.concatenate([uv[:2, 1], [[1020, 360]]]), np.zeros((3, 2, 2)))
     nothing = Detections(np.arange(3), np.tile([1015.0, 360], (3, 1)), np.zeros((3, 2, 2)))
     reverse = np.arange(2, -1, -1)
-    assert match(rig, body_of(p), left, right, flips=(reverse,)).ids.tolist() == [0, 1]
-    assert match(rig, body_of(p), left, renamed(right, reverse), flips=(reverse,)).ids.tolist() == [0, 1]
-    assert len(match(rig, body_of(p), left, nothing, flips=(reverse,)).ids) == 0
+    assert match(rig, body_of(p), left, right, symmetries=(reverse,)).ids.tolist() == [0, 1]
+    assert match(rig, body_of(p), left, renamed(right, reverse), symmetries=(reverse,)).ids.tolist() == [0, 1]
+    assert len(match(rig, body_of(p), left, nothing, symmetries=(reverse,)).ids) == 0
 
 
 def test_nothing_in_nothing_out():
     rig, none = ordinary_rig(), Detections.none("no board")
     some = split(seen(rig, board(), somewhere(np.random.default_rng(5))))
     body, flip = body_of(board()), np.arange(29, -1, -1)
-    assert len(match(rig, body, none, none, flips=(flip,)).ids) == 0
-    alone = match(rig, body, some[0], none, flips=(flip,))
+    assert len(match(rig, body, none, none, symmetries=(flip,)).ids) == 0
+    alone = match(rig, body, some[0], none, symmetries=(flip,))
     assert not alone.paired.any()
     np.testing.assert_array_equal(alone.uv[:, 0], some[0].uv)

@@ -7,6 +7,7 @@ from scipy.stats import chi2
 from armsight.data import Detections, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.detections import SeenShot
+from armsight.vision.markers.marker import Target
 from armsight.vision.match import renamed
 from armsight.vision.measure import measure, measure_detections, measure_seen, size_problem
 from board_views import SIZE, bench, board_pairs, detections
@@ -14,11 +15,19 @@ from board_views import SIZE, bench, board_pairs, detections
 SIGMA = 0.1
 
 
-class Told:
-    """A target that says it detects what the test tells it to."""
+class Scripted(Target):
+    """A target that says it detects what the test asks for."""
 
-    def __init__(self, body, left, right, flips=()):
-        self.body, self.flips, self._rest = body, flips, [left, right]
+    def __init__(self, body, left, right, symmetries=()):
+        self._body, self._symmetries, self._rest = body, symmetries, [left, right]
+
+    @property
+    def body(self):
+        return self._body
+
+    @property
+    def symmetries(self):
+        return self._symmetries
 
     def detect(self, image):
         return self._rest.pop(0)
@@ -41,7 +50,7 @@ def test_the_pose_is_found_within_its_covariance():
     _, _, Ts = bench()
     nees = []
     for n, pair in enumerate(board_pairs(rig, board.body.points, Ts, sigma=SIGMA, seed=1)):
-        estimate = measure(rig, Told(board.body, pair.left, pair.right), grey_shot())
+        estimate = measure(rig, Scripted(board.body, pair.left, pair.right), grey_shot())
         assert isinstance(estimate, PoseEstimate)
         e = log_se3(inverse(estimate.T_left_body) @ Ts[n])
         nees.append(e @ np.linalg.solve(estimate.cov, e))
@@ -52,7 +61,7 @@ def test_the_pose_is_found_within_its_covariance():
 
 def test_a_shot_without_images_is_missed_with_its_reason():
     rig, board, _, pair = known()
-    target = Told(board.body, pair.left, pair.right)
+    target = Scripted(board.body, pair.left, pair.right)
     assert measure(rig, target, Shot("s", None, None, problem="unplugged")).reason == "unplugged"
     assert measure(rig, target, Shot("s", None, None)).reason == "no image"
     wrong = measure(rig, target, grey_shot(width=320))
@@ -63,15 +72,15 @@ def test_a_shot_without_images_is_missed_with_its_reason():
 def test_what_was_not_detected_is_named_by_side():
     rig, board, _, pair = known()
     nothing = Detections.none("no board")
-    assert measure(rig, Told(board.body, nothing, pair.right), grey_shot()).reason == "left: no board"
-    assert measure(rig, Told(board.body, nothing, nothing), grey_shot()).reason == "left: no board; right: no board"
+    assert measure(rig, Scripted(board.body, nothing, pair.right), grey_shot()).reason == "left: no board"
+    assert measure(rig, Scripted(board.body, nothing, nothing), grey_shot()).reason == "left: no board; right: no board"
 
 
-def test_exchanged_cameras_are_told():
+def test_exchanged_cameras_are_reported():
     rig, board, _, pair = known()
-    swapped = measure_detections(rig, board.body, pair.right, pair.left)
-    assert isinstance(swapped, Missed)
-    assert swapped.reason.startswith("left and right are exchanged")
+    exchanged = measure_detections(rig, board.body, pair.right, pair.left)
+    assert isinstance(exchanged, Missed)
+    assert exchanged.reason.startswith("left and right are exchanged")
 
 
 def test_detections_of_nothing_are_not_called_exchanged():
@@ -85,10 +94,12 @@ def test_detections_of_nothing_are_not_called_exchanged():
 
 def test_a_symmetric_board_read_from_the_other_end_is_measured_all_the_same():
     rig, board, T, pair = known("chessboard:9x7:25mm")
-    straight = measure_detections(rig, board.body, pair.left, pair.right, flips=board.flips)
-    turned = measure_detections(rig, board.body, pair.left, renamed(pair.right, board.flips[0]), flips=board.flips)
-    assert turned.T_left_body == pytest.approx(straight.T_left_body, abs=1e-12)
-    assert np.linalg.norm(turned.T_left_body[:3, 3] - T[:3, 3]) < 5 * np.sqrt(np.trace(turned.cov[:3, :3]))
+    straight = measure_detections(rig, board.body, pair.left, pair.right, symmetries=board.symmetries)
+    rotated = measure_detections(
+        rig, board.body, pair.left, renamed(pair.right, board.symmetries[0]), symmetries=board.symmetries
+    )
+    assert rotated.T_left_body == pytest.approx(straight.T_left_body, abs=1e-12)
+    assert np.linalg.norm(rotated.T_left_body[:3, 3] - T[:3, 3]) < 5 * np.sqrt(np.trace(rotated.cov[:3, :3]))
 
 
 def test_one_wrong_point_is_dropped_by_name_and_changes_little():
@@ -134,4 +145,4 @@ def test_markers_that_stand_twice_and_agree_with_nothing_are_a_miss():
     rng = np.random.default_rng(2)
     ids = np.array([7, 7, 40, 40])
     shot = SeenShot("1", (ids, ids), tuple(rng.uniform(0, 360, (4, 2)) for _ in "lr"))
-    assert "stand twice" in measure_seen(rig, board.body, shot).reason
+    assert "occur twice" in measure_seen(rig, board.body, shot).reason

@@ -12,13 +12,13 @@ from views import board, pixels
 pytestmark = pytest.mark.opencv
 
 RNG = np.random.default_rng(0)
-TURNED = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+ROTATED = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
 BODIES = {
     "corner": np.array([[0.0, 0, 0], [0.06, 0, 0], [0, 0.06, 0], [0, 0, 0.06]]),
     "cloud": RNG.uniform(-0.1, 0.1, (12, 3)),
     "board": board(),
     "square": board(2, 2, 0.1),
-    "tilted board": board() @ TURNED + [0.3, 0.1, -0.2],
+    "tilted board": board() @ ROTATED + [0.3, 0.1, -0.2],
     "bowed board": board() + np.column_stack([np.zeros((30, 2)), 0.02 * board()[:, 0] ** 2]),
 }
 MODELS = list(CAMERAS)
@@ -28,14 +28,14 @@ def views(n=10, seed=1):
     """Poses of a body before a camera, tilted between 20 and 60 degrees so that mirror solutions lie apart."""
     rng = np.random.default_rng(seed)
     for _ in range(n):
-        turn, axis = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+        rotation, axis = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
         tilt = np.radians(rng.uniform(20, 60)) * np.array([np.cos(axis), np.sin(axis), 0])
-        R = exp_so3(tilt) @ exp_so3(np.array([0, 0, turn]))
+        R = exp_so3(tilt) @ exp_so3(np.array([0, 0, rotation]))
         yield R, np.array([*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.6, 1.0)])
 
 
-def placed(points, R, middle):
-    """The pose that turns a body and puts its middle somewhere."""
+def posed(points, R, middle):
+    """The pose that rotates a body and sets its middle somewhere."""
     return pose(R, middle - R @ points.mean(axis=0))
 
 
@@ -50,7 +50,7 @@ def apart(T, other):
 def test_without_noise_the_best_pose_is_the_truth(name, model):
     camera, points = CAMERAS[model], BODIES[name]
     for R, middle in views():
-        T = placed(points, R, middle)
+        T = posed(points, R, middle)
         found = body_poses(points, camera, pixels(camera, points @ T[:3, :3].T + T[:3, 3]))
         # OpenCV's closed forms lose half the digits at their roots: 1e-8 of a focal length of 1e3 px.
         assert found[0][1] < 1e-4
@@ -65,7 +65,7 @@ def test_a_plane_has_two_poses(name):
     camera, points, rng = CAMERAS["brown5"], BODIES[name], np.random.default_rng(3)
     normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
     for R, middle in views():
-        T = placed(points, R, 3 * middle)  # far away, where the two look nearly alike
+        T = posed(points, R, 3 * middle)  # far away, where the two look nearly alike
         found = body_poses(
             points, camera, pixels(camera, points @ T[:3, :3].T + T[:3, 3]) + 0.1 * rng.normal(size=(len(points), 2))
         )
@@ -94,7 +94,7 @@ def test_what_does_not_determine_a_pose_has_none():
 def test_consensus_finds_the_truth_among_wrong_names(name):
     camera, points, rng = CAMERAS["brown5"], BODIES[name], np.random.default_rng(4)
     for R, middle in views(5):
-        T = placed(points, R, middle)
+        T = posed(points, R, middle)
         uv = pixels(camera, points @ T[:3, :3].T + T[:3, 3]) + 0.1 * rng.normal(size=(len(points), 2))
         ids = np.append(np.arange(len(points)), 1)  # one point stands twice, the second time elsewhere
         found = consensus_poses(points, camera, ids, np.append(uv, [[100.0, 100.0]], axis=0))

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.vision.bundle import CAUCHY_SCALE, Model, Observations, State, minimise
+from armsight.vision.bundle import CAUCHY_SCALE, BundleModel, BundleState, Observations, minimise
 from armsight.vision.posefit import PixelObservations, fit_pose
 from strategies import ordinary_rig
 from views import pixels, seen, somewhere
@@ -72,9 +72,9 @@ def test_bundle_adjustment_finds_the_same(model, robust):
         np.zeros(len(order), np.int64), observations.camera[order], observations.point[order], observations.uv[order],
         observations.cov_uv[order] - SIGMA_PX**2 * np.eye(2), 1,
     )  # fmt: skip
-    state = State(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
+    state = BundleState(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
     held = np.zeros(sum(camera.parameters.size for camera in rig.cameras) + 6, bool)
-    model_ = Model(points, np.zeros((0, len(points), 3)), 1.0, False)
+    model_ = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False)
     slow = minimise(model_, state, observations, SIGMA_PX, robust=robust, free=held)
     fast = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=robust)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-7)
@@ -114,7 +114,7 @@ def test_a_body_behind_the_camera_is_no_start():
     assert fit_pose(rig.cameras, rig.T_left_right, points, observations, behind, robust=True) is None
 
 
-def test_too_few_sightings_determine_no_pose_or_keep_to_the_data():
+def test_too_few_observations_determine_no_pose_or_keep_to_the_data():
     rig, points, T_true, observations, _ = shot("brown4", 6)
     two = observations.select(np.arange(len(observations.uv)) < 2)
     fit = fit_pose(rig.cameras, rig.T_left_right, points, two, T_true, robust=False)

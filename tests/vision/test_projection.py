@@ -12,14 +12,14 @@ BODIES = {"ball": BALL, "board": board(), "tilted board": board() @ np.linalg.qr
 
 
 def freedoms(points):
-    """(7, M, 3) three shifts, three turns and one growth, as velocities of the points."""
+    """(7, M, 3) three shifts, three rotations and one scaling, as velocities of the points."""
     x, y, z = points.T
     o, i = np.zeros_like(x), np.ones_like(x)
     return np.array(
         [
             *(np.column_stack(c) for c in ([i, o, o], [o, i, o], [o, o, i])),  # shifts
-            *(np.column_stack(c) for c in ([o, -z, y], [z, o, -x], [-y, x, o])),  # turns about x, y, z
-            points,  # growth
+            *(np.column_stack(c) for c in ([o, -z, y], [z, o, -x], [-y, x, o])),  # rotations about x, y, z
+            points,  # scaling
         ]
     )
 
@@ -68,7 +68,7 @@ def test_smooth_modes_are_the_polynomials_but_for_the_seven_freedoms(degree, cou
     assert np.linalg.matrix_rank(np.concatenate([span(fields), span(modes)]), tol=1e-8) == 3 * len(terms)
 
 
-def test_a_stretch_and_a_bow_are_among_the_smooth_modes():
+def test_a_scaling_and_a_bow_are_among_the_smooth_modes():
     points = board()
     x, y, o = points[:, 0], points[:, 1], np.zeros(len(points))
     for field in (np.column_stack([x, -y, o]), np.column_stack([y, x, o]), np.column_stack([o, o, x * x])):

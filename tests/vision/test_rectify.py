@@ -1,4 +1,4 @@
-"""Standard form against OpenCV's projections, for every camera model, and back."""
+"""Rectification against OpenCV's projections, for every camera model, and back."""
 
 import cv2
 import numpy as np
@@ -44,12 +44,12 @@ def test_images_show_at_each_pixel_what_the_map_says(model):
     left, _ = form.images(ramp, ramp)
     inside = form.seen("left")
     inside[:, [0, -1]], inside[[0, -1]] = False, False
-    place = form.map_left
-    within = inside & (place > 2).all(axis=2) & (place < np.array([width, height]) - 3).all(axis=2)
-    # OpenCV's remap rounds places to 1/32 px, half a step along each axis, and its cubic kernel (a = -0.75) moves a
+    position = form.map_left
+    within = inside & (position > 2).all(axis=2) & (position < np.array([width, height]) - 3).all(axis=2)
+    # OpenCV's remap rounds positions to 1/32 px, half a step along each axis, and its cubic kernel (a = -0.75) moves a
     # ramp by up to 0.035 px more.
     bound = (1 / 8 + 1 / 16) * (1 / 64 + 0.035)
-    assert np.abs(left - (place[..., 0] / 8 + place[..., 1] / 16))[within].max() <= bound
+    assert np.abs(left - (position[..., 0] / 8 + position[..., 1] / 16))[within].max() <= bound
     assert within.mean() > 0.5
 
 
@@ -64,14 +64,14 @@ def test_a_pair_in_standard_form_stays_as_it_is():
     assert form.seen("left")[1:-1, 1:-1].all()
 
 
-def test_rigs_without_a_standard_form_are_refused():
+def test_rigs_without_a_standard_form_are_rejected():
     camera = CAMERAS["none"]
     for t, word in (([-0.1, 0, 0], "exchange"), ([0.001, 0, 0.3], "behind the other")):
         with pytest.raises(InputError, match=word):
             StereoRig(camera, camera, pose(exp_so3(np.zeros(3)), np.array(t)), np.zeros((14, 14)), 0.1).rectify()
 
 
-def test_images_of_another_size_are_refused():
+def test_images_of_another_size_are_rejected():
     form = ordinary_rig().rectify()
     good = np.zeros((720, 1280), np.uint8)
     with pytest.raises(InputError, match="right image: 640x480"):
@@ -84,18 +84,18 @@ def test_a_verging_rig_agrees_with_opencv():
     T = inverse(rig.T_left_right)
     K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in (c.intrinsics for c in rig.cameras)]
     bent, size = [c.distortion for c in rig.cameras], rig.left.image_size_px
-    turns = cv2.stereoRectify(K[0], bent[0], K[1], bent[1], size, T[:3, :3].copy(), T[:3, 3:].copy())[:2]
-    # Both turn the cameras until the rows are the same planes through the baseline; about the baseline they may choose
-    # another turn. OpenCV's own rows agree to its undistortion's last step.
+    rotations = cv2.stereoRectify(K[0], bent[0], K[1], bent[1], size, T[:3, :3].copy(), T[:3, 3:].copy())[:2]
+    # Both rotate the cameras until the rows are the same planes through the baseline; about the baseline they may choose
+    # another rotation. OpenCV's own rows agree to its undistortion's last step.
     P = np.array([[form.focal_px, 0, form.principal_px[0]], [0, form.focal_px, form.principal_px[1]], [0, 0, 1.0]])
     for k, (side, ours) in enumerate((("left", form.T_left_rectleft), ("right", form.T_right_rectright))):
-        between = turns[k] @ ours[:3, :3]
+        between = rotations[k] @ ours[:3, :3]
         np.testing.assert_allclose(between[0], [1, 0, 0], atol=1e-9)
-        place = cv2.undistortPoints(
+        position = cv2.undistortPoints(
             uv[:, k][:, None], K[k], bent[k], R=ours[:3, :3].T, P=P,
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
         )[:, 0]  # fmt: skip
-        np.testing.assert_allclose(form.to_rect(uv[:, k], side), place, atol=1e-6)
+        np.testing.assert_allclose(form.to_rect(uv[:, k], side), position, atol=1e-6)
         maps = cv2.initUndistortRectifyMap(K[k], bent[k], ours[:3, :3].T, P, size, cv2.CV_32FC2)[0]
         here = form.map_left if side == "left" else form.map_right
         high = np.array(size) - 1

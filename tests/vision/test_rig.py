@@ -1,4 +1,4 @@
-"""The rig and its file: exact round trips, every damage told, and no file lost to a full disk."""
+"""The rig and its file: exact round trips, every damage reported, and no file lost to a full disk."""
 
 import contextlib
 import functools
@@ -55,7 +55,7 @@ def test_round_trip_is_exact(tmp_path, model):
     assert path.read_bytes() == before
 
 
-def test_facts_of_the_geometry():
+def test_properties_of_the_geometry():
     rig = ordinary_rig()
     x, y, z = rig.T_left_right[:3, 3]
     assert rig.baseline_m == pytest.approx((x * x + y * y + z * z) ** 0.5, rel=1e-15)
@@ -159,7 +159,7 @@ def test_a_missing_entry_is_named(tmp_path, key, said):
         ({"sigma_px": None}, "damaged"),
     ],
 )
-def test_a_damaged_entry_is_told(tmp_path, changes, said):
+def test_a_damaged_entry_is_reported(tmp_path, changes, said):
     path = saved(tmp_path, **changes)
     with pytest.raises(InputError, match=said) as caught:
         StereoRig.load(path)
@@ -171,11 +171,11 @@ def test_the_symmetry_asked_of_a_covariance_is_relative():
     rig = ordinary_rig()
     sigma = np.logspace(-12, 3, rig.parameter_count)  # from radians of a good rig to pixels of a bad one
     C = np.outer(sigma, sigma) * (0.5 + 0.5 * np.eye(len(sigma)))
-    for off, refused in ((1e-6, False), (1e-4, True)):
+    for off, rejected in ((1e-6, False), (1e-4, True)):
         for i, j in ((0, 1), (0, len(C) - 1), (len(C) - 2, len(C) - 1)):
             cov = C.copy()
             cov[i, j] *= 1 + off
-            with pytest.raises(InputError, match="not symmetric") if refused else contextlib.nullcontext():
+            with pytest.raises(InputError, match="not symmetric") if rejected else contextlib.nullcontext():
                 replace(rig, cov=cov)
 
 
@@ -184,7 +184,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
     max_leaves=8,
 )
-PLACES = st.sampled_from(
+POSITIONS = st.sampled_from(
     [
         *(["version"], ["left"], ["T_left_right_m"], ["T_left_right_m", 3], ["T_left_right_m", 1, 2], ["sigma_px"]),
         *(["covariance"], ["covariance", 2], ["covariance", 2, 2], ["covariance", 2, 3], ["provenance"], ["format"]),
@@ -195,11 +195,11 @@ PLACES = st.sampled_from(
 
 
 @settings(max_examples=300)
-@given(PLACES, JSON)
-def test_whatever_stands_in_a_rig_file_is_a_rig_or_one_clear_line(tmp_path_factory, place, value):
+@given(POSITIONS, JSON)
+def test_whatever_stands_in_a_rig_file_is_a_rig_or_one_clear_line(tmp_path_factory, position, value):
     path = tmp_path_factory.getbasetemp() / "any_rig.json"
     document = entry = json.loads(rig_text("brown4"))
-    *way, last = place
+    *way, last = position
     for key in way:
         entry = entry[key]
     entry[last] = value
@@ -224,14 +224,14 @@ def rig_text(model):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"format": ' + "9" * 5000 + "}"])
-def test_monstrous_files_are_told(tmp_path, text):
+def test_monstrous_files_are_reported(tmp_path, text):
     path = tmp_path / "rig.json"
     path.write_text(text)
     with pytest.raises(InputError, match=r"rig\.json: not a rig file"):
         StereoRig.load(path)
 
 
-def test_every_truncation_is_told(tmp_path):
+def test_every_truncation_is_reported(tmp_path):
     path = tmp_path / "rig.json"
     ordinary_rig("none").save(path)
     whole = path.read_text()
@@ -242,14 +242,14 @@ def test_every_truncation_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"3", b"\xff\xfe\x00rig", b"left: 1\n"])
-def test_other_files_are_told(tmp_path, content):
+def test_other_files_are_reported(tmp_path, content):
     path = tmp_path / "rig.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"rig\.json"):
         StereoRig.load(path)
 
 
-def test_missing_files_and_folders_are_told(tmp_path):
+def test_missing_files_and_folders_are_reported(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         StereoRig.load(tmp_path / "none.json")
     with pytest.raises(InputError, match="cannot be read"):

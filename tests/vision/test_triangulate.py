@@ -163,7 +163,7 @@ def test_rays_that_part_or_are_parallel_meet_nowhere():
         rig = ordinary_rig(model)
         directions = points_in_view(50) * [0.5, 1, 1] - [0.1, 0, 0]
         for angle in (0.0, 1e-5, 1e-3, 0.1, 0.3):
-            # Turned by up to 0.3 rad more they are still well within the right image, where no lens here folds.
+            # Rotated by up to 0.3 rad more they are still well within the right image, where no lens here folds.
             away = directions + angle * np.linalg.norm(directions, axis=1, keepdims=True) * [1.0, 0, 0]
             origin = rig.T_left_right[:3, 3]
             uv = np.stack([both_pixels(rig, directions)[:, 0], both_pixels(rig, away + origin)[:, 1]], axis=1)

@@ -22,7 +22,7 @@ def test_the_true_rig_is_found_within_its_covariance(flat):
     scale = 1 / np.sqrt(np.diag(c.rig.cov))
     correlation, e = c.rig.cov * np.outer(scale, scale), error * scale
     assert e @ np.linalg.solve(correlation, e) < chi2.ppf(0.9999, len(e))
-    # 20 pairs of 54 corners of both cameras tell the noise to sqrt(1 / (2 * 4320)), 1.1%; four times that, and what
+    # 20 pairs of 54 corners of both cameras determine the noise to sqrt(1 / (2 * 4320)), 1.1%; four times that, and what
     # the held-out pairs say of it (a fifth as many, so twice as vague), is allowed.
     assert c.rig.sigma_px == pytest.approx(0.1, rel=0.12)
     assert c.reprojection_rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.06)
@@ -40,7 +40,7 @@ def test_a_perfect_board_stays_perfect():
 
 
 def bowed(points):
-    """Return the board stretched by 0.2% along its rows and bowed by half a millimetre."""
+    """Return the board scaled by 0.2% along its rows and bowed by half a millimetre."""
     xy = points[:, :2] - points[:, :2].mean(axis=0)
     r2 = (xy**2).sum(axis=1) / (xy**2).sum(axis=1).max()
     return points + np.column_stack([0.002 * xy[:, 0], np.zeros(len(points)), 5e-4 * (1 - r2)])
@@ -48,19 +48,19 @@ def bowed(points):
 
 def test_a_bowed_board_is_found_and_taken_out_of_the_cameras():
     true, board, Ts = bench()
-    drawn = board.body.points
-    printed = bowed(drawn)
+    nominal = board.body.points
+    printed = bowed(nominal)
     pairs = board_pairs(true, printed, Ts, sigma=0.01)
     flat, shaped = (
         calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=flat, folds=2) for flat in (True, False)
     )
     assert shaped.heldout.epipolar_rms_px < 0.8 * flat.heldout.epipolar_rms_px
     assert np.linalg.norm(rig_error(shaped.rig, true)[:4]) < 0.3 * np.linalg.norm(rig_error(flat.rig, true)[:4])
-    # Size cannot be told from the distance of the cameras: shapes are compared at the same size.
+    # Size cannot be distinguished from the distance of the cameras: shapes are compared at the same size.
     size = fit_scale(printed, shaped.body.points)
     found = shaped.body.points / size
     gap = np.linalg.norm(transform(fit_rigid(found, printed), found) - printed, axis=1)
-    whole = np.linalg.norm(transform(fit_rigid(drawn, printed), drawn) - printed, axis=1)
+    whole = np.linalg.norm(transform(fit_rigid(nominal, printed), nominal) - printed, axis=1)
     assert np.sqrt((gap**2).mean()) < 0.15 * np.sqrt((whole**2).mean())
     assert shaped.deviation_m == pytest.approx(np.sqrt((whole**2).mean()), rel=0.3)
 
@@ -95,7 +95,7 @@ def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
     assert "wrong corners" in c.rejected[0].reason
     assert [note.split(":")[0] for note in c.notes] == ["p02", "p05", "p11"]
     assert all("1 of 108 corners dropped" in note for note in c.notes)
-    # The pairs' places in the folds shift by one, so held-out figures differ a little whatever is done.
+    # The pairs' positions in the folds shift by one, so held-out metrics differ a little whatever is done.
     assert c.heldout.epipolar_rms_px == pytest.approx(best.heldout.epipolar_rms_px, rel=0.03)
     assert c.heldout.rigid_rms_m == pytest.approx(best.heldout.rigid_rms_m, rel=0.03)
     assert c.rig.left.intrinsics == pytest.approx(best.rig.left.intrinsics, abs=0.1)
@@ -103,10 +103,10 @@ def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
 
 def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
     true, board, Ts = bench(spec="chessboard:9x7:25mm")
-    assert board.flips, "a board of odd counts can be read from both ends"
+    assert board.symmetries, "a board of odd counts can be read from both ends"
     clean = board_pairs(true, board.body.points, Ts)
     dirty = [
-        replace(pair, right=renamed(pair.right, board.flips[0])) if n in (3, 9) else pair
+        replace(pair, right=renamed(pair.right, board.symmetries[0])) if n in (3, 9) else pair
         for n, pair in enumerate(clean)
     ]
     c, best = (
@@ -143,7 +143,7 @@ def test_too_few_pairs_say_how_many_are_needed_and_why_there_are_not():
         calibrate_boards(board, pairs, SIZES)
 
 
-def test_corners_in_random_places_are_no_calibration():
+def test_corners_in_random_positions_are_no_calibration():
     _, board, Ts = bench()
     rng = np.random.default_rng(0)
     ids = np.arange(54)

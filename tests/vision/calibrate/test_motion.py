@@ -1,4 +1,4 @@
-"""Boards that move between the two exposures: true motions, drawn by a seed, are the oracle."""
+"""Boards that move between the two exposures: true motions, sampled by a seed, are the oracle."""
 
 from dataclasses import replace
 
@@ -8,23 +8,23 @@ from scipy.stats import chi2
 
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import Model, Observations, State, minimise
+from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate import choose
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
-from armsight.vision.calibrate.motion import Motion
+from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.match import join, renamed
 from armsight.vision.measure import measure_detections
 from armsight.vision.triangulate import optimal_points
 from board_views import SIZES, bench, board_pairs, rig_error
 from views import both_pixels
 
-WAY_M, TURN_RAD, SIGMA_PX = 3e-4, 2e-3, 0.05
+WAY_M, ROTATION_RAD, SIGMA_PX = 3e-4, 2e-3, 0.05
 
 
 def motions_of(count, seed=11, far=()):
     """(count, 6) motions, those in ``far`` five times as long."""
-    motions = np.random.default_rng(seed).normal(size=(count, 6)) * np.repeat([WAY_M, TURN_RAD], 3)
+    motions = np.random.default_rng(seed).normal(size=(count, 6)) * np.repeat([WAY_M, ROTATION_RAD], 3)
     motions[list(far)] *= 5
     return motions
 
@@ -81,11 +81,11 @@ def test_the_rig_of_moving_boards_is_within_its_covariance_and_better_than_witho
     monkeypatch.setattr(choose, "MOTION_WORTH", 1.0)
     true, board, Ts = bench(count=24)
     pairs = unsynchronised(true, board, Ts, motions_of(len(Ts), far=(4, 13)))
-    believed = calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=True)
-    assert believed.motion is None
+    assumed = calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=True)
+    assert assumed.motion is None
     for rows in (slice(0, 4), slice(-6, None)):
         assert np.linalg.norm(error[rows] / sigma[rows]) < np.linalg.norm(
-            rig_error(believed.rig, true)[rows] / sigma[rows]
+            rig_error(assumed.rig, true)[rows] / sigma[rows]
         )
 
 
@@ -121,7 +121,7 @@ def test_a_body_at_rest_is_measured_within_the_sigma_of_a_rig_of_moving_boards(m
 def test_a_motion_seen_from_a_camera_moves_points_as_it_does():
     true, board, Ts = bench()
     points, T = board.body.points, Ts[3]
-    middle, motion = points.mean(axis=0), Motion(1.0, 1.0, np.ones(1), 2e-6, 3e-5)
+    middle, motion = points.mean(axis=0), ExposureMotion(1.0, 1.0, np.ones(1), 2e-6, 3e-5)
     T_right_board = np.linalg.inv(true.T_left_right) @ T
     seen = both_pixels(true, transform(T, points))
     p, _, by_rig = optimal_points(true, seen, np.tile(np.eye(2), (len(points), 2, 1, 1)))
@@ -154,18 +154,18 @@ def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
     true, board, Ts = bench(count=3)
     points = board.body.points
     rows = Observations.from_shots([join(p.left, p.right) for p in board_pairs(true, points, Ts)])
-    model = Model(points, np.zeros((0, len(points), 3)), 1.0, True)
-    solution = minimise(model, State(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0)), rows, 0.1)
+    model = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
+    solution = minimise(model, BundleState(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0)), rows, 0.1)
     # Student's t of four degrees of freedom, seen without noise: EM finds its scale.
     count = 4000
     inverse_variance = rng.gamma(2.0, 0.5, size=(count, 1))
-    seen = rng.normal(size=(count, 6)) * np.repeat([WAY_M, TURN_RAD], 3) / np.sqrt(inverse_variance)
+    seen = rng.normal(size=(count, 6)) * np.repeat([WAY_M, ROTATION_RAD], 3) / np.sqrt(inverse_variance)
     solution = replace(solution, state=replace(solution.state, motions=seen), cov_motions=np.zeros((count, 6, 6)))
-    motion = Motion.guessed(points, count)
+    motion = ExposureMotion.guessed(points, count)
     for _ in range(60):
         motion, freed = motion.updated(solution)
     assert freed == 6 * count
     # A scale of 12000 draws of a heavy tail: about 1 / sqrt(2 * 12000) each, four of these and a half for the tail.
     assert motion.scale_m == pytest.approx(WAY_M, rel=0.04)
-    assert motion.scale_rad == pytest.approx(TURN_RAD, rel=0.04)
+    assert motion.scale_rad == pytest.approx(ROTATION_RAD, rel=0.04)
     assert motion.rms_m == pytest.approx(np.sqrt((seen[:, :3] ** 2).mean()), rel=1e-12)

@@ -7,10 +7,10 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import Model, Observations, State, minimise
+from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import cross_validate, folds_of, pair_errors, residual_epipolar_rms, summary
-from armsight.vision.calibrate.screen import mend_flips, noise_px, robust_sigma, screen
+from armsight.vision.calibrate.screen import correct_symmetries, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, weaknesses
 from armsight.vision.match import join, renamed
@@ -22,11 +22,11 @@ def observed(pairs):
 
 
 def flat(points):
-    return Model(points, np.zeros((0, len(points), 3)), 1.0, True)
+    return BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
 
 
 def truth(rig, Ts):
-    return State(rig.cameras, rig.T_left_right, np.array(Ts), np.zeros(0))
+    return BundleState(rig.cameras, rig.T_left_right, np.array(Ts), np.zeros(0))
 
 
 # Starting from nothing.
@@ -102,10 +102,10 @@ def test_only_what_is_wrong_is_thrown_out():
 def test_a_reversed_board_is_found_by_shot():
     true, board, Ts = bench(spec="chessboard:9x7:25mm")
     pairs = board_pairs(true, board.body.points, Ts[:4])
-    pairs[2] = replace(pairs[2], right=renamed(pairs[2].right, board.flips[0]))
-    found = mend_flips(board.body.points, truth(true, Ts[:4]), observed(pairs), board.flips)
+    pairs[2] = replace(pairs[2], right=renamed(pairs[2].right, board.symmetries[0]))
+    found = correct_symmetries(board.body.points, truth(true, Ts[:4]), observed(pairs), board.symmetries)
     assert list(found) == [2]
-    assert (found[2] == board.flips[0]).all()
+    assert (found[2] == board.symmetries[0]).all()
 
 
 # Held-out errors.
@@ -151,7 +151,7 @@ def test_every_shot_is_held_out_once_and_never_fitted_then():
     assert errors.epipolar_px == pytest.approx(direct.epipolar_px, rel=1e-12)
 
 
-# What is weak, in words.
+# What is weak, as sentences.
 
 
 @pytest.fixture(scope="module")
@@ -162,8 +162,8 @@ def calibration():
     )
 
 
-def said(calibration, words):
-    return any(words in w for w in weaknesses(calibration))
+def said(calibration, texts):
+    return any(texts in w for w in weaknesses(calibration))
 
 
 def test_coverage_counts_every_detection(calibration):
@@ -171,7 +171,7 @@ def test_coverage_counts_every_detection(calibration):
         assert coverage(calibration, side, 8).sum() == (calibration.observations.camera == side).sum()
 
 
-def test_each_weakness_is_told_where_it_is_and_only_there(calibration):
+def test_each_weakness_is_reported_where_it_is_and_only_there(calibration):
     c = calibration
     assert not said(c, "pairs were")
     assert said(replace(c, pairs=c.pairs[:5]), "only 5 pairs were used")
@@ -191,7 +191,7 @@ def test_each_weakness_is_told_where_it_is_and_only_there(calibration):
     late[4] *= 6
     assert not said(c, "unsynchronised")
     assert said(replace(c, errors=replace(c.errors, epipolar_px=late)), "p04")
-    assert not said(c, "swapped")
+    assert not said(c, "exchanged")
     assert not said(c, "the square size")
     large = replace(c.errors, scale=c.errors.scale + 0.03)
     wrong = replace(c, errors=large, heldout=replace(c.heldout, scale_error=0.03))
@@ -199,11 +199,11 @@ def test_each_weakness_is_told_where_it_is_and_only_there(calibration):
     assert said(replace(c, rig=replace(c.rig, cov=900 * c.rig.cov)), "the focal length is known to")
 
 
-def test_swapped_cameras_are_suspected():
+def test_exchanged_cameras_are_suspected():
     true, board, Ts = bench()
     pairs = [replace(p, left=p.right, right=p.left) for p in board_pairs(true, board.body.points, Ts[:8])]
     c = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2, flat=True)
-    assert said(c, "are left and right swapped?")
+    assert said(c, "are left and right exchanged?")
     assert c.rig.baseline_m == pytest.approx(true.baseline_m, rel=0.02)
 
 

@@ -37,7 +37,7 @@ def layers(height=120, width=200, far=6, near=22, seed=0, noise=1.0):
 
 @lru_cache
 def rendered(seed, size=(360, 270), noise=2.0):
-    """Boxes anyhow turned before a wall: left, right, truth; disparities 8 to 56."""
+    """Boxes anyhow rotated before a wall: left, right, truth; disparities 8 to 56."""
     rng = np.random.default_rng(seed)
     focal, baseline = 400.0, 0.1
     camera = Camera(size, "none", np.array([focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2]), np.zeros(0))
@@ -53,8 +53,8 @@ def rendered(seed, size=(360, 270), noise=2.0):
             contrast=rng.uniform(6, 40),
             seed=int(rng.integers(10**6)),
         )
-        place = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
-        solids.append((body, pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), place)))
+        position = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
+        solids.append((body, pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), position)))
     left, depth, _ = see(camera, solids)
     aside = pose(np.eye(3), np.array([-baseline, 0.0, 0.0]))
     right, depth_right, _ = see(camera, [(s, aside @ T) for s, T in solids])

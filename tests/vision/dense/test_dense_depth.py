@@ -43,10 +43,12 @@ def test_sigma_of_depth_holds_both_shares():
     np.testing.assert_allclose(depth.depth_m[where], z[where], rtol=1e-5)
     matching = z**2 / (form.focal_px * rig.baseline_m) * 0.2
     np.testing.assert_allclose(depth.sigma_m[where] ** 2, (matching**2 + depth.calibration_m**2)[where], rtol=1e-5)
-    places = np.array([[640.0, 360.0], [300.0, 200.0], [1000.0, 600.0]])
-    exact = calibration_share(form, places, d[places[:, 1].astype(int), places[:, 0].astype(int)].astype(float))
-    found = (depth.calibration_m / depth.depth_m)[places[:, 1].astype(int), places[:, 0].astype(int)]
-    np.testing.assert_allclose(found, exact, rtol=0.05)  # linear between 7 x 5 x 4 places
+    positions = np.array([[640.0, 360.0], [300.0, 200.0], [1000.0, 600.0]])
+    exact = calibration_share(
+        form, positions, d[positions[:, 1].astype(int), positions[:, 0].astype(int)].astype(float)
+    )
+    found = (depth.calibration_m / depth.depth_m)[positions[:, 1].astype(int), positions[:, 0].astype(int)]
+    np.testing.assert_allclose(found, exact, rtol=0.05)  # linear between 7 x 5 x 4 positions
 
 
 def test_a_rig_of_unknown_uncertainty_adds_nothing():

@@ -1,4 +1,4 @@
-"""Figures of the benchmark, its files and folders, against counting by hand and against OpenCV's reader."""
+"""Metrics of the benchmark, its files and folders, against counting by hand and against OpenCV's reader."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from armsight.vision.dense.middlebury import find_scenes, load_scene, read_pfm, 
 pytestmark = pytest.mark.opencv
 
 
-def test_figures_are_those_counted_by_hand():
+def test_metrics_are_those_counted_by_hand():
     truth = TrueDisparity(np.array([[10.0, 10.0, 10.0, 10.0, np.nan]]), np.array([[True, True, True, False, True]]))
     d = np.array([[10.4, 11.5, np.nan, 15.0, 3.0]])
     whole, nonocc = evaluate_disparity(d, truth, truth.known), evaluate_disparity(d, truth, truth.seen)
@@ -25,7 +25,7 @@ def test_figures_are_those_counted_by_hand():
     assert nonocc.bad_percent == pytest.approx((200 / 3, 200 / 3, 100 / 3, 100 / 3))
 
 
-def test_nothing_to_judge_is_nan_and_nothing_given_is_all_bad():
+def test_nothing_to_evaluate_is_nan_and_nothing_given_is_all_bad():
     truth = TrueDisparity(np.array([[5.0]]), np.array([[True]]))
     assert evaluate_disparity(np.array([[np.inf]]), truth, truth.known).bad_percent == (100,) * 4
     assert np.isnan(evaluate_disparity(np.array([[1.0]]), truth, np.array([[False]])).bad_percent).all()
@@ -56,7 +56,7 @@ def test_pfm_goes_round_and_opencv_reads_it(tmp_path):
 @pytest.mark.parametrize(
     "data", [b"", b"PF\n1 1\n-1\n" + bytes(12), b"Pf\n2 2\n-1\n" + bytes(8), b"Pf\nx y\n-1\n" + bytes(8)]
 )
-def test_what_is_no_pfm_is_refused_by_name(tmp_path, data):
+def test_what_is_no_pfm_is_rejected_by_name(tmp_path, data):
     (tmp_path / "a.pfm").write_bytes(data)
     with pytest.raises(InputError, match=r"a\.pfm"):
         read_pfm(tmp_path / "a.pfm")
@@ -106,7 +106,7 @@ def test_a_mask_says_what_both_cameras_see(tmp_path):
     assert scene.weight == 0.5
 
 
-def test_folders_without_scenes_are_refused(tmp_path):
+def test_folders_without_scenes_are_rejected(tmp_path):
     for folder, word in ((tmp_path / "none", "no such folder"), (tmp_path, "neither a scene")):
         with pytest.raises(InputError, match=word):
             find_scenes(folder)

@@ -37,7 +37,7 @@ def test_flat_layers_are_found_to_a_tenth_of_a_pixel(name):
     sure = result.measured & truth.seen
     assert sure.mean() > 0.75
     over = evaluate_disparity(result.disparity, truth, sure)
-    # The truth is whole, the noise is 1 level of 40: half the errors are far below the place between two disparities; a
+    # The truth is whole, the noise is 1 level of 40: half the errors are far below the step between two disparities; a
     # window that sees both layers is wrong within its reach of the square's rim, 200 px long, in at most 6 px of 24000.
     assert over.quantiles_px[0] < 0.1
     assert over.bad_percent[1] < 100 * 200 * 6 / truth.known.sum()
@@ -56,7 +56,7 @@ def test_states_sigma_and_confidence_belong_together(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_what_the_right_camera_cannot_see_is_told_and_filled_from_behind(name):
+def test_what_the_right_camera_cannot_see_is_reported_and_filled_from_behind(name):
     left, right, truth = layers()
     result = open_method(name).match(left, right, SEARCH)
     # Left of the square, 16 px of the wall are hidden; windows blur the ends.
@@ -130,6 +130,6 @@ def test_sigma_holds_the_error_on_scenes_it_was_not_set_on(name, seed):
         (lambda: Search(0, 1), "two disparities"),
     ],
 )
-def test_what_is_unknown_is_refused_with_what_is_known(make, word):
+def test_what_is_unknown_is_rejected_with_what_is_known(make, word):
     with pytest.raises(InputError, match=word):
         make()

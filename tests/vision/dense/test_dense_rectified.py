@@ -1,4 +1,4 @@
-"""Pairs that are none: each is told from what it shows."""
+"""Image pairs that cannot be matched: each is reported with its reason."""
 
 import cv2
 import numpy as np
@@ -19,10 +19,10 @@ def pair():
     return layers(height=240, width=320, seed=4)[:2]
 
 
-def refused(left, right, *words, search=SEARCH):
+def rejected(left, right, *texts, search=SEARCH):
     with pytest.raises(InputError) as error:
         match_pair(open_method("block"), left, right, search)
-    for word in words:
+    for word in texts:
         assert word in str(error.value)
 
 
@@ -32,11 +32,11 @@ def test_a_good_pair_passes_without_a_remark():
     assert said == []
 
 
-def test_rows_that_are_apart_are_told():
+def test_rows_that_are_apart_are_reported():
     left, right = pair()
-    refused(left, np.roll(right, 5, axis=0), "not in standard form", "5.0 px")
-    turn = cv2.getRotationMatrix2D((160, 120), 3, 1)
-    refused(left, cv2.warpAffine(right, turn, (320, 240)), "not in standard form")
+    rejected(left, np.roll(right, 5, axis=0), "not rectified", "5.0 px")
+    rotation = cv2.getRotationMatrix2D((160, 120), 3, 1)
+    rejected(left, cv2.warpAffine(right, rotation, (320, 240)), "not rectified")
 
 
 def test_rows_that_are_a_little_apart_are_a_remark():
@@ -47,16 +47,16 @@ def test_rows_that_are_a_little_apart_are_a_remark():
     assert "2.0 px apart" in said[0]
 
 
-def test_exchanged_images_are_told():
+def test_exchanged_images_are_reported():
     left, right = pair()
-    refused(right, left, "exchanged")
+    rejected(right, left, "exchanged")
 
 
-def test_sizes_and_searches_that_do_not_fit_are_told():
+def test_sizes_and_searches_that_do_not_fit_are_reported():
     left, right = pair()
-    refused(left, right[:-1], "320x240", "320x239")
-    refused(left, right, "outside an image 320 px wide", search=Search(0, 321))
-    refused(left, right, "outside", search=Search(319, 2))
+    rejected(left, right[:-1], "320x240", "320x239")
+    rejected(left, right, "outside an image 320 px wide", search=Search(0, 321))
+    rejected(left, right, "outside", search=Search(319, 2))
 
 
 def test_floats_are_taken_unless_they_are_none():
@@ -65,9 +65,9 @@ def test_floats_are_taken_unless_they_are_none():
     np.testing.assert_array_equal(as_floats.disparity, match_pair(open_method("block"), left, right, SEARCH).disparity)
     bad = left.astype(np.float32)
     bad[3, 4] = np.nan
-    refused(bad, right, "left image", "1 values are NaN")
-    refused(left, np.full(right.shape, np.inf), "right image", "NaN or infinite")
-    refused(left / 255.0 * 1000, right, "0 to 255")
+    rejected(bad, right, "left image", "1 values are NaN")
+    rejected(left, np.full(right.shape, np.inf), "right image", "NaN or infinite")
+    rejected(left / 255.0 * 1000, right, "0 to 255")
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense import simd as lanes
+from armsight.vision.dense import simd as simd
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.window import RAW_MAX
@@ -79,36 +79,36 @@ def test_no_sum_leaves_its_type():
 @numba.njit
 def worked(a, b, out):
     """Write what each operation makes of 32 bytes, one row after another."""
-    p, q, o, n = lanes.start(a), lanes.start(b), lanes.start(out), np.uintp(lanes.SIMD_WIDTH)
-    x, y = lanes.load(p, np.uintp(0)), lanes.load(q, np.uintp(3))
-    lanes.store(o, np.uintp(0), lanes.plus(x, y))
-    lanes.store(o, n, lanes.minus(x, y))
-    lanes.store(o, np.uintp(2) * n, lanes.least(x, y))
-    lanes.store(o, np.uintp(3) * n, lanes.above(x, y))
-    lanes.store(o, np.uintp(4) * n, lanes.differing(x, y))
-    lanes.store(o, np.uintp(5) * n, lanes.bits_set(x))
-    lanes.store(o, np.uintp(6) * n, lanes.half(x))
-    lanes.store(o, np.uintp(7) * n, lanes.where_less(x, y, lanes.spread(np.uint8(1)), lanes.count_up(np.uint8(250))))
+    p, q, o, n = simd.start(a), simd.start(b), simd.start(out), np.uintp(simd.SIMD_WIDTH)
+    x, y = simd.load(p, np.uintp(0)), simd.load(q, np.uintp(3))
+    simd.store(o, np.uintp(0), simd.plus(x, y))
+    simd.store(o, n, simd.minus(x, y))
+    simd.store(o, np.uintp(2) * n, simd.least(x, y))
+    simd.store(o, np.uintp(3) * n, simd.above(x, y))
+    simd.store(o, np.uintp(4) * n, simd.differing(x, y))
+    simd.store(o, np.uintp(5) * n, simd.bits_set(x))
+    simd.store(o, np.uintp(6) * n, simd.half(x))
+    simd.store(o, np.uintp(7) * n, simd.where_less(x, y, simd.spread(np.uint8(1)), simd.count_up(np.uint8(250))))
 
 
 @numba.njit
 def widened(a, out):
-    p, o = lanes.start(a), lanes.start(out)
-    lanes.store(o, np.uintp(0), lanes.plus(lanes.as_in(lanes.load(p, np.uintp(0)), o), lanes.spread(np.uint16(1000))))
+    p, o = simd.start(a), simd.start(out)
+    simd.store(o, np.uintp(0), simd.plus(simd.as_in(simd.load(p, np.uintp(0)), o), simd.spread(np.uint16(1000))))
 
 
 def test_vectors_work_as_numbers_do():
     rng = np.random.default_rng(0)
-    a, b = (rng.integers(0, 256, lanes.SIMD_WIDTH + 3).astype(np.uint8) for _ in range(2))
-    x, y = a[: lanes.SIMD_WIDTH], b[3:]
-    out = np.zeros(8 * lanes.SIMD_WIDTH, np.uint8)
+    a, b = (rng.integers(0, 256, simd.SIMD_WIDTH + 3).astype(np.uint8) for _ in range(2))
+    x, y = a[: simd.SIMD_WIDTH], b[3:]
+    out = np.zeros(8 * simd.SIMD_WIDTH, np.uint8)
     worked(a, b, out)
-    counted = (250 + np.arange(lanes.SIMD_WIDTH)).astype(np.uint8)
-    wanted = [
+    counted = (250 + np.arange(simd.SIMD_WIDTH)).astype(np.uint8)
+    expected = [
         x + y, x - y, np.minimum(x, y), np.where(x > y, x - y, 0), x ^ y, np.bitwise_count(x), x // 2,
         np.where(x < y, 1, counted),
     ]  # fmt: skip
-    np.testing.assert_array_equal(out.reshape(8, -1), np.array(wanted))
-    wide = np.zeros(lanes.SIMD_WIDTH, np.uint16)
+    np.testing.assert_array_equal(out.reshape(8, -1), np.array(expected))
+    wide = np.zeros(simd.SIMD_WIDTH, np.uint16)
     widened(a, wide)
     np.testing.assert_array_equal(wide, x.astype(np.uint16) + 1000)

@@ -18,7 +18,7 @@ GRAIN = {"grain_m": 0.012, "contrast": 30.0, "seed": 3}
 
 
 def tool():
-    """A gripper's body with a plate and an arm: no turn of it looks like another."""
+    """A gripper's body with a plate and an arm: no rotation of it looks like another."""
     return joined(
         box(np.array([0.10, 0.08, 0.06]), **GRAIN),
         moved(box(np.array([0.03, 0.12, 0.03]), **GRAIN), pose(np.eye(3), np.array([0.03, 0.06, -0.02]))),

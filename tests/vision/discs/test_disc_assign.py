@@ -49,7 +49,7 @@ def test_discs_are_named_rightly_or_not_at_all_in_clutter():
     assert named > 0.9 * 2 * 6 * 100
 
 
-def test_covariances_and_places_come_through_unchanged():
+def test_covariances_and_positions_come_through_unchanged():
     rig = hd_rig()
     left, right, owner = views(rig, PLATE, [T_FRONT])
     seen = assign(rig, PLATE, T_FRONT, SURE, left, right)
@@ -69,7 +69,7 @@ def test_a_disc_that_one_camera_sees_is_named_there():
 
 
 def test_two_that_compete_are_dropped_by_name():
-    """Along the epipolar line and by less than the pose is known: nothing tells them apart, if not the other discs."""
+    """Along the epipolar line and by less than the pose is known: nothing distinguishes them, if not the other discs."""
     rig = hd_rig()
     loose = np.diag([6e-3, 6e-3, 0.02, 4e-3, 4e-3, 4e-3]) ** 2
     for hidden, named in (([0, 2], []), ([], [0, 1, 2])):
@@ -116,7 +116,7 @@ def test_one_detection_that_two_discs_want_is_given_to_neither():
     assert assign(rig, close, T_FRONT, loose, left, right).ids.tolist() == [1, 2, 3]
 
 
-def test_detections_that_no_one_place_explains_are_not_a_disc():
+def test_detections_that_no_one_position_explains_are_not_a_disc():
     rig = hd_rig()
     left, right, owner = views(rig, PLATE, [T_FRONT])
     uv = np.array(right.uv)
@@ -130,7 +130,7 @@ def test_detections_that_no_one_place_explains_are_not_a_disc():
         Discs(*(a[[row_of(o, 0)]] for a in (at, d.cov_uv, d.shape, d.bright)))
         for at, d, o in zip((left.uv, uv), (left, right), owner, strict=True)
     ]
-    assert "does not belong together" in assign(rig, PLATE, T_FRONT, loose, *alone).reason
+    assert "do not agree" in assign(rig, PLATE, T_FRONT, loose, *alone).reason
 
 
 def test_nothing_there_is_a_miss():
@@ -140,7 +140,7 @@ def test_nothing_there_is_a_miss():
     assert assign(rig, PLATE, away, SURE, left, right).reason == "no disc is where plate should show one"
 
 
-def test_the_faces_of_a_thin_plate_are_told_by_their_normals():
+def test_the_faces_of_a_thin_plate_are_reported_by_their_normals():
     rig = hd_rig()
     points = np.tile(PLATE.body.points, (2, 1))
     normals = np.repeat([[0, 0, 1.0], [0, 0, -1.0]], 3, axis=0)

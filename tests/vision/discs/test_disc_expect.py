@@ -1,6 +1,7 @@
-"""What cameras should see of discs at a pose, its derivatives, and the perspective bias, against rims drawn by OpenCV."""
+"""What cameras should see of discs at a pose, its derivatives, and the perspective bias, against rims sampled by OpenCV."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,29 +12,24 @@ from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.discs.bias import bias_normals, centred, expect, visible
 from asserts import assert_jacobian, numeric_jacobian
-from disc_views import PLATE, discs_of, hd_rig, someplace, views
+from disc_rims import disc_ellipses
+from disc_views import PLATE, SHAPE_NOISE, discs_of, hd_rig, someplace, views
 from views import both_pixels, pixels
 
 SOLID = discs_of([[0, 0, 0], [0.06, 0, 0], [0.06, 0.05, 0.01], [-0.02, 0.07, 0.03]])
 
 
 def ellipse_centres(rig, target, T, normals):
-    """(M, 2, 2) centres of the ellipses that fit rims of 720 points, projected by OpenCV, best."""
-    turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    """(M, 2, 2) centres of the ellipses through rims that OpenCV projects."""
     out = np.empty((len(normals), 2, 2))
-    for m, (p, n, r) in enumerate(zip(target.body.points, normals, target.radii_m, strict=True)):
-        a = np.cross(n, [0.3, 0.5, 0.8])
-        a /= np.linalg.norm(a)
-        rim = p + r * (np.outer(np.cos(turn), a) + np.outer(np.sin(turn), np.cross(n, a)))
-        for side, uv in enumerate(np.moveaxis(both_pixels(rig, transform(T, rim)), 1, 0)):
-            x, y = (uv - uv.mean(axis=0)).T
-            A = np.column_stack([x * x, x * y, y * y, x, y])
-            a_, b_, c_, d_, e_ = np.linalg.lstsq(A, np.ones(len(x)), rcond=None)[0]
-            out[m, side] = uv.mean(axis=0) + np.linalg.solve([[2 * a_, b_], [b_, 2 * c_]], [-d_, -e_])
+    for side, camera in enumerate(rig.cameras):
+        T_camera_body = T if side == 0 else inverse(rig.T_left_right) @ T
+        p, n = transform(T_camera_body, target.body.points), normals @ T_camera_body[:3, :3].T
+        out[:, side], _ = disc_ellipses(partial(pixels, camera), p, n, target.radii_m)
     return out
 
 
-def test_centres_and_bias_are_those_of_drawn_rims():
+def test_centres_and_bias_are_those_of_sampled_rims():
     rig, rng = hd_rig(), np.random.default_rng(0)
     for _ in range(10):
         T = someplace(rng)
@@ -59,7 +55,7 @@ def test_derivatives():
 
 
 def test_bias_of_a_large_disc_nearby_and_what_correcting_leaves():
-    """The issue's figure: R = 15 mm at 0.5 m and 45 degrees, 0.3 px without, under 0.005 px with correction."""
+    """The requirement: R = 15 mm at 0.5 m and 45 degrees, 0.3 px without, under 0.005 px with correction."""
     rig = hd_rig()
     target = discs_of([[0, 0, 0], [0.08, 0, 0], [0, 0.08, 0]], radius=0.015)
     T = pose(exp_so3(np.array([0, np.radians(45), 0])), np.array([0.1, 0.0, 0.5]))
@@ -83,9 +79,9 @@ def test_the_covariance_of_a_bias_is_that_of_the_pose():
     sigma = np.array([1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.01])
     none = Correspondences(np.arange(4), np.zeros((4, 2, 2)), np.zeros((4, 2, 2, 2)))
     said = centred(rig, SOLID, T, np.diag(sigma**2), none).cov_uv
-    drawn = np.array([expect(rig, SOLID, T @ exp_se3(sigma * rng.normal(size=6))).bias for _ in range(2000)])
-    variance = drawn.var(axis=0)
-    # 2000 draws tell a variance to sqrt(2 / 2000) = 3%, one sigma; the bias' curvature adds a little.
+    samples = np.array([expect(rig, SOLID, T @ exp_se3(sigma * rng.normal(size=6))).bias for _ in range(2000)])
+    variance = samples.var(axis=0)
+    # 2000 samples give a variance to sqrt(2 / 2000) = 3%, one sigma; the bias' curvature adds a little.
     np.testing.assert_allclose(np.einsum("mcii->mci", said), variance, rtol=0.2)
 
 
@@ -142,5 +138,6 @@ def test_hand_made_views_are_what_is_expected():
     left, right, owner = views(rig, PLATE, [T], sigma=0.0)
     e = expect(rig, PLATE, T)
     for side, found in enumerate((left, right)):
-        np.testing.assert_allclose(found.uv, e.uv[owner[side][:, 1], side], atol=1e-9)
+        np.testing.assert_allclose(found.uv, e.uv[owner[side][:, 1], side], atol=2e-4)
+        np.testing.assert_allclose(found.shape, e.shape[owner[side][:, 1], side], rtol=4 * SHAPE_NOISE)
     assert cv2.norm(left.uv - right.uv) > 0

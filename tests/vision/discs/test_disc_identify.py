@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from armsight.data import Discs, Missed, Rejected
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.discs.identify import ERROR_ODDS, Identified, identify
+from armsight.vision.discs.identify import ERROR_ODDS, IdentifiedDiscs, identify
 from disc_views import PLATE, discs_of, hd_rig, someplace, views
 
 SIX = discs_of([[0, 0, 0], [0.06, 0, 0], [0.06, 0.05, 0], [-0.02, 0.07, 0], [0.03, -0.04, 0.02], [-0.05, 0.02, 0.03]])
@@ -42,7 +42,7 @@ def whole(owner, count):
 
 
 def test_no_pose_in_a_thousand_images_of_clutter():
-    """The issue's figure: 0 accepted. Discs of the sizes the plate's would have, 200 in each image."""
+    """The requirement: 0 accepted. Discs of the sizes the plate's would have, 200 in each image."""
     for _, result, _, _ in looked(PLATE, range(1000), clutter=200, bodies=0, radii=(5.0, 15.0)):
         assert isinstance(result, Missed)
 
@@ -51,17 +51,17 @@ def test_no_pose_in_a_thousand_images_of_clutter():
 def test_none_is_wrong_and_few_are_missed_in_clutter(target, count, least):
     found = seen = 0
     for _, result, owner, _ in looked(target, range(count), clutter=200):
-        if isinstance(result, Identified):
+        if isinstance(result, IdentifiedDiscs):
             assert wrong(result, owner) == []
             assert result.log_odds >= np.log(ERROR_ODDS)
         if whole(owner, len(target.radii_m)):
-            found, seen = found + isinstance(result, Identified), seen + 1
+            found, seen = found + isinstance(result, IdentifiedDiscs), seen + 1
     # A binomial share lies within three standard deviations of its mean.
     assert found / seen > least - 3 * np.sqrt(least * (1 - least) / seen)
 
 
 def test_a_plain_view_is_always_named_whatever_the_calibration_is_off_by():
-    """True rigs drawn from the calibration's covariance, which leaves 0.3 px and more between epipolar lines."""
+    """True rigs sampled from the calibration's covariance, which leaves 0.3 px and more between epipolar lines."""
     rig = hd_rig()
     root = np.linalg.cholesky(rig.cov)
 
@@ -69,7 +69,7 @@ def test_a_plain_view_is_always_named_whatever_the_calibration_is_off_by():
         return rig.perturbed(root @ rng.normal(size=22))
 
     for _, result, owner, _ in looked(PLATE, range(100), rig=rig, true=true, clutter=10):
-        assert isinstance(result, Identified)
+        assert isinstance(result, IdentifiedDiscs)
         assert wrong(result, owner) == []
 
 
@@ -85,7 +85,7 @@ def test_the_pose_is_within_its_covariance():
 
 def test_one_missing_disc_of_more_than_three_is_no_loss():
     for seed, result, owner, _ in looked(SIX, range(30), clutter=30, hidden=[(0, 2, 0), (0, 2, 1), (0, 4, 1)]):
-        assert isinstance(result, Identified), seed
+        assert isinstance(result, IdentifiedDiscs), seed
         assert wrong(result, owner) == []
         assert (result.rows[2] < 0).all()
         assert result.rows[4, 0] >= 0
@@ -97,15 +97,15 @@ def test_a_body_of_three_needs_all_three():
         assert isinstance(result, Missed)
 
 
-def test_two_of_a_kind_are_ambiguous_and_both_places_are_told():
+def test_two_of_a_kind_are_ambiguous_and_both_positions_are_reported():
     rig, rng = hd_rig(), np.random.default_rng(0)
     Ts = [pose(exp_so3(np.array([0.1, 0.2, a])), np.array([x, 0.0, 0.9])) for x, a in ((0.0, 0.3), (0.25, 2.0))]
     left, right, _ = views(rig, SIX, Ts, rng)
     result = identify(rig, SIX, left, right)
     assert isinstance(result, Missed)
     assert result.reason.startswith("ambiguous: plate may be at (")
-    for place in ("(-0 ", "(0 "), ("(250 ",):
-        assert any(text in result.reason for text in place)
+    for position in ("(-0 ", "(0 "), ("(250 ",):
+        assert any(text in result.reason for text in position)
     for target in (PLATE, SIX):
         for _, many, _, _ in looked(target, range(30), bodies=2, clutter=10):
             # Where one of them is partly out of view the other one is named.
@@ -127,14 +127,14 @@ def test_another_body_is_not_confused_with_it():
         )
         assert isinstance(identify(rig, PLATE, views_[1][0], views_[1][1]), Missed)
         result = identify(rig, PLATE, left, right)
-        assert isinstance(result, Identified)
+        assert isinstance(result, IdentifiedDiscs)
         assert wrong(result, views_[0][2]) == []  # its rows come first
 
 
 def test_the_twin_of_an_isosceles_triangle_is_settled_by_the_faces():
     unturned = replace(PLATE, normals=np.full((3, 3), np.nan))
     for _, result, owner, _ in looked(PLATE, range(30)):
-        assert isinstance(result, Identified)
+        assert isinstance(result, IdentifiedDiscs)
         assert wrong(result, owner) == []
     for _, result, _, _ in looked(unturned, range(10)):
         assert result.reason in (
@@ -142,11 +142,11 @@ def test_the_twin_of_an_isosceles_triangle_is_settled_by_the_faces():
             "ambiguous: the same discs may be P2 P1 P3 of plate, or P1 P2 P3",
         )
     for _, result, owner, _ in looked(discs_of(SCALENE.body.points, normal=None), range(30), clutter=20):
-        assert isinstance(result, Identified)
+        assert isinstance(result, IdentifiedDiscs)
         assert wrong(result, owner) == []
 
 
-def test_a_body_seen_from_behind_is_told():
+def test_a_body_seen_from_behind_is_reported():
     # Discs painted through a plate, say: the right distances, the wrong side.
     backwards = replace(SCALENE, normals=-SCALENE.normals)
     rig, rng = hd_rig(), np.random.default_rng(3)
@@ -159,8 +159,8 @@ def test_nearly_isosceles_is_right_or_ambiguous():
     for off in (0.5e-3, 1e-3, 2e-3, 4e-3):
         target = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [off, 0.085, 0]], normal=None)
         results = [(result, owner) for _, result, owner, _ in looked(target, range(25))]
-        assert all(wrong(result, owner) == [] for result, owner in results if isinstance(result, Identified))
-        named.append(sum(isinstance(result, Identified) for result, _ in results))
+        assert all(wrong(result, owner) == [] for result, owner in results if isinstance(result, IdentifiedDiscs))
+        named.append(sum(isinstance(result, IdentifiedDiscs) for result, _ in results))
     assert named[0] < 12 < 22 < named[-1]
 
 
@@ -174,15 +174,15 @@ def test_a_body_with_symmetry_and_a_wall_of_discs_are_ambiguous():
     corner = discs_of([[0, 0, 0], [0.06, 0, 0], [0.06, 0.03, 0]])
     result = identify(rig, corner, left, right)
     assert result.reason == (
-        "ambiguous: 88 discs in the left and 88 discs in the right image show plate in more than 64 places or turns"
+        "ambiguous: 88 discs in the left and 88 discs in the right image show plate at more than 64 poses"
     )
 
 
 def test_bodies_of_many_discs_are_named_all_around():
     """A ball of 16 discs of one size, of which a camera sees six to eight, from all sides."""
     k = np.arange(16) + 0.5
-    z, turn = 1 - k / 8, np.pi * (1 + np.sqrt(5)) * k
-    out = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    z, rotation = 1 - k / 8, np.pi * (1 + np.sqrt(5)) * k
+    out = np.column_stack([np.sqrt(1 - z**2) * np.cos(rotation), np.sqrt(1 - z**2) * np.sin(rotation), z])
     points = 0.06 * out + 0.004 * np.random.default_rng(0).normal(size=(16, 3))
     ball, rng, named = discs_of(points, radius=0.006, normal=out), np.random.default_rng(1), 0
     rig = hd_rig()
@@ -190,7 +190,7 @@ def test_bodies_of_many_discs_are_named_all_around():
         R = exp_so3(rng.normal(size=3) * 2)
         left, right, owner = views(rig, ball, [pose(R, np.array([0.1, 0.0, rng.uniform(0.5, 0.8)]))], rng, clutter=10)
         result = identify(rig, ball, left, right)
-        if isinstance(result, Identified):
+        if isinstance(result, IdentifiedDiscs):
             assert wrong(result, owner) == []
             named += 1
     assert named >= 13
@@ -203,7 +203,7 @@ def test_radii_and_brightness_name_discs_that_distances_do_not():
         discs_of(points, bright=[True, False, False, False]),
     ):
         for _, result, owner, _ in looked(target, range(20), clutter=20):
-            assert isinstance(result, Identified)
+            assert isinstance(result, IdentifiedDiscs)
             assert wrong(result, owner) == []
 
 
@@ -219,7 +219,7 @@ def test_misses_count_what_was_found():
     left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
     two = Discs(left.uv[:2], left.cov_uv[:2], left.shape[:2], left.bright[:2], (Rejected((3.0, 4.0), "glint"),))
     assert identify(rig, PLATE, two, right).reason == (
-        "left: 2 discs found (1 other place looked at; the most likely: glint); right: 3 discs found; plate has 3"
+        "left: 2 discs found (1 other candidate rejected; the most likely: glint); right: 3 discs found; plate has 3"
     )
     nothing = Discs(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 3)), np.zeros(0, bool))
     assert identify(rig, PLATE, nothing, nothing).reason == "left: 0 discs found; right: 0 discs found; plate has 3"
@@ -235,18 +235,18 @@ def test_a_disc_found_twice_is_one():
         *(np.concatenate([a, a[:2]]) for a in (left.cov_uv, left.shape, left.bright)),
     )
     result = identify(rig, PLATE, twice, right)
-    assert isinstance(result, Identified)
+    assert isinstance(result, IdentifiedDiscs)
     assert wrong(result, owner) == []
 
 
 @pytest.mark.parametrize("points", [[[0, 0, 0], [0.1, 0, 0]], [[0, 0, 0], [0.05, 0, 0], [0.1, 0, 0]]])
-def test_a_body_that_fixes_no_pose_is_told(points):
+def test_a_body_that_fixes_no_pose_is_reported(points):
     rig, rng = hd_rig(), np.random.default_rng(0)
     left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
-    assert "fix no pose" in identify(rig, discs_of(points), left, right).reason
+    assert "do not determine a pose" in identify(rig, discs_of(points), left, right).reason
 
 
-def test_a_wrong_radius_and_a_wrong_size_are_told():
+def test_a_wrong_radius_and_a_wrong_size_are_reported():
     rig, rng = hd_rig(known=True), np.random.default_rng(21)
     T = someplace(rng, z=(0.7, 0.8), tilt=0.3)
     left, right, _ = views(rig, PLATE, [T], rng)

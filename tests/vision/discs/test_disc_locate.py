@@ -135,7 +135,7 @@ def test_discs_name_themselves_where_the_code_is_not_seen():
     assert missed.reason == ("left: no tag; right: no tag; left: 0 discs found; right: 0 discs found; plate has 3")
 
 
-def test_exchanged_cameras_are_told():
+def test_exchanged_cameras_are_reported():
     rig, rng = hd_rig(), np.random.default_rng(0)
     left, right, _ = views(rig, PLATE, [someplace(rng)], rng)
     assert alone(rig, PLATE, right, left).reason.startswith(
@@ -144,7 +144,7 @@ def test_exchanged_cameras_are_told():
 
 
 class Discerning:
-    """A DiscTarget that finds what the test tells it to."""
+    """A DiscTarget that finds what the test asks for."""
 
     def __init__(self, target, found):
         self.body, self.radii_m, self.bright, self.normals = target.body, target.radii_m, target.bright, target.normals
@@ -171,11 +171,11 @@ def test_a_shot_is_measured_from_its_discs():
 def test_three_discs_in_the_chapters_frame_report_its_angles(seed):
     """x along P1 P2 and z from P3 to their middle: the pose's roll, pitch, yaw are those of 18.11 to 18.16."""
     rig, rng = hd_rig(known=True), np.random.default_rng(seed)
-    chapter = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0, -0.085]], normal=(0.0, 1.0, 0.0))
+    published = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0, -0.085]], normal=(0.0, 1.0, 0.0))
     facing = pose(exp_so3(np.array([np.pi / 2, 0, 0])), np.zeros(3))  # its y, out of the faces, towards the cameras
     T = someplace(rng) @ inverse(facing)
-    left, right, _ = views(rig, chapter, [T], rng, sigma=1e-7)
-    estimate = alone(rig, replace(chapter), left, right)
+    left, right, _ = views(rig, published, [T], rng, sigma=1e-7)
+    estimate = alone(rig, replace(published), left, right)
     angles, _ = euler_zyx(estimate.T_left_body[:3, :3])
     p = estimate.points.p_left
     assert angles == pytest.approx(orientation(*p).euler_zyx, abs=1e-5)

@@ -77,9 +77,9 @@ def test_clutter_without_the_plate_is_a_miss_that_counts(tmp_path):
 def test_tags_and_discs_of_one_body_are_located_together(tmp_path):
     rig = hd_rig(known=True)
     patterns, text = tag_plate()
-    places = [(0.0, -34.0), (0.0, 0.0), (0.0, 34.0)]
-    text += "".join(DISC.format(f"D{i}", x, y, 4) for i, (x, y) in enumerate(places))
-    painted = plate(*PLATE_M, value=0.12, discs=[(x / 1e3, y / 1e3, 0.004, 0.85) for x, y in places])
+    positions = [(0.0, -34.0), (0.0, 0.0), (0.0, 34.0)]
+    text += "".join(DISC.format(f"D{i}", x, y, 4) for i, (x, y) in enumerate(positions))
+    painted = plate(*PLATE_M, value=0.12, discs=[(x / 1e3, y / 1e3, 0.004, 0.85) for x, y in positions])
     target = open_target(file_of(tmp_path, text))
     assert target.body.point_names[-3:] == ("D0", "D1", "D2")
     nees = []

@@ -47,7 +47,7 @@ def test_pairs_are_those_of_trying_every_one(seed):
         if not c < 1.1 * GATE_SIGMAS**2 or left.bright[a] != right.bright[b]:
             assert (a, b) not in got
             continue
-        # A disc's longer half axis is its radius over its distance, stretched towards the corner by a fifth at most.
+        # A disc's longer half axis is its radius over its distance, scaled towards the corner by a fifth at most.
         ratio = np.array([left.radius_px[a], right.radius_px[b]]) * at[2] / f
         kinds = target.radii_m[target.bright == left.bright[a]]
         surely = ((ratio[:, None] > 1.05 * (1 - SIZE_TOLERANCE) * kinds) & (ratio[:, None] < kinds)).all(axis=0).any()
@@ -85,8 +85,8 @@ def test_true_pairs_are_found_through_any_lens_and_with_a_rig_that_is_badly_know
                     assert (n, m) in got
 
 
-def test_what_pairs_say_of_their_place_is_true():
-    """A pair's place is off by its covariance and the rig's: mean of the normalised squares over 100 views of 4 discs."""
+def test_what_pairs_say_of_their_position_is_true():
+    """A pair's position is off by its covariance and the rig's: mean normalised square over 100 views of 4 discs."""
     rig, nees = hd_rig(), []
     root = np.linalg.cholesky(rig.cov)
     for seed in range(100):
@@ -105,7 +105,7 @@ def test_what_pairs_say_of_their_place_is_true():
     assert abs(np.mean(nees) - 3) < 4 * np.sqrt(2 * 3 / 100)
 
 
-def test_too_many_pairs_are_told():
+def test_too_many_pairs_are_reported():
     rig, n = hd_rig(known=True), int(np.sqrt(MOST_PAIRS)) + 20
     rng = np.random.default_rng(0)
     z = rng.uniform(0.8, 0.81, n)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.sim.example_rig import example_rig
 from armsight.vision.discs.predict import look_direction, plain_rig, pose_covariance, separation, view
-from armsight.vision.discs.symmetry import relabelings
+from armsight.vision.discs.symmetry import symmetries
 from armsight.vision.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 
@@ -20,13 +20,13 @@ NO_FACE = np.full((3, 3), np.nan)
 
 
 def seen_by_opencv(rig, T_left_body, points):
-    """(2N, 2) places in both images."""
+    """(2N, 2) positions in both images."""
     out = []
     for camera, T in ((rig.left, T_left_body), (rig.right, inverse(rig.T_left_right) @ T_left_body)):
         fx, fy, cx, cy = camera.intrinsics
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-        out.append(cv2.projectPoints(points, turn, T[:3, 3], K, camera.distortion)[0].reshape(-1, 2))
+        rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+        out.append(cv2.projectPoints(points, rotation, T[:3, 3], K, camera.distortion)[0].reshape(-1, 2))
     return np.concatenate(out)
 
 
@@ -41,7 +41,7 @@ def test_the_body_faces_the_cameras_at_its_distance():
         assert seen.seen.all()
 
 
-def test_a_face_turned_away_or_outside_the_image_is_not_seen():
+def test_a_face_rotated_away_or_outside_the_image_is_not_seen():
     rig = plain_rig()
     normals = np.array([[0, 0, -1.0], [0, 0, -1], [0, 0, 1]])
     assert view(rig, PLATE, normals, 0.8).seen.tolist() == [[True, True], [True, True], [False, False]]
@@ -100,13 +100,13 @@ def test_too_few_points_in_view_fix_no_pose():
 
 
 @pytest.mark.parametrize("distance", [0.6, 1.2])
-def test_separation_is_the_least_that_scipy_finds_over_the_turns(distance):
+def test_separation_is_the_least_that_scipy_finds_over_the_rotations(distance):
     rig, sigma = plain_rig(), 0.2
     points = PLATE + np.array([[0, 0, 0], [0.004, 0, 0], [0, 0, 0]])
-    (one, *_) = relabelings(points, np.ones((3, 3), bool), np.arange(3), 0.006)
+    (one, *_) = symmetries(points, np.ones((3, 3), bool), np.arange(3), 0.006)
     least = np.inf
-    for turn in ((0, 0), (np.pi / 4, 0), (-np.pi / 4, 0), (0, np.pi / 4), (0, -np.pi / 4)):
-        T = view(rig, points, NO_FACE, distance, turn).T_left_body
+    for rotation in ((0, 0), (np.pi / 4, 0), (-np.pi / 4, 0), (0, np.pi / 4), (0, -np.pi / 4)):
+        T = view(rig, points, NO_FACE, distance, rotation).T_left_body
         uv, start = seen_by_opencv(rig, T, points), T @ inverse(one.T)
 
         def residuals(xi, uv=uv, start=start):

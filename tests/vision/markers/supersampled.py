@@ -5,10 +5,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 
-def view(size_px, tilt, tilt_axis, turn, centre, distance=12.0):
+def view(size_px, tilt, tilt_axis, rotation, centre, distance=12.0):
     """Return the homography (3, 3) from the plane's coordinates (about 0, pattern one unit large) to pixels."""
     axis = np.array([np.cos(tilt_axis), np.sin(tilt_axis), 0.0])
-    R = cv2.Rodrigues(axis * tilt)[0] @ cv2.Rodrigues(np.array([0.0, 0.0, turn]))[0]
+    R = cv2.Rodrigues(axis * tilt)[0] @ cv2.Rodrigues(np.array([0.0, 0.0, rotation]))[0]
     f = size_px * distance
     K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
     return K @ np.column_stack([R[:, 0], R[:, 1], [0.0, 0.0, distance]])
@@ -59,7 +59,7 @@ def board(columns, rows, margin=1.0):
 
 
 def picture(cells, outside=1.0, low=0.0, high=1.0):
-    """Return the pattern of a picture (h, w) stretched over low..high along x; y in proportion."""
+    """Return the pattern of a picture (h, w) scaled over low..high along x; y in proportion."""
     h, w = cells.shape
     scale = w / (high - low)
 

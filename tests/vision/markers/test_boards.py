@@ -61,7 +61,7 @@ def tags(columns, rows, spacing, border=2):
 
 
 @lru_cache(maxsize=32)
-def painted(kind, tilt, turn, blur_px=0.8, samples=7, spec=None):
+def painted(kind, tilt, rotation, blur_px=0.8, samples=7, spec=None):
     """Return the board, a painted view of it in -1..1, and where its points are in it."""
     target = open_board(spec or SPECS[kind])
     points = target.body.points[:, :2]
@@ -72,15 +72,15 @@ def painted(kind, tilt, turn, blur_px=0.8, samples=7, spec=None):
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.family))
         size = (target.columns, target.rows)
         layout = cv2.aruco.CharucoBoard(size, target.square_m, target.marker_m, dictionary)
-        drawn = layout.generateImage((size[0] * 60, size[1] * 60))
-        pattern = picture(np.where(drawn > 127, 1.0, -1.0), low=-1.0, high=size[0] - 1.0)
+        rendered = layout.generateImage((size[0] * 60, size[1] * 60))
+        pattern = picture(np.where(rendered > 127, 1.0, -1.0), low=-1.0, high=size[0] - 1.0)
     elif kind == "aprilgrid":
         unit, pattern = target.tag_m, tags(target.columns, target.rows, target.spacing)
     else:
         unit = target.pitch_m
         pattern = discs(target.columns, target.rows, 0.45 if target.staggered else 0.3, target.staggered)
     middle, size = 0.5 * (points.min(axis=0) + points.max(axis=0)) / unit, 1.45 * np.ptp(points, axis=0).max() / unit
-    H = view(300.0, tilt, 1.0, turn, (SHAPE[1] / 2 + 3.3, SHAPE[0] / 2 - 2.2))
+    H = view(300.0, tilt, 1.0, rotation, (SHAPE[1] / 2 + 3.3, SHAPE[0] / 2 - 2.2))
     if kind == "aprilgrid":
         H = H @ np.diag([1.0, -1.0, 1.0])
     H = H @ np.array([[1 / size, 0.0, -middle[0] / size], [0.0, 1 / size, -middle[1] / size], [0.0, 0.0, 1.0]])
@@ -110,10 +110,10 @@ def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):
         assert sorted(flip.tolist()) == list(range(len(points)))
         assert flip.tolist() != list(range(len(points)))
         # A rotation keeps all scalar and cross products.
-        turned = points[flip]
-        np.testing.assert_allclose(turned @ turned.T, points @ points.T, atol=1e-12)
+        rotated = points[flip]
+        np.testing.assert_allclose(rotated @ rotated.T, points @ points.T, atol=1e-12)
         half = np.array([[0.0, 1.0], [-1.0, 0.0]])
-        np.testing.assert_allclose(turned @ half @ turned.T, points @ half @ points.T, atol=1e-12)
+        np.testing.assert_allclose(rotated @ half @ rotated.T, points @ half @ points.T, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):
     [
         ("chessboard:9x6:25mm", 0),  # one end dark, one bright
         ("chessboard:9x7:25mm", 1),
-        ("chessboard:7x7:25mm", 1),  # a quarter turn changes the colours
+        ("chessboard:7x7:25mm", 1),  # a rotation by 90 degrees changes the colours
         ("chessboard:8x8:25mm", 3),
         ("circles:7x6:20mm", 1),
         ("circles:6x6:20mm", 3),
@@ -136,9 +136,9 @@ def test_what_a_board_leaves_open(spec, symmetries):
 
 
 @pytest.mark.parametrize("kind", BOARDS)
-@pytest.mark.parametrize(("tilt", "turn"), [(0.0, 0.1), (0.5, -0.3)])
-def test_boards_are_found_where_they_are(kind, tilt, turn):
-    target, image, truth = painted(kind, tilt, turn)
+@pytest.mark.parametrize(("tilt", "rotation"), [(0.0, 0.1), (0.5, -0.3)])
+def test_boards_are_found_where_they_are(kind, tilt, rotation):
+    target, image, truth = painted(kind, tilt, rotation)
     normalised = []
     for seed in range(4):
         found = target.detect(expose(image, 150, 2, np.random.default_rng(seed)))
@@ -146,7 +146,7 @@ def test_boards_are_found_where_they_are(kind, tilt, turn):
         assert len(found.ids) == len(truth)
         assert (np.diff(found.ids) > 0).all()
         error = found.uv - truth[found.ids]
-        # Discs have their perspective bias, which the module tells and does not correct.
+        # Discs have their perspective bias, which the module states and does not correct.
         assert np.abs(error).max() < (0.12 if "circles" in kind else 0.045)
         np.testing.assert_allclose(found.cov_uv, np.swapaxes(found.cov_uv, 1, 2))
         assert (np.linalg.eigvalsh(found.cov_uv)[:, 0] > 0).all()
@@ -171,25 +171,25 @@ def test_nothing_found_is_a_reason_and_never_an_exception(kind, image):
     assert len(found.ids) == 0
 
 
-@pytest.mark.parametrize("turn", [0.2, 0.2 + np.pi / 2, 0.2 + np.pi, 0.2 - np.pi / 2])
+@pytest.mark.parametrize("rotation", [0.2, 0.2 + np.pi / 2, 0.2 + np.pi, 0.2 - np.pi / 2])
 @pytest.mark.parametrize("spec", ["chessboard:9x6:25mm", "chessboard:8x5:25mm"])
-def test_colours_decide_where_a_chessboard_begins(spec, turn):
-    target, image, truth = painted("chessboard", 0.3, turn, samples=4, spec=spec)
+def test_colours_decide_where_a_chessboard_begins(spec, rotation):
+    target, image, truth = painted("chessboard", 0.3, rotation, samples=4, spec=spec)
     found = target.detect(expose(image, 150, 1, np.random.default_rng(4)))
     assert np.abs(found.uv - truth[found.ids]).max() < 0.1
 
 
 @pytest.mark.parametrize("spec", ["chessboard:7x5:25mm", "chessboard:5x5:25mm", "chessboard:6x6:25mm"])
-@pytest.mark.parametrize("turn", [0.1, 1.3, 2.9, -1.7])
-def test_what_colours_leave_open_is_a_flip(spec, turn):
-    target, image, truth = painted("chessboard", 0.2, turn, samples=4, spec=spec)
+@pytest.mark.parametrize("rotation", [0.1, 1.3, 2.9, -1.7])
+def test_what_colours_leave_open_is_a_flip(spec, rotation):
+    target, image, truth = painted("chessboard", 0.2, rotation, samples=4, spec=spec)
     found = target.detect(expose(image, 150, 1, np.random.default_rng(5)))
     names = [found.ids, *(flip[found.ids] for flip in target.symmetries)]
     off = [np.abs(found.uv - truth[ids]).max() for ids in names]
     assert min(off) < 0.1
     across = truth[1] - truth[0]
-    if abs(turn) < 0.7 or len(target.symmetries) == 3:  # the order that runs to the right is taken
-        assert (off[0] < 0.1) == (across[0] > np.abs(across[1]) or abs(turn) < 0.7)
+    if abs(rotation) < 0.7 or len(target.symmetries) == 3:  # the order that runs to the right is taken
+        assert (off[0] < 0.1) == (across[0] > np.abs(across[1]) or abs(rotation) < 0.7)
 
 
 def test_a_covered_corner_is_left_out_and_the_others_stay():
@@ -232,7 +232,7 @@ def test_boards_are_frozen():
 
 
 @pytest.mark.parametrize(
-    ("spec", "words"),
+    ("spec", "texts"),
     [
         ("chessbord:9x6:25mm", ["unknown board", *BOARDS]),
         ("chessboard:9x6:25", ["no unit", "mm, cm, m, in"]),
@@ -254,10 +254,10 @@ def test_boards_are_frozen():
         ("aprilgrid:30x30:88mm:0.3", ["900", "587"]),
     ],
 )
-def test_a_malformed_spec_says_what_is_wrong_and_what_is_right(spec, words):
+def test_a_malformed_spec_says_what_is_wrong_and_what_is_right(spec, texts):
     with pytest.raises(InputError) as error:
         open_board(spec)
-    for word in words:
+    for word in texts:
         assert word in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -268,7 +268,7 @@ def test_lengths_take_their_units(text, metres):
 
 
 @pytest.mark.parametrize("said", ["8x6", "9x5", "7x5"])
-def test_a_board_said_too_small_is_refused(said):
+def test_a_board_said_too_small_is_rejected(said):
     T = pose(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([-0.1, -0.06, 0.45]))
     camera = Camera((640, 480), "none", np.array([560.0, 560.0, 319.5, 239.5]), np.zeros(0))
     image = render(camera, [PosedBody((chessboard(9, 6, 0.025),), T)], rng=np.random.default_rng(0))

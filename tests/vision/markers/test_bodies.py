@@ -13,7 +13,7 @@ TAG = """
 [[markers]]
 name = "A"
 position_mm = [10, 20, 30]
-{turn}
+{rotation}
 tag = {{ family = "tag36h11", id = 3, size_mm = 40 }}
 """
 
@@ -43,7 +43,7 @@ def test_csv_takes_both_headers_blank_lines_and_a_byte_order_mark(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lines", "words"),
+    ("lines", "texts"),
     [
         ("", ["line 1", "marker,x_m,y_m,z_m"]),
         ("a,b,c,d\n", ["line 1", "a,b,c,d", "marker,x_m,y_m,z_m"]),
@@ -57,10 +57,10 @@ def test_csv_takes_both_headers_blank_lines_and_a_byte_order_mark(tmp_path):
         ("id,x,y,z\n1,0,0,0\n2,550,0,0\n3,0,20,0\n", ["550 m", "metres"]),
     ],
 )
-def test_a_wrong_csv_names_file_and_line(tmp_path, lines, words):
+def test_a_wrong_csv_names_file_and_line(tmp_path, lines, texts):
     with pytest.raises(InputError) as error:
         load_body_csv(written(tmp_path, "ball.csv", lines))
-    for word in ["ball.csv", *words]:
+    for word in ["ball.csv", *texts]:
         assert word in str(error.value)
 
 
@@ -68,7 +68,7 @@ def test_tags_sit_where_the_file_says(tmp_path):
     h = 0.02
     corners = np.array([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]])
     p = np.array([0.01, 0.02, 0.03])
-    for turn, R in [
+    for rotation, R in [
         ("normal = [0, 0, -2]\nx_axis = [3, 0, 0]", np.eye(3)),
         # On the body's right side, upright: its face looks along +x, its right is along +z ... seen from there.
         ("normal = [1, 0, 0]\nx_axis = [0, 0, 1]", np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])),
@@ -76,14 +76,14 @@ def test_tags_sit_where_the_file_says(tmp_path):
         ("quaternion_wxyz = [2, 2, 0, 0]", from_quaternion_wxyz(np.array([1.0, 1, 0, 0]))),
         ("roll_pitch_yaw_deg = [90, 0, 0]", np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])),
     ]:
-        body = open_body(written(tmp_path, "b.toml", TAG.format(turn=turn)))
+        body = open_body(written(tmp_path, "b.toml", TAG.format(rotation=rotation)))
         assert body.name == "b"
         assert body.point_names == ("A.0", "A.1", "A.2", "A.3")
         np.testing.assert_allclose(body.points, p + corners @ R.T, atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "texts"),
     [
         ("name = ", ["not TOML"]),
         ("title = 1", ["'title'", "name and [[markers]]"]),
@@ -95,40 +95,46 @@ def test_tags_sit_where_the_file_says(tmp_path):
         ('[[markers]]\nname = "A"\nposition_mm = [0, 0]\ntag = { id = 1 }', ["(A)", "position_mm", "(2,)"]),
         ('[[markers]]\nname = "A"\nposition_mm = [0, nan, 0]\ntag = { id = 1 }', ["(A)", "position_mm", "NaN"]),
         ('[[markers]]\nname = "A"\nposition_mm = [0, 0, "1"]\ntag = 3', ["(A)", "tag", "table"]),
-        (TAG.format(turn=""), ["(A)", "normal, x_axis", "quaternion_wxyz", "none"]),
-        (TAG.format(turn="normal = [0, 0, 1]"), ["(A)", "exactly one"]),
-        (TAG.format(turn="normal = [0, 0, 0]\nx_axis = [1, 0, 0]"), ["(A)", "normal", "zero"]),
-        (TAG.format(turn="normal = [0, 0, 1]\nx_axis = [1, 0, 1]"), ["(A)", "x_axis", "normal"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0]"), ["(A)", "quaternion_wxyz", "(3,)"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]") * 2, ["marker 2", "'A'", "marker 1"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("36h11", "99h9"), ["(A)", "tag99h9", "tag36h11"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 587"), ["(A)", "587", "0 to 586"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 3.0"), ["(A)", "3.0"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 0"), ["(A)", "size_mm", "0"]),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("size_mm", "size_m"), ["(A)", "size_mm"]),
+        (TAG.format(rotation=""), ["(A)", "normal, x_axis", "quaternion_wxyz", "none"]),
+        (TAG.format(rotation="normal = [0, 0, 1]"), ["(A)", "exactly one"]),
+        (TAG.format(rotation="normal = [0, 0, 0]\nx_axis = [1, 0, 0]"), ["(A)", "normal", "zero"]),
+        (TAG.format(rotation="normal = [0, 0, 1]\nx_axis = [1, 0, 1]"), ["(A)", "x_axis", "normal"]),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0]"), ["(A)", "quaternion_wxyz", "(3,)"]),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]") * 2, ["marker 2", "'A'", "marker 1"]),
         (
-            TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 40, ink = 1"),
+            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("36h11", "99h9"),
+            ["(A)", "tag99h9", "tag36h11"],
+        ),
+        (
+            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 587"),
+            ["(A)", "587", "0 to 586"],
+        ),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 3.0"), ["(A)", "3.0"]),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 0"), ["(A)", "size_mm", "0"]),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("size_mm", "size_m"), ["(A)", "size_mm"]),
+        (
+            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 40, ink = 1"),
             ["(A)", "'ink'", "family"],
         ),
-        (TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]").replace("10,", "1e6,"), ["(A)", "1000 m", "mm"]),
+        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("10,", "1e6,"), ["(A)", "1000 m", "mm"]),
     ],
 )
-def test_a_wrong_body_file_names_file_and_marker(tmp_path, text, words):
+def test_a_wrong_body_file_names_file_and_marker(tmp_path, text, texts):
     with pytest.raises(InputError) as error:
         open_target(written(tmp_path, "plate.toml", text))
-    for word in ["plate.toml", *words]:
+    for word in ["plate.toml", *texts]:
         assert word in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_one_tag_twice_on_a_body_is_refused(tmp_path):
-    one = TAG.format(turn="quaternion_wxyz = [1, 0, 0, 0]")
+def test_one_tag_twice_on_a_body_is_rejected(tmp_path):
+    one = TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]")
     with pytest.raises(InputError, match=r"marker 2 \(B\).*id 3.*'A'"):
         open_target(written(tmp_path, "b.toml", one + one.replace('"A"', '"B"')))
 
 
 @pytest.mark.parametrize(
-    ("spec", "words"),
+    ("spec", "texts"),
     [
         ("points.csv", ["points.csv", "--detections", "TOML"]),
         ("none.toml", ["none.toml", "no such file"]),
@@ -137,10 +143,10 @@ def test_one_tag_twice_on_a_body_is_refused(tmp_path):
         ("chessbord:9x6:25mm", ["unknown board", "chessboard"]),
     ],
 )
-def test_what_is_no_target_says_what_is(spec, words):
+def test_what_is_no_target_says_what_is(spec, texts):
     with pytest.raises(InputError) as error:
         open_target(spec)
-    for word in words:
+    for word in texts:
         assert word in str(error.value)
 
 

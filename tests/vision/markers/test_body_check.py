@@ -1,4 +1,4 @@
-"""Bodies that are refused everywhere; discs that may be taken for others; boards as markers of a body."""
+"""Bodies that are rejected everywhere; discs that may be taken for others; boards as markers of a body."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from armsight.data import Detections
 from armsight.errors import InputError
 from armsight.geometry.pose import transform
-from armsight.vision.discs.symmetry import flat, other_side, relabelings
+from armsight.vision.discs.symmetry import flat, other_side, symmetries
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import read_body_file
 from armsight.vision.markers.body_layout import read_layout
@@ -20,23 +20,25 @@ from armsight.vision.markers.targets import open_target
 TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
 
 
-def disc(name, place, *, normal="normal = [0, 0, -1]", radius=8.0):
-    return f'[[markers]]\nname = "{name}"\nposition_mm = {list(place)}\n{normal}\ndisc = {{ radius_mm = {radius} }}\n'
+def disc(name, position, *, normal="normal = [0, 0, -1]", radius=8.0):
+    return (
+        f'[[markers]]\nname = "{name}"\nposition_mm = {list(position)}\n{normal}\ndisc = {{ radius_mm = {radius} }}\n'
+    )
 
 
-def written(tmp_path, places, more="", **looks):
+def written(tmp_path, positions, more="", **looks):
     path = tmp_path / "plate.toml"
-    path.write_text("".join(disc(f"P{i + 1}", p, **looks) for i, p in enumerate(places)) + more)
+    path.write_text("".join(disc(f"P{i + 1}", p, **looks) for i, p in enumerate(positions)) + more)
     return str(path)
 
 
 @pytest.mark.parametrize(
-    ("places", "looks", "words"),
+    ("positions", "looks", "texts"),
     [
         (TRIANGLE[:1], {}, ["1 disc cannot", "3 or more"]),
         (TRIANGLE[:2], {}, ["2 discs cannot", "3 or more"]),
         (((-55, 0, 0), (0, 0, 0), (65, 0, 0)), {}, ["P1, P2, P3", "one line"]),
-        (((-55, 0, 0), (-55, 0, 0), (0, 85, 0)), {}, ["marker 2 (P2)", "same place as P1"]),
+        (((-55, 0, 0), (-55, 0, 0), (0, 85, 0)), {}, ["marker 2 (P2)", "same position as P1"]),
         (((-0.055, 0, 0), (0.055, 0, 0), (0, 0.085, 0)), {}, ["(P2)", "0.11 mm from P1", "mm?"]),
         (((-55e3, 0, 0), (55e3, 0, 0), (0, 85e3, 0)), {}, ["(P2)", "110 m from P1", "mm?"]),
         (TRIANGLE, {"radius": 0.0}, ["(P1)", "radius_mm", "0.0"]),
@@ -44,25 +46,25 @@ def written(tmp_path, places, more="", **looks):
         (TRIANGLE, {"radius": 8000.0}, ["(P1)", "8000", "16 m across", "mm?"]),
     ],
 )
-def test_what_no_body_may_be_is_refused_when_it_is_opened(tmp_path, places, looks, words):
-    path = written(tmp_path, places, **looks)
+def test_what_no_body_may_be_is_rejected_when_it_is_opened(tmp_path, positions, looks, texts):
+    path = written(tmp_path, positions, **looks)
     for opened in (open_target, read_layout):
         with pytest.raises(InputError) as error:
             opened(path)
-        for word in ["plate.toml", *words]:
+        for word in ["plate.toml", *texts]:
             assert word in str(error.value)
         assert "\n" not in str(error.value)
 
 
 def test_five_thousand_discs_are_compared_with_their_neighbours_only(tmp_path):
-    places = np.random.default_rng(0).uniform(-2000, 2000, (5000, 3)).tolist()
+    positions = np.random.default_rng(0).uniform(-2000, 2000, (5000, 3)).tolist()
     path = tmp_path / "cloud.toml"
-    path.write_text("".join(disc(f"P{i}", p, radius=0.1) for i, p in enumerate(places)))
+    path.write_text("".join(disc(f"P{i}", p, radius=0.1) for i, p in enumerate(positions)))
     target = DiscTarget.from_markers(*read_body_file(path, ("disc",)))
     assert target.radii_m.shape == (5000,)
 
 
-def test_the_two_faces_of_a_thin_plate_may_share_a_place(tmp_path):
+def test_the_two_faces_of_a_thin_plate_may_share_a_position(tmp_path):
     faces = written(tmp_path, TRIANGLE)
     back = "".join(disc(f"B{i}", (x, y, 1), normal="normal = [0, 0, 1]") for i, (x, y, _) in enumerate(TRIANGLE))
     both = tmp_path / "both.toml"
@@ -71,7 +73,7 @@ def test_the_two_faces_of_a_thin_plate_may_share_a_place(tmp_path):
     assert len(read_layout(both).body.points) == 6
 
 
-def turns_of(points, seen, tolerance, mirrored=False):
+def rotations_of(points, seen, tolerance, mirrored=False):
     """All ways to take the discs in view for others by trying every one: the slow oracle."""
     found = set()
     a = points[seen] - points[seen].mean(axis=0)
@@ -79,7 +81,7 @@ def turns_of(points, seen, tolerance, mirrored=False):
         b = points[list(taken)] - points[list(taken)].mean(axis=0)
         if np.abs(pdist(a) - pdist(b)).max() > tolerance or (list(taken) == list(seen) and not mirrored):
             continue
-        # A flat body is its own mirror image; any other is turned where the linear map of the two has det > 0.
+        # A flat body is its own mirror image; any other is rotated where the linear map of the two has det > 0.
         if np.linalg.matrix_rank(a, 1e-9) == 2 or (np.linalg.det(np.linalg.lstsq(a, b)[0]) < 0) == mirrored:
             found.add(taken)
     return found
@@ -91,7 +93,7 @@ def regular(count, radius=0.06):
 
 
 SHAPES = {
-    "the chapter's plate": np.array(TRIANGLE) * 1e-3,
+    "the published plate": np.array(TRIANGLE) * 1e-3,
     "equilateral": regular(3),
     "square": regular(4),
     "hexagon": regular(6),
@@ -104,12 +106,12 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("hidden", [False, True])
-def test_relabelings_are_those_that_trying_everything_finds(name, mirrored, hidden):
+def test_symmetries_are_those_that_trying_everything_finds(name, mirrored, hidden):
     points = Rotation.from_rotvec([0.3, -0.2, 0.9]).apply(SHAPES[name])
     seen = np.arange(len(points))[1:] if hidden and len(points) > 3 else np.arange(len(points))
     alike = np.ones((len(points), len(points)), bool)
-    found = relabelings(points, alike, seen, 1e-6, mirrored=mirrored)
-    assert {tuple(one.taken_for.tolist()) for one in found} == turns_of(points, seen, 1e-6, mirrored)
+    found = symmetries(points, alike, seen, 1e-6, mirrored=mirrored)
+    assert {tuple(one.taken_for.tolist()) for one in found} == rotations_of(points, seen, 1e-6, mirrored)
     for one in found:
         source = points * [1, 1, -1] if mirrored else points
         np.testing.assert_allclose(transform(one.T, source[seen]), points[one.taken_for], atol=1e-9)
@@ -119,7 +121,7 @@ def test_relabelings_are_those_that_trying_everything_finds(name, mirrored, hidd
 def test_discs_that_look_different_are_not_taken_for_each_other():
     points = regular(3)
     bright = np.array([True, True, False])
-    found = relabelings(points, bright[:, None] == bright[None], np.arange(3), 1e-6)
+    found = symmetries(points, bright[:, None] == bright[None], np.arange(3), 1e-6)
     assert [one.taken_for.tolist() for one in found] == [[1, 0, 2]]
 
 
@@ -127,28 +129,28 @@ def test_the_tolerance_decides_what_is_alike():
     points = np.array(TRIANGLE) * 1e-3
     alike = np.ones((3, 3), bool)
     off = 0.110 - np.hypot(0.055, 0.085)
-    assert len(relabelings(points, alike, np.arange(3), 0.99 * off)) == 1
-    found = relabelings(points, alike, np.arange(3), 1.01 * off)
+    assert len(symmetries(points, alike, np.arange(3), 0.99 * off)) == 1
+    found = symmetries(points, alike, np.arange(3), 1.01 * off)
     assert len(found) == 5  # every order of three
     assert found[0].off_m == pytest.approx(0.0, abs=1e-15)
     assert [one.off_m for one in found[1:]] == pytest.approx([off] * 4)
 
 
-def test_a_swap_about_its_axis_shows_the_other_side_and_a_turn_within_the_plane_does_not():
+def test_a_symmetry_about_its_axis_shows_the_other_side_and_a_rotation_within_the_plane_does_not():
     alike = np.ones((3, 3), bool)
-    for one in relabelings(regular(3), alike, np.arange(3), 1e-6):
+    for one in symmetries(regular(3), alike, np.arange(3), 1e-6):
         exchanged = (one.taken_for == np.arange(3)).any()
         assert other_side(one, regular(3)) == exchanged
     assert flat(SHAPES["hexagon"], 1e-9)
     assert not flat(SHAPES["mirror"], 1e-3)
 
 
-BOARD = '[[markers]]\nname = "B"\nposition_mm = [10, 20, 30]\n{turn}\nboard = {{ spec = "{spec}" }}\n'
+BOARD = '[[markers]]\nname = "B"\nposition_mm = [10, 20, 30]\n{rotation}\nboard = {{ spec = "{spec}" }}\n'
 
 
-def boarded(tmp_path, spec, turn="normal = [0, 0, -1]\nx_axis = [1, 0, 0]", more=""):
+def boarded(tmp_path, spec, rotation="normal = [0, 0, -1]\nx_axis = [1, 0, 0]", more=""):
     path = tmp_path / "board.toml"
-    path.write_text(BOARD.format(spec=spec, turn=turn) + more)
+    path.write_text(BOARD.format(spec=spec, rotation=rotation) + more)
     return str(path)
 
 
@@ -171,7 +173,7 @@ def test_a_boards_points_sit_where_the_body_file_says(tmp_path, spec):
 def test_a_board_on_a_body_is_found_under_its_names(tmp_path, monkeypatch):
     seen = Detections(np.array([0, 5]), np.array([[1.0, 2], [3, 4]]), np.tile(np.eye(2), (2, 1, 1)))
     image = np.zeros((64, 64), np.uint8)
-    two = BOARD.format(spec="charuco:8x5:15mm:11mm:DICT_5X5_100", turn="quaternion_wxyz = [1, 0, 0, 0]")
+    two = BOARD.format(spec="charuco:8x5:15mm:11mm:DICT_5X5_100", rotation="quaternion_wxyz = [1, 0, 0, 0]")
     path = boarded(tmp_path, "chessboard:9x6:25mm", more=two.replace('"B"', '"C"'))
     target = open_target(path)
     assert "B: no chessboard" in target.detect(image).problem
@@ -182,18 +184,18 @@ def test_a_board_on_a_body_is_found_under_its_names(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("spec", "words"),
+    ("spec", "texts"),
     [
-        ("chessboard:8x6:25mm", ["(B)", "same when it is turned", "9x6", "charuco"]),
-        ("circles:4x3:20mm", ["(B)", "same when it is turned"]),
+        ("chessboard:8x6:25mm", ["(B)", "same when it is rotated", "9x6", "charuco"]),
+        ("circles:4x3:20mm", ["(B)", "same when it is rotated"]),
         ("chessboard:9x6:25", ["(B)", "no unit"]),
         ("chess", ["(B)", "unknown board"]),
     ],
 )
-def test_a_board_that_cannot_be_named_on_a_body_is_refused(tmp_path, spec, words):
+def test_a_board_that_cannot_be_named_on_a_body_is_rejected(tmp_path, spec, texts):
     with pytest.raises(InputError) as error:
         open_target(boarded(tmp_path, spec))
-    for word in ["board.toml", *words]:
+    for word in ["board.toml", *texts]:
         assert word in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -208,8 +210,8 @@ def test_a_board_that_cannot_be_named_on_a_body_is_refused(tmp_path, spec, words
         ("chessboard:9x6:25mm", "aprilgrid:3x2:20mm:0.3", True),
     ],
 )
-def test_two_boards_of_a_body_that_look_alike_are_refused(tmp_path, one, other, good):
-    more = BOARD.format(spec=other, turn="quaternion_wxyz = [1, 0, 0, 0]").replace('"B"', '"C"')
+def test_two_boards_of_a_body_that_look_alike_are_rejected(tmp_path, one, other, good):
+    more = BOARD.format(spec=other, rotation="quaternion_wxyz = [1, 0, 0, 0]").replace('"B"', '"C"')
     path = boarded(tmp_path, one, more=more)
     if good:
         assert len(open_target(path).boards) == 2
@@ -218,7 +220,7 @@ def test_two_boards_of_a_body_that_look_alike_are_refused(tmp_path, one, other, 
             open_target(path)
 
 
-def test_a_tag_that_is_on_a_board_too_is_refused(tmp_path):
+def test_a_tag_that_is_on_a_board_too_is_rejected(tmp_path):
     tag = (
         '[[markers]]\nname = "T"\nposition_mm = [200, 0, 0]\nnormal = [0, 0, -1]\nx_axis = [1, 0, 0]\n'
         'tag = { family = "tag36h11", id = 5, size_mm = 40 }\n'

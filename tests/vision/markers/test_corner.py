@@ -1,4 +1,4 @@
-"""X corners against brute-force paintings: error, bias, honesty of the covariance, and what is refused."""
+"""X corners against brute-force paintings: error, bias, honesty of the covariance, and what is rejected."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from supersampled import checks, expose, paint, project, view
 
 from armsight.vision.markers import crossing
-from armsight.vision.markers.corner import MOVED_MAX_PX, VERDICTS, refine_corners
+from armsight.vision.markers.corner import MOVED_MAX_PX, OUTCOMES, refine_corners
 from armsight.vision.markers.normal import edge, edge_single
 from asserts import assert_jacobian
 
@@ -14,7 +14,7 @@ NEIGHBOURS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1
 
 
 def scene(rng, pitch_px, tilt, blur_px):
-    """Return a painted corner of a random view, its place and the sides of its square."""
+    """Return a painted corner of a random view, its position and the sides of its square."""
     samples = 16 if pitch_px < 28 else 10
     size = int(3.2 * pitch_px) | 1
     centre = size // 2 + rng.uniform(-0.5, 0.5, 2)
@@ -34,7 +34,7 @@ def trials(rng, pitch_px, tilt, blur_px, contrast, noise, scenes=6, draws=50):
             image = expose(painted, contrast, noise, rng)
             start = truth + rng.normal(0.0, 0.4, 2)
             fit = refine_corners(image, start[None], sides[None])
-            assert fit.kept.all(), VERDICTS[fit.verdict[0]]
+            assert fit.kept.all(), OUTCOMES[fit.outcome[0]]
             e = fit.uv[0] - truth
             errors.append(e)
             normalised.append(e @ np.linalg.solve(fit.cov_uv[0], e))
@@ -148,7 +148,7 @@ def test_pixels_of_plain_squares_count_by_their_moments_as_one_by_one():
     assert (np.abs(found[1] - found[0]) / scale).max() < 1e-4  # single precision on one side only
 
 
-def test_a_start_far_off_is_refused():
+def test_a_start_far_off_is_rejected():
     painted, truth, sides = scene(np.random.default_rng(5), 30, 0.2, 0.8)
     image = expose(painted, 120, 1, np.random.default_rng(5))
     fit = refine_corners(image, truth[None] + MOVED_MAX_PX + 0.5, sides[None])
@@ -156,7 +156,7 @@ def test_a_start_far_off_is_refused():
 
 
 @pytest.mark.parametrize("what", ["blank", "noise", "edge", "outside", "unknown", "covered"])
-def test_what_is_no_corner_is_refused(what):
+def test_what_is_no_corner_is_rejected(what):
     rng = np.random.default_rng(6)
     painted, truth, sides = scene(rng, 24, 0.2, 0.8)
     image = expose(painted, 120, 2, rng)
@@ -175,7 +175,7 @@ def test_what_is_no_corner_is_refused(what):
     assert not refine_corners(image, truth[None], sides[None]).kept[0]
 
 
-def test_contrast_tells_the_colours_and_does_not_depend_on_which_way_the_sides_point():
+def test_contrast_gives_the_colours_and_does_not_depend_on_which_way_the_sides_point():
     painted, truth, sides = scene(np.random.default_rng(7), 24, 0.2, 0.8)
     image = expose(painted, 120, 1, np.random.default_rng(7))
     fit = refine_corners(image, np.repeat(truth[None], 3, axis=0), np.array([sides, -sides, sides * [[1], [-1]]]))

@@ -1,4 +1,4 @@
-"""Chessboards in the real recordings: found in every image, and placed more smoothly than OpenCV places them."""
+"""Chessboards in the real recordings: found in every image, and located more smoothly than by OpenCV."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ COLUMNS, ROWS = 9, 6
 
 
 def roughness(ids, uv):
-    """Return the typical residual, px an axis, of places from a perspective and a smooth quartic field over the board.
+    """Return the typical residual, px an axis, of positions from a perspective and a smooth quartic field over the board.
 
     Lens distortion and the board's bend are smooth over the board; errors of single corners are not.
     """
@@ -31,7 +31,7 @@ def roughness(ids, uv):
     [("webcams-360p", 58), ("opencv-480p", 26), ("stereopi-240p", 60)],
     ids=lambda value: str(value),
 )
-def test_boards_are_found_in_every_image_and_placed_smoothly(data_dir, folder, images):
+def test_boards_are_found_in_every_image_and_posed_smoothly(data_dir, folder, images):
     board = open_board(f"chessboard:{COLUMNS}x{ROWS}:25mm")
     paths = sorted(path for path in (data_dir / "stereo" / folder).iterdir() if path.suffix in (".jpg", ".png"))
     assert len(paths) == images
@@ -44,8 +44,8 @@ def test_boards_are_found_in_every_image_and_placed_smoothly(data_dir, folder, i
         assert len(found.ids) >= 48, path.name
         ours.append(roughness(found.ids, found.uv))
         rough = find_grid(image, COLUMNS, ROWS).reshape(-1, 1, 2).astype(np.float32)
-        placed = cv2.cornerSubPix(image, rough, (5, 5), (-1, -1), stop).reshape(-1, 2).astype(np.float64)
-        theirs.append(roughness(np.arange(COLUMNS * ROWS), placed))
+        posed = cv2.cornerSubPix(image, rough, (5, 5), (-1, -1), stop).reshape(-1, 2).astype(np.float64)
+        theirs.append(roughness(np.arange(COLUMNS * ROWS), posed))
     assert np.median(ours) < 0.07
     assert np.median(ours) < 0.75 * np.median(theirs)
 

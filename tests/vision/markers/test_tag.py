@@ -18,10 +18,10 @@ pytestmark = pytest.mark.opencv
 OUTLINE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
 
-def scene(side_px, tilt, turn, blur_px, code, samples=12, quiet=1.2):
+def scene(side_px, tilt, rotation, blur_px, code, samples=12, quiet=1.2):
     """Return a painted marker in a white plate in a grey world, and its corners."""
     size = int(1.8 * side_px)
-    H = view(side_px, tilt, 0.7, turn, (size / 2 + 0.21, size / 2 - 0.37))
+    H = view(side_px, tilt, 0.7, rotation, (size / 2 + 0.21, size / 2 - 0.37))
     plate = 0.5 + quiet / len(code)
     marker = picture(code.astype(float), low=-0.5, high=0.5)
 
@@ -36,12 +36,12 @@ def scene(side_px, tilt, turn, blur_px, code, samples=12, quiet=1.2):
     ("side_px", "tilt", "blur_px", "noise"),
     [(40, 0.3, 1.0, 2), (24, 0.3, 0.7, 2), (90, 0.6, 0.8, 2), (45, 1.0, 0.8, 3), (30, 0.2, 0.4, 4)],
 )
-def test_corners_are_placed_as_well_as_predicted(side_px, tilt, blur_px, noise):
+def test_corners_are_posed_as_well_as_predicted(side_px, tilt, blur_px, noise):
     rng = np.random.default_rng(side_px)
     code = cells("tag36h11", 17)
     errors, normalised = [], []
-    for turn in (0.2, 1.1, 2.6, -1.9):
-        painted, truth = scene(side_px, tilt, turn, blur_px, code)
+    for rotation in (0.2, 1.1, 2.6, -1.9):
+        painted, truth = scene(side_px, tilt, rotation, blur_px, code)
         for _ in range(12):
             fit = fit_square(expose(painted, 130, noise, rng), truth + rng.normal(0, 0.6, (4, 2)), code)
             assert fit.problem is None
@@ -67,7 +67,7 @@ def test_gamma_and_bleeding_print_do_not_move_the_outline():
 
 
 @pytest.mark.parametrize("side_px", [16, 40, 100])
-def test_corners_found_most_of_a_cell_off_come_home_or_are_refused(side_px):
+def test_corners_found_most_of_a_cell_off_come_home_or_are_rejected(side_px):
     code, rng = cells("tag36h11", 3), np.random.default_rng(2)
     painted, truth = scene(side_px, 0.5, 0.9, 1.0, code, samples=8)
     for _ in range(12):
@@ -80,7 +80,7 @@ def test_corners_found_most_of_a_cell_off_come_home_or_are_refused(side_px):
 
 
 @pytest.mark.parametrize("what", ["other", "blank", "half", "outside"])
-def test_what_is_not_the_marker_is_refused(what):
+def test_what_is_not_the_marker_is_rejected(what):
     code, rng = cells("tag36h11", 3), np.random.default_rng(3)
     painted, truth = scene(40, 0.2, 0.3, 0.8, code, samples=8)
     image = expose(painted, 130, 2, rng)
@@ -101,8 +101,8 @@ def test_upright_is_whose_name_it_bears():
     # The AprilTag project's code of 36h11 number 0, row by row from the upper left.
     code = [int(bit) for bit in f"{0xD5D628584:036b}"]
     np.testing.assert_array_equal((cells("tag36h11", 0)[1:7, 1:7] > 0).ravel(), code)
-    drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6)
-    np.testing.assert_array_equal(cells("DICT_4X4_50", 7) > 0, drawn > 0)
+    rendered = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6)
+    np.testing.assert_array_equal(cells("DICT_4X4_50", 7) > 0, rendered > 0)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

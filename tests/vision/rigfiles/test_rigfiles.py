@@ -1,4 +1,4 @@
-"""Foreign rig files: exact round trips, OpenCV's own projection as the oracle of every import, every damage told."""
+"""Foreign rig files: exact round trips, OpenCV's own projection as the oracle of every import, every damage reported."""
 
 import builtins
 import errno
@@ -134,7 +134,7 @@ def test_a_full_disk_replaces_neither_file_of_a_pair(tmp_path, monkeypatch, full
     real, count = io.FileIO.write, itertools.count()
 
     def write(file, data):
-        if next(count) == full:  # the disk turns out to be full only when the buffer is written out
+        if next(count) == full:  # the disk is found to be full only when the buffer is written out
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
         return real(file, data)
 
@@ -150,8 +150,8 @@ def test_a_pair_in_the_wrong_order_is_remarked(tmp_path, name):
     export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
     rig = import_rig(name, paths(tmp_path, name))
     assert not any("left of the first" in note for note in rig.provenance["notes"])
-    swapped = StereoRig(rig.right, rig.left, inverse(rig.T_left_right), rig.cov, 0.1)
-    export_rig(swapped, name, paths(tmp_path, name))
+    exchanged = StereoRig(rig.right, rig.left, inverse(rig.T_left_right), rig.cov, 0.1)
+    export_rig(exchanged, name, paths(tmp_path, name))
     back = import_rig(name, paths(tmp_path, name))
     np.testing.assert_allclose(back.T_left_right, inverse(rig.T_left_right), atol=2e-15)
     assert any("left of the first" in note for note in back.provenance["notes"])
@@ -329,7 +329,7 @@ def test_opencv_other_files(tmp_path, text):
     assert "\n" not in str(caught.value)
 
 
-def test_opencv_truncations_are_told(tmp_path):
+def test_opencv_truncations_are_reported(tmp_path):
     (path,) = stereo_calib(tmp_path, files=1)
     whole = path.read_text()
     for length in range(0, whole.index("R1:") - 40, 61):
@@ -568,7 +568,7 @@ def test_without_pyyaml_the_error_says_what_to_install(tmp_path, monkeypatch, na
 
 
 def run(*args):
-    """Run ``armsight rig``; an error comes back as the exception the main program turns into one line."""
+    """Run ``armsight rig``; an error comes back as the exception that the main program prints as one line."""
     return CliRunner().invoke(command, [str(a) for a in args], catch_exceptions=False)
 
 
@@ -593,13 +593,13 @@ def test_command_export_import_show(tmp_path, name):
 def test_command_show_knows_the_sigmas(tmp_path):
     rig, path = ordinary_rig(), tmp_path / "rig.json"
     rig.save(path)
-    facts = json.loads(run("show", path, "--json").stdout)
-    assert facts["sigmas"]["left.fx_px"] == pytest.approx(rig.cov[0, 0] ** 0.5)
+    properties = json.loads(run("show", path, "--json").stdout)
+    assert properties["sigmas"]["left.fx_px"] == pytest.approx(rig.cov[0, 0] ** 0.5)
     # The baseline's own variance, from many draws of the translation.
     draws = np.random.default_rng(3).multivariate_normal(np.zeros(3), rig.cov[-6:-3, -6:-3], 100_000)
     lengths = np.linalg.norm(rig.T_left_right[:3, 3] + draws @ rig.T_left_right[:3, :3].T, axis=1)
     # 100 000 draws settle a standard deviation to 0.22 %; four of those, and the curvature of the length.
-    assert facts["baseline_sigma_m"] == pytest.approx(lengths.std(), rel=0.01)
+    assert properties["baseline_sigma_m"] == pytest.approx(lengths.std(), rel=0.01)
     text = run("show", path).stdout
     assert "baseline: " in text
     assert f"{rig.baseline_m * 1e3:.3f} +- " in text

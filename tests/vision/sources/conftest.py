@@ -1,4 +1,4 @@
-"""Images that tell which camera and which frame they are: left frame k is grey 10k, right frame k grey 10k + 5."""
+"""Images that show which camera and which frame they are: left frame k is grey 10k, right frame k grey 10k + 5."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,8 +23,8 @@ def picture() -> Callable[..., np.ndarray]:
 
 
 @pytest.fixture
-def told() -> Callable[[np.ndarray], tuple[str, int]]:
-    """Tell side and frame number from an image; lossy codecs move the grey by less than 2."""
+def read_back() -> Callable[[np.ndarray], tuple[str, int]]:
+    """Read side and frame number from an image; lossy codecs move the grey by less than 2."""
 
     def read(image: np.ndarray) -> tuple[str, int]:
         value = float(np.mean(image))

@@ -22,13 +22,15 @@ def shots(source):
     return found
 
 
-def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, told):
+def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, read_back):
     for k in (1, 2, 10):
         store(tmp_path / f"left{k}.png", "left", k)
         store(tmp_path / f"right{k}.png", "right", k)
     found = shots(PairsSource.open(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png"))
     assert [shot.name for shot in found] == ["left1", "left2", "left10"]
-    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in (1, 2, 10)]
+    assert [(read_back(shot.left), read_back(shot.right)) for shot in found] == [
+        (("left", k), ("right", k)) for k in (1, 2, 10)
+    ]
     assert all(shot.t_s is None and shot.problem is None for shot in found)
 
 
@@ -115,13 +117,16 @@ def test_a_glob_that_matches_nothing_or_a_folder_says_so(tmp_path):
         PairsSource.open(str(tmp_path), str(tmp_path))
 
 
-def test_a_folder_with_left_and_right_subfolders(tmp_path, store, told):
+def test_a_folder_with_left_and_right_subfolders(tmp_path, store, read_back):
     for k in (2, 10):
         store(tmp_path / "left" / f"{k}.png", "left", k)
         store(tmp_path / "right" / f"{k}.png", "right", k)
     (tmp_path / "left" / "notes.txt").write_text("no image")
     found = shots(open_source(f"folder:{tmp_path}"))
-    assert [(shot.name, told(shot.left)[1], told(shot.right)[1]) for shot in found] == [("2", 2, 2), ("10", 10, 10)]
+    assert [(shot.name, read_back(shot.left)[1], read_back(shot.right)[1]) for shot in found] == [
+        ("2", 2, 2),
+        ("10", 10, 10),
+    ]
 
 
 def test_a_folder_without_shots_or_none_at_all(tmp_path):
@@ -157,12 +162,12 @@ def test_a_damaged_index_is_named_with_its_line(tmp_path, text, said):
         FolderSource.open(tmp_path)
 
 
-def test_an_index_is_obeyed(tmp_path, store, told):
+def test_an_index_is_followed(tmp_path, store, read_back):
     store(tmp_path / "b.png", "left", 3)
     store(tmp_path / "a.png", "right", 3)
     (tmp_path / "shots.csv").write_text(HEADER + "x,1.25,b.png,a.png,\ny,1.5,,,camera asleep\nz,,gone.png,a.png,\n")
     x, y, z = shots(FolderSource.open(tmp_path))
-    assert (x.name, x.t_s, told(x.left), told(x.right)) == ("x", 1.25, ("left", 3), ("right", 3))
+    assert (x.name, x.t_s, read_back(x.left), read_back(x.right)) == ("x", 1.25, ("left", 3), ("right", 3))
     assert (y.name, y.t_s, y.problem, y.left) == ("y", 1.5, "camera asleep", None)
     assert (z.t_s, z.problem) == (None, f"{tmp_path}/gone.png: no such file")
 

@@ -28,23 +28,23 @@ ANSWERS = {
 
 def packets(jpeg, number, time_stamp):
     """Yield the RTP packets of one JPEG file: its tables and its scan without the other headers."""
-    tables, place = {}, 2
-    while jpeg[place + 1] != 0xDA:
-        body = jpeg[place + 4 : place + 2 + int.from_bytes(jpeg[place + 2 : place + 4], "big")]
-        if jpeg[place + 1] == 0xDB:
+    tables, position = {}, 2
+    while jpeg[position + 1] != 0xDA:
+        body = jpeg[position + 4 : position + 2 + int.from_bytes(jpeg[position + 2 : position + 4], "big")]
+        if jpeg[position + 1] == 0xDB:
             tables.update((body[i] & 15, body[i + 1 : i + 65]) for i in range(0, len(body), 65))
-        elif jpeg[place + 1] == 0xC0:
+        elif jpeg[position + 1] == 0xC0:
             height, width = struct.unpack(">HH", body[1:5])
-        place += 4 + len(body)
-    scan = jpeg[place + 2 + int.from_bytes(jpeg[place + 2 : place + 4], "big") : -2]
+        position += 4 + len(body)
+    scan = jpeg[position + 2 + int.from_bytes(jpeg[position + 2 : position + 4], "big") : -2]
     for k, start in enumerate(range(0, len(scan), 1300)):
         last = start + 1300 >= len(scan)
         head = struct.pack(">BBHII", 0x80, 26 | (last << 7), (number + k) & 0xFFFF, time_stamp, 7)
         kind = struct.pack(
             ">IBBBB", start, 1, 255, width // 8, height // 8
         )  # 1: colour at half resolution; 255: tables
-        told = b"\0\0\0\x80" + tables[0] + tables[1] if start == 0 else b""
-        packet = head + kind + told + scan[start : start + 1300]
+        reported = b"\0\0\0\x80" + tables[0] + tables[1] if start == 0 else b""
+        packet = head + kind + reported + scan[start : start + 1300]
         yield b"$\0" + struct.pack(">H", len(packet)) + packet
 
 
@@ -97,13 +97,13 @@ def serve(picture):
         yield start
 
 
-def test_two_streams_then_one_stalls(serve, told, monkeypatch):
+def test_two_streams_then_one_stalls(serve, read_back, monkeypatch):
     monkeypatch.setitem(STREAMS, "rtsp", partial(RtspStream, timeout_s=2.0))
     left, right = serve("left"), serve("right")
     with contextlib.closing(open_source(f"url:{left.url},{right.url}")) as source:
         found = [source.read() for _ in range(8)]
         assert all(shot.problem is None for shot in found)
-        assert [(told(shot.left)[0], told(shot.right)[0]) for shot in found] == [("left", "right")] * 8
+        assert [(read_back(shot.left)[0], read_back(shot.right)[0]) for shot in found] == [("left", "right")] * 8
         times = [shot.t_s for shot in found]
         assert times == sorted(set(times))
         right.stall.set()

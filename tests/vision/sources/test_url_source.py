@@ -105,7 +105,7 @@ def threads():
         (False, f'multipart/x-mixed-replace; boundary="{BOUNDARY}"'),
     ],
 )
-def test_two_mjpeg_streams(server, films, told, length, said):
+def test_two_mjpeg_streams(server, films, read_back, length, said):
     for side in ("left", "right"):
         server.routes[f"/{side}?size=small"] = server.stream(films[side], length, said)
     before = time.monotonic()
@@ -116,7 +116,7 @@ def test_two_mjpeg_streams(server, films, told, length, said):
     assert threads() == set()
     assert [shot.name for shot in found] == [f"{k:06d}" for k in range(6)]
     assert all(shot.problem is None for shot in found)
-    assert all((told(shot.left)[0], told(shot.right)[0]) == ("left", "right") for shot in found)
+    assert all((read_back(shot.left)[0], read_back(shot.right)[0]) == ("left", "right") for shot in found)
     times = [before, *(shot.t_s for shot in found), time.monotonic()]
     assert times == sorted(times)
 
@@ -238,7 +238,7 @@ def gibberish(server, films):
         (gibberish, "SSH-2.0-OpenSSH_9.2p1"),
     ],
 )
-def test_a_bad_stream_is_told_by_its_address(server, films, behaviour, said):
+def test_a_bad_stream_is_reported_by_its_address(server, films, behaviour, said):
     server.routes["/left"] = server.stream(films["left"])
     server.routes["/right"] = behaviour(server, films)
     error = error_of(f"url:http://{server.host}/left,http://{server.host}/right")
@@ -348,7 +348,7 @@ def test_a_frame_waits_for_the_partner_nearest_in_time(fed):
     assert (shot.left[0, 0], shot.right[0, 0]) == (2, 2)
 
 
-def test_streams_that_never_meet_are_told(fed):
+def test_streams_that_never_meet_are_reported(fed):
     source, left, right = fed
     for k in range(3):
         left.push(0.1 * k, k)

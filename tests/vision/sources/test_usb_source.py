@@ -150,7 +150,7 @@ def test_a_driver_without_time_stamps_gets_the_time_after_the_grab(bench):
     assert shot.t_s == pytest.approx(bench.clock.now, abs=PERIOD)
 
 
-def test_cameras_of_rates_that_never_meet_are_told(bench):
+def test_cameras_of_rates_that_never_meet_are_reported(bench):
     source = bench.open(left={"period": PERIOD}, right={"period": PERIOD})
     bench.captures[1].clock = Clock()  # the right one's stamps stand on a clock that stays behind
     bench.captures[1].clock.now -= 5.0
@@ -202,7 +202,7 @@ def test_exposure_can_be_set_back_to_automatic(bench):
     assert bench.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
 
 
-def test_a_stall_is_told_and_who_stalled(bench):
+def test_a_stall_is_reported_and_who_stalled(bench):
     source = bench.open()
     source.read()
     bench.captures[1].dead = True
@@ -211,7 +211,7 @@ def test_a_stall_is_told_and_who_stalled(bench):
     assert str(caught.value) == f"{bench.devices[1]}: no frame for 5 s: stalled; two cameras may need two USB ports"
 
 
-def test_an_unplugged_camera_is_told(bench):
+def test_an_unplugged_camera_is_reported(bench):
     source = bench.open()
     source.read()
     bench.captures[0].dead = True
@@ -238,7 +238,7 @@ def test_a_frame_that_does_not_decode_is_a_shot_with_a_problem(bench):
     assert source.read().problem is None
 
 
-def test_a_frame_of_another_size_is_told(bench):
+def test_a_frame_of_another_size_is_reported(bench):
     source = bench.open("@1280x720", right={"size": (640, 480)})
     with pytest.raises(DeviceError, match=r"cam1: sends frames of 640x480 px, agreed on 1280x720"):
         source.read()
@@ -249,7 +249,7 @@ def test_a_frame_of_another_size_is_told(bench):
     ["", "0", "0,", ",1", "0,1@", "0,1@640x480@", "0,1@640x480x3", "0,1,2", "0,1,exposure=5",
      "0,1,exposure=5ms=6", "0,1,gain=3", "0,1,format=MJPEG", "0,1@30@640x480"],
 )  # fmt: skip
-def test_a_text_of_another_form_is_told(rest):
+def test_a_text_of_another_form_is_reported(rest):
     opened = []
     with pytest.raises(InputError, match=r"expected usb:LEFT,RIGHT\[@WIDTHxHEIGHT\]"):
         usb.open_usb(rest, opened.append)

@@ -38,10 +38,12 @@ def shots(spec):
     return found
 
 
-def test_two_files_frame_by_frame_with_the_files_times(film, picture, told):
+def test_two_files_frame_by_frame_with_the_files_times(film, picture, read_back):
     left, right = (film(f"{side}.avi", [picture(side, k) for k in range(12)]) for side in ("left", "right"))
     found = shots(f"video:{left},{right}")
-    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in range(12)]
+    assert [(read_back(shot.left), read_back(shot.right)) for shot in found] == [
+        (("left", k), ("right", k)) for k in range(12)
+    ]
     assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in range(12)], abs=1e-6)
     assert [shot.name for shot in found[:2]] == ["000000", "000001"]
 
@@ -54,21 +56,23 @@ def test_unequal_lengths_stop_at_the_shorter_and_say_so(film, picture):
     assert found[-1].problem == f"{right} ends after 7 frames, {left} goes on: stopped there"
 
 
-def test_frames_are_paired_by_time_and_those_without_a_partner_named(film, picture, told):
+def test_frames_are_paired_by_time_and_those_without_a_partner_named(film, picture, read_back):
     left = film("left.avi", [picture("left", k) for k in range(10)], fps=30)
     right = film("right.avi", [picture("right", k) for k in range(5)], fps=15)
     found = shots(f"video:{left},{right}")
-    pairs = [(told(shot.left)[1], told(shot.right)[1]) for shot in found if shot.problem is None]
+    pairs = [(read_back(shot.left)[1], read_back(shot.right)[1]) for shot in found if shot.problem is None]
     assert pairs == [(2 * k, k) for k in range(5)]
     alone = [shot for shot in found if shot.problem]
     assert alone[0].problem == f"{right} has no frame for {left}'s at 0.033 s: its next is at 0.067 s"
     assert alone[0].t_s == pytest.approx(1 / 30)
 
 
-def test_a_side_by_side_file_is_split_in_the_middle(film, picture, told):
+def test_a_side_by_side_file_is_split_in_the_middle(film, picture, read_back):
     images = [np.hstack([picture("left", k), picture("right", k)]) for k in range(5)]
     found = shots(f"video:{film('both.avi', images)}")
-    assert [(told(shot.left), told(shot.right)) for shot in found] == [(("left", k), ("right", k)) for k in range(5)]
+    assert [(read_back(shot.left), read_back(shot.right)) for shot in found] == [
+        (("left", k), ("right", k)) for k in range(5)
+    ]
     assert found[0].left.shape == found[0].right.shape == (48, 64, 3)
 
 

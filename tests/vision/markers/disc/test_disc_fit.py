@@ -10,14 +10,14 @@ from disc_views import discs_of
 BRIGHT, DARK = (discs_of(np.eye(3) * 0.05, bright=kind) for kind in (True, False))
 
 
-def bound(window, contrast, blur, noise, c, a, b, turn, step=1e-3):
+def bound(window, contrast, blur, noise, c, a, b, rotation, step=1e-3):
     """Cramer-Rao bound of the centre, px^2: derivatives of brute-force images by the centre and all nuisances."""
     v, u = np.mgrid[: len(window), : len(window)]
 
     def image(x):
         return contrast * share([outline(x[:2], x[2], x[3], x[4])], x[5], np.zeros(2), len(window))
 
-    x0 = np.array([*c, a, b, turn, blur])
+    x0 = np.array([*c, a, b, rotation, blur])
     J = [
         (image(x0 + e) - image(x0 - e)) / (2 * step * 10)
         for e in np.diag(np.full(6, 10 * step))
@@ -44,9 +44,9 @@ def test_centre_reaches_the_bound(a, b, blur, contrast, noise):
     errors, normed = [], []
     target = BRIGHT if contrast > 0 else DARK
     for _ in range(6):
-        c, turn = size / 2 + rng.uniform(-0.5, 0.5, 2), rng.uniform(0, np.pi)
-        window = share([outline(c, a, b, turn)], blur, np.zeros(2), size)
-        limit = bound(window, contrast, blur, noise, c, a, b, turn)
+        c, rotation = size / 2 + rng.uniform(-0.5, 0.5, 2), rng.uniform(0, np.pi)
+        window = share([outline(c, a, b, rotation)], blur, np.zeros(2), size)
+        limit = bound(window, contrast, blur, noise, c, a, b, rotation)
         for _ in range(40):
             found = target.find(grey((45.0 if contrast > 0 else 190.0) + contrast * window, noise, rng))
             assert len(found.uv) == 1
@@ -74,7 +74,7 @@ def test_an_uneven_surround_and_uneven_light_do_not_pull():
         assert np.abs(e.mean(axis=0)).max() < 0.003 + 4 * e.std() / np.sqrt(len(e))
 
 
-def test_motion_smears_a_disc_about_its_middle_or_is_told():
+def test_motion_smears_a_disc_about_its_middle_or_is_reported():
     rng = np.random.default_rng(3)
     size, c, r = 72, np.array([35.6, 35.2]), 8.0
     for length in (4.0, 8.0, 12.0, 16.0):
@@ -91,10 +91,10 @@ def test_motion_smears_a_disc_about_its_middle_or_is_told():
             assert np.sqrt((e**2).mean()) < np.sqrt(np.mean([np.trace(d.cov_uv[0]) / 2 for d in good]))
 
 
-def square(c, half, turn):
+def square(c, half, rotation):
     return c + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ [
-        [np.cos(turn), np.sin(turn)],
-        [-np.sin(turn), np.cos(turn)],
+        [np.cos(rotation), np.sin(rotation)],
+        [-np.sin(rotation), np.cos(rotation)],
     ]
 
 
@@ -181,7 +181,7 @@ def test_noise_alone_shows_no_disc():
         assert len(BRIGHT.find(grey(np.full((480, 640), 100.0), noise, rng)).uv) == 0
 
 
-def test_an_image_with_too_many_places_is_said_to_be():
+def test_an_image_with_too_many_positions_is_said_to_be():
     image = (255 * np.random.default_rng(12).integers(0, 2, (2160, 3840))).astype(np.uint8)
 
     def full(part):
