@@ -1,4 +1,4 @@
-"""Interrupts from the keyboard that must wait."""
+"""Keyboard interrupts that must wait until something is complete."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[list[int]]:
-    """Hold an interrupt from the keyboard back; the block is handed a list that has those which came."""
+    """Delay keyboard interrupts within the block; it is given a list to which those that came are appended."""
     held: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # only the main thread is interrupted
         yield held

@@ -1,4 +1,4 @@
-"""The ``armsight`` command: the group, and how errors reach a person.
+"""The ``armsight`` command: the group of commands, and how errors are reported.
 
 Every command takes ``--json`` (machine-readable on stdout); progress and warnings go to stderr. A mistake in the input
 is one line on stderr and exit code 2; an interrupt is exit code 130.
@@ -14,29 +14,33 @@ import click
 
 from armsight.errors import ArmsightError
 
-#: The commands; each has a folder of its name, whose ``command.py`` holds a click command called ``command``.
-COMMANDS = (
-    "arm",
-    "board",
-    "body",
-    "calibrate",
-    "cameras",
-    "check",
-    "demo",
-    "dense",
-    "identify",
-    "measure",
-    "record",
-    "rig",
-    "run",
-)
+#: What a person is about -> the commands; each has a folder of its name, whose ``command.py`` holds a click command called
+#: ``command``.
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "Calibrate cameras": ("calibrate", "cameras", "record", "rig"),
+    "Measure": ("body", "measure", "dense"),
+    "Operate an arm": ("arm", "board", "run"),
+    "Check and identify an arm": ("check", "identify"),
+    "Simulate": ("demo",),
+}
+COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
 
 
-class _Lazy(click.Group):
-    """A group that imports a command's module only when that command is asked for."""
+class _Sections(click.Group):
+    """A group that lists its commands by section, and imports a command's module only when that command is requested."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(COMMANDS)
+        return list(COMMANDS)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands, section by section, each with the first sentence of its help."""
+        longest = max(map(len, COMMANDS))
+        for title, names in SECTIONS.items():
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            limit = formatter.width - 6 - longest
+            rows = [(name, command.get_short_help_str(limit)) for name, command in commands if command is not None]
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(longest), text) for name, text in rows])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
@@ -53,10 +57,10 @@ class _Lazy(click.Group):
             raise click.exceptions.Abort from None
 
 
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_Sections, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="armsight")
 def group() -> None:
-    """Say where a robot arm's end-effector is, from two USB cameras, in millimetres and with an honest sigma."""
+    """Measure the pose of a robot arm's end-effector with two USB cameras, in millimetres, with its uncertainty."""
 
 
 def main() -> None:
@@ -85,12 +89,12 @@ def main() -> None:
     except BrokenPipeError:
         _silence_stdout()
         sys.exit(0)
-    except OSError as error:  # every file and device names itself in an ArmsightError: what is left is the output
+    except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
         _silence_stdout()
         click.echo(f"armsight: error: the output cannot be written: {error.strerror}", err=True)
         sys.exit(2)
 
 
 def _silence_stdout() -> None:
-    """Let what is still buffered go nowhere, so that the interpreter does not stumble over it at its end."""
+    """Discard what is still buffered, so that the interpreter does not fail on it at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar where a person watches, silence where a program does."""
+"""Progress on stderr: a bar where that is a terminal, nothing elsewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 @contextlib.contextmanager
 def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
-    """Show a progress bar; the block is handed a function that advances it by one."""
+    """Show a progress bar; the block is given a function that advances it by one."""
     console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -21,7 +21,7 @@ def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def steps() -> Iterator[Callable[[str], None]]:
-    """Show what is being done; the block is handed a function that takes the next line."""
+    """Show what is being done; the block is given a function that sets the line."""
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:

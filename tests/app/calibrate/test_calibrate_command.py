@@ -17,7 +17,7 @@ from cli_runs import listening, refused
 
 pytestmark = pytest.mark.opencv
 
-QUICK = ("--model", "brown5", "--folds", "3", "--flat-board")
+QUICK = ("--lens-model", "brown5", "--folds", "3", "--flat-target")
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def images(folder):
     return "--left", folder / "left*.png", "--right", folder / "right*.png"
 
 
-CHESS = ("--board", "chessboard:9x6:25mm")
+CHESS = ("--target", "chessboard:9x6:25mm")
 
 
 def test_the_rendered_rig_is_recovered(bench):
@@ -87,7 +87,7 @@ def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monk
         "calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--report", tmp_path / "r", "--json"
     )
     assert said.code == 0, said.err
-    assert Path(said.lines[0]["report"]) == tmp_path / "r" / "index.html"
+    assert Path(said.lines[0]["report"]) == tmp_path / "r" / "report.html"
     ((calibration, folder),) = written
     assert folder == tmp_path / "r"
     assert len(calibration.pairs) == 5
@@ -131,8 +131,8 @@ def test_one_truncated_image_is_a_rejected_pair(few, armsight, tmp_path, keep):
 
 
 def test_the_wrong_board(few, armsight, tmp_path):
-    said = armsight("calibrate", *images(few), "--board", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
-    refused(said, "0 of 5 pairs are usable", "Is --board the board in the images")
+    said = armsight("calibrate", *images(few), "--target", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
+    refused(said, "0 of 5 pairs are usable", "Is --target the target in the images")
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -140,7 +140,7 @@ def test_the_wrong_square_size_cannot_be_seen_but_scales_the_baseline(few, armsi
     sizes = []
     for square in ("25mm", "50mm"):
         said = armsight(
-            "calibrate", *images(few), "--board", f"chessboard:9x6:{square}", *QUICK, "-o", tmp_path / "r", "--json"
+            "calibrate", *images(few), "--target", f"chessboard:9x6:{square}", *QUICK, "-o", tmp_path / "r", "--json"
         )
         sizes.append(said.lines[0]["baseline_m"])
     # The same images at twice the size: what is left is where the iterations stop.
@@ -161,13 +161,13 @@ def test_the_same_images_on_both_sides(few, armsight, tmp_path):
     refused(said, "both a left and a right image")
 
 
-def test_left_and_right_exchanged_is_told(few, armsight, tmp_path):
+def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
     said = armsight(
         "calibrate", "--left", few / "right*.png", "--right", few / "left*.png", *CHESS, *QUICK,
         "-o", tmp_path / "rig.json", "--json",
     )  # fmt: skip
     assert said.code == 0, said.err
-    assert any("are left and right swapped" in weak for weak in said.lines[0]["weaknesses"])
+    assert any("are left and right exchanged" in weak for weak in said.lines[0]["weaknesses"])
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_left_and_right_exchanged_is_told(few, armsight, tmp_path):
      "chessboard:9x6:-25mm", "chessboard:9x6:nanmm", "", "charuco:9x6:25mm:30mm:DICT_4X4_50"],
 )  # fmt: skip
 def test_a_bad_board_spec(few, armsight, tmp_path, spec):
-    refused(armsight("calibrate", *images(few), "--board", spec, "-o", tmp_path / "rig.json"))
+    refused(armsight("calibrate", *images(few), "--target", spec, "-o", tmp_path / "rig.json"))
 
 
 def test_no_folder_for_the_result(few, armsight, tmp_path):
@@ -198,8 +198,8 @@ def test_a_report_where_a_file_stands(few, armsight, tmp_path):
         (),
         ("--left", "a*.png"),
         ("--left", "a*.png", "--right", "b*.png"),
-        ("--left", "a", "--right", "b", "--board", "chessboard:9x6:25mm", "--detections", "d.csv"),
-        ("--left", "a", "--right", "b", "--board", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
+        ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--detections", "d.csv"),
+        ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
         ("--detections", "d.csv", "--cameras", "c.json"),
     ],
 )
@@ -235,11 +235,11 @@ from unittest import mock
 import {module}
 from armsight.app.main import main
 real = {module}.{name}
-def told(*arguments, **options):
+def waiting(*arguments, **options):
     print("there", flush=True)
     {wait}
     return real(*arguments, **options)
-with mock.patch("{module}.{name}", told):
+with mock.patch("{module}.{name}", waiting):
     main()
 """
 

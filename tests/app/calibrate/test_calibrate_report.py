@@ -1,4 +1,4 @@
-"""The report of a calibration: every section and every reason is there, figures are drawn, nothing is left by half."""
+"""The report of a calibration: every section, reason and figure is there, nothing is written in part."""
 
 import base64
 import errno
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from armsight.app.calibrate import report
-from armsight.app.calibrate.assessment import advice, predicted_sigmas, verdict, volume_slice
+from armsight.app.calibrate.assessment import advice, assess, predicted_sigmas, volume_slice
 from armsight.app.calibrate.figures import (
     MOST_BARS,
     STANDS_OUT,
@@ -23,7 +23,7 @@ from armsight.app.calibrate.figures import (
     pairs_figure,
     round_steps,
 )
-from armsight.app.calibrate.report import FIGURES, pose_table, report_folder, write_report
+from armsight.app.calibrate.report import FIGURES, pose_table, write_report
 from armsight.app.report import page
 from armsight.app.report.plotting import drawing, nice, plain, png
 from armsight.data import Body, Detections
@@ -40,14 +40,14 @@ matplotlib = pytest.importorskip("matplotlib", reason="the report needs matplotl
 
 SIZE = (640, 480)
 SECTIONS = {
-    "result": "Is it good?",
-    "coverage": "What the cameras have seen",
+    "result": "Assessment",
+    "coverage": "Coverage of the images",
     "residuals": "Residuals of the fit",
     "pairs": "Held-out errors by pair",
-    "volume": "What to expect of a measurement",
-    "board": "The board itself",
-    "parameters": "The cameras in numbers",
-    "provenance": "Where it comes from",
+    "volume": "Predicted uncertainty of a measurement",
+    "target": "Shape of the target",
+    "parameters": "Parameters of the cameras",
+    "provenance": "Provenance",
 }
 NO_BOARD = "no chessboard of 7x5 inner corners found <script>alert('here')</script>"
 
@@ -84,7 +84,7 @@ def calibration():
 def written(calibration, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "new" / "folder"
     page = write_report(calibration, folder)
-    assert page == folder / "index.html"
+    assert page == folder / "report.html"
     return folder
 
 
@@ -123,7 +123,7 @@ class Page(html.parser.HTMLParser):
 
 
 def page_of(folder):
-    return Page((folder / "index.html").read_text(encoding="utf-8"))
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 
 def test_every_section_is_there_in_order_and_says_something(written):
@@ -136,7 +136,7 @@ def test_every_section_is_there_in_order_and_says_something(written):
     assert "10 of 12 pairs of images used" in page.text[""]
 
 
-def test_the_held_out_figures_stand_beside_the_fits_in_mm_and_px(written, calibration):
+def test_the_held_out_metrics_stand_beside_the_fits_in_mm_and_px(written, calibration):
     text, h = page_of(written).text["result"], calibration.heldout
     for figure in (
         f"{1e3 * h.rigid_rms_m:.3g} mm",
@@ -146,7 +146,7 @@ def test_the_held_out_figures_stand_beside_the_fits_in_mm_and_px(written, calibr
         f"{calibration.epipolar_rms_px:.3g} px",
         f"{calibration.reprojection_rms_px:.3g} px",
         "held out, 3 folds",
-        "Believe the held-out column",
+        "Rely on the held-out column",
     ):
         assert figure in text
 
@@ -167,12 +167,12 @@ def test_nothing_from_outside_gets_into_the_page_as_html(written):
     assert "<test>" in page.text["provenance"]
     assert {value.split(":")[0] for _, key, value in page.attributes if key == "src"} == {"data"}
     assert all(value.startswith("#") for _, key, value in page.attributes if key == "href")
-    assert not re.search(r"url\(|@import", (written / "index.html").read_text(encoding="utf-8"))
+    assert not re.search(r"url\(|@import", (written / "report.html").read_text(encoding="utf-8"))
 
 
 def test_every_figure_is_in_the_page_and_beside_it_and_not_blank(written):
     assert sorted(path.name for path in written.iterdir()) == sorted(
-        ["index.html", *(f"report-{name}.png" for name in FIGURES)]
+        ["report.html", *(f"report-{name}.png" for name in FIGURES)]
     )
     embedded = [base64.b64decode(v.split(",")[1]) for _, key, v in page_of(written).attributes if key == "src"]
     assert embedded == [(written / f"report-{name}.png").read_bytes() for name in FIGURES]
@@ -184,7 +184,7 @@ def test_every_figure_is_in_the_page_and_beside_it_and_not_blank(written):
         assert len(np.unique(image.astype(int) @ [1, 256, 65536])) > 50  # colours
 
 
-def test_the_parameters_are_told_with_their_sigmas(written, calibration):
+def test_the_parameters_are_shown_with_their_sigmas(written, calibration):
     text, rig = page_of(written).text["parameters"], calibration.rig
     sigma = np.sqrt(np.diag(rig.cov))
     found = re.search(r"fx, px(\d+\.\d+) ± (\d+\.\d+)(\d{3}\.\d+) ± ", text)
@@ -209,16 +209,16 @@ def test_the_pose_tables_sigmas_are_along_the_left_cameras_axes():
     assert f"baseline, mm{1e3 * np.hypot(0.1, 0.2):.1f} ± {2 * along:.1f}" in text
 
 
-def test_without_an_estimated_board_its_picture_is_left_out_and_an_old_one_goes(calibration, tmp_path, undrawn):
+def test_without_an_estimated_target_its_picture_is_left_out_and_an_old_one_goes(calibration, tmp_path, undrawn):
     write_report(calibration, tmp_path)
-    assert (tmp_path / "report-board.png").exists()
+    assert (tmp_path / "report-target.png").exists()
     (tmp_path / "mine.png").write_bytes(b"kept")
     flat = replace(calibration, deviation_m=0.0)
     hand = replace(calibration, body=Body("hand", calibration.body.point_names, calibration.body.points + 0.01))
     for other in (flat, hand):
         write_report(other, tmp_path)
-        assert not (tmp_path / "report-board.png").exists()
-        assert "board" not in page_of(tmp_path).text
+        assert not (tmp_path / "report-target.png").exists()
+        assert "target" not in page_of(tmp_path).text
     assert "points of the body" in page_of(tmp_path).text["coverage"]
     assert (tmp_path / "mine.png").read_bytes() == b"kept"
 
@@ -261,38 +261,37 @@ def test_the_users_own_matplotlib_settings_neither_matter_nor_change(calibration
 def test_without_matplotlib_there_is_one_clear_error_and_no_folder(calibration, tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
         monkeypatch.setitem(sys.modules, name, None)
-    for attempt in (lambda: write_report(calibration, tmp_path / "a"), lambda: report_folder(tmp_path / "a")):
-        with pytest.raises(InputError) as caught:
-            attempt()
-        assert 'pip install "armsight[report]"' in str(caught.value)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError) as caught:
+        write_report(calibration, tmp_path / "a")
+    assert 'pip install "armsight[report]"' in str(caught.value)
+    assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_error(calibration, tmp_path):
     (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file", tmp_path / "file" / "below", "/proc/none"):
-        with pytest.raises(InputError, match=f"{place}: no report can be written here: ") as caught:
-            write_report(calibration, place)
+    for folder in (tmp_path / "file", tmp_path / "file" / "below", "/proc/none"):
+        with pytest.raises(InputError, match=f"{folder}: no report can be written here: ") as caught:
+            write_report(calibration, folder)
         assert "\n" not in str(caught.value)
 
 
 def test_a_folder_without_permission_is_one_clear_error(forbidden):
     with pytest.raises(InputError, match="no report can be written here: Permission denied"):
-        report_folder(forbidden)
+        page.writable_folder(forbidden, "no report")
 
 
 def test_a_disk_that_fills_leaves_nothing_half_written(calibration, tmp_path, monkeypatch, undrawn):
     replacing = page.replacing
 
     def failing(path, mode="w"):
-        if path.name == "index.html":
+        if path.name == "report.html":
             raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
         return replacing(path, mode)
 
     with monkeypatch.context() as patch:
         patch.setattr(page, "replacing", failing)
-        with pytest.raises(InputError, match=r"index.html: cannot be written: No space left on device"):
+        with pytest.raises(InputError, match=r"report.html: cannot be written: No space left on device"):
             write_report(calibration, tmp_path / "a")
     assert list((tmp_path / "a").iterdir()) == []
 
@@ -301,32 +300,32 @@ def test_a_disk_that_fills_leaves_nothing_half_written(calibration, tmp_path, mo
     ("changes", "grade", "said"),
     [
         ({}, "good", "Leave mount, focus and zoom"),
-        ({"epipolar_rms_px": 0.7}, "fair", "hold the board still"),
-        ({"epipolar_rms_px": 3.0}, "poor", "hold the board still"),
-        ({"scale_error": -0.003}, "fair", "check the size given for the board"),
-        ({"scale_error": 0.02}, "poor", "check the size given for the board"),
-        ({"normalised_rms": 1.5}, "fair", "held-out errors are larger than the fit predicted"),
+        ({"epipolar_rms_px": 0.7}, "fair", "hold the target still"),
+        ({"epipolar_rms_px": 3.0}, "poor", "hold the target still"),
+        ({"scale_error": -0.003}, "fair", "check the size given for the target"),
+        ({"scale_error": 0.02}, "poor", "check the size given for the target"),
+        ({"normalised_rms": 1.5}, "fair", "held-out errors are larger than predicted"),
         ({"normalised_rms": 0.7}, "good", "Leave mount"),
         ({"normalised_rms": float("nan")}, "poor", ""),
     ],
 )
-def test_the_verdict_follows_the_held_out_figures(calibration, changes, grade, said):
+def test_the_assessment_follows_the_held_out_metrics(calibration, changes, grade, said):
     sound = {"epipolar_rms_px": 0.1, "scale_error": 0.0002, "normalised_rms": 1.0}
     fit = changes.get("epipolar_rms_px", 0.1)
     changed = replace(
         calibration, heldout=replace(calibration.heldout, **{**sound, **changes}), epipolar_rms_px=fit, weaknesses=()
     )
-    found, headline, meaning = verdict(changed)
-    assert found == grade
-    assert headline.startswith({"good": "Good", "fair": "Usable", "poor": "Do not rely"}[grade])
-    assert said in " ".join([meaning, *advice(changed)])
+    found = assess(changed)
+    assert found.grade == grade
+    assert found.headline.startswith({"good": "Good", "fair": "Usable", "poor": "Do not rely"}[grade])
+    assert said in " ".join([found.meaning, *advice(changed)])
 
 
-def test_a_fit_learned_by_heart_is_told(calibration):
+def test_overfitting_is_reported(calibration):
     sound = replace(calibration.heldout, epipolar_rms_px=0.28, scale_error=0.0, normalised_rms=1.0)
-    by_heart = replace(calibration, heldout=sound, epipolar_rms_px=0.1, weaknesses=())
-    assert verdict(by_heart)[0] == "poor"
-    assert "take more pairs" in advice(by_heart)[0]
+    overfitted = replace(calibration, heldout=sound, epipolar_rms_px=0.1, weaknesses=())
+    assert assess(overfitted).grade == "poor"
+    assert "take more pairs" in advice(overfitted)[0]
 
 
 def parallel_rig(cov=None, baseline=0.2, focal=800.0):
@@ -365,12 +364,12 @@ def test_the_slice_spans_the_boards_and_is_sideways_along_the_baseline(calibrati
     assert shown.seen.mean() > 0.3
     noise, share, both = shown.sigma_depth_m[:, shown.seen]
     np.testing.assert_allclose(both, np.hypot(noise, share), rtol=1e-9)
-    turn = pose(exp_so3(np.array([0, 0, np.pi / 2])), np.zeros(3))
-    turned = replace(
+    T_upright = pose(exp_so3(np.array([0, 0, np.pi / 2])), np.zeros(3))
+    upright = replace(
         calibration,
-        rig=replace(calibration.rig, T_left_right=turn @ calibration.rig.T_left_right @ inverse(turn)),
+        rig=replace(calibration.rig, T_left_right=T_upright @ calibration.rig.T_left_right @ inverse(T_upright)),
     )
-    assert volume_slice(turned).axis == 1
+    assert volume_slice(upright).axis == 1
 
 
 def test_coverage_counts_every_point_once(calibration):

@@ -23,7 +23,7 @@ from cli_runs import refused
 pytestmark = pytest.mark.opencv
 
 KEYS = {
-    "shot", "status", "reason", "t_s", "position_m", "quaternion_wxyz", "roll_pitch_yaw_deg", "covariance",
+    "shot", "status", "reason", "t_s", "position_m", "quaternion_wxyz", "euler_zyx_deg", "covariance",
     "residual_rms_m", "reprojection_rms_px", "points_m",
 }  # fmt: skip
 
@@ -37,10 +37,10 @@ def measured(bench, tmp_path_factory):
     done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
-    def refuse(text):
+    def reject(text):
         raise AssertionError(f"{text} is not JSON")
 
-    records = [json.loads(line, parse_constant=refuse) for line in done.stdout.splitlines()]
+    records = [json.loads(line, parse_constant=reject) for line in done.stdout.splitlines()]
     with open(out, newline="", encoding="utf-8") as file:
         return records, list(csv.DictReader(file)), done.stderr
 
@@ -65,7 +65,7 @@ def test_every_shot_is_measured_within_its_uncertainty(bench, measured):
     sigma = np.sqrt(np.einsum("nii->ni", covs))
     assert (np.abs(errors) < 4 * sigma).all(), np.abs(errors / sigma).max(axis=0)
     nees = np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, covs, strict=True)])
-    # The calibration's share is common to all shots, so they are fewer than 16 independent draws: the band is that of
+    # The calibration's share is common to all shots, so they are fewer than 16 independent samples: the band is that of
     # one shot in a thousand below and above for four.
     low, high = chi2.ppf([1e-3, 1 - 1e-3], 6 * 4) / 4
     assert low < nees.mean() < high, nees
@@ -81,18 +81,17 @@ def test_a_record_has_what_was_promised(bench, measured):
         assert set(record["points_m"]) <= set(body.point_names)
         assert len(record["points_m"]) + len(record["dropped"]) >= 3
         w, x, y, z = record["quaternion_wxyz"]
-        roll, pitch, yaw = record["roll_pitch_yaw_deg"]
         R = Rotation.from_quat([x, y, z, w]).as_matrix()
-        turned = Rotation.from_euler("ZYX", [roll, pitch, yaw], degrees=True).as_matrix()
-        assert pytest.approx(turned, abs=1e-12) == R
+        by_angles = Rotation.from_euler("ZYX", record["euler_zyx_deg"], degrees=True).as_matrix()
+        assert pytest.approx(by_angles, abs=1e-12) == R
 
 
-def test_the_covariance_is_that_of_the_body_turned_into_the_left_cameras_axes(measured):
+def test_the_covariance_is_that_of_the_body_rotated_to_the_left_cameras_axes(measured):
     for record in measured[0]:
         w, x, y, z = record["quaternion_wxyz"]
-        turn = block_diag(*[Rotation.from_quat([x, y, z, w]).as_matrix()] * 2)
+        both = block_diag(*[Rotation.from_quat([x, y, z, w]).as_matrix()] * 2)
         body, left = np.array(record["covariance_body"]), np.array(record["covariance"])
-        assert left == pytest.approx(turn @ body @ turn.T, abs=1e-12 * np.trace(body))
+        assert left == pytest.approx(both @ body @ both.T, abs=1e-12 * np.trace(body))
         assert (np.linalg.eigvalsh(left) > 0).all()
 
 
@@ -101,8 +100,8 @@ def test_the_csv_says_the_same(measured):
     assert tuple(rows[0]) == CSV_COLUMNS
     for record, row in zip(records, rows, strict=True):
         assert (row["shot"], row["status"], row["reason"]) == (record["shot"], "ok", "")
-        said = [record["t_s"], *record["position_m"], *record["quaternion_wxyz"], *record["roll_pitch_yaw_deg"]]
-        names = ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "roll_deg", "pitch_deg", "yaw_deg"]
+        said = [record["t_s"], *record["position_m"], *record["quaternion_wxyz"], *record["euler_zyx_deg"]]
+        names = ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "euler_z_deg", "euler_y_deg", "euler_x_deg"]
         assert [float(row[name]) for name in names] == said
         cov = np.array(record["covariance"])
         for i in range(6):
@@ -224,7 +223,7 @@ def test_shots_given_no_way_or_two(start, armsight, options):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "said"),
     [
         ("", "not JSON"),
         ("{", "not JSON"),
@@ -234,10 +233,10 @@ def test_shots_given_no_way_or_two(start, armsight, options):
         (b"\xff\xfe\x00", "not a text file"),
     ],
 )
-def test_a_damaged_rig(bench, arm, tmp_path, armsight, text, words):
+def test_a_damaged_rig(bench, arm, tmp_path, armsight, text, said):
     path = tmp_path / "rig.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, words)
+    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, said)
 
 
 def test_half_a_rig_and_a_newer_one_and_one_with_nan(bench, arm, tmp_path, armsight):
@@ -312,7 +311,7 @@ def test_detections_are_measured_and_too_few_points_missed(bench, seen, armsight
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new", "words"),
+    ("file", "old", "new", "said"),
     [
         ("d.csv", "3,left,T0.0,", "3,left,T0.0,nan,1\n3,left,T0.0,", "line 2: u_px is nan"),
         ("d.csv", "u_px", "u", "no column u_px"),
@@ -324,12 +323,12 @@ def test_detections_are_measured_and_too_few_points_missed(bench, seen, armsight
         ("plate.csv", "x_m", "left_m", "line 1"),
     ],
 )
-def test_a_wrong_line_in_a_table(bench, seen, armsight, file, old, new, words):
+def test_a_wrong_line_in_a_table(bench, seen, armsight, file, old, new, said):
     text = (seen / file).read_text()
     assert old in text
     (seen / file).write_text(text.replace(old, new, 1))
-    said = armsight(*by_detections(bench, seen), "-o", seen / "poses.csv")
-    refused(said, seen / file, words)
+    result = armsight(*by_detections(bench, seen), "-o", seen / "poses.csv")
+    refused(result, seen / file, said)
     assert not (seen / "poses.csv").exists()
 
 

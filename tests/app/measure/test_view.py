@@ -1,4 +1,4 @@
-"""measure --view: what is drawn is what was measured, every picture is there, and nothing else is touched."""
+"""measure --view: the pictures show what was measured, all of them are there, and nothing else is touched."""
 
 import os
 import sys
@@ -10,7 +10,7 @@ import pytest
 
 from armsight.app.measure import command as measure_module
 from armsight.app.measure import view as view_module
-from armsight.app.measure.chart import SHOT, TIME, _stretches, chart, run_of
+from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
 from armsight.app.measure.picture import (
     WIDTH,
     _Panel,
@@ -22,8 +22,9 @@ from armsight.app.measure.picture import (
     marks_of,
     wrapped,
 )
-from armsight.app.measure.poses import pose_record
-from armsight.app.measure.view import CHART, EACH_UP_TO, View, view_folder
+from armsight.app.measure.poses import ShotPose, shot_pose
+from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
+from armsight.app.report import page
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
@@ -53,14 +54,14 @@ def located(target=PLATE, hidden=(), seed=5):
 
 
 def record_of(result, name="007", t_s=0.25, **more):
-    return {**pose_record(name, t_s, PLATE.body, result), **more}
+    return replace(shot_pose(name, t_s, PLATE.body, result), **more)
 
 
 def blank(value=90):
     return np.full(SIZE[::-1], value, np.uint8)
 
 
-# What is drawn.
+# The picture of a shot.
 
 
 def test_residuals_are_those_of_the_freed_centres_against_opencvs_projection():
@@ -86,17 +87,17 @@ def test_a_rim_is_that_of_its_quadratic_form():
     assert np.isnan(ellipse(np.full(3, np.nan))).all()
 
 
-def test_a_place_is_centred_to_the_pixel_and_its_pixels_are_squares():
+def test_a_detail_is_centred_to_the_pixel_and_its_pixels_are_squares():
     image = np.zeros((60, 80), np.uint8)
     image[21, 33] = 255
-    tile = _Panel("left", image, (80, 60)).place(np.array([33.0, 21.0]), 8.0)
+    tile = _Panel("left", image, (80, 60)).detail(np.array([33.0, 21.0]), 8.0)
     v, u = np.nonzero(tile[..., 0])
     assert len(u) == 64
     assert (u.min() + u.max(), v.min() + v.max()) == (tile.shape[1] - 1, tile.shape[0] - 1)
-    assert (_Panel("left", None, (80, 60)).place(np.array([33.0, 21.0]), 8.0) == tile[0, 0]).sum() == 0
+    assert (_Panel("left", None, (80, 60)).detail(np.array([33.0, 21.0]), 8.0) == tile[0, 0]).sum() == 0
 
 
-def test_a_disc_that_one_camera_does_not_see_is_drawn_with_its_reason():
+def test_a_disc_that_one_camera_does_not_see_is_shown_with_its_reason():
     rig, result = located(FIVE, hidden=[(0, 1, 0)])
     dropped = (Dropped("P2", "left: not where it should be"), Dropped("somebody", "is no point"))
     marks = marks_of(rig, FIVE.body, FIVE, replace(result, dropped=dropped))
@@ -119,8 +120,8 @@ def test_what_neither_camera_sees_is_shown_too_but_not_on_the_far_side():
     assert marks.names == FIVE.body.point_names
     assert marks.seen.tolist() == [[True, True], [False, False], [True, True], [True, True], [True, True]]
     assert np.isfinite(marks.shape[1]).all()
-    turned = replace(FIVE, normals=FIVE.normals * np.array([[1], [-1], [1], [1], [1]]))
-    assert np.isnan(marks_of(rig, FIVE.body, turned, result).shape[1]).all()
+    mirrored = replace(FIVE, normals=FIVE.normals * np.array([[1], [-1], [1], [1], [1]]))
+    assert np.isnan(marks_of(rig, FIVE.body, mirrored, result).shape[1]).all()
     assert draw_shot([], None, (blank(), blank()), (SIZE, SIZE), marks).shape[1] == WIDTH
 
 
@@ -134,7 +135,7 @@ def test_what_neither_camera_sees_is_shown_too_but_not_on_the_far_side():
         (["left: a", "right: b"], [True, True], "left: a; right: b"),
     ],
 )
-def test_reasons_tell_in_which_image(reasons, sides, said):
+def test_reasons_name_the_image(reasons, sides, said):
     rig, result = located()
     marks = marks_of(rig, PLATE.body, PLATE, replace(result, dropped=tuple(Dropped("P3", r) for r in reasons)))
     assert marks.dropped[2].tolist() == sides
@@ -150,7 +151,7 @@ def test_of_many_points_the_dropped_and_the_worst_are_enlarged():
     assert marks.worst(3) == np.argsort(-off)[:3].tolist()
 
 
-def test_a_missed_shot_is_drawn_with_its_reason_in_red_and_without_images_too():
+def test_a_missed_shot_is_shown_with_its_reason_in_red_and_without_images_too():
     for pictures in ((blank(), blank()), (None, None), (blank(), None)):
         canvas = draw_shot(["shot 3"], "the plate is not there", pictures, (SIZE, SIZE), None)
         assert canvas.dtype == np.uint8
@@ -175,28 +176,28 @@ def test_the_header_says_what_was_measured_and_how_it_was_found():
     record = record_of(result, way="followed", jump="jumped 40 mm", took_ms=2.34)
     first, second, third = header(record)
     assert first == "shot 007, t 0.250 s, followed, 2.3 ms, jumped 40 mm"
-    x, sigma = 1e3 * record["position_m"][0], 1e3 * np.sqrt(record["covariance"][0][0])
+    x, sigma = 1e3 * record.position_m[0], 1e3 * np.sqrt(record.cov[0, 0])
     assert second.startswith(f"x {x:.3f} +- {sigma:.3f}, y ")
-    assert " mm; roll " in second
+    assert " mm; rz " in second
     assert second.endswith(" deg")
     assert f"reprojection {result.reprojection_rms_px:.3f} px RMS, misfit 1.0, 3 points" == third
-    assert header({"shot": "a", "t_s": None, "status": "missed", "reason": "gone"}) == ["shot a"]
+    assert header(ShotPose("a", None, "gone")) == ["shot a"]
 
 
-def test_the_sigmas_of_the_angles_are_those_of_turns_drawn_at_random():
+def test_the_sigmas_of_the_angles_are_those_of_random_rotations():
     _, result = located()
     record = record_of(result)
     rng, count = np.random.default_rng(1), 4000
-    turns = rng.multivariate_normal(np.zeros(3), np.array(record["covariance"])[3:, 3:], count)
+    rotations = rng.multivariate_normal(np.zeros(3), record.cov[3:, 3:], count)
     R = result.T_left_body[:3, :3]
-    angles = np.degrees([euler_zyx(exp_so3(w) @ R)[0] for w in turns])
+    angles = np.degrees([euler_zyx(exp_so3(w) @ R)[0] for w in rotations])
     # A sample's standard deviation has a relative error of 1/sqrt(2 n): four of them.
     np.testing.assert_allclose(angles.std(axis=0), angle_sigmas_deg(record), rtol=4 / np.sqrt(2 * count))
-    assert np.isnan(angle_sigmas_deg({**record, "pitch_singular": True})).all()
-    assert "pitch singular" in header({**record, "pitch_singular": True})[1]
+    assert np.isnan(angle_sigmas_deg(replace(record, pitch_singular=True))).all()
+    assert "only rz and rx together" in header(replace(record, pitch_singular=True))[1]
 
 
-def test_text_is_ascii_and_broken_between_words():
+def test_text_is_ascii_and_wrapped_at_spaces():
     assert ascii_text("±3° naïve\nσ") == "+-3 deg na?ve sigma"
     lines = wrapped("one two three " * 20 + "x" * 300, 0.5, 200)
     assert "".join(lines).replace(" ", "") == "onetwothree" * 20 + "x" * 300
@@ -215,20 +216,20 @@ def stub(monkeypatch):
 
 def run_of_shots(folder, total, count, odd=(), way=None):
     rig, result = located()
-    view, good = View(view_folder(folder), rig, PLATE.body, PLATE, total), record_of(result)
+    view, good = PictureFolder(view_folder(folder), rig, PLATE.body, PLATE, total), record_of(result)
     for n in range(count):
         shot = Shot(f"{n:04d}", None, None)
         if n in odd and way is None:
-            view.add(shot, Missed("gone"), {"shot": shot.name, "t_s": None, "status": "missed", "reason": "gone"})
+            view.add(shot, Missed("gone"), ShotPose(shot.name, None, "gone"))
         else:
-            view.add(shot, result, {**good, "way": way if n in odd else "followed", "took_ms": 1.0})
+            view.add(shot, result, replace(good, way=way if n in odd else "followed", took_ms=1.0))
     return view, {int(path.stem.removeprefix("view-")) for path in folder.glob("view-*.png")}
 
 
-def test_a_short_run_is_drawn_whole_and_a_long_one_in_part(stub, tmp_path):
+def test_a_short_run_is_shown_whole_and_a_long_one_in_part(stub, tmp_path):
     assert run_of_shots(tmp_path / "a", EACH_UP_TO, EACH_UP_TO)[1] == set(range(60))
-    view, drawn = run_of_shots(tmp_path / "b", 150, 150, odd={7, 8, 100})
-    assert drawn == {*range(0, 150, 3), 7, 8, 100}
+    view, pictures = run_of_shots(tmp_path / "b", 150, 150, odd={7, 8, 100})
+    assert pictures == {*range(0, 150, 3), 7, 8, 100}
     assert "53 of 150 shots" in view.summary()
     assert "one in 3 of the others" in view.summary()
     assert run_of_shots(tmp_path / "c", 150, 150, odd={7, 8}, way="searched")[1] == {*range(0, 150, 3), 7, 8}
@@ -237,17 +238,17 @@ def test_a_short_run_is_drawn_whole_and_a_long_one_in_part(stub, tmp_path):
 
 
 def test_a_camera_that_sees_nothing_for_hours_does_not_fill_the_disk(stub, tmp_path):
-    _, drawn = run_of_shots(tmp_path / "a", None, 2100, odd=set(range(2100)))
-    assert drawn >= set(range(500))
-    assert len(drawn) <= 500 + 250 * 2 + 13, "250 for every doubling, and every 32nd of all at most"
+    _, pictures = run_of_shots(tmp_path / "a", None, 2100, odd=set(range(2100)))
+    assert pictures >= set(range(500))
+    assert len(pictures) <= 500 + 250 * 2 + 13, "250 for every doubling, and every 32nd of all at most"
 
 
 def test_names_of_shots_become_names_of_files(stub, tmp_path):
     rig, _ = located()
-    view = View(tmp_path, rig, PLATE.body, PLATE)
+    view = PictureFolder(tmp_path, rig, PLATE.body, PLATE)
     names = ["a/b", "a:b", "../../etc", "é" * 200, "run", "\udcff", "a/b"]
     for name in names:
-        view.add(Shot(name, None, None), Missed("gone"), {"shot": name, "t_s": None, "status": "missed"})
+        view.add(Shot(name, None, None), Missed("gone"), ShotPose(name, None, "gone"))
     files = sorted(os.listdir(tmp_path))
     assert len(files) == len(names)
     assert {"view-a_b.png", "view-a_b~2.png", "view-a_b~3.png", "view-.._.._etc.png", "view-run.png"} <= set(files)
@@ -255,7 +256,7 @@ def test_names_of_shots_become_names_of_files(stub, tmp_path):
 
 def test_no_shot_no_chart(stub, tmp_path):
     rig, _ = located()
-    View(tmp_path, rig, PLATE.body).finish([])
+    PictureFolder(tmp_path, rig, PLATE.body).finish([])
     assert os.listdir(tmp_path) == []
 
 
@@ -263,25 +264,24 @@ def test_no_shot_no_chart(stub, tmp_path):
 
 
 def shots(angles_deg, times):
-    """Records of a run that turns; None was missed."""
-    out = []
-    for n, (angle, t) in enumerate(zip(angles_deg, times, strict=True)):
-        head = {"shot": str(n), "t_s": t}
-        if angle is None:
-            out.append({**head, "status": "missed", "reason": "gone"})
-            continue
-        pose = {"position_m": [0.1, 0.2, 0.7], "roll_pitch_yaw_deg": [angle, 10.0, 0.0], "pitch_singular": False}
-        fit = {"covariance": (1e-8 * np.eye(6)).tolist(), "reprojection_rms_px": 0.1}
-        out.append({**head, "status": "ok", **pose, **fit})
-    return out
+    """Records of a body that rotates about z; None was missed."""
+    cov, position = 1e-8 * np.eye(6), np.array([0.1, 0.2, 0.7])
+    return [
+        ShotPose(str(n), t, "gone")
+        if angle is None
+        else ShotPose(
+            str(n), t, None, position, euler_zyx_deg=np.array([angle, 10.0, 0.0]), cov=cov, reprojection_rms_px=0.1
+        )
+        for n, (angle, t) in enumerate(zip(angles_deg, times, strict=True))
+    ]
 
 
-def test_the_chart_shows_the_records_and_no_whole_turns():
-    run = run_of(shots([170.0, 178.0, None, -174.0, -170.0], [5.0, 5.1, 5.2, 5.3, 5.4]))
+def test_the_chart_shows_the_records_without_steps_of_360_degrees():
+    run = chart_data(shots([170.0, 178.0, None, -174.0, -170.0], [5.0, 5.1, 5.2, 5.3, 5.4]))
     np.testing.assert_allclose(run.pose[:, 3], [170.0, 178.0, np.nan, 186.0, 190.0])
     np.testing.assert_allclose(run.pose[0, :3], [100.0, 200.0, 700.0])
     np.testing.assert_allclose(run.pose_sigma[0, :3], 0.1)
-    np.testing.assert_allclose(run.turn_sigma[0], np.degrees(1e-4))
+    np.testing.assert_allclose(run.rotation_sigma[0], np.degrees(1e-4))
     assert run.way == ("measured", "measured", "missed", "measured", "measured")
     assert run.label == TIME
     np.testing.assert_allclose(run.along, [0.0, 0.1, 0.2, 0.3, 0.4])
@@ -289,16 +289,16 @@ def test_the_chart_shows_the_records_and_no_whole_turns():
 
 @pytest.mark.parametrize("times", [[1.0, None, 2.0], [1.0, 1.0, 2.0], [3.0, 2.0, 1.0], [None] * 3])
 def test_without_times_that_rise_shots_are_counted(times):
-    run = run_of(shots([0.0, 1.0, 2.0], times))
+    run = chart_data(shots([0.0, 1.0, 2.0], times))
     assert run.label == SHOT
     assert run.along.tolist() == [1.0, 2.0, 3.0]
 
 
-def test_stretches_end_where_the_way_changes_and_at_gaps_in_time():
+def test_intervals_end_where_the_way_changes_and_at_gaps_in_time():
     times = [0.0, 1.0, 2.0, 3.0, 10.0, 11.0]
-    run = run_of(shots([0.0, 0.0, None, 0.0, 0.0, 0.0], times))
-    wanted = [(-0.5, 1.5, "measured"), (1.5, 2.5, "missed"), (2.5, 3.5, "measured"), (9.5, 11.5, "measured")]
-    assert list(_stretches(run)) == wanted
+    run = chart_data(shots([0.0, 0.0, None, 0.0, 0.0, 0.0], times))
+    expected = [(-0.5, 1.5, "measured"), (1.5, 2.5, "missed"), (2.5, 3.5, "measured"), (9.5, 11.5, "measured")]
+    assert list(_intervals(run)) == expected
 
 
 @pytest.mark.parametrize(
@@ -308,8 +308,8 @@ def test_stretches_end_where_the_way_changes_and_at_gaps_in_time():
         shots([None], [None]),
         shots([None] * 5, [1.0, 2.0, 3.0, 4.0, 5.0]),
         shots([1.0, None] * 40, [None] * 80),
-        [{**r, "pitch_singular": True, "way": "searched", "jump": "jumped"} for r in shots([1.0, 2.0], [1.0, 2.0])],
-        [{**r, "covariance": np.zeros((6, 6)).tolist()} for r in shots([1.0, 2.0], [1.0, 2.0])],
+        [replace(r, pitch_singular=True, way="searched", jump="jumped") for r in shots([1.0, 2.0], [1.0, 2.0])],
+        [replace(r, cov=np.zeros((6, 6))) for r in shots([1.0, 2.0], [1.0, 2.0])],
     ],
     ids=["one", "one missed", "all missed", "every other", "singular", "certain"],
 )
@@ -363,14 +363,14 @@ def test_every_shot_has_its_picture_and_foreign_files_stay(start, arm, armsight,
         assert picture.std() > 1
 
 
-def test_nothing_measured_is_drawn_too(bench, start, armsight, tmp_path):
+def test_nothing_measured_has_pictures_too(bench, start, armsight, tmp_path):
     where = f"{bench.folder}/board/left00[01].png", f"{bench.folder}/board/right00[01].png"
     said = armsight(*start, "--left", where[0], "--right", where[1], "--view", tmp_path / "v")
     assert said.code == 2
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-left000.png", "view-left001.png"}
 
 
-def test_detections_are_drawn_on_empty_images(bench, start, armsight, tmp_path):
+def test_detections_are_shown_on_empty_images(bench, start, armsight, tmp_path):
     rig, body, T = StereoRig.load(bench.rig), open_body(str(bench.plate)), bench.of_arm.Ts_left_body[3]
     lines = ["shot,camera,marker,u_px,v_px"]
     for side, camera, to in zip(SIDES, rig.cameras, (T, inverse(rig.T_left_right) @ T), strict=True):
@@ -383,7 +383,7 @@ def test_detections_are_drawn_on_empty_images(bench, start, armsight, tmp_path):
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-3.png", "view-9.png"}
 
 
-def test_an_interrupt_keeps_what_was_drawn(start, arm, armsight, tmp_path, monkeypatch):
+def test_an_interrupt_keeps_the_pictures(start, arm, armsight, tmp_path, monkeypatch):
     measure, calls = measure_module.measure, []
 
     def interrupted(*arguments):
@@ -419,7 +419,7 @@ def test_a_folder_without_leave_to_write(tmp_path, monkeypatch):
     def no(**_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(view_module.tempfile, "TemporaryFile", no)
+    monkeypatch.setattr(page.tempfile, "TemporaryFile", no)
     with pytest.raises(InputError, match="no pictures can be written here: Permission denied"):
         view_folder(tmp_path / "v")
 

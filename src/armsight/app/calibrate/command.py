@@ -117,7 +117,7 @@ def _from_images(
     left: str, right: str, target: CalibrationBoard, models: tuple[str, ...], flat: bool, folds: int
 ) -> Calibration:
     """Detect the target in every pair of images and calibrate."""
-    source = PairsSource(left, right)
+    source = PairsSource.open(left, right)
     pairs: list[Pair] = []
     sizes: Sizes | None = None
     with bar("detecting the target", len(source.pairs)) as advance:

@@ -1,4 +1,4 @@
-"""``armsight cameras``: list the attached cameras and what each can do (:mod:`armsight.vision.sources.v4l2`)."""
+"""``armsight cameras``: list the attached cameras and their modes (:mod:`armsight.vision.sources.v4l2`)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def command(as_json: bool) -> None:
 
 
 def _lines(camera: VideoDevice) -> Iterator[str]:
-    """Write one camera for a person to read."""
+    """Yield one camera as lines of text."""
     yield f"{camera.device}  {camera.name}" + (f"  ({camera.driver}, {camera.bus})" if camera.driver else "")
     for path in camera.stable:
         yield f"  {path}"

@@ -1,9 +1,12 @@
-"""The strip chart of a run: pose, its sigmas, the residuals and how each shot was found, one above the other."""
+"""The strip chart of many shots: how each was found, the pose, its sigmas and the residuals, one above the other.
+
+In: the shots' :class:`~armsight.app.measure.poses.ShotPose`. Out: a PNG.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.measure.picture import angle_sigmas_deg
+from armsight.app.measure.poses import ANGLES, ShotPose
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array, Record
 
@@ -23,24 +27,24 @@ TIME, SHOT = "time since the first shot, s", "shot"
 #: How a shot was found -> its colour in the band, the usual ones first.
 _WAYS = {"followed": _GREEN, "measured": BLUE, "searched": ORANGE, "lost": RED, "missed": RED}
 _STRIPS = 9
-_DOTS_UP_TO = 80  # shots that can be told apart as dots
-_THIN_FROM = 1000  # from so many shots on lines are thinner
-_LOG_FROM = 20.0  # sigmas that differ by more are drawn on a logarithmic scale
-_GAP_STEPS = 3.0  # a longer gap between shots, in the usual step, is no time in which anything was found
+_DOTS_UP_TO = 80  # shots that can be distinguished as dots
+_THIN_FROM = 1000  # from this many shots on lines are thinner
+_LOG_FROM = 20.0  # sigmas that differ by a larger factor are plotted on a logarithmic scale
+_GAP_STEPS = 3.0  # an interval between shots that is longer, in median steps, is a gap
 
 
 @dataclass(frozen=True, eq=False)
-class Run(Record):
-    """N shots as they are drawn; NaN where one was missed.
+class ChartData(Record):
+    """N shots as they are plotted; NaN where one was missed.
 
     Attributes:
         along: (N,) time since the first shot, s, or the number of the shot.
-        label: what that is.
+        label: of that axis.
         way: how each was found: a key of the band's colours.
         jumped: (N,) whether the pose jumped.
-        pose: (N, 6) x, y, z, mm; roll, pitch, yaw, degrees, without steps of a whole turn.
+        pose: (N, 6) x, y, z, mm; angles about z, y, x, degrees, without steps of 360 degrees.
         pose_sigma: (N, 6) one sigma of these.
-        turn_sigma: (N, 3) one sigma of the rotation about the left camera's axes, degrees.
+        rotation_sigma: (N, 3) one sigma of the rotation about the left camera's axes, degrees.
         rms_px: (N,) reprojection RMS, px.
     """
 
@@ -50,45 +54,42 @@ class Run(Record):
     jumped: NDArray[np.bool_]
     pose: Array
     pose_sigma: Array
-    turn_sigma: Array
+    rotation_sigma: Array
     rms_px: Array
 
 
-def run_of(records: Sequence[Mapping[str, Any]]) -> Run:
-    """Collect a run from its shots as ``measure --json`` prints them."""
-    count = len(records)
-    times = np.array([np.nan if r["t_s"] is None else r["t_s"] for r in records], float)
+def chart_data(poses: Sequence[ShotPose]) -> ChartData:
+    """Return what is plotted of many shots."""
+    count = len(poses)
+    times = np.array([np.nan if p.t_s is None else p.t_s for p in poses], float)
     timed = count > 1 and bool((np.diff(times) > 0).all())
-    pose, sigma, turn, rms = (np.full((count, width), np.nan) for width in (6, 6, 3, 1))
-    for n, r in enumerate(records):
-        if r["status"] == "ok":
-            each = np.sqrt(np.diag(r["covariance"]))
-            pose[n] = [*(1e3 * np.array(r["position_m"])), *r["roll_pitch_yaw_deg"]]
-            sigma[n] = [*(1e3 * each[:3]), *angle_sigmas_deg(r)]
-            turn[n], rms[n] = np.degrees(each[3:]), r["reprojection_rms_px"]
+    pose, sigma, rotation, rms = (np.full((count, width), np.nan) for width in (6, 6, 3, 1))
+    for n, p in enumerate(poses):
+        if p.ok:
+            each = np.sqrt(np.diag(p.cov))
+            pose[n] = [*(1e3 * p.position_m), *p.euler_zyx_deg]
+            sigma[n] = [*(1e3 * each[:3]), *angle_sigmas_deg(p)]
+            rotation[n], rms[n] = np.degrees(each[3:]), p.reprojection_rms_px
     good = np.isfinite(rms[:, 0])
     pose[good, 3:] = np.unwrap(pose[good, 3:], period=360.0, axis=0)
-    way = tuple(str(r.get("way") or ("measured" if r["status"] == "ok" else "missed")) for r in records)
-    jumped = np.array([bool(r.get("jump")) for r in records], bool)
+    way = tuple(p.way or ("measured" if p.ok else "missed") for p in poses)
+    jumped = np.array([bool(p.jump) for p in poses], bool)
     along = times - times[0] if timed else np.arange(1.0, count + 1)
-    return Run(along, TIME if timed else SHOT, way, jumped, pose, sigma, turn, rms[:, 0])
+    return ChartData(along, TIME if timed else SHOT, way, jumped, pose, sigma, rotation, rms[:, 0])
 
 
-def chart(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """Draw the strip chart of a run as PNG.
-
-    Args:
-        records: its shots as ``measure --json`` prints them, at least one.
+def chart(poses: Sequence[ShotPose]) -> bytes:
+    """Return the strip chart of at least one shot as PNG.
 
     Raises:
         InputError: matplotlib is missing.
     """
     with drawing():
-        return png(_figure(run_of(records)))
+        return png(_figure(chart_data(poses)))
 
 
-def _figure(run: Run) -> Figure:
-    """Draw the band, and nine strips below it that share its axis."""
+def _figure(run: ChartData) -> Figure:
+    """Plot the band, and nine strips below it that share its axis."""
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(11.5)
@@ -96,15 +97,15 @@ def _figure(run: Run) -> Figure:
     top = figure.add_subplot(grid[0])
     strips = [figure.add_subplot(grid[1 + k], sharex=top) for k in range(_STRIPS)]
     _band(top, run)
-    for k, (name, unit) in enumerate([*((n, "mm") for n in "xyz"), *((n, "deg") for n in ("roll", "pitch", "yaw"))]):
+    for k, (name, unit) in enumerate([*((n, "mm") for n in "xyz"), *((n, "deg") for n in ANGLES)]):
         _strip(strips[k], run, run.pose[:, k], run.pose_sigma[:, k], f"{name}\n{unit}")
     _sigmas(strips[6], run, run.pose_sigma[:, :3], "sigma of\nposition\nmm")
-    _sigmas(strips[7], run, run.turn_sigma, "sigma of\nrotation\ndeg")
+    _sigmas(strips[7], run, run.rotation_sigma, "sigma of\nrotation\ndeg")
     _line(strips[8], run, run.rms_px, INK)
     _from_zero(strips[8], run.rms_px[np.isfinite(run.rms_px)])
     strips[8].set_ylabel("reprojection\nRMS, px")
     for axes in strips:
-        for begin, end, way in _stretches(run):
+        for begin, end, way in _intervals(run):
             if way in ("lost", "missed"):
                 axes.axvspan(begin, end, color=_LOST, linewidth=0.8, zorder=0)
         axes.grid(axis="y", color="#e4e7eb", linewidth=0.6)
@@ -119,18 +120,18 @@ def _figure(run: Run) -> Figure:
 
 
 def _gaps(along: Array) -> NDArray[np.bool_]:
-    """(N - 1,) whether so much time lies between two shots that nothing can be said of it."""
+    """Return (N - 1,) whether the interval between two shots is a gap."""
     steps = np.diff(along)
     return np.asarray(steps > _GAP_STEPS * np.median(steps)) if len(steps) else np.zeros(0, bool)
 
 
 def _broken(along: Array, values: Array) -> Array:
-    """Return values with NaN put in where there is a gap in time, to break a line."""
+    """Return values with a NaN inserted at every gap, which interrupts the line."""
     return np.insert(values, np.flatnonzero(_gaps(along)) + 1, np.nan)
 
 
 def _edges(along: Array) -> tuple[Array, Array]:
-    """Return where each shot's stretch of the axis begins and ends: half way to its neighbours."""
+    """Return the begin (N,) and the end (N,) of each shot's interval on the axis: half way to its neighbours."""
     if len(along) == 1:
         return along - 0.5, along + 0.5
     steps = np.diff(along)
@@ -139,8 +140,8 @@ def _edges(along: Array) -> tuple[Array, Array]:
     return along - np.append(half[0], half), along + np.append(half, half[-1])
 
 
-def _stretches(run: Run) -> Iterator[tuple[float, float, str]]:
-    """Yield begin, end and way of every stretch of shots that were found the same way, gaps in time between them."""
+def _intervals(run: ChartData) -> Iterator[tuple[float, float, str]]:
+    """Yield begin, end and way of every interval of consecutive shots that were found the same way; gaps separate them."""
     low, high = _edges(run.along)
     begin = 0
     for n in range(1, len(low) + 1):
@@ -149,15 +150,15 @@ def _stretches(run: Run) -> Iterator[tuple[float, float, str]]:
             begin = n
 
 
-def _band(axes: Axes, run: Run) -> None:
-    """Draw how each shot was found; rare ways last and never thinner than a line."""
+def _band(axes: Axes, run: ChartData) -> None:
+    """Plot how each shot was found; rare ways last and never thinner than a line."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     counts = Counter(run.way)
-    stretches = list(_stretches(run))
+    intervals = list(_intervals(run))
     for way, count in counts.most_common():
-        bars = [(begin, end - begin) for begin, end, w in stretches if w == way]
+        bars = [(begin, end - begin) for begin, end, w in intervals if w == way]
         rare = 0.8 if count < len(run.way) / 2 else 0.0
         axes.broken_barh(bars, (0.0, 1.0), facecolor=_WAYS[way], edgecolor=_WAYS[way], linewidth=rare, clip_on=False)
     handles: list[Any] = [
@@ -167,13 +168,13 @@ def _band(axes: Axes, run: Run) -> None:
         style: Any = {"marker": "v", "color": _PURPLE, "linestyle": "none", "clip_on": False}
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
         handles.append(Line2D([], [], label=f"{run.jumped.sum()} jumped", **style))
-    place: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.15), "borderaxespad": 0.0, "handlelength": 1.2}
+    position: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.15), "borderaxespad": 0.0, "handlelength": 1.2}
     axes.legend(
         handles=handles,
         ncols=len(handles),
         title=f"shots: {len(run.way)}",
         alignment="left",
-        **place,
+        **position,
     )
     axes.set_ylim(0.0, 1.0)
     low, high = _edges(run.along)
@@ -184,8 +185,8 @@ def _band(axes: Axes, run: Run) -> None:
         spine.set_visible(False)
 
 
-def _line(axes: Axes, run: Run, values: Array, colour: str, width: float = 0.9, label: str | None = None) -> None:
-    """Draw values as a line that is broken where shots were missed; single shots as dots."""
+def _line(axes: Axes, run: ChartData, values: Array, colour: str, width: float = 0.9, label: str | None = None) -> None:
+    """Plot values as a line that is interrupted where shots were missed; single shots as dots."""
     good = np.isfinite(values)
     linked = good[1:] & good[:-1] & ~_gaps(run.along)
     beside = np.append(linked, False) | np.append(False, linked)
@@ -195,8 +196,8 @@ def _line(axes: Axes, run: Run, values: Array, colour: str, width: float = 0.9, 
     axes.plot(run.along[dots], values[dots], ".", color=colour, markersize=3.5)
 
 
-def _strip(axes: Axes, run: Run, values: Array, sigma: Array, name: str) -> None:
-    """Draw one coordinate with its band of 3 sigma, and say how wide the band is, for it may be thinner than the line."""
+def _strip(axes: Axes, run: ChartData, values: Array, sigma: Array, name: str) -> None:
+    """Plot one coordinate with its band of 3 sigma, and print the band's width, as it may be thinner than the line."""
     x, low, high = (_broken(run.along, v) for v in (run.along, values - 3 * sigma, values + 3 * sigma))
     axes.fill_between(x, low, high, color=BLUE, alpha=0.25, linewidth=0.0)
     _line(axes, run, values, BLUE)
@@ -213,9 +214,9 @@ def _from_zero(axes: Axes, values: Array) -> None:
         axes.set_ylim(0.0, 1.12 * float(values.max()))
 
 
-def _sigmas(axes: Axes, run: Run, sigma: Array, name: str) -> None:
-    """Draw three sigmas, on a logarithmic scale where they differ much."""
-    # The wider beneath the narrower: lines that coincide can both be seen.
+def _sigmas(axes: Axes, run: ChartData, sigma: Array, name: str) -> None:
+    """Plot three sigmas, on a logarithmic scale where they differ much."""
+    # The wider line beneath the narrower: where they coincide both can be seen.
     for k, (letter, colour, width) in enumerate(zip("xyz", (BLUE, ORANGE, _GREEN), (2.2, 1.3, 0.7), strict=True)):
         _line(axes, run, sigma[:, k], colour, width, letter)
     good = sigma[np.isfinite(sigma)]
@@ -223,6 +224,6 @@ def _sigmas(axes: Axes, run: Run, sigma: Array, name: str) -> None:
         axes.set_yscale("log")
     else:
         _from_zero(axes, good)
-    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.96), "borderaxespad": 0.0, "handlelength": 1.2}
-    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, **place)
+    position: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.96), "borderaxespad": 0.0, "handlelength": 1.2}
+    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, **position)
     axes.set_ylabel(name)

@@ -1,28 +1,25 @@
 """One shot as a picture: what was measured, both images side by side, and below them the points enlarged.
 
-What a shot's picture shows of the body's points: where the pose puts each, where it was seen, what was dropped and why.
+In: the rig, the body, a shot and its measured pose. Out: a BGR image. In order: :class:`Marks`, the positions of the body's
+points in both images (by the pose, as detected, dropped and why); lines and text on an image, with OpenCV; the header; the
+picture.
 
-A disc is shown by its image ellipse. Its detected centre, which a measurement frees of the perspective bias, gets that
-bias back, so that detection and ellipse belong together; the residual is the same either way.
-
-Strokes and letters on a BGR image, with OpenCV.
-
-Its letters are ASCII on some versions: other characters are spelt out, or become a question mark.
-
-What is written above a shot's picture, and the sigmas of roll, pitch and yaw that it and the chart show.
+A disc is shown by its image ellipse. A measurement corrects the detected centre for the perspective bias; here the bias is
+added again, so that the detection lies in its ellipse. The residual is the same either way. OpenCV's letters are ASCII on
+some versions: other characters are spelt out, or become a question mark.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.measure.poses import ANGLES, ShotPose
 from armsight.app.report.plotting import nice, plain
 from armsight.data import SIDES, Array, Body, Dropped, Image, PoseEstimate, Record
 from armsight.geometry.pose import inverse, transform
@@ -38,15 +35,15 @@ class Marks(Record):
     """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none.
 
     Attributes:
-        names: what the points are called.
-        at: (N, 2, 2) where the located pose puts a point, or the centre of a disc's ellipse, raw px; NaN where that is
-            not seen and looks away from the camera.
-        shape: (N, 2, 3) S11, S12, S22 of the ellipse that a disc has at the located pose, px^2.
-        found: (N, 2, 2) where a camera saw it, raw px; of a disc the centre of its ellipse.
-        cov: (N, 2, 2, 2) covariance of that, px^2.
-        dropped: (N, 2) whether a camera's sight of it was dropped.
+        names: names of the points.
+        at: (N, 2, 2) projection of a point, or of the centre of a disc's ellipse, at the measured pose, raw px; NaN where
+            it was not detected and faces away from the camera.
+        shape: (N, 2, 3) S11, S12, S22 of a disc's ellipse at the measured pose, px^2.
+        found: (N, 2, 2) detected position, raw px; of a disc the centre of its ellipse.
+        cov: (N, 2, 2, 2) its covariance, px^2.
+        dropped: (N, 2) whether the detection was dropped.
         reasons: why; empty where neither was.
-        others: what else was dropped, in words.
+        others: what else was dropped, and why.
     """
 
     names: tuple[str, ...]
@@ -60,31 +57,31 @@ class Marks(Record):
 
     @property
     def residual(self) -> Array:
-        """(N, 2, 2) detection less the pose's projection, px."""
+        """(N, 2, 2) detection minus projection, px."""
         return np.asarray(self.found - self.at)
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(N, 2) whether a camera saw a point."""
+        """(N, 2) whether a point was detected."""
         return np.asarray(np.isfinite(self.found[..., 0]))
 
     def worst(self, most: int) -> list[int]:
-        """Return the rows to show enlarged: all where that is at most ``most``, else the dropped and the worst."""
+        """Return the rows to show enlarged: all if there are at most ``most``, else the dropped and the worst."""
         if len(self.names) <= most:
             return list(range(len(self.names)))
-        off = np.nan_to_num(np.linalg.norm(self.residual, axis=2)).max(axis=1)
-        order: list[int] = np.lexsort([-off, ~self.dropped.any(axis=1)]).tolist()
-        return order[:most]
+        length = np.nan_to_num(np.linalg.norm(self.residual, axis=2)).max(axis=1)
+        worst_first: list[int] = np.lexsort([-length, ~self.dropped.any(axis=1)]).tolist()
+        return worst_first[:most]
 
 
 def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: PoseEstimate) -> Marks:
-    """Say what there is to draw of a measured shot.
+    """Return the marks of a measured shot.
 
     Args:
         rig: the calibrated pair.
         body: all points; the discs' come last.
         discs: the body's plain discs, None where it has none.
-        estimate: what was measured.
+        estimate: the measured pose.
     """
     at, shape, bias, away = _expected(rig, body, discs, estimate.T_left_body)
     seen = estimate.points.seen
@@ -104,7 +101,10 @@ def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: Pos
 def _expected(
     rig: StereoRig, body: Body, discs: DiscTarget | None, T: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return where a pose puts all M points (M, 2, 2), their ellipses (M, 2, 3), biases (M, 2, 2), and what looks away."""
+    """Return the projections (M, 2, 2) of all points, px, ellipses (M, 2, 3), biases (M, 2, 2), px, and facing (M, 2).
+
+    The last is True for discs that face away from the camera.
+    """
     p_left, count = transform(T, body.points), len(body.points)
     p_right = transform(inverse(rig.T_left_right), p_left)
     at = np.stack([camera.project(p) for camera, p in zip(rig.cameras, (p_left, p_right), strict=True)], axis=1)
@@ -117,22 +117,22 @@ def _expected(
 
 
 def _reasons(body: Body, dropped: tuple[Dropped, ...]) -> tuple[dict[int, list[str]], tuple[str, ...]]:
-    """Return why points were dropped by their row, and the words for what is no point of the body."""
+    """Return the reasons of dropped points by their row, and texts on what is not a point of the body."""
     row = {name: i for i, name in enumerate(body.point_names)}
-    said: dict[int, list[str]] = {}
+    found: dict[int, list[str]] = {}
     others = []
     for drop in dropped:
         if drop.point in row:
-            said.setdefault(row[drop.point], []).append(drop.reason)
+            found.setdefault(row[drop.point], []).append(drop.reason)
         else:
             others.append(f"{drop.point}: {drop.reason}")
-    return {i: list(dict.fromkeys(reasons)) for i, reasons in said.items()}, tuple(others)
+    return {i: list(dict.fromkeys(reasons)) for i, reasons in found.items()}, tuple(others)
 
 
 def _sides(reasons: list[str]) -> list[bool]:
-    """Tell in which images a point was dropped: those its reasons speak of, both where they speak of none."""
-    spoken = [[bool(re.search(rf"\b{side}\b", reason)) for side in SIDES] for reason in reasons]
-    return [any(said[side] or not any(said) for said in spoken) for side in (0, 1)]
+    """Return in which images a point was dropped: those its reasons name, both where they name none."""
+    named = [[bool(re.search(rf"\b{side}\b", reason)) for side in SIDES] for reason in reasons]
+    return [any(sides[side] or not any(sides) for sides in named) for side in (0, 1)]
 
 
 def _together(reasons: list[str]) -> str:
@@ -152,11 +152,11 @@ PAPER: Colour = (255, 255, 255)
 INK: Colour = (41, 32, 26)
 MUTED: Colour = (124, 110, 97)
 RED: Colour = (40, 40, 200)
-BLANK = 200  # grey of what no image covers
+BLANK = 200  # grey value where there is no image
 LINE = 24  # height of a line of text, px
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
-_FAR = 1e5  # px: what lies further off is not drawn
+_FAR = 1e5  # px: points further away are not drawn
 _SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
 
 
@@ -166,7 +166,7 @@ def ascii_text(text: str) -> str:
 
 
 def wrapped(text: str, size: float, width: int) -> list[str]:
-    """Break a text into lines of at most ``width`` px, between words where that is possible."""
+    """Return a text as lines of at most ``width`` px, wrapped at spaces where that is possible."""
     lines = [""]
     for word in ascii_text(text).split():
         if text_width(f"{lines[-1]} {word}", size) > width and lines[-1]:
@@ -188,7 +188,7 @@ def text_width(text: str, size: float) -> int:
 def write(
     canvas: Canvas, text: str, at: tuple[int, int], colour: Colour, size: float, *, rim: Colour | None = None
 ) -> None:
-    """Write one line from its lower left corner on, with a rim of another colour where it stands on an image."""
+    """Write one line from its lower left corner, px; ``rim`` is the colour of an outline, for text on an image."""
     text = ascii_text(text)
     if rim is not None:
         for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
@@ -197,7 +197,7 @@ def write(
 
 
 def paragraph(lines: Sequence[str], colour: Colour, size: float, width: int, edge: int = 0) -> Canvas:
-    """Return lines of text on white, broken where they are too long, ``edge`` px from the left."""
+    """Return lines of text on white, wrapped where they are too long, ``edge`` px from the left."""
     broken = [part for line in lines for part in wrapped(line, size, width - 2 * edge)]
     canvas = paper(LINE * len(broken), width)
     for row, text in enumerate(broken):
@@ -212,31 +212,31 @@ def paper(height: int, width: int) -> Canvas:
 
 def beside(parts: Sequence[Canvas], width: int, gap: int) -> Canvas:
     """Put canvases beside one another on white, with gaps before and between them."""
-    out = paper(max(part.shape[0] for part in parts), width)
+    canvas = paper(max(part.shape[0] for part in parts), width)
     x = gap
     for part in parts:
-        out[: part.shape[0], x : x + part.shape[1]] = part
+        canvas[: part.shape[0], x : x + part.shape[1]] = part
         x += part.shape[1] + gap
-    return out
+    return canvas
 
 
 def ellipse(packed: Array) -> Array:
     """Return (64, 2) rim of an ellipse x^T S^-1 x = 1 about the origin, from its S11, S12, S22; NaN where it is none."""
     values, axes = np.linalg.eigh(np.nan_to_num(packed[[0, 1, 1, 2]]).reshape(2, 2))
-    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sqrt(np.maximum(values, 0)) @ axes.T
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.sqrt(np.maximum(values, 0)) @ axes.T
     return rim if np.isfinite(packed).all() else np.full_like(rim, np.nan)
 
 
 def outline(canvas: Canvas, points: Array, colour: Colour, width: int = 1) -> None:
-    """Draw a closed line through points (N, 2), px; nothing where a point is far off or none."""
+    """Draw a closed line through points (N, 2), px; nothing where a point is far outside or NaN."""
     if (np.abs(points) < _FAR).all():
         fixed = np.rint(points * 2**_SHIFT).astype(np.int32)
         cv2.polylines(canvas, [fixed], True, colour, width, cv2.LINE_AA, _SHIFT)
 
 
 def segment(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
-    """Draw a line between two places (2,), px."""
+    """Draw a line between two positions (2,), px."""
     outline(canvas, np.array([a, b]), colour, width)
 
 
@@ -256,28 +256,26 @@ def arrow(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) ->
             segment(canvas, b, b - along + side * 0.45 * np.array([-along[1], along[0]]), colour, width)
 
 
-def header(record: Mapping[str, Any]) -> list[str]:
-    """Return the lines above a shot's picture, mm and degrees, one sigma behind each +-.
-
-    Args:
-        record: the shot as ``measure --json`` prints it.
-    """
-    first = [f"shot {record['shot']}"]
-    if record["t_s"] is not None:
-        first.append(f"t {record['t_s']:.3f} s")
-    if "way" in record:
-        first.append(f"{record['way']}, {record['took_ms']:.1f} ms")
-    if record.get("jump"):
-        first.append(str(record["jump"]))
-    if record["status"] != "ok":
+def header(shot: ShotPose) -> list[str]:
+    """Return the lines above a shot's picture, mm and degrees, one sigma after each +-."""
+    first = [f"shot {shot.shot}"]
+    if shot.t_s is not None:
+        first.append(f"t {shot.t_s:.3f} s")
+    if shot.way is not None:
+        first.append(shot.way if shot.took_ms is None else f"{shot.way}, {shot.took_ms:.1f} ms")
+    if shot.jump:
+        first.append(shot.jump)
+    if not shot.ok:
         return [", ".join(first)]
-    sigma = 1e3 * np.sqrt(np.diag(record["covariance"])[:3])
-    place = _pairs(("x", "y", "z"), 1e3 * np.array(record["position_m"]), sigma)
-    turn = _pairs(("roll", "pitch", "yaw"), np.array(record["roll_pitch_yaw_deg"]), angle_sigmas_deg(record))
-    singular = " (pitch singular: only roll and yaw together are determined)" if record["pitch_singular"] else ""
-    count, dropped = len(record["points_m"]), len(record["dropped"])
-    fit = f"reprojection {record['reprojection_rms_px']:.3f} px RMS, misfit {record['misfit']:.1f}, {count} points"
-    return [", ".join(first), f"{place} mm; {turn} deg{singular}", fit + (f", {dropped} dropped" if dropped else "")]
+    position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov)[:3]))
+    rotation = _pairs(ANGLES, shot.euler_zyx_deg, angle_sigmas_deg(shot))
+    count, dropped = len(shot.points_m), len(shot.dropped)
+    fit = f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {count} points"
+    return [
+        ", ".join(first),
+        f"{position} mm; {rotation} deg{SINGULAR if shot.pitch_singular else ''}",
+        fit + (f", {dropped} dropped" if dropped else ""),
+    ]
 
 
 def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
@@ -288,31 +286,33 @@ def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
     )
 
 
-def angle_sigmas_deg(record: Mapping[str, Any]) -> Array:
-    """Return (3,) one sigma of roll, pitch and yaw of a measured shot, degrees; NaN where the pitch is singular.
+def angle_sigmas_deg(shot: ShotPose) -> Array:
+    """Return (3,) one sigma of the angles about z, y, x of a measured shot, degrees; NaN at the singularity.
 
-    A turn of the body by the rotation vector w along the left camera's axes changes the angles by J^-1 w; the columns of
-    J are the axes that roll, pitch and yaw turn about, R = R_z(roll) R_y(pitch) R_x(yaw).
+    A rotation of the body by the rotation vector w along the left camera's axes changes the angles by J^-1 w; the columns
+    of J are the axes of rotation of the three angles, R = R_z R_y R_x.
     """
-    if record["pitch_singular"]:
+    if shot.pitch_singular:
         return np.full(3, np.nan)
-    roll, pitch, _ = np.radians(record["roll_pitch_yaw_deg"])
-    of_roll, of_pitch = exp_so3(np.array([0.0, 0.0, roll])), exp_so3(np.array([0.0, pitch, 0.0]))
-    J = np.column_stack([[0.0, 0.0, 1.0], of_roll[:, 1], (of_roll @ of_pitch)[:, 0]])
+    about_z, about_y, _ = np.radians(shot.euler_zyx_deg)
+    R_z, R_y = exp_so3(np.array([0.0, 0.0, about_z])), exp_so3(np.array([0.0, about_y, 0.0]))
+    J = np.column_stack([[0.0, 0.0, 1.0], R_z[:, 1], (R_z @ R_y)[:, 0]])
     back = np.linalg.inv(J)
-    return np.asarray(np.degrees(np.sqrt(np.diag(back @ np.array(record["covariance"])[3:, 3:] @ back.T))))
+    return np.asarray(np.degrees(np.sqrt(np.diag(back @ shot.cov[3:, 3:] @ back.T))))
 
 
-#: Width of a picture, height of its two images at the most, side of an enlarged place: px.
+#: What is printed behind the angles at their singularity.
+SINGULAR = " (ry is +-90: only rz and rx together are determined)"
+#: Width of a picture, height of its two images at the most, side of an enlarged detail: px.
 WIDTH, _TALLEST, _TILE, _GAP = 1640, 760, 264, 12
 _HALF = (WIDTH - 3 * _GAP) // 2
 _PER_ROW = (WIDTH - _GAP) // (2 * _TILE + _GAP)
 _MIDDLE = np.full(2, (_TILE - 1) / 2)
-#: Up to so many points are all shown enlarged; of more only the worst few.
+#: Up to this many points are all shown enlarged; of more only the worst few.
 _ALL, _WORST = 12, 6
-#: How many times larger a place is shown: less where its disc would not fit.
+#: Enlargement of a detail; less where its disc would not fit.
 _ZOOM = 8.0
-#: Length of the longest residual, px of the picture: in an enlarged place, where sigma counts as well, and in the images.
+#: Length of the longest residual, px of the picture: in an enlarged detail, where sigma counts as well, and in the images.
 _REACH, _LONGEST = 0.42 * _TILE, 40.0
 _MOST = 1e5
 _RIM, _CROSS, _ARROW, _SIGMA = (255, 200, 40), (70, 220, 70), (30, 110, 255), (235, 70, 225)
@@ -348,13 +348,13 @@ def draw_shot(
         factor = _factor(np.linalg.norm(marks.residual, axis=2)[~marks.dropped], _LONGEST)
         for side, panel in enumerate(panels):
             panel.draw(marks, side, shown, factor)
-        below = [*_places(marks, shown, panels, factor), *_unshown(marks, shown)]
+        below = [*_details(marks, shown, panels, factor), *_unshown(marks, shown)]
     parts += [beside([panel.titled() for panel in panels], WIDTH, _GAP), *below]
     return np.vstack([paper(_GAP, WIDTH), *(canvas for part in parts for canvas in (part, paper(_GAP, WIDTH)))])
 
 
 class _Panel:
-    """One camera's image as it stands in the picture."""
+    """One camera's image in the picture."""
 
     def __init__(self, side: str, image: Image | None, size: tuple[int, int]) -> None:
         self.image = None if image is None else cv2.cvtColor(grey(image), cv2.COLOR_GRAY2BGR)
@@ -370,20 +370,20 @@ class _Panel:
 
     def draw(self, marks: Marks, side: int, named: list[int], factor: float) -> None:
         """Draw every point, its residual ``factor`` times as long, and the names of some."""
-        places = (marks.at[:, side] + 0.5) * self.scale - 0.5
-        for i, at in enumerate(places):
+        positions = (marks.at[:, side] + 0.5) * self.scale - 0.5
+        for i, at in enumerate(positions):
             bad = marks.dropped[i, side]
             outline(self.canvas, ellipse(marks.shape[i, side]) * self.scale + at, RED if bad else _RIM)
             if np.isfinite(marks.found[i, side]).all():
                 cross(self.canvas, at + self.scale * marks.residual[i, side], 3.0, RED if bad else _CROSS)
             arrow(self.canvas, at, at + factor * marks.residual[i, side], RED if bad else _ARROW)
-        good = np.asarray((np.abs(np.nan_to_num(places, nan=np.inf)) < 2 * WIDTH).all(axis=1))
-        middle = places[good].mean(axis=0) if good.any() else np.zeros(2)
+        good = np.asarray((np.abs(np.nan_to_num(positions, nan=np.inf)) < 2 * WIDTH).all(axis=1))
+        middle = positions[good].mean(axis=0) if good.any() else np.zeros(2)
         for i in (i for i in named if good[i]):
             # Away from the middle of the body, where the other names are.
-            away = (places[i] - middle) / max(float(np.linalg.norm(places[i] - middle)), 1.0)
+            away = (positions[i] - middle) / max(float(np.linalg.norm(positions[i] - middle)), 1.0)
             wide = float(np.sqrt(np.nan_to_num(marks.shape[i, side, 0]))) * self.scale
-            text, at = plain(marks.names[i], 24), places[i] + (wide + 10.0) * away
+            text, at = plain(marks.names[i], 24), positions[i] + (wide + 10.0) * away
             left = round(float(at[0])) - (text_width(text, 0.5) if away[0] < 0 else 0)
             colour = _PALE if marks.dropped[i, side] else PAPER
             write(self.canvas, text, (left, round(float(at[1])) + 5), colour, 0.5, rim=INK)
@@ -393,8 +393,8 @@ class _Panel:
         write(self.canvas, self.title, (8, 20), PAPER, 0.55, rim=INK)
         return self.canvas
 
-    def place(self, centre: Array, zoom: float) -> Canvas:
-        """Return a square around a place (2,), raw px, pixels as squares; grey where there is no image."""
+    def detail(self, centre: Array, zoom: float) -> Canvas:
+        """Return an enlarged square around a position (2,), raw px, pixels as squares; grey where there is no image."""
         if self.image is None or not np.isfinite(centre).all():
             return np.full((_TILE, _TILE, 3), BLANK, np.uint8)
         to_image = np.column_stack([np.eye(2) / zoom, centre - _MIDDLE / zoom])
@@ -407,13 +407,13 @@ class _Panel:
 
 
 def _factor(lengths: Array, reach: float) -> float:
-    """Return a round factor that makes the longest of lengths at most ``reach``; 1 where all are nothing."""
+    """Return a round factor that makes the longest of lengths at most ``reach``; 1 where all are zero."""
     longest = float(np.nan_to_num(lengths).max(initial=0.0))
     return nice(min(reach / longest, _MOST)) if longest > 0 else 1.0
 
 
-def _places(marks: Marks, shown: list[int], panels: list[_Panel], in_images: float) -> list[Canvas]:
-    """Return the enlarged places, row by row, and the legend below them."""
+def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: float) -> list[Canvas]:
+    """Return the enlarged details, row by row, and the legend below them."""
     if not shown:
         return []
     wide = float(np.sqrt(np.nan_to_num(marks.shape[shown][..., [0, 2]]).max()))
@@ -428,10 +428,10 @@ def _places(marks: Marks, shown: list[int], panels: list[_Panel], in_images: flo
 
 
 def _block(marks: Marks, i: int, panels: list[_Panel], zoom: float, factor: float) -> Canvas:
-    """Return one point enlarged, left and right: its name above, its residuals and its fate below."""
+    """Return one point enlarged, left and right: its name and residuals above, why it was dropped below."""
     tiles, name = [], plain(marks.names[i], 40)
     for side, panel in enumerate(panels):
-        tile, residual, bad = panel.place(marks.at[i, side], zoom), marks.residual[i, side], marks.dropped[i, side]
+        tile, residual, bad = panel.detail(marks.at[i, side], zoom), marks.residual[i, side], marks.dropped[i, side]
         outline(tile, ellipse(marks.shape[i, side]) * zoom + _MIDDLE, RED if bad else _RIM)
         if np.isfinite(residual).all():
             outline(tile, ellipse(marks.cov[i, side].ravel()[[0, 1, 3]]) * factor + _MIDDLE, _SIGMA)
@@ -439,27 +439,27 @@ def _block(marks: Marks, i: int, panels: list[_Panel], zoom: float, factor: floa
             arrow(tile, _MIDDLE, _MIDDLE + factor * residual, RED if bad else _ARROW, 2)
         cv2.rectangle(tile, (0, 0), (_TILE - 1, _TILE - 1), RED if bad else MUTED, 1)
         tiles.append(tile)
-    words = paper(2 * LINE, 2 * _TILE)
+    caption = paper(2 * LINE, 2 * _TILE)
     lost = [side for side, bad in zip(SIDES, marks.dropped[i], strict=True) if bad]
     if lost:
         name += ", dropped" if len(lost) == 2 else f", dropped in the {lost[0]} image"
-    write(words, name, (2, 17), RED if lost else INK, 0.6)
-    for side, off in enumerate(np.linalg.norm(marks.residual[i], axis=1)):
-        unseen = "not used" if marks.dropped[i, side] else "not seen"
-        told = f"{off:.3f} px off" if np.isfinite(off) else unseen
-        write(words, f"{SIDES[side]}: {told}", (2 + side * _TILE, LINE + 17), MUTED, 0.5)
+    write(caption, name, (2, 17), RED if lost else INK, 0.6)
+    for side, length in enumerate(np.linalg.norm(marks.residual[i], axis=1)):
+        unseen = "not used" if marks.dropped[i, side] else "not detected"
+        value = f"residual {length:.3f} px" if np.isfinite(length) else unseen
+        write(caption, f"{SIDES[side]}: {value}", (2 + side * _TILE, LINE + 17), MUTED, 0.5)
     reason = wrapped(marks.reasons[i], 0.5, 2 * _TILE - 4)[:2] if marks.reasons[i] else []
-    return np.vstack([words, np.hstack(tiles), paragraph(reason, RED, 0.5, 2 * _TILE, 2)])
+    return np.vstack([caption, np.hstack(tiles), paragraph(reason, RED, 0.5, 2 * _TILE, 2)])
 
 
 def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canvas:
-    """Say what is drawn, with a bar for the length of the enlarged vectors."""
+    """Return the legend, with a bar for the length of the enlarged vectors."""
     discs = bool(np.isfinite(marks.shape).any())
     detected = (
-        "detected centre of its ellipse (the place used plus the perspective bias)" if discs else "detected place"
+        "detected centre of its ellipse (the position used plus the perspective bias)" if discs else "detected position"
     )
     entries: list[tuple[Colour, str]] = [
-        *([(_RIM, "rim a disc should have at the located pose")] if discs else []),
+        *([(_RIM, "predicted rim of a disc at the measured pose")] if discs else []),
         (_CROSS, detected),
         (_ARROW, f"residual, from the pose's projection to the detection, {factor:g}x; in the images {in_images:g}x"),
         (_SIGMA, f"1 sigma of the detection, {factor:g}x"),
@@ -476,13 +476,13 @@ def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canva
     y += LINE
     bar = nice(0.6 * _TILE / factor)
     segment(canvas, np.array([_GAP, y - 5.0]), np.array([_GAP + bar * factor, y - 5.0]), INK, 2)
-    text = f"{bar:g} px of residual and sigma; places enlarged {zoom:.3g}x"
+    text = f"{bar:g} px of residual and sigma; details enlarged {zoom:.3g}x"
     write(canvas, text, (round(_GAP + bar * factor) + 10, y), INK, 0.5)
     return canvas[: y + 7]
 
 
 def _unshown(marks: Marks, shown: list[int]) -> list[Canvas]:
-    """Say in words what is not shown enlarged."""
+    """Return a text on what is not shown enlarged."""
     count, lines = len(marks.names), []
     if len(shown) < count:
         lines.append(f"enlarged: the worst {len(shown)} of {count} points, dropped ones first")

@@ -1,8 +1,12 @@
-"""Measured poses as people and programs read them: a JSON line per shot, and a CSV.
+"""A shot's pose as a record, as a line of JSON, and as a row of CSV.
 
-Everything is in the left camera's frame; ``covariance`` is that of [translation m; rotation rad] along the axes of the
-left camera (the true pose is the estimate turned by the rotation vector about the body's origin, and shifted), and
-``covariance_body`` the same along the body's axes, as docs/concepts/conventions.md has it (perturbation on the right).
+In: what vision measured in a shot. Out: a :class:`ShotPose`. All is in the left camera's frame. ``covariance`` is that of
+[translation m; rotation rad] along the axes of the left camera (the true pose is the estimate rotated by the rotation
+vector about the body's origin, and shifted); ``covariance_body`` is the same along the body's axes, as
+docs/concepts/conventions.md defines it (perturbation on the right).
+
+``euler_zyx_deg`` are the angles about z, y and x, in this order: R = R_z R_y R_x. ROS lists the same three angles the other
+way round, as roll (about x), pitch, yaw (about z).
 """
 
 from __future__ import annotations
@@ -10,15 +14,19 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from armsight.data import Body, Missed, PoseEstimate
+from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, Record
 from armsight.geometry.rotation import euler_zyx, quaternion_wxyz
 
 #: Elements of a 6x6 covariance that are written.
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+#: Names of the three angles for people: about z, y, x.
+ANGLES = ("rz", "ry", "rx")
 CSV_COLUMNS = (
     "shot",
     "status",
@@ -26,7 +34,7 @@ CSV_COLUMNS = (
     "t_s",
     *(f"{axis}_m" for axis in "xyz"),
     *(f"q{axis}" for axis in "wxyz"),
-    *(f"{angle}_deg" for angle in ("roll", "pitch", "yaw")),
+    *(f"euler_{axis}_deg" for axis in "zyx"),
     *(f"sigma_{axis}_m" for axis in "xyz"),
     *(f"sigma_r{axis}_rad" for axis in "xyz"),
     "residual_rms_m",
@@ -38,55 +46,131 @@ CSV_COLUMNS = (
 )
 
 
-def pose_record(name: str, t_s: float | None, body: Body, result: PoseEstimate | Missed) -> dict[str, Any]:
-    """Turn one shot's result into the object that ``measure --json`` prints."""
-    head: dict[str, Any] = {"shot": name, "t_s": t_s}
+@dataclass(frozen=True, eq=False)
+class ShotPose(Record):
+    """What was measured in one shot; the values after ``reason`` hold only where ``reason`` is None.
+
+    Attributes:
+        shot: name of the shot.
+        t_s: its time, s; None where it has none.
+        reason: why no pose was measured; None where one was.
+        position_m: (3,) position of the body's origin, m.
+        quaternion_wxyz: (4,) orientation of the body.
+        euler_zyx_deg: (3,) the same as angles about z, y, x, degrees.
+        pitch_singular: whether the angle about y is +-90 degrees: then only those about z and x together are determined.
+        cov: (6, 6) covariance [m; rad] along the left camera's axes.
+        cov_body: (6, 6) covariance [m; rad] along the body's axes.
+        residual_rms_m: RMS distance of the points from the body's, m; None where it is not known.
+        reprojection_rms_px: RMS reprojection error, px.
+        misfit: Birge ratio: how many times larger the residuals are than the pixel noise allows, 1 where they are not
+            larger; the covariances include it.
+        points_m: triangulated points by name, m.
+        dropped: points that were left out, and why.
+        way: how the follower found the body; None where it was not followed.
+        jump: what was noticed about a jump of the pose; None without.
+        took_ms: duration of the measurement, ms; None where it was not followed.
+    """
+
+    shot: str
+    t_s: float | None
+    reason: str | None = None
+    position_m: Array = field(default_factory=lambda: np.full(3, np.nan))
+    quaternion_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))
+    euler_zyx_deg: Array = field(default_factory=lambda: np.full(3, np.nan))
+    pitch_singular: bool = False
+    cov: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    cov_body: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    residual_rms_m: float | None = None
+    reprojection_rms_px: float = math.nan
+    misfit: float = math.nan
+    points_m: Mapping[str, Array] = field(default_factory=dict)
+    dropped: tuple[Dropped, ...] = ()
+    way: str | None = None
+    jump: str | None = None
+    took_ms: float | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether a pose was measured."""
+        return self.reason is None
+
+    @property
+    def status(self) -> str:
+        """Status as JSON and CSV have it: ok or missed."""
+        return "ok" if self.ok else "missed"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that ``measure --json`` prints."""
+        found: dict[str, Any] = {"shot": self.shot, "t_s": self.t_s, "status": self.status, "reason": self.reason}
+        if self.ok:
+            found |= {
+                "position_m": self.position_m.tolist(),
+                "quaternion_wxyz": self.quaternion_wxyz.tolist(),
+                "euler_zyx_deg": self.euler_zyx_deg.tolist(),
+                "pitch_singular": self.pitch_singular,
+                "covariance": self.cov.tolist(),
+                "covariance_body": self.cov_body.tolist(),
+                "residual_rms_m": self.residual_rms_m,
+                "reprojection_rms_px": self.reprojection_rms_px,
+                "misfit": self.misfit,
+                "points_m": {name: p.tolist() for name, p in self.points_m.items()},
+                "dropped": [{"point": d.point, "reason": d.reason} for d in self.dropped],
+            }
+        if self.way is not None:
+            found |= {"way": self.way, "jump": self.jump, "took_ms": self.took_ms}
+        return found
+
+
+def shot_pose(name: str, t_s: float | None, body: Body, result: PoseEstimate | Missed) -> ShotPose:
+    """Return the record of one shot.
+
+    Args:
+        name: of the shot.
+        t_s: its time, s.
+        body: what was measured; names of its points.
+        result: of the measurement.
+    """
     if isinstance(result, Missed):
-        return {**head, "status": "missed", "reason": result.reason}
+        return ShotPose(name, t_s, result.reason)
     T = result.T_left_body
     angles, singular = euler_zyx(T[:3, :3])
     names = body.point_names
-    return {
-        **head,
-        "status": "ok",
-        "reason": None,
-        "position_m": T[:3, 3].tolist(),
-        "quaternion_wxyz": quaternion_wxyz(T[:3, :3]).tolist(),
-        "roll_pitch_yaw_deg": np.degrees(angles).tolist(),
-        "pitch_singular": singular,
-        "covariance": left_axes(T, result.cov).tolist(),
-        "covariance_body": result.cov.tolist(),
-        "residual_rms_m": _finite(result.residual_rms_m),
-        "reprojection_rms_px": result.reprojection_rms_px,
-        "misfit": result.misfit,
-        "points_m": {names[i]: p.tolist() for i, p in zip(result.points.ids, result.points.p_left, strict=True)},
-        "dropped": [{"point": d.point, "reason": d.reason} for d in result.dropped],
-    }
+    return ShotPose(
+        name,
+        t_s,
+        None,
+        T[:3, 3],
+        quaternion_wxyz(T[:3, :3]),
+        np.degrees(angles),
+        singular,
+        left_axes(T, result.cov),
+        result.cov,
+        result.residual_rms_m if math.isfinite(result.residual_rms_m) else None,
+        result.reprojection_rms_px,
+        result.misfit,
+        {names[i]: p for i, p in zip(result.points.ids, result.points.p_left, strict=True)},
+        tuple(result.dropped),
+    )
 
 
-def left_axes(T_left_body: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """Turn a covariance of the right tangent into one along the left camera's axes."""
+def left_axes(T_left_body: Array, cov: Array) -> Array:
+    """Return the covariance (6, 6) of the right tangent of a pose as one along the left camera's axes."""
     R = T_left_body[:3, :3]
     blocks = cov.reshape(2, 3, 2, 3).swapaxes(1, 2)
     return np.asarray((R @ blocks @ R.T).swapaxes(1, 2).reshape(6, 6))
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no NaN."""
-    return value if math.isfinite(value) else None
-
-
-def csv_text(records: list[dict[str, Any]]) -> str:
-    """Return the CSV of many shots' records; ``cov_ij`` is the upper triangle of ``covariance``."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+def csv_text(poses: Sequence[ShotPose]) -> str:
+    """Return the CSV of many shots; ``cov_ij`` is the upper triangle of ``covariance``."""
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)
-    for r in records:
-        row: list[Any] = [r["shot"], r["status"], r["reason"], r["t_s"]]
-        if r["status"] == "ok":
-            cov = np.array(r["covariance"])
-            row += [*r["position_m"], *r["quaternion_wxyz"], *r["roll_pitch_yaw_deg"], *np.sqrt(np.diag(cov))]
-            row += [r["residual_rms_m"], r["reprojection_rms_px"], r["misfit"], len(r["points_m"]), len(r["dropped"])]
-            row += [cov[i, j] for i, j in UPPER]
-        writer.writerow(["" if cell is None else cell for cell in row] + [""] * (len(CSV_COLUMNS) - len(row)))
-    return out.getvalue()
+    for p in poses:
+        row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
+        if p.ok:
+            row += [*p.position_m.tolist(), *p.quaternion_wxyz.tolist(), *p.euler_zyx_deg.tolist()]
+            row += np.sqrt(np.diag(p.cov)).tolist()
+            row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
+            row += [float(p.cov[i, j]) for i, j in UPPER]
+        writer.writerow(["" if value is None else value for value in row] + [""] * (len(CSV_COLUMNS) - len(row)))
+    return output.getvalue()

@@ -1,21 +1,21 @@
-"""``armsight measure --view``: a folder of annotated pictures, one a shot, and the strip chart of the run.
+"""``armsight measure --view``: a folder of annotated pictures, one a shot, and the strip chart of all shots.
 
-Every picture is put in place whole as soon as its shot is measured; nothing of a shot is kept but its record, which the
-caller has. A long run gets a picture of every shot that was missed, searched or jumped, and of every few others.
+Each picture is written completely as soon as its shot is measured; of a shot only its record is kept, by the caller. A long
+run gets a picture of every shot that was missed, searched for or jumped, and of every few others.
 """
 
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from armsight.app.measure.chart import chart
 from armsight.app.measure.picture import draw_shot, header, marks_of
+from armsight.app.measure.poses import ShotPose
+from armsight.app.report.page import writable_folder
 from armsight.app.report.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
@@ -30,7 +30,7 @@ _LONGEST_NAME = 50  # a file system's 255 bytes hold that many letters of any sc
 
 
 def view_folder(directory: str | Path) -> Path:
-    """Make sure that a run can be drawn, before it is measured.
+    """Check that pictures can be written, before anything is measured.
 
     Args:
         directory: the folder of the pictures; made with its parents where it does not exist.
@@ -45,20 +45,13 @@ def view_folder(directory: str | Path) -> Path:
         require_matplotlib()
     except InputError:
         raise InputError(
-            '--view draws a chart with matplotlib, which is not installed: pip install "armsight[report]"'
+            '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"'
         ) from None
-    folder = Path(directory).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{folder}: no pictures can be written here: {error.strerror}; give a folder") from None
-    return folder
+    return writable_folder(directory, "no pictures", "; give a folder")
 
 
-class View:
-    """Draws a run, shot after shot."""
+class PictureFolder:
+    """Writes the pictures of a run, shot after shot."""
 
     def __init__(
         self, folder: Path, rig: StereoRig, body: Body, discs: DiscTarget | None = None, total: int | None = None
@@ -78,13 +71,13 @@ class View:
         self._written: set[str] = set()
         self._earlier: set[str] | None = None
 
-    def add(self, shot: Shot, result: PoseEstimate | Missed, record: Mapping[str, Any]) -> None:
-        """Draw a shot, or leave it out of a long run.
+    def add(self, shot: Shot, result: PoseEstimate | Missed, record: ShotPose) -> None:
+        """Write the picture of a shot, or leave it out of a long run.
 
         Args:
             shot: the images; a detection's shot has none.
             result: what was measured in it.
-            record: the same as ``measure --json`` prints it.
+            record: the record of the same.
 
         Raises:
             InputError: the picture cannot be written.
@@ -93,10 +86,10 @@ class View:
             self._earlier = {path.name for path in self.folder.glob(f"{PREFIX}*.png")}
         number, odd = self._shots, _is_odd(record)
         step = _step(number, EACH_UP_TO) if self._every is None else self._every
-        wanted = number % step == 0 or (odd and self._odd % _step(self._odd, ODD_UP_TO) == 0)
+        chosen = number % step == 0 or (odd and self._odd % _step(self._odd, ODD_UP_TO) == 0)
         self._shots += 1
         self._odd += odd
-        if not wanted:
+        if not chosen:
             return
         marks = marks_of(self.rig, self.body, self.discs, result) if isinstance(result, PoseEstimate) else None
         sizes = self.rig.left.image_size_px, self.rig.right.image_size_px
@@ -104,8 +97,8 @@ class View:
         canvas = draw_shot(header(record), problem, (shot.left, shot.right), sizes, marks)
         self._put(self._file_name(shot.name), cv2.imencode(".png", canvas)[1].tobytes())
 
-    def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
-        """Draw the chart of the run so far; a run without a shot has none.
+    def finish(self, records: Sequence[ShotPose]) -> None:
+        """Write the chart of the shots so far; without a shot there is none.
 
         Raises:
             InputError: it cannot be written.
@@ -114,20 +107,20 @@ class View:
             self._put(CHART, chart(records))
 
     def summary(self) -> str:
-        """Say which shots were drawn, and whether pictures of an earlier run are left."""
-        drawn = len(self._written - {CHART})
-        said = f"{CHART} and pictures of {drawn} of {self._shots} shots are in {self.folder}"
-        if drawn < self._shots:
+        """Return a text on the shots with a picture, and whether pictures of an earlier run are left."""
+        pictures = len(self._written - {CHART})
+        text = f"{CHART} and pictures of {pictures} of {self._shots} shots are in {self.folder}"
+        if pictures < self._shots:
             kind = "every one" if self._odd <= ODD_UP_TO else "many"
             often = (
                 f"one in {self._every} of the others" if self._every else "fewer and fewer of the others as it went on"
             )
-            said += f": {kind} that was missed, searched or jumped, and {often}"
+            text += f": {kind} that was missed, searched or jumped, and {often}"
         old = len((self._earlier or set()) - self._written)
-        return said + (f"; of an earlier run there are left: {old}" if old else "")
+        return text + (f"; of an earlier run there are left: {old}" if old else "")
 
     def _file_name(self, shot: str) -> str:
-        """Return a name of its own for a shot's picture, of characters that any file system takes."""
+        """Return a unique name for a shot's picture, of characters that any file system accepts."""
         stem = PREFIX + re.sub(r"[^\w.-]", "_", shot)[-_LONGEST_NAME:]
         name, again = f"{stem}.png", 1
         while name in self._written:
@@ -136,17 +129,21 @@ class View:
         return name
 
     def _put(self, name: str, data: bytes) -> None:
-        """Put a file in place, whole."""
+        """Write a file, complete or not at all."""
         with replacing(self.folder / name, "wb") as file:
             file.write(data)
         self._written.add(name)
 
 
-def _is_odd(record: Mapping[str, Any]) -> bool:
-    """Whether a shot is one to look at: missed, searched for in the whole image, or with a jump."""
-    return record["status"] != "ok" or record.get("way") == "searched" or bool(record.get("jump"))
+def _is_odd(record: ShotPose) -> bool:
+    """Return whether a shot is unusual: missed, searched for in the whole image, or with a jump."""
+    return not record.ok or record.way == "searched" or bool(record.jump)
 
 
 def _step(number: int, most: int) -> int:
-    """Return that every so manieth is drawn: each of the first ``most``, then every 2nd, 4th, 8th in twice the number."""
+    """Return the step between shots with a picture at a shot's number.
+
+    It is 1 for the first ``most`` shots, and doubles each time the number of shots doubles: each doubling adds the
+    same number of pictures.
+    """
     return 1 << (number // most).bit_length()

@@ -1,4 +1,4 @@
-"""``armsight record``: store the shots of a source, so that the folder is a source."""
+"""``armsight record``: store the shots of a source in a folder, which is then a source itself."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import json
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from armsight.app.progress import bar
 from armsight.app.record.recording import record
 from armsight.errors import ArmsightError
 from armsight.vision.sources import open_source
@@ -17,13 +16,15 @@ from armsight.vision.sources import open_source
 
 @click.command("record")
 @click.argument("source")
-@click.option("-o", "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="New or empty folder.")
+@click.option(
+    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="New or empty folder."
+)
 @click.option("--shots", type=click.IntRange(min=1), help="Stop after so many shots.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.pass_context
 def command(
-    ctx: click.Context, source: str, out: Path, shots: int | None, seconds: float | None, as_json: bool
+    ctx: click.Context, source: str, output: Path, shots: int | None, seconds: float | None, as_json: bool
 ) -> None:
     """Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.
 
@@ -34,22 +35,16 @@ def command(
       video:LEFT.mp4,RIGHT.mp4            or one side-by-side file
       folder:DIR                          or just DIR
 
-    Ctrl-C stops; what was stored until then stays and is readable.
+    Ctrl-C stops the recording; what was stored until then is complete and readable.
     """  # noqa: D301 - click reads the backspace character
-    columns = (TextColumn("recording"), BarColumn(), MofNCompleteColumn(), TextColumn("shots"), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with (
-        contextlib.closing(open_source(source)) as opened,
-        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
-    ):
-        task = progress.add_task("recording", total=shots)
-        result = record(opened, out, shots=shots, seconds=seconds, on_shot=lambda _: progress.advance(task))
+    with contextlib.closing(open_source(source)) as opened, bar("recording shots", shots) as advance:
+        result = record(opened, output, shots=shots, seconds=seconds, on_shot=lambda _: advance())
     if as_json:
         keys = {"directory": str(result.directory), "shots": result.shots, "problems": result.problems}
         click.echo(json.dumps({**keys, "stopped": result.stopped}))
     stored = f"{result.shots} shots are stored in {result.directory}"
     if result.problems:
-        stored += f", {result.problems} of them without images: shots.csv says why"
+        stored += f", {result.problems} of them without images: shots.csv has the reasons"
     if result.interrupted:
         click.echo(f"armsight: interrupted; {stored}", err=True)
         ctx.exit(130)

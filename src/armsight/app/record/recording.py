@@ -1,7 +1,7 @@
 """Store the shots of a source in a folder that is a source itself.
 
 In: a source. Out: a folder with a left and a right PNG a shot, lossless, and the index ``shots.csv``, one line a shot.
-A line is added after both images are whole on disk: whatever stops the recording, all that the index names is readable.
+A line is added after both images are complete on disk: whatever stops the recording, all files in the index are readable.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Recording:
     """What was stored.
 
     Attributes:
-        directory: where.
+        directory: the folder.
         shots: number of shots in the index.
-        problems: how many of them have no images, but the reason why.
-        stopped: what stopped the recording early; None when it ended as asked.
+        problems: number of shots that have no images, but a reason.
+        stopped: what stopped the recording early; None when it ended as requested.
         interrupted: whether that was an interrupt from the keyboard.
     """
 
@@ -58,12 +58,12 @@ def record(
     Args:
         source: where shots come from; stays open.
         directory: a new or empty folder.
-        shots: stop after so many, those with a problem included; None is no limit.
-        seconds: stop at this age of the first shot by the shots' own time, or by the clock for a source without one.
+        shots: stop after this many, those with a problem included; None is no limit.
+        seconds: stop at this age of the first shot, s, by the shots' own time, or by the clock for a source without one.
         on_shot: called after each shot is stored.
 
     Returns:
-        How much is stored; an interrupt, a full disk or a camera that fails is no exception but told there.
+        How much is stored. An interrupt, a full disk or a failing camera raises no exception: ``stopped`` has it.
 
     Raises:
         InputError: the folder is not empty, or holds a recording already.
@@ -81,7 +81,7 @@ def record(
             first = first or shot
             if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
-            with uninterrupted() as came:  # no shot is stored by half
+            with uninterrupted() as came:  # no shot is stored in part
                 writer.add(shot)
             if came:
                 raise KeyboardInterrupt
@@ -97,14 +97,14 @@ def record(
 
 
 def _age_s(shot: Shot, first: Shot, started_s: float) -> float:
-    """Return how much later than the first shot this one is, s; by the clock where the first has no time."""
+    """Return the time from the first shot to this one, s; by the clock where the first has no time."""
     if first.t_s is None:
         return time.monotonic() - started_s
     return 0.0 if shot.t_s is None else shot.t_s - first.t_s
 
 
 def _unused(folder: Path) -> Path:
-    """Check that a folder is new or empty."""
+    """Return a folder; raise an InputError if it is not new or empty."""
     try:
         names = os.listdir(folder)
     except FileNotFoundError:
@@ -119,17 +119,17 @@ def _unused(folder: Path) -> Path:
 
 
 class _Writer:
-    """The folder being written; made with the first shot."""
+    """The folder being written; it is made with the first shot."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._index: int | None = None
-        self._whole = 0  # bytes of the index that are good
+        self._whole = 0  # bytes of the index that are complete
         self.shots = 0
         self.problems = 0
 
     def add(self, shot: Shot) -> None:
-        """Store one shot, all of it or nothing."""
+        """Store one shot, completely or not at all."""
         index = self._opened()
         files: list[Path] = []
         try:
@@ -152,14 +152,14 @@ class _Writer:
         self.problems += shot.problem is not None
 
     def close(self) -> None:
-        """Close the index, and take it away if it names no shot."""
+        """Close the index, and remove it if it names no shot."""
         if self._index is not None:
             os.close(self._index)
             if self._whole == 0:
                 (self._folder / INDEX).unlink()
 
     def _opened(self) -> int:
-        """Return the open index; make folder and index the first time."""
+        """Return the open index, a file descriptor; make folder and index the first time."""
         if self._index is None:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
@@ -169,7 +169,7 @@ class _Writer:
         return self._index
 
     def _append(self, index: int, row: list[str]) -> None:
-        """Add a line to the index, the first time with the header above it, in one write."""
+        """Append a line to the index in one write, the first time with the header above it."""
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([row] if self._whole else [COLUMNS, row])
         data = text.getvalue().encode()

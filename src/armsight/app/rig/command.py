@@ -1,4 +1,4 @@
-"""``armsight rig``: look at a rig file, and carry rigs from and to other programs."""
+"""``armsight rig``: show a rig file, and convert rigs from and to other programs' formats."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FORMAT = click.option("--format", "name", required=True, type=click.Choice(list
 
 @click.group()
 def command() -> None:
-    """Look at a rig file, import a rig of another program, or export one.
+    """Show a rig file, import a rig of another program, or export one.
 
     Files of each format, in this order: opencv: intrinsics.yml extrinsics.yml (or one file with both); ros: left.yaml
     right.yaml (camera_info); kalibr: camchain.yaml.
@@ -31,17 +31,17 @@ def command() -> None:
 @click.argument("path", metavar="RIG.json")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def show(path: str, as_json: bool) -> None:
-    """Print what a rig file holds, with standard deviations where they are known."""
+    """Print the contents of a rig file, with standard deviations where they are known."""
     rig = StereoRig.load(path)
-    click.echo(json.dumps(_facts(path, rig)) if as_json else "\n".join(_lines(rig)))
+    click.echo(json.dumps(_json(path, rig)) if as_json else "\n".join(_lines(rig)))
 
 
 @command.command("import")
 @click.argument("files", nargs=-1, required=True)
 @click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
 @_FORMAT
-@click.option("--unit-m", type=float, help="Metres a unit of the file's translations; OpenCV files need it.")
-@click.option("--image-size", metavar="WxH", help="Image size in pixels; OpenCV files that hold none need it.")
+@click.option("--unit-m", type=float, help="Length of the file's unit of translation, m; OpenCV files need it.")
+@click.option("--image-size", metavar="WxH", help="Image size, px; OpenCV files without one need it.")
 @click.option(
     "--sigma-px", type=float, default=ASSUMED_SIGMA_PX, show_default=True, help="Standard deviation of a detection, px."
 )
@@ -55,7 +55,7 @@ def import_(
     sigma_px: float,
     as_json: bool,
 ) -> None:
-    """Turn another program's calibration into a rig file. Its uncertainty is unknown, and the rig file says so."""
+    """Convert another program's calibration to a rig file. Its uncertainty is unknown, which the rig file records."""
     size = None if image_size is None else _image_size(image_size)
     rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px)
     rig.save(output)
@@ -63,7 +63,7 @@ def import_(
         click.echo(f"note: {key}: {rig.provenance[key]}", err=True)
     for note in rig.provenance["notes"]:
         click.echo(f"note: {note}", err=True)
-    click.echo(json.dumps(_facts(output, rig)) if as_json else f"{output}: baseline {rig.baseline_m * 1e3:.3f} mm")
+    click.echo(json.dumps(_json(output, rig)) if as_json else f"{output}: baseline {rig.baseline_m * 1e3:.3f} mm")
 
 
 @command.command()
@@ -73,7 +73,7 @@ def import_(
 @_FORMAT
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
-    """Write a rig for another program, and say what its format cannot hold."""
+    """Write a rig for another program, and print what its format cannot hold."""
     paths = (*output, *more)
     lost = export_rig(StereoRig.load(path), name, paths)
     for what in lost:
@@ -82,7 +82,7 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
 
 
 def _image_size(text: str) -> tuple[int, int]:
-    """Read WxH."""
+    """Return (width, height) of a text WxH, px."""
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text.strip())
     if match is None:
         raise InputError(f"--image-size {text!r}: expected WIDTHxHEIGHT in pixels, such as 1280x720")
@@ -96,7 +96,7 @@ def _baseline_sigma_m(rig: StereoRig) -> float | None:
     return float(np.sqrt(variance)) if variance > 0 else None
 
 
-def _facts(path: str, rig: StereoRig) -> dict[str, Any]:
+def _json(path: str, rig: StereoRig) -> dict[str, Any]:
     """Return the rig as one JSON object."""
     sigmas = np.sqrt(np.clip(np.diag(rig.cov), 0, None)).tolist()
     return {

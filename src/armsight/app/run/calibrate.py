@@ -18,7 +18,7 @@ from armsight.data import Array, JointStates, PoseEstimate, Record, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.delay import LEAST, estimate_delay
+from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
 from armsight.robot.arm import Arm
@@ -33,7 +33,7 @@ Progress = Callable[[str], None]
 SETTLE_S, LOOK_S = 0.25, 0.1
 DELAY_REST_S = 1.0  # before and after the sweep
 #: Duration of the sweep, s, and the least number of shots in it: it lasts longer with slow cameras. Some may be missed.
-SWEEP_S, SWEEP_SHOTS = 4.0, LEAST + 6
+SWEEP_S, SWEEP_SHOTS = 4.0, MIN_MEASUREMENTS + 6
 #: In the sweep the joints stay on one side of their backlash, so their errors change little beyond what can be learned.
 STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5, flip_rad=0.0, flip_float_rad=0.0)
 _SAMPLES = 50  # candidates for each pose
@@ -206,10 +206,11 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     )
     newest = states.t_s > states.t_s[-1] - sweep.duration_s - 2 * DELAY_REST_S
     swept = JointStates(states.t_s[newest], states.q[newest])
-    if len(seen) < LEAST:
+    if len(seen) < MIN_MEASUREMENTS:
         raise CalibrationError(
-            f"the body was seen {len(seen)} times in {sweep.duration_s:.1f} s of sweep, {LEAST} times at least are needed "
-            f"to estimate the delay of the images: are the cameras slower than {loop.setup.rate_hz:g} Hz, or is the body "
+            f"the body was seen {len(seen)} times in {sweep.duration_s:.1f} s of sweep, {MIN_MEASUREMENTS} times at "
+            "least are needed to estimate the delay of the images: are the cameras slower than "
+            f"{loop.setup.rate_hz:g} Hz, or is the body "
             "out of view near the end of the first motion?"
         )
     sync_s = loop.setup.sync_s

@@ -25,7 +25,7 @@ from armsight.app.run.setup import Setup
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement, Prior
-from armsight.loop.servo import PoseServo, LoopTiming
+from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.arm import Arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault

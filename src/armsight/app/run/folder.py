@@ -27,7 +27,7 @@ import numpy as np
 
 from armsight.app.demo.studies import Study
 from armsight.app.interrupts import uninterrupted
-from armsight.app.measure.poses import UPPER, csv_text, left_axes, pose_record
+from armsight.app.measure.poses import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.app.record.recording import record
 from armsight.app.report.page import PAGE, writable_folder
 from armsight.app.run.calibrate import HandEyeRun
@@ -204,7 +204,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
     """Write the tables and the summary; return the summary, and the contents of the report if there is enough for one."""
     outcome, wall_s = finished.outcome, _wall_s(finished)
     with _as_much_as_fits() as keep:
-        keep(write_text, folder / "poses.csv", csv_text(_pose_records(finished)))
+        keep(write_text, folder / "poses.csv", csv_text(_shot_poses(finished)))
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
@@ -281,10 +281,10 @@ def _tracks(run: RunData) -> dict[str, ToolTrack]:
     return {name: track for name, track in tracks.items() if track is not None}
 
 
-def _pose_records(finished: Finished) -> list[dict[str, Any]]:
+def _shot_poses(finished: Finished) -> list[ShotPose]:
     """Return what vision measured shot by shot, in the left camera's frame, as ``measure`` writes it."""
     body = finished.outcome.body
-    return [pose_record(name, float(t), body, result) for name, t, result in finished.outcome.log.poses]
+    return [shot_pose(name, float(t), body, result) for name, t, result in finished.outcome.log.poses]
 
 
 def _picture(finished: Finished) -> Image | None:

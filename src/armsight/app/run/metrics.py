@@ -125,8 +125,9 @@ def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]
 def partly_uncorrected(arm: Arm, q: Array) -> bool:
     """Return whether the servo corrects the tool only in part at joint angles (6,), rad, as the arm is nearly singular.
 
-    That is where the least singular value of the Jacobian (linear rows divided by the arm's size) is below the servo's
-    tuning ``CORRECTED_ABOVE``: from there on the servo reduces its correction in that direction. Rests there are reported apart.
+    That is where the least singular value of the Jacobian (linear rows divided by the arm's size) is below
+    ``CORRECTED_ABOVE``, a tuning of the servo: from there on it reduces its correction in that direction. Rests there are
+    reported apart.
     """
     J = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])[:, None]
     return bool(np.linalg.svd(J, compute_uv=False)[-1] < CORRECTED_ABOVE)

@@ -23,7 +23,7 @@ from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate
 from armsight.errors import InputError
 from armsight.files import read_table, replacing
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.estimators import ArmEstimate, Delay, Mounting, PoseMeasurement, Outcome
+from armsight.loop.estimators import ArmEstimate, Delay, Mounting, Outcome, PoseMeasurement
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.rig import StereoRig
