@@ -34,7 +34,7 @@ class Bench:
     @property
     def board(self):
         """Arguments that name the pictures of the board."""
-        return [*self.images("board"), "--board", "chessboard:9x6:25mm"]
+        return [*self.images("board"), "--target", "chessboard:9x6:25mm"]
 
     def images(self, name):
         """Arguments that name the pictures of a folder."""
@@ -57,7 +57,7 @@ def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
     of_board, of_arm = demo_recording(folder, seed=3, image_size_px=(640, 360), boards=12, shots=16, rate_hz=4.0)
     here = Bench(folder, of_board, of_arm)
-    assert run("calibrate", *here.board, "--model", "brown5", "--folds", 4, "-o", here.rig) == 0
+    assert run("calibrate", *here.board, "--lens-model", "brown5", "--folds", 4, "-o", here.rig) == 0
     return here
 
 
