@@ -151,7 +151,7 @@ class Arm(Record):
         return float(np.hypot(rows[:, 0], rows[:, 1]).sum())
 
     def forward(self, q: ArrayLike) -> Array:
-        """Return where the tool is.
+        """Return the pose T_base_tool of the tool.
 
         Args:
             q: (6,) joint angles, rad, or (N, 6) of them.
@@ -174,7 +174,7 @@ class Arm(Record):
         return Ts
 
     def links(self, q: ArrayLike) -> Array:
-        """Return where every link is.
+        """Return the frames of all links.
 
         Args:
             q: (6,) joint angles, rad.

@@ -34,7 +34,7 @@ TRUTH, TRUTH_RIG = "truth.json", "truth_rig.json"
 
 @dataclass(frozen=True, eq=False)
 class Truth(Record):
-    """What is true of a recording.
+    """The true values of a recording.
 
     Attributes:
         rig: the cameras that took it; its covariance is zero.
@@ -90,7 +90,7 @@ class Truth(Record):
 
 @dataclass(frozen=True)
 class Look:
-    """How a recording looks.
+    """The appearance of a recording: lens, sensor, shutter, background.
 
     Attributes:
         optics: lenses and light.

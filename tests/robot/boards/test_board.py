@@ -272,10 +272,10 @@ def test_a_link_that_breaks_is_reported_with_what_the_arm_does():
         board.send(hold(ZERO))
 
 
-def test_a_board_that_started_anew_is_reported():
+def test_a_board_that_restarted_is_reported():
     board, link, _ = host_board()
     link.restart(watchdog=True)
-    with pytest.raises(DeviceError, match="has started anew: its drives are off; connect to it again"):
+    with pytest.raises(DeviceError, match="has restarted: its drives are off; connect to it again"):
         keep_on(board, sends=hold(ZERO), times=5)
     assert [each.fault for each in Board.connect(link).status.faults] == [Fault.WATCHDOG]
 
@@ -287,7 +287,7 @@ def test_a_clock_that_starts_again_is_reported():
     link.waiting = speaker.angles(50_100) + speaker.angles(50_099)
     assert board.receive().t_s.tolist() == [50.1, 50.099]
     link.waiting = speaker.angles(3)
-    with pytest.raises(DeviceError, match="has started anew"):
+    with pytest.raises(DeviceError, match="has restarted"):
         board.receive()
 
 

@@ -147,7 +147,7 @@ def test_the_self_test_of_a_real_board_keeps_its_drives_off(cable):
     on = []
     cable.link._watch = lambda _: on.append(bool(cable.link.answer["outputs"]["drives_on"]))
     start = cable.plant.q.copy()
-    result = selftest(f"serial:{cable.port}", told=lambda _: None)
+    result = selftest(f"serial:{cable.port}", progress=lambda _: None)
     assert {name: each.problems for name, each in result.scenarios.items()} == {
         "nominal": (),
         "crc_faults": (),
@@ -167,7 +167,7 @@ def test_a_bare_board_passes_at_rest():
     for joint in range(6):
         cable.plant.break_pot(joint, PotFault.OPEN)
     try:
-        result = selftest(f"serial:{cable.port}", told=lambda _: None)
+        result = selftest(f"serial:{cable.port}", progress=lambda _: None)
     finally:
         cable.close()
     assert [each.problems for each in result.scenarios.values()] == [()] * 4

@@ -84,7 +84,7 @@ class Session:
 
     @contextmanager
     def reached(self) -> Iterator[Wire]:
-        """Give the wire; an error of the link then says what the arm does without a host."""
+        """Yield the wire; an error of the link then says what the arm does without a host."""
         try:
             yield self.wire
         except DeviceError as error:
@@ -96,7 +96,7 @@ class Session:
         return taken
 
     def pump(self, wait_s: float) -> None:
-        """Let time pass and take what comes."""
+        """Let ``wait_s`` pass and take the messages that come."""
         with self.reached() as wire:
             messages = wire.receive(wait_s)
         self._quiet_s = 0.0 if messages else self._quiet_s + wait_s
@@ -111,7 +111,7 @@ class Session:
             )
 
     def config_part(self, offset: int) -> bytes:
-        """Ask for the configuration in use from this byte on; returns as much of it as one message holds."""
+        """Return the configuration in use from a byte on, as many bytes as one message holds."""
         self._parts.clear()
         for _ in range(_HELLOS):
             with self.reached() as wire:
@@ -136,21 +136,21 @@ class Session:
             self._parts[message.offset] = bytes(message.bytes[: message.length])
 
     def _take_status(self, status: BoardStatus) -> None:
-        """Keep a status; one that newly rejects commands for want of a hello is of a board that has restarted."""
+        """Keep a status; where it newly rejects commands because no hello came, the board has restarted."""
         if self._started and status.rejection == Rejection.NO_HELLO:
             before = self.status
             if (before.rejected_count, before.rejected_sequence) != (status.rejected_count, status.rejected_sequence):
-                raise self._anew()
+                raise self._restarted()
         self.status = status
 
-    def _anew(self) -> DeviceError:
-        return DeviceError(f"{self.name} has started anew: its drives are off; connect to it again")
+    def _restarted(self) -> DeviceError:
+        return DeviceError(f"{self.name} has restarted: its drives are off; connect to it again")
 
     def _time_s(self, tick: int) -> float:
-        """Return the time of a tick: they wrap, and messages of neighbouring ticks may come in any order."""
+        """Return the time of a tick, s: ticks wrap, and messages of neighbouring ticks may come in any order."""
         ahead = (tick - self._tick + _WRAP // 2) % _WRAP - _WRAP // 2
         if self._started and ahead < -self.ticks_per_s:
-            raise self._anew()
+            raise self._restarted()
         self._tick += ahead
         return self._tick / self.ticks_per_s
 
@@ -254,7 +254,7 @@ class Board:
 
     @property
     def broken_messages(self) -> int:
-        """How often what came from the board was no message, or one was missing."""
+        """Number of broken or missing messages from the board."""
         return self._session.wire.broken + self._session.wire.lost
 
     def send(self, command: JointCommand) -> int:
@@ -277,7 +277,7 @@ class Board:
         return self._sequence
 
     def command(self, command: Command) -> int:
-        """Send a command and return its number; :meth:`confirm` waits for what became of it."""
+        """Send a command and return its number; :meth:`confirm` waits until the board acknowledges or rejects it."""
         with self._session.reached() as wire:
             wire.command(self._next(), int(command))
         return self._sequence
@@ -366,7 +366,7 @@ class Board:
         self.confirm(self._sequence, _STORE_S)
 
     def close(self) -> None:
-        """Let go of the link; a driven arm then does what its board does without commands."""
+        """Close the link; a driven arm then does what its board does without commands."""
         self._link.close()
 
     def __enter__(self) -> Self:
@@ -376,7 +376,7 @@ class Board:
         self.close()
 
     def _next(self) -> int:
-        """Count a command on and return its number."""
+        """Return the number of the next command."""
         self._sequence = (self._sequence + 1) % _WRAP
         return self._sequence
 

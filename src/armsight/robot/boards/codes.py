@@ -10,7 +10,7 @@ from enum import IntEnum, IntFlag
 
 
 class BoardState(IntEnum):
-    """What the board does with its drives."""
+    """The state of a board and its drives."""
 
     DISABLED = 0
     ENABLED = 1
@@ -77,7 +77,7 @@ class Command(IntEnum):
 
 
 class Reaction(IntEnum):
-    """What an arm does that hears nothing of its host."""
+    """What an arm does when no command comes from its host."""
 
     HOLD = 1
     RELEASE = 2

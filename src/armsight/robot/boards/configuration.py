@@ -117,7 +117,7 @@ _ARM_RANGES = {
 
 
 def lab_configuration() -> Configuration:
-    """Return a configuration for the simulated arm: firm gains, +-2.4 rad, 2 rad/s, 12 V, silent after 100 ms."""
+    """Return a configuration for the simulated arm: firm gains, +-2.4 rad, 2 rad/s, 12 V, host silent after 100 ms."""
     config = np.zeros((), CONFIG)
     joint = config["joint"]
     joint["gains"] = np.array((4.0, 8.0, 0.1, 0.2, 0.005, 20.0), GAINS)
@@ -154,7 +154,7 @@ def gains_array(config: Configuration) -> Array:
 
 
 def check_gains(gains: Array) -> Array:
-    """Return a gain set as an array of shape (6, 6), or say which gain of which joint is wrong.
+    """Return a gain set as an array (6, 6), a row per joint; an error names the gain and the joint.
 
     Raises:
         InputError: the shape, a number that is not finite, or one outside its range.

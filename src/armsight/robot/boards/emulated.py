@@ -87,7 +87,7 @@ class EmulatedLink:
 
     @property
     def answer(self) -> Any:  # noqa: ANN401 - a structured scalar
-        """The newest answer of the firmware (``pil_answer``): all it knows, not only what the wire carries."""
+        """The newest answer of the firmware (``pil_answer``): its whole output, not only what the wire carries."""
         return np.frombuffer(self._reply, ANSWER)[0]
 
     @property
@@ -96,7 +96,7 @@ class EmulatedLink:
         return self._ticks * TICK_S
 
     def write(self, data: bytes) -> None:
-        """Send bytes; they ride in with the next ticks."""
+        """Send bytes; they arrive with the next ticks."""
         self._check_open()
         self._to_board += data
 
@@ -112,17 +112,17 @@ class EmulatedLink:
         return data
 
     def step(self, ticks: int = 1) -> None:
-        """Run the board and the plant on by so many milliseconds."""
+        """Run the board and the plant for so many milliseconds."""
         self._check_open()
         for _ in range(ticks):
             self._tick()
 
     def overrun(self) -> None:
-        """Let the board's last tick have taken longer than its period."""
+        """Report to the board that its last tick took longer than its period."""
         self._overrun = True
 
     def restart(self, *, watchdog: bool = False) -> None:
-        """Let the board start anew with the next tick, as after a power cut or by its watchdog; what it stored stays."""
+        """Restart the board with the next tick, as after a power cut or by its watchdog; what it stored stays."""
         self._restart = RESTART_WATCHDOG if watchdog else RESTART_POWER
         self._to_board.clear()
 
@@ -130,7 +130,7 @@ class EmulatedLink:
         """Let time pass in which the board does not run: the last duties stay on, and what is sent to it is lost."""
         for _ in range(ticks):
             self._ticks += 1
-            self._ride()
+            self._arriving()
             self._plant.sense()
             self._plant.step(self._duty, self._drives_on)
 
@@ -144,8 +144,8 @@ class EmulatedLink:
         if self._closed:
             raise DeviceError("the emulated board is closed")
 
-    def _ride(self) -> bytes:
-        """Return what reaches the board in this tick."""
+    def _arriving(self) -> bytes:
+        """Return the bytes that reach the board in this tick."""
         self._credit += self._bytes_per_tick
         if not self._to_board:
             self._credit = 0.0
@@ -157,7 +157,7 @@ class EmulatedLink:
         return data if self._faults is None else self._faults.to_board(self._ticks, data)[:WIRE_BYTES]
 
     def _request(self) -> bytes:
-        sensed, data = self._plant.sense(), self._ride()
+        sensed, data = self._plant.sense(), self._arriving()
         request = REQUEST_FIELDS.pack(
             REQUEST_MAGIC,
             VERSION,

@@ -70,5 +70,5 @@ class Link(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device; harmless when called twice."""
+        """Close the device; harmless when called twice."""
         ...

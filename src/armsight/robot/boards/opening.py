@@ -50,7 +50,7 @@ EMULATED, SERIAL = "emulated:", "serial:"
 def open_board(
     name: str, plant: Plant | None = None, *, config: Configuration | None = None, baud: int = BAUD
 ) -> Board:
-    """Open a board; time with an emulated one passes by ``receive`` alone.
+    """Open a board; the time of an emulated one passes in ``receive`` only.
 
     Args:
         name: see the module.
@@ -85,7 +85,7 @@ def emulator_name(name: str) -> str:
 
 
 def configured(link: EmulatedLink, config: Configuration | None = None) -> Board:
-    """Store a configuration (the lab's without) on a fresh emulated board, start it anew, and return it.
+    """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it.
 
     Raises:
         InputError: a value of the configuration is outside its range.

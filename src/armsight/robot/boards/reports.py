@@ -15,7 +15,7 @@ _NO_JOINT = 255
 
 @dataclass(frozen=True)
 class Welcome:
-    """Who a board is.
+    """The identity of a board.
 
     Attributes:
         board: its name.
@@ -51,7 +51,7 @@ class JointFault:
 
 @dataclass(frozen=True)
 class BoardStatus:
-    """How a board is.
+    """The status of a board.
 
     Attributes:
         t_s: when, s on the board's clock.

@@ -74,7 +74,7 @@ class SerialLink:
             raise self._gone(error) from None
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         self._serial.close()
 
     def _gone(self, error: Exception) -> DeviceError:

@@ -31,7 +31,7 @@ class Message(Protocol):
 
 
 class _Angles(NamedTuple):
-    """A whole message of angles, as the dialect's own has it."""
+    """A complete message of angles, with the attributes of the dialect's own."""
 
     tick: int
     angle_rad: list[float]
@@ -96,7 +96,7 @@ class Wire:
         self._mav.config_store_send(sequence, crc)
 
     def receive(self, wait_s: float) -> list[Message]:
-        """Let ``wait_s`` pass and return the whole messages that came."""
+        """Let ``wait_s`` pass, s, and return the complete messages that came."""
         came = self._link.read(wait_s)
         self.heard = self.heard or bool(came)
         mav, found = self._mav, list[Message]()
@@ -116,7 +116,7 @@ class Wire:
                 found.append(message)
 
     def _angles(self, data: bytes, found: list[Message]) -> int:
-        """Take whole frames of angles at the beginning of what came; returns where something else begins."""
+        """Append the frames of angles at the beginning of the data to ``found``; return the index of the first other byte."""
         kind, extra, fields = self._kind
         at, whole = 0, len(data)
         while whole - at >= _FRAME:
@@ -135,7 +135,7 @@ class Wire:
         return at
 
     def close(self) -> None:
-        """Let go of the link."""
+        """Close the link."""
         self._close()
 
     def _count_frame(self, number: int) -> None:

@@ -136,7 +136,7 @@ def _key(path: str, key: str) -> tuple[str, float, float, float]:
 
 
 def _value(path: str, key: str, value: object) -> float | int | tuple[float, float]:
-    """Return what a key holds, in SI."""
+    """Return the value of a key, in SI units."""
     _, factor, low, high = _key(path, key)
     numbers = value if isinstance(value, list) else [value]
     pair = key == "backlash_deg"
@@ -153,12 +153,12 @@ def _value(path: str, key: str, value: object) -> float | int | tuple[float, flo
 
 @dataclass(frozen=True, eq=False)
 class TrueArm(Record):
-    """An arm as it really is.
+    """The true arm: its table, its backlash and its potentiometers' errors.
 
     Attributes:
         arm: the true table; limits, home and names are the nominal one's.
         backlash_rad: (6,) backlash of each joint, from stop to stop.
-        pot_offset_rad: (6,) what each potentiometer says too much.
+        pot_offset_rad: (6,) offset error of each potentiometer, rad.
         pot_sines: (6, 3, 3) amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
         imperfections: what it was sampled from.
     """

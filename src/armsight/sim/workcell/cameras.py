@@ -41,7 +41,7 @@ BASELINE_M = 0.2
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """How two cameras keep time.
+    """The timing of two cameras.
 
     Attributes:
         image_size_px: (width, height).
@@ -74,7 +74,7 @@ WEBCAMS = CameraTiming((1280, 720), 30.0, 0.008, 0.040, 1e-3, 5e-4, 4e-3, 2e-5)
 
 @dataclass(frozen=True)
 class ShotTimes:
-    """When a shot was taken and came.
+    """When a shot was exposed and when it arrived.
 
     Attributes:
         left_s: middle of the left exposure (of the middle row), s.
@@ -273,7 +273,7 @@ class WorkcellSource:
         return shot
 
     def close(self) -> None:
-        """Let go of the threads."""
+        """End the threads."""
         self._pool.shutdown()
 
     def clear(self, pattern: Pattern, T_left_body: Array) -> bool:
@@ -380,7 +380,7 @@ class WorkcellSource:
         return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
 
     def _bodies(self, t_s: Array, shutter: Shutter) -> list[PosedBody]:
-        """Return where the body is to each camera in an exposure about its time (2,).
+        """Return the body as each camera sees it in an exposure about its time (2,), s.
 
         That is its mean pose during the exposure of its own rows, and its velocity.
         """

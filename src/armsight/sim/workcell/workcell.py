@@ -63,7 +63,7 @@ _POSES = (
 
 @dataclass(frozen=True, eq=False)
 class WorkcellTruth(Record):
-    """What is true of a workcell up to now. No estimator gets it.
+    """The true values of a workcell up to now. No estimator gets them.
 
     Attributes:
         arm: the true table.
@@ -226,7 +226,7 @@ class Workcell:
 
     @property
     def t_s(self) -> float:
-        """Now, s, on the board's clock too."""
+        """The time now, s, on the board's clock too."""
         return self.link.t_s
 
     def advance(self, dt_s: float) -> None:
@@ -282,7 +282,7 @@ class Workcell:
 
     @property
     def truth(self) -> WorkcellTruth:
-        """What is true up to now; for evaluation only."""
+        """The true values up to now; for evaluation only."""
         path = self.plant.path.copy()
         taken = {name: times.left_s for name, times in self.source.taken.items()}
         return WorkcellTruth(
