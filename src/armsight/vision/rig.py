@@ -1,7 +1,7 @@
 """StereoRig: two calibrated cameras, their relative pose, and how well all of it is known; load and save.
 
-A rig file is one JSON, described in docs/rig_file.md. Nothing is written before everything is checked, and a file is
-replaced in one step, so an interrupted save leaves the old one.
+A rig file is one JSON, described in docs/reference/rig_file.md. Nothing is written before everything is checked, and a
+file is replaced in one step, so an interrupted save leaves the old one.
 """
 
 from __future__ import annotations

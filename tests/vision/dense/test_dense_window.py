@@ -6,9 +6,8 @@ import pytest
 from dense_scenes import layers
 
 from armsight.vision.dense import simd as simd
-from armsight.vision.dense.block import Block
+from armsight.vision.dense.block import RAW_MAX, Block
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.window import RAW_MAX
 
 pytestmark = pytest.mark.opencv
 

@@ -2,7 +2,7 @@
 
 The contract is :class:`~armsight.vision.dense.method.Method` in ``method.py``; ``methods.py`` is the registry.
 
-- The methods: ``block.py`` (windows, kernels in ``window.py``), ``scanline.py`` (dynamic programming),
+- The methods: ``block.py`` (windows), ``scanline.py`` (dynamic programming),
   ``semiglobal.py``, ``opencv.py``. What they share: ``cost.py`` (matching costs), ``winner.py`` (the least total),
   ``simd.py`` (vectors for numba), ``postprocess.py`` (rejection, smoothing, filling, sigma).
 - Before and after: ``rectified.py`` (checks of a pair), ``depth.py`` (depth with its standard deviation),

@@ -1,18 +1,294 @@
-"""Local matching: the least cost summed over a square window, winner takes all.
+"""Local matching over square windows: the least cost summed over a window, winner takes all.
 
-The cost is census with absolute differences; a running sum and SIMD vectors make it fast (``window.py``).
+A byte per pixel and disparity holds the cost of a match: twice the number of bits in which two census words of eight
+neighbours differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute
+difference of the grey levels, cut off: the order of grey levels is robust to light, their values help where the order
+is ambiguous (Mei et al., "On building an accurate stereo matching system on graphics hardware", 2011). Costs are summed
+along the row, and then by a running sum down the columns, so that the work for a pixel does not grow with the window's
+height. Pixels of a row lie side by side, and the loop over disparities is outside: the least so far, of the left pixel
+and of the right one, needs no search across a vector. No cost volume is kept, only the sums of as many rows as the
+window is high.
+
+First the planes of a pair and the compiled kernels, then the method :class:`Block`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numba
+import numpy as np
 
 from armsight.data import Image
 from armsight.errors import InputError
+from armsight.vision.dense.cost import Bytes
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
-from armsight.vision.dense.window import make_buffers, match_windows, prepare_planes
-from armsight.vision.dense.winner import Winners, for_each_strip, make_winners
+from armsight.vision.dense.simd import (
+    SIMD_WIDTH,
+    above,
+    as_in,
+    bits_set,
+    count_up,
+    differing,
+    half,
+    least,
+    load,
+    minus,
+    plus,
+    spread,
+    start,
+    store,
+    where_less,
+)
+from armsight.vision.dense.winner import NOWHERE, Counts, Winners, for_each_strip, make_winners
+
+ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(SIMD_WIDTH)
+#: Distance of the neighbours in a census word from the middle, px, along rows, columns and diagonals.
+_CENSUS_REACH = 2
+#: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
+#: an ambiguous pixel; the largest cost of a match.
+_CUT, _OUTSIDE, RAW_MAX = np.uint8(20), np.uint8(10), 2 * 8 + 20 // 2
+#: The reach whose sum is written out.
+_USUAL = 4
+#: Up to this reach the sum along a row fits a byte.
+BYTE_REACH = (255 // RAW_MAX - 1) // 2
+
+
+class PairPlanes(NamedTuple):
+    """A pair as the costs need it: rows of bytes, one after another, widened so that every window lies inside.
+
+    Attributes:
+        left: grey levels.
+        left_census: census words.
+        right: grey levels; one pixel further left for each disparity.
+        right_census: census words.
+        left_stride: bytes in a row of the left planes.
+        right_stride: bytes in a row of the right planes.
+    """
+
+    left: Bytes
+    left_census: Bytes
+    right: Bytes
+    right_census: Bytes
+    left_stride: np.uintp
+    right_stride: np.uintp
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _census(padded: Bytes, out: Bytes) -> None:
+    """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
+    height, width = out.shape
+    for y in range(height):
+        row, middle = out[y], padded[y + _CENSUS_REACH]
+        for j in range(0, 5, 2):
+            other = padded[y + j]
+            for i in range(0, 5, 2):
+                if i == _CENSUS_REACH and j == _CENSUS_REACH:
+                    continue
+                for x in range(width):
+                    row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + i] < middle[x + _CENSUS_REACH])
+
+
+def prepare_planes(left: Image, right: Image, reach: int, further: int) -> PairPlanes:
+    """Compute the planes of both images of a pair.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        reach: of the windows, px.
+        further: how far to the left of the right image a match may lie: the search's last disparity and one.
+    """
+
+    def widened(image: Image, before: int) -> Bytes:
+        return np.asarray(
+            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * SIMD_WIDTH, cv2.BORDER_REPLICATE)
+        )
+
+    def census(image: Image) -> Bytes:
+        out = np.zeros(image.shape, np.uint8)
+        around = (_CENSUS_REACH,) * 4
+        _census(np.asarray(cv2.copyMakeBorder(image, *around, cv2.BORDER_REPLICATE), np.uint8), out)
+        return out
+
+    planes = (widened(left, 0), widened(census(left), 0), widened(right, further), widened(census(right), further))
+    a, b, c, d = (plane.reshape(-1) for plane in planes)
+    return PairPlanes(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _costs(g: Any, word: Any, r: Any, other: Any) -> Any:  # noqa: ANN401
+    """Return the costs of matching grey levels and census words."""
+    apart = least(plus(above(g, r), above(r, g)), spread(_CUT))
+    bits = bits_set(differing(word, other))
+    return plus(plus(bits, bits), half(apart))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _over(raw: Bytes, threes: Bytes, at: np.uintp, reach: int, kept: Bytes) -> Any:  # noqa: ANN401
+    """Return costs summed over 2 ``reach`` + 1 pixels, in as many bits as ``kept`` has; all are addresses of arrays."""
+    if reach == _USUAL:
+        a, b = load(threes, at), load(threes, at + np.uintp(3))
+        return as_in(plus(plus(a, b), load(threes, at + np.uintp(6))), kept)
+    total, size = as_in(load(threes, at), kept), np.uintp(2 * reach + 1)
+    for k in range(THREE, size - size % THREE, THREE):
+        total = plus(total, as_in(load(threes, at + k), kept))
+    for k in range(size - size % THREE, size):
+        total = plus(total, as_in(load(raw, at + k), kept))
+    return total
+
+
+class StripBuffers(NamedTuple):
+    """The buffers of a strip.
+
+    Attributes:
+        raw: one row's costs at one disparity, with the windows' reach to either side.
+        threes: sums of three of them, from each on: windows are made of these.
+        kept: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest.
+        total: (count, T) sums over windows.
+        least: (T,) least total of each left pixel so far.
+        where: (T,) and at which disparity, from the search's first on.
+        right: (T + pad,) least total of each right pixel so far; pixel u is at u + pad.
+    """
+
+    raw: Bytes
+    threes: Bytes
+    kept: Bytes
+    total: Counts
+    least: Counts
+    where: Counts
+    right: Counts
+
+
+def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffers:
+    """Return buffers for strips of images of a width."""
+    wide = -(-width // SIMD_WIDTH) * SIMD_WIDTH
+    kind = np.uint8 if reach <= BYTE_REACH else np.uint16
+    return StripBuffers(
+        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
+        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
+        np.zeros((2 * reach + 1) * count * wide, kind),
+        np.zeros(count * wide, np.uint16),
+        np.zeros(wide, np.uint16),
+        np.zeros(wide, np.uint16),
+        np.zeros(wide + further, np.uint16),
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
+    """Write the costs of a row at disparity d, from ``reach`` pixels before it to ``reach`` after it."""
+    grey, word, r_grey, r_word = (
+        start(planes.left),
+        start(planes.left_census),
+        start(planes.right),
+        start(planes.right_census),
+    )
+    left = np.uintp(row) * planes.left_stride
+    right, out = np.uintp(row) * planes.right_stride + np.uintp(pad - d), start(raw)
+    for j in range(np.uintp(0), np.uintp(width + 2 * reach), BLOCK):
+        costs = _costs(load(grey, left + j), load(word, left + j), load(r_grey, right + j), load(r_word, right + j))
+        store(out, j, costs)
+    raw[: min(d, width) + reach] = _OUTSIDE if d > 0 else raw[reach]
+    raw[width + reach : width + 2 * reach] = raw[width + reach - 1]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_row(
+    planes: PairPlanes,
+    row: int,
+    choose: bool,
+    reach: int,
+    first: int,
+    count: int,
+    width: int,
+    pad: int,
+    buffers: StripBuffers,
+) -> None:
+    """Move the windows down by a row of the widened images; with ``choose`` find the least totals.
+
+    Pixels from which a disparity leads out of the right image do not choose it, nor do columns beyond the left one's
+    end.
+    """
+    stride, end = np.uintp(buffers.least.shape[0]), np.uintp(width)
+    slot = np.uintp(row % (2 * reach + 1)) * np.uintp(count) * stride
+    raw, threes, kept, total = start(buffers.raw), start(buffers.threes), start(buffers.kept), start(buffers.total)
+    lowest, where, right = start(buffers.least), start(buffers.where), start(buffers.right)
+    for k in range(count):
+        d = first + k
+        _cost_row(planes, row, d, pad, width, reach, buffers.raw)
+        for x in range(np.uintp(0), stride + np.uintp(2 * reach), BLOCK):
+            store(threes, x, plus(plus(load(raw, x), load(raw, x + ONE)), load(raw, x + np.uintp(2))))
+        at, here, begin = np.uintp(k) * stride, spread(np.uint16(k)), np.uintp(d)
+        for x in range(begin // BLOCK * BLOCK, stride, BLOCK):
+            h = _over(raw, threes, np.uintp(x), reach, kept)
+            t = plus(load(total, at + x), as_in(h, total))
+            t = minus(t, as_in(load(kept, slot + at + x), total))
+            store(kept, slot + at + x, h)
+            store(total, at + x, t)
+            if choose:
+                if x < begin:
+                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(begin)), spread(NOWHERE), t)
+                if x + BLOCK > end:
+                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(end)), t, spread(NOWHERE))
+                before, u = load(lowest, x), x + np.uintp(pad - d)
+                store(where, x, where_less(t, before, here, load(where, x)))
+                store(lowest, x, least(t, before))
+                store(right, u, least(t, load(right, u)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _write_row(y: int, first: int, count: int, pad: int, buffers: StripBuffers, found: Winners) -> None:
+    """Write the winners of row y: sub-pixel disparities, curvatures, and whether the right image agrees."""
+    stride, total = np.uintp(buffers.least.shape[0]), buffers.total
+    width = found.disparity.shape[1]
+    for x in range(min(first, width)):  # nothing of the search lies in the right image
+        found.disparity[y, x], found.agreed[y, x], found.curvature[y, x] = first, False, 0
+    for x in range(first, width):
+        k, reached = np.uintp(buffers.where[x]), np.uintp(min(x - first + 1, count))
+        at = k * stride + np.uintp(x)
+        around = total[at]
+        low, offset, curvature = np.float32(around), np.float32(0), np.float32(0)
+        if k > 0:
+            around = min(around, total[at - stride - ONE])
+            if k + ONE < reached:
+                below, beyond = np.float32(total[at - stride]) - low, np.float32(total[at + stride]) - low
+                curvature = below + beyond
+                if curvature > 0:  # two lines of equal slope, not a parabola: these are sums of absolute differences
+                    offset = np.float32(0.5) * (below - beyond) / max(below, beyond)
+        if k + ONE < np.uintp(count) and x + 1 < width:
+            around = min(around, total[at + stride + ONE])
+        found.disparity[y, x] = np.float32(first) + np.float32(k) + offset
+        found.least[y, x], found.curvature[y, x] = low, curvature
+        found.agreed[y, x] = around <= buffers.right[np.uintp(x - first + pad) - k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def match_windows(
+    planes: PairPlanes,
+    begin: int,
+    end: int,
+    reach: int,
+    first: int,
+    count: int,
+    pad: int,
+    buffers: StripBuffers,
+    found: Winners,
+) -> None:
+    """Choose the disparities of the rows from ``begin`` to ``end`` by the least sum over a window."""
+    width = found.disparity.shape[1]
+    buffers.kept[:] = 0
+    buffers.total[:] = 0
+    for row in range(begin, end + 2 * reach):
+        y = row - 2 * reach  # the row whose window this one completes
+        buffers.least[:] = NOWHERE
+        buffers.right[:] = NOWHERE
+        _add_row(planes, row, y >= begin, reach, first, count, width, pad, buffers)
+        if y >= begin:
+            _write_row(y, first, count, pad, buffers, found)
+
 
 _STRIP_ROWS = 384
 #: The largest window whose sum of raw costs still fits two bytes.

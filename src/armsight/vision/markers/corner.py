@@ -386,7 +386,7 @@ def refine_corners(
 
     Args:
         image: (H, W) grey image.
-        uv: (N, 2) rough places, raw pixels, right to a few pixels and a quarter of a square.
+        uv: (N, 2) rough corners, raw pixels, right to a few pixels and a quarter of a square.
         squares: (N, 2, 2) the two sides of the square at each corner, px: along the columns, along the rows.
         bows: (N, 2, 2) how each of the two edges bows, 1/px: a point t px along it lies ``t^2 * bow`` off its tangent;
             straight by default.
