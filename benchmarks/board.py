@@ -35,7 +35,7 @@ import test_firmware_pid as pid_tests  # noqa: E402
 from firmware_stack import stack_use  # noqa: E402
 
 from armsight import firmware  # noqa: E402
-from armsight.app.board.scenarios import DRIVEN, Bench  # noqa: E402
+from armsight.app.board.scenarios import DRIVEN, BoardTestRig  # noqa: E402
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
 from armsight.robot.boards.configuration import gains_array, lab_configuration  # noqa: E402
@@ -78,7 +78,7 @@ def paced(name, ticks, prepare, run):
 
 def swinging(link):
     configured(link)
-    bench = Bench(link, None, [])
+    bench = BoardTestRig.connect(link, None, [])
     bench.enable()
     return bench
 
@@ -133,7 +133,7 @@ def metric_2():
                 link = EmulatedLink(emulator, plant)
                 configured(link)
                 emulator.counts.clear()
-                DRIVEN[scenario](Bench(link, plant, []))
+                DRIVEN[scenario](BoardTestRig.connect(link, plant, []))
                 counts += emulator.counts
                 link.close()
             begin, control, end = np.array(counts).T
@@ -221,7 +221,7 @@ def replayed():
 
     link = EmulatedLink(open_emulator("unicorn"), Heard())
     configured(link)
-    bench = Bench(link, None, [])
+    bench = BoardTestRig.connect(link, None, [])
     link._watch = lambda _: outputs.append(link.answer["outputs"].copy())
     bench.readings(0.2)  # both speed filters forget how they began
     bench.enable()

@@ -39,20 +39,20 @@ class Deaf:
     """A board that does not hear commands once it is driven: its arm goes where it likes."""
 
     def __init__(self, image):
-        self.machine, self.ticks = HostEmulator.open(host_library()), 0
+        self.emulator, self.ticks = HostEmulator.open(host_library()), 0
 
     def tick(self, request):
         self.ticks += 1
         frame = bytearray(request)
         if self.ticks > 700:
             frame[:] = request[:76] + bytes(len(request) - 76)  # no byte of the wire
-        return self.machine.tick(bytes(frame))
+        return self.emulator.tick(bytes(frame))
 
     def close(self):
-        self.machine.close()
+        self.emulator.close()
 
 
-def test_a_board_that_fails_is_told_with_what_is_wrong(armsight, monkeypatch):
+def test_a_board_that_fails_is_reported_with_what_is_wrong(armsight, monkeypatch):
     monkeypatch.setitem(EMULATORS, "host", (Deaf, lambda: None))
     monkeypatch.setattr(board_selftest, "DRIVEN", {"nominal": DRIVEN["nominal"], "e_stop": DRIVEN["e_stop"]})
     said = armsight("board", "selftest", *HOST, "--json")
@@ -113,7 +113,7 @@ def test_gains_are_printed_and_changed(armsight):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "parts"),
     [
         (
             ("gains", *HOST, "--set", "3:kp_per_rad=700"),
@@ -132,18 +132,18 @@ def test_gains_are_printed_and_changed(armsight):
         (("build", "--board", "stm32f4", "-o", "/proc/none"), ["/proc/none: cannot be made"]),
     ],
 )
-def test_a_mistake_is_one_line(armsight, arguments, words):
-    refused(armsight("board", *arguments), *words)
+def test_a_mistake_is_one_line(armsight, arguments, parts):
+    refused(armsight("board", *arguments), *parts)
 
 
 def test_an_image_is_built_with_its_pieces(armsight, tmp_path):
     said = armsight("board", "build", "--board", "stm32f4", "-o", tmp_path / "out", "--json")
-    (facts,) = said.lines
-    assert facts["board"] == "stm32f4"
-    assert facts["hard_float"] is True
-    assert facts["compiler"] in build.compilers()
-    assert sum(os.path.getsize(piece) for _, piece in facts["pieces"]) == facts["flash_bytes"]
-    assert facts["pieces"][0][0] == 0x08000000
+    (found,) = said.lines
+    assert found["board"] == "stm32f4"
+    assert found["hard_float"] is True
+    assert found["compiler"] in build.compilers()
+    assert sum(os.path.getsize(piece) for _, piece in found["pieces"]) == found["flash_bytes"]
+    assert found["pieces"][0][0] == 0x08000000
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def stm32f4(tmp_path_factory):
 
 @pytest.fixture
 def programmers(tmp_path, monkeypatch, stm32f4):
-    """Installs programmers that write down what they were told; the image they are given is built already."""
+    """Installs programmers that write down their arguments; the image they are given is built already."""
     monkeypatch.setattr(build, "build_board", lambda board, target, compiler: shutil.copyfile(stm32f4, target))
     folder = tmp_path / "bin"
     folder.mkdir()
@@ -163,7 +163,7 @@ def programmers(tmp_path, monkeypatch, stm32f4):
         for name in names:
             program = folder / name
             program.write_text(
-                f'#!/bin/sh\necho "{name} $@" >> {tmp_path}/told\necho "no probe found" >&2\nexit {code}\n'
+                f'#!/bin/sh\necho "{name} $@" >> {tmp_path}/arguments\necho "no probe found" >&2\nexit {code}\n'
             )
             program.chmod(program.stat().st_mode | stat.S_IXUSR)
         monkeypatch.setenv("PATH", str(folder) + os.pathsep + os.environ["PATH"])
@@ -172,7 +172,7 @@ def programmers(tmp_path, monkeypatch, stm32f4):
     return install
 
 
-def test_without_a_programmer_the_user_is_told_what_to_install_and_where_the_image_lies(
+def test_without_a_programmer_the_message_says_what_to_install_and_where_the_image_lies(
     armsight, programmers, tmp_path
 ):
     programmers()
@@ -185,22 +185,22 @@ def test_without_a_programmer_the_user_is_told_what_to_install_and_where_the_ima
 
 
 @pytest.mark.parametrize("name", PROGRAMMERS)
-def test_a_programmer_writes_every_piece_to_its_place(armsight, programmers, tmp_path, name):
+def test_a_programmer_writes_every_piece_to_its_address(armsight, programmers, tmp_path, name):
     programmers(name)
     said = armsight("board", "flash", "-o", tmp_path / "out", "--json")
     assert said.code == 0, said.err
-    facts = said.lines[0]
-    assert facts["programmer"] == name
-    told = (tmp_path / "told").read_text()
+    found = said.lines[0]
+    assert found["programmer"] == name
+    arguments = (tmp_path / "arguments").read_text()
     if name == "openocd":
-        assert f"program {{{facts['image']}}} verify reset exit" in told
+        assert f"program {{{found['image']}}} verify reset exit" in arguments
     else:
-        for address, piece in facts["pieces"]:
-            assert piece in told
-            assert f"{address:#x}" in told
+        for address, piece in found["pieces"]:
+            assert piece in arguments
+            assert f"{address:#x}" in arguments
 
 
-def test_a_programmer_that_fails_is_told_in_its_own_words(armsight, programmers, tmp_path):
+def test_a_programmer_that_fails_is_reported_by_its_own_message(armsight, programmers, tmp_path):
     programmers("st-flash", code=1)
     said = armsight("board", "flash", "-o", tmp_path / "out")
     refused(said, "st-flash could not write the board (no probe found)", "is it plugged in", "stm32f4-08000000.bin")

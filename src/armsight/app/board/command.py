@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import click
 
 from armsight import firmware
-from armsight.app.board import text as board_words
+from armsight.app.board import text
 from armsight.app.board.flash import FLASHED, PROGRAMMERS, build_firmware, flash
 from armsight.app.board.selftest import selftest
 from armsight.app.progress import steps
@@ -40,7 +39,7 @@ def _board(action: Callable[..., Any]) -> Callable[..., Any]:
 
 _compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; the first one installed without it.")
 _folder = click.option(
-    "-o", "--out", metavar="DIR", type=click.Path(path_type=Path), default=Path("firmware-build"), show_default=True
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), default=Path("firmware-build"), show_default=True
 )
 
 
@@ -58,16 +57,16 @@ def command() -> None:
 @_folder
 @_compiler
 @_JSON
-def build_(name: str | None, out: Path, compiler: str | None, as_json: bool) -> None:
+def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
     """Build the firmware: for the emulated boards where armsight finds it, or a real board's image into a folder."""
-    with steps() as told:
-        told("compiling")
+    with steps() as progress:
+        progress("compiling")
         if name is None:
             build.build_package(firmware.BUILT, build.open_compiler(compiler))
-            facts = board_words.package_facts()
+            built = text.package_build()
         else:
-            facts = dataclasses.asdict(build_firmware(name, out, compiler))
-    click.echo(json.dumps(facts, default=str) if as_json else board_words.built_text(facts))
+            built = build_firmware(name, output, compiler)
+    click.echo(json.dumps(text.built_json(built)) if as_json else text.built_text(built))
 
 
 @command.command("flash")
@@ -76,37 +75,36 @@ def build_(name: str | None, out: Path, compiler: str | None, as_json: bool) -> 
 @_folder
 @_compiler
 @_JSON
-def flash_(name: str, programmer: str | None, out: Path, compiler: str | None, as_json: bool) -> None:
+def flash_(name: str, programmer: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
     """Build a board's firmware and write it to the board; what the board stored stays."""
-    with steps() as told:
-        told("compiling")
-        built = build_firmware(name, out, compiler)
-        told("writing")
+    with steps() as progress:
+        progress("compiling")
+        built = build_firmware(name, output, compiler)
+        progress("writing")
         used = flash(built, programmer)
-    facts = {**dataclasses.asdict(built), "programmer": used}
-    click.echo(json.dumps(facts, default=str) if as_json else f"{built.image} is on the board, written by {used}")
+    answer = {**text.built_json(built), "programmer": used}
+    click.echo(json.dumps(answer) if as_json else f"{built.image} is on the board, written by {used}")
 
 
 @command.command()
 @_board
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
 @click.option("--every", type=click.FloatRange(min=0.01), default=0.5, show_default=True, help="Seconds between lines.")
 @_JSON
 def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: bool) -> None:
-    """Print what a board says of itself, a line at a time, until Ctrl-C; with --json an object a line.
+    """Print a board's state and angles, a line at a time, until Ctrl-C; with --json an object a line.
 
     Nothing is commanded: the drives stay as they are.
     """
     if seconds is None and not name.startswith(SERIAL):
         seconds = _WATCH_S
     with _open(name, baud) as board:
-        click.echo(board_words.welcome_text(board.welcome), err=True)
+        click.echo(text.welcome_text(board.welcome), err=True)
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)
             passed += every
-            facts = board_words.status_facts(board, states)
-            click.echo(json.dumps(facts) if as_json else board_words.status_text(facts))
+            click.echo(json.dumps(text.status_json(board, states)) if as_json else text.status_text(board, states))
 
 
 @command.command()
@@ -125,16 +123,17 @@ def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: 
         config = board.configuration()
         values = gains_array(config)
         if changes:
-            values = board_words.changed_gains(values, changes)
+            values = text.changed_gains(values, changes)
             board.confirm(board.set_gains(values))
         if store:
-            board.store(board_words.with_gains(config, values))
-    click.echo(json.dumps(board_words.gains_facts(values)) if as_json else board_words.gains_text(values))
+            board.store(text.with_gains(config, values))
+    click.echo(json.dumps(text.gains_json(values)) if as_json else text.gains_text(values))
     if store:
         click.echo("stored: in use after the board's next start, too", err=True)
         if board.welcome.config_source == ConfigSource.FACTORY:
             click.echo(
-                "the rest of what was stored are factory values: see docs/firmware.md before motors turn", err=True
+                "the rest of what was stored are factory values: see docs/reference/firmware.md before motors move",
+                err=True,
             )
 
 
@@ -155,9 +154,9 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
             else "drives stay off; --drives moves the arm"
         )
         click.echo(f"{name}: {moves}", err=True)
-    with steps() as told:
-        result = selftest(name, drives=drives, baud=baud, told=told)
-    click.echo(json.dumps(result.record()) if as_json else board_words.selftest_text(result))
+    with steps() as progress:
+        result = selftest(name, drives=drives, baud=baud, progress=progress)
+    click.echo(json.dumps(result.record()) if as_json else text.selftest_text(result))
     for scenario, found in result.scenarios.items():
         for problem in found.problems:
             click.echo(f"{scenario}: {problem}", err=True)

@@ -99,7 +99,7 @@ def flash(built: Built, programmer: str | None = None) -> str:
     """Write a board's firmware to it and return which programmer did.
 
     Raises:
-        DeviceError: there is no programmer, or it failed; the message tells where the image lies.
+        DeviceError: there is no programmer, or it failed; the message says where the image lies.
     """
     if built.board not in FLASHED:
         raise InputError(f"{built.board} is no board to plug in; there is {', '.join(FLASHED)}")

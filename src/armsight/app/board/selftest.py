@@ -1,7 +1,11 @@
-"""The board's self-test: every scenario on a fresh board, what it did as a hash, how fast it runs, how large it is."""
+"""The board's self-test: every scenario on a fresh board, a hash of its answers, its speed and its size.
+
+In: the name of a board. Out: a :class:`SelftestResult`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import time
 from collections.abc import Callable, Mapping
@@ -9,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from armsight import firmware
-from armsight.app.board.scenarios import AT_REST, DRIVEN, EMULATED_ONLY, Bench, Scenario
+from armsight.app.board.scenarios import AT_REST, DRIVEN, EMULATED_ONLY, BoardTestRig, Scenario
 from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.firmware.elf import read_elf
@@ -20,9 +24,11 @@ from armsight.robot.boards.opening import SERIAL, configured, emulator_name, ope
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant
 
-#: A real arm swings by so much where it is told to move: less than 3 degrees.
+#: A real arm swings by this much where it may move, rad: less than 3 degrees.
 _SMALL_RAD = 0.05
+#: The speed of an emulated board is measured over this many ticks.
 _SPEED_TICKS = 4000
+#: The speed of a real board is measured over this time, s.
 _SPEED_S = 1.0
 
 
@@ -32,7 +38,7 @@ class ScenarioResult:
 
     Attributes:
         problems: what was not as it must be; empty where it passed.
-        trace_sha256: of every answer frame of the run, in order; None on a real board, which has none.
+        trace_sha256: of every answer frame of the run, by time; None on a real board, which has none.
     """
 
     problems: tuple[str, ...]
@@ -40,20 +46,35 @@ class ScenarioResult:
 
 
 @dataclass(frozen=True)
-class Selftest:
+class ImageSize:
+    """The size of an emulated image; None each where the image is not known.
+
+    Attributes:
+        flash_bytes: of flash memory.
+        ram_bytes: of its variables, without the stack.
+        hard_float: whether it is built for the processor's floating-point unit.
+    """
+
+    flash_bytes: int | None
+    ram_bytes: int | None
+    hard_float: bool | None
+
+
+@dataclass(frozen=True)
+class SelftestResult:
     """What the self-test found.
 
     Attributes:
         board: its name.
         scenarios: by name.
         ticks_per_s: how fast the board runs, plant and telemetry with it; a real one by this computer's clock.
-        elf: flash_bytes, ram_bytes and hard_float of the emulated image; None each where the image is not known.
+        elf: size of the emulated image.
     """
 
     board: str
     scenarios: Mapping[str, ScenarioResult]
     ticks_per_s: float
-    elf: Mapping[str, int | bool | None]
+    elf: ImageSize
 
     @property
     def passed(self) -> bool:
@@ -69,18 +90,18 @@ class Selftest:
                 for name, each in self.scenarios.items()
             },
             "ticks_per_s": round(self.ticks_per_s, 1),
-            "elf": dict(self.elf),
+            "elf": dataclasses.asdict(self.elf),
         }
 
 
-def run_scenario(scenario: Scenario, machine: Emulator) -> ScenarioResult:
-    """Run a scenario on a fresh emulated board; the machine is closed after it."""
+def run_scenario(scenario: Scenario, emulator: Emulator) -> ScenarioResult:
+    """Run a scenario on a fresh emulated board; the emulator is closed after it."""
     trace, plant = hashlib.sha256(), JointPlant()
-    link = EmulatedLink(machine, plant, watch=trace.update)
+    link = EmulatedLink(emulator, plant, watch=trace.update)
     problems: list[str] = []
     try:
         configured(link)
-        scenario(Bench(link, plant, problems))
+        scenario(BoardTestRig.connect(link, plant, problems))
     except ArmsightError as error:
         problems.append(str(error))
     finally:
@@ -88,9 +109,9 @@ def run_scenario(scenario: Scenario, machine: Emulator) -> ScenarioResult:
     return ScenarioResult(tuple(problems), trace.hexdigest())
 
 
-def speed(machine: Emulator, ticks: int = _SPEED_TICKS) -> float:
-    """Return how many ticks a second an emulated board runs, plant and telemetry with it; the machine is closed."""
-    link = EmulatedLink(machine, JointPlant())
+def speed(emulator: Emulator, ticks: int = _SPEED_TICKS) -> float:
+    """Return how many ticks a second an emulated board runs, plant and telemetry with it; the emulator is closed."""
+    link = EmulatedLink(emulator, JointPlant())
     try:
         configured(link)
         start = time.perf_counter()
@@ -100,54 +121,55 @@ def speed(machine: Emulator, ticks: int = _SPEED_TICKS) -> float:
         link.close()
 
 
-def selftest(board: str, *, drives: bool = False, baud: int = BAUD, told: Callable[[str], None] = print) -> Selftest:
+def selftest(
+    board: str, *, drives: bool = False, baud: int = BAUD, progress: Callable[[str], None] = print
+) -> SelftestResult:
     """Run the scenarios on a board.
 
     Args:
         board: ``emulated:unicorn``, ``emulated:qemu``, ``emulated:host`` or ``serial:PORT``.
         drives: let a real board move its arm, by less than 3 degrees; without it its drives are never switched on.
         baud: of a serial port.
-        told: called with what is being done, a line at a time.
+        progress: called with what is being done, a line at a time.
 
     Raises:
         DeviceError: the board is not there, or of another version.
         InputError: there is no such kind of board.
     """
     if board.startswith(SERIAL):
-        return _of_real(board, drives, baud, told)
-    machine = emulator_name(board)
+        return _of_real(board, drives, baud, progress)
+    emulator = emulator_name(board)
     scenarios = {}
     for name, scenario in DRIVEN.items():
-        told(name)
-        scenarios[name] = run_scenario(scenario, open_emulator(machine))
-    told("speed")
+        progress(name)
+        scenarios[name] = run_scenario(scenario, open_emulator(emulator))
+    progress("speed")
     elf = read_elf(firmware.image())
-    figures = {"flash_bytes": elf.flash_bytes, "ram_bytes": elf.ram_bytes, "hard_float": elf.hard_float}
-    return Selftest(board, scenarios, speed(open_emulator(machine)), figures)
+    size = ImageSize(elf.flash_bytes, elf.ram_bytes, elf.hard_float)
+    return SelftestResult(board, scenarios, speed(open_emulator(emulator)), size)
 
 
-def _of_real(board: str, drives: bool, baud: int, told: Callable[[str], None]) -> Selftest:
-    """Run what is safe on a real board; it is told to stay, or after moving to switch its drives off."""
+def _of_real(board: str, drives: bool, baud: int, progress: Callable[[str], None]) -> SelftestResult:
+    """Run what is safe on a real board; its drives stay off, or are switched off after it has moved."""
     port = board.removeprefix(SERIAL)
     chosen = {name: run for name, run in DRIVEN.items() if name not in EMULATED_ONLY} if drives else AT_REST
     scenarios = {}
     home_rad: Array | None = None
     for name, scenario in chosen.items():
-        told(name)
+        progress(name)
         problems: list[str] = []
         link = SerialLink.open(port, baud)
-        bench = Bench(link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, name=port)
-        home_rad = bench.home_rad
+        test_rig = BoardTestRig.connect(link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, name=port)
+        home_rad = test_rig.home_rad
         try:
-            scenario(bench)
+            scenario(test_rig)
         except ArmsightError as error:
             problems.append(str(error))
         finally:
-            bench.end()
+            test_rig.end()
         scenarios[name] = ScenarioResult(tuple(problems), None)
-    told("speed")
-    unknown = {"flash_bytes": None, "ram_bytes": None, "hard_float": None}
-    return Selftest(board, scenarios, _ticks_per_s(port, baud), unknown)
+    progress("speed")
+    return SelftestResult(board, scenarios, _ticks_per_s(port, baud), ImageSize(None, None, None))
 
 
 def _ticks_per_s(port: str, baud: int) -> float:

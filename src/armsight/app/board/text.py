@@ -1,21 +1,26 @@
-"""What a board is and does, as JSON-ready facts in SI units and as lines to read, in degrees."""
+"""What ``armsight board`` prints: JSON objects in SI units, and text in degrees.
+
+In: records of a board and of a build. Out: for each a function NAME_json and a function NAME_text; gains with changes.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from armsight import firmware
-from armsight.app.board.selftest import Selftest
+from armsight.app.board.flash import Built
+from armsight.app.board.selftest import SelftestResult
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource, State
+from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource
 from armsight.robot.boards.configuration import GAIN_RANGES, JOINTS, Configuration
 from armsight.robot.boards.reports import Welcome
 
@@ -26,41 +31,39 @@ _SOURCES = {
 }
 
 
-def package_facts() -> dict[str, Any]:
-    """Return what armsight's own build is."""
+def package_build() -> Built:
+    """Return armsight's own build, as emulated boards run it."""
     elf = read_elf(firmware.image())
     about = json.loads(read_text(firmware.BUILT / "build.json"))
-    return {
-        "board": "pil",
-        "compiler": about["compiler"],
-        "image": str(firmware.image()),
-        "pieces": [],
-        "flash_bytes": elf.flash_bytes,
-        "ram_bytes": elf.ram_bytes,
-        "hard_float": elf.hard_float,
-    }
+    return Built("pil", about["compiler"], firmware.image(), (), elf.flash_bytes, elf.ram_bytes, elf.hard_float)
 
 
-def built_text(facts: Mapping[str, Any]) -> str:
-    """Return what was built, in lines."""
-    float_text = "hardware" if facts["hard_float"] else "software"
+def built_json(built: Built) -> dict[str, Any]:
+    """Return a build as JSON has it."""
+    pieces = [[address, str(piece)] for address, piece in built.pieces]
+    return {**dataclasses.asdict(built), "image": str(built.image), "pieces": pieces}
+
+
+def built_text(built: Built) -> str:
+    """Return a build as lines."""
+    float_text = "hardware" if built.hard_float else "software"
     lines = [
-        f"{facts['image']}: {facts['board']}, by {facts['compiler']}, flash {facts['flash_bytes']} bytes,"
-        f" RAM {facts['ram_bytes']} bytes, {float_text} floating point"
+        f"{built.image}: {built.board}, by {built.compiler}, flash {built.flash_bytes} bytes,"
+        f" RAM {built.ram_bytes} bytes, {float_text} floating point"
     ]
-    return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in facts["pieces"]])
+    return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in built.pieces])
 
 
 def welcome_text(welcome: Welcome) -> str:
-    """Return who a board is, in a line."""
+    """Return a board's name, firmware and configuration in a line."""
     return (
         f"board {welcome.board}, firmware {welcome.firmware}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud,"
         f" runs on {_SOURCES[welcome.config_source]}"
     )
 
 
-def status_facts(board: Board, states: JointStates) -> dict[str, Any]:
-    """Return how a board is: its state, faults, newest angles and counters."""
+def status_json(board: Board, states: JointStates) -> dict[str, Any]:
+    """Return a board's state, faults, newest angles and counters as JSON has them, SI units."""
     status = board.status
     return {
         "t_s": round(status.t_s, 3),
@@ -77,18 +80,18 @@ def status_facts(board: Board, states: JointStates) -> dict[str, Any]:
     }
 
 
-def status_text(facts: Mapping[str, Any]) -> str:
-    """Return how a board is, in a line."""
-    faults = ", ".join(f["fault"] + (f" joint {f['joint']}" if f["joint"] else "") for f in facts["faults"])
-    q = facts["q_rad"]
-    angles = " ".join(f"{np.degrees(each):7.2f}" for each in q) + " deg" if q else "no readings"
-    state = STATE_TEXTS[State[facts["state"]]].split(":")[0]
-    line = f"{facts['t_s']:8.2f} s  {state:14} {angles}  {facts['supply_v']:5.2f} V"
+def status_text(board: Board, states: JointStates) -> str:
+    """Return a board's state, newest angles and faults in a line."""
+    status = board.status
+    faults = ", ".join(f.fault.name + ("" if f.joint is None else f" joint {f.joint + 1}") for f in status.faults)
+    angles = " ".join(f"{np.degrees(q):7.2f}" for q in states.q[-1]) + " deg" if len(states.q) else "no readings"
+    state = STATE_TEXTS[status.state].split(":")[0]
+    line = f"{status.t_s:8.2f} s  {state:14} {angles}  {status.supply_v:5.2f} V"
     return f"{line}  {faults}" if faults else line
 
 
-def gains_facts(values: Array) -> dict[str, Any]:
-    """Return gains (6, 6), a list a joint by the gain's name."""
+def gains_json(values: Array) -> dict[str, Any]:
+    """Return gains (6, 6) as JSON has them: a list of six joints for each gain."""
     return {name: [float(np.float32(each)) for each in values[:, k]] for k, name in enumerate(GAIN_RANGES)}
 
 
@@ -128,16 +131,14 @@ def with_gains(config: Configuration, values: Array) -> Configuration:
     return changed
 
 
-def selftest_text(result: Selftest) -> str:
-    """Return what a self-test found, in lines."""
+def selftest_text(result: SelftestResult) -> str:
+    """Return the result of a self-test as lines."""
     lines = [
         f"{name:14} {'failed' if each.problems else 'passed'}  {(each.trace_sha256 or '')[:16]}".rstrip()
         for name, each in result.scenarios.items()
     ]
     lines.append(f"{result.ticks_per_s:.0f} ticks/s, {result.ticks_per_s / 1000:.1f} times real time")
-    if result.elf["flash_bytes"] is not None:
-        float_text = "hardware" if result.elf["hard_float"] else "software"
-        lines.append(
-            f"flash {result.elf['flash_bytes']}, RAM {result.elf['ram_bytes']} bytes, {float_text} floating point"
-        )
+    if result.elf.flash_bytes is not None:
+        float_text = "hardware" if result.elf.hard_float else "software"
+        lines.append(f"flash {result.elf.flash_bytes}, RAM {result.elf.ram_bytes} bytes, {float_text} floating point")
     return "\n".join(lines)
