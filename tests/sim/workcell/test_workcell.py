@@ -129,8 +129,8 @@ def test_a_card_hides_the_body_from_both_cameras(workcell):
 
 def test_the_board_is_seen(workcell):
     before = workcell.t_s
-    board = open_board(workcell.board_spec)
-    for shot in workcell.board_shots(4):
+    board = open_board(workcell.chessboard_spec)
+    for shot in workcell.chessboard_shots(4):
         for side in ("left", "right"):
             assert board.detect(shot.image(side)).problem is None
     assert workcell.t_s == before
@@ -173,7 +173,7 @@ def _numbers(seed):
         _, readings = go(workcell, workcell.model.home, workcell.poses[0], 0.0, lambda: polled.append(workcell.poll()))
         shots = [shot for shot in polled if shot is not None]
         images = np.stack([image for shot in shots for image in (shot.left, shot.right)])
-        return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.board_shots(1)).left
+        return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.chessboard_shots(1)).left
 
 
 def test_a_picture_of_the_workcell(workcell):

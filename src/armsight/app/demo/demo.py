@@ -80,7 +80,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         open_folder(demo.folder)
         make_room(demo.folder)
         progress("rendering the calibration target")
-        calibration = calibrated(workcell.board_spec, workcell.board_shots(pairs), progress)
+        calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", workcell.body_text)
         write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))

@@ -116,7 +116,7 @@ class Wire:
                 found.append(message)
 
     def _angles(self, data: bytes, found: list[Message]) -> int:
-        """Append the frames of angles at the beginning of the data to ``found``; return the index of the first other byte."""
+        """Append the frames of angles at the beginning of the data to ``found``; return where another byte begins."""
         kind, extra, fields = self._kind
         at, whole = 0, len(data)
         while whole - at >= _FRAME:

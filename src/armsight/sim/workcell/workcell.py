@@ -46,9 +46,9 @@ from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 
-#: The board that is shown to the cameras.
-BOARD = "chessboard:9x6:30mm"
-_BOARD_FILL = (0.35, 1.0)  # of the image's height
+#: The chessboard that is shown to the cameras.
+CHESSBOARD = "chessboard:9x6:30mm"
+_CHESSBOARD_FILL = (0.35, 1.0)  # of the image's height
 #: The body on the tool: rotated by 180 degrees about y, so that its z runs into the plate, on a bracket to the cameras.
 _MOUNT_M, _MOUNT_RAD = np.array([0.003, -0.004, 0.035]), np.radians([-10.0, 12.0, 4.0])
 #: Five poses, seen from home: the tool's shift, m, base axes, and its rotation vector about its own axes, degrees.
@@ -147,7 +147,7 @@ class Workcell:
         source: the cameras.
         target: the body on the tool, as it is looked for.
         body_text: its body file.
-        board_spec: the board that :meth:`board_shots` shows.
+        chessboard_spec: the chessboard that :meth:`chessboard_shots` shows.
         timing: how the cameras keep time, as their maker says: rate, exposure, how well they are synchronised.
     """
 
@@ -159,7 +159,7 @@ class Workcell:
         self._T_tool_body, self._T_base_rig = parts.T_tool_body, parts.T_base_rig
         self.link, self.board = parts.link, parts.board
         self.target: Composite = body_target()
-        self.body_text, self.board_spec = body_text(), BOARD
+        self.body_text, self.chessboard_spec = body_text(), CHESSBOARD
         clock = (lambda: self.t_s, self.advance)
         body = (body_patterns(), self._T_tool_body)
         self.source = WorkcellSource(self.plant, self._cameras, self.timing, body, clock, self._seed)
@@ -257,7 +257,7 @@ class Workcell:
             found.append(solutions.best)
         return np.array(found)
 
-    def board_shots(self, count: int) -> Iterator[Shot]:
+    def chessboard_shots(self, count: int) -> Iterator[Shot]:
         """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.
 
         Args:
@@ -266,7 +266,7 @@ class Workcell:
         pattern, shown = chessboard(9, 6, 0.030), 0
         rng = np.random.default_rng([self._seed, 10])
         while shown < count:
-            for T in board_poses(rng, self._rig, pattern, count, fill=_BOARD_FILL):
+            for T in board_poses(rng, self._rig, pattern, count, fill=_CHESSBOARD_FILL):
                 if shown < count and self.source.clear(pattern, T):
                     yield self.source.still((pattern,), T, shown)
                     shown += 1
