@@ -25,7 +25,19 @@ def site(tmp_path_factory):
     """Build the site; examples and tutorials are not run here."""
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", folder / "doctrees", DOCS, folder / "html"],
+        [
+            sys.executable,
+            "-m",
+            "sphinx",
+            "-W",
+            "--keep-going",
+            "-n",
+            "-q",
+            "-d",
+            folder / "doctrees",
+            DOCS,
+            folder / "html",
+        ],
         capture_output=True,
         text=True,
         check=False,

@@ -1,0 +1,123 @@
+"""What the pages name exists: files, modules, functions, commands, options, pages."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+from armsight.app.main import COMMANDS, group
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [page for page in PAGES if not {"_build", "_made", "gallery"} & set(page.relative_to(ROOT).parts)]
+#: A file of the repository; brackets and ellipses stand for names that a reader chooses.
+FILE = re.compile(r"\b((?:src|tests|benchmarks|docs|examples|firmware)/[\w./-]*\w/?)")
+#: Folders that appear when something is built, and names that a reader chooses.
+LATER = re.compile(r"docs/_build|NAME")
+MODULE = re.compile(r"\barmsight(?:\.\w+)+")
+IMPORT = re.compile(r"from (armsight[\w.]*) import ([\w, ]+)")
+LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)]*)?\)")
+
+
+def missing_files(text: str) -> list[str]:
+    """Return the files of the repository that a text names and that are not there."""
+    names = {match[1] for match in FILE.finditer(text) if not LATER.search(match[0])}
+    return sorted(name for name in names if not (ROOT / name).exists())
+
+
+def missing_names(text: str) -> list[str]:
+    """Return the dotted names below ``armsight`` that a text has and that cannot be imported."""
+    missing = []
+    for name in sorted(set(MODULE.findall(text))):
+        parts = name.split(".")
+        if parts[-1] in ("xml", "toml", "json", "fish"):  # a file's name
+            continue
+        if not _imports(name):
+            missing.append(name)
+    for module, names in IMPORT.findall(text):
+        named = [f"{module}.{name.strip()}" for name in names.split(",")]
+        missing += [name for name in named if not _imports(name)]
+    return missing
+
+
+def _imports(name: str) -> bool:
+    """Say whether a dotted name can be imported."""
+    parts = name.split(".")
+    return any(_found(parts, cut) for cut in range(len(parts), 0, -1))
+
+
+def _found(parts: list[str], cut: int) -> bool:
+    """Say whether the first ``cut`` parts are a module and the others attributes in it."""
+    try:
+        found: object = importlib.import_module(".".join(parts[:cut]))
+    except ImportError:
+        return False
+    for part in parts[cut:]:
+        if not hasattr(found, part):
+            return False
+        found = getattr(found, part)
+    return True
+
+
+def calls(text: str) -> list[list[str]]:
+    """Return the ``armsight`` command lines of a text: lines of blocks, and code in a sentence."""
+    found = []
+    for line in re.findall(r"^(?: {4}|\$ )(?:\$ )?(armsight [^\n]*)$|`(armsight [^`\n]+)`", text, re.MULTILINE):
+        words = re.split(r"\s#|\s{3,}", line[0] or line[1])[0]
+        try:
+            found.append(shlex.split(words))
+        except ValueError:
+            continue
+    return found
+
+
+def unknown_parts(words: list[str]) -> list[str]:
+    """Return the commands and options of a command line that do not exist."""
+    command, rest = group, words[1:]
+    while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
+        context = click.Context(command)
+        below = command.get_command(context, rest[0])
+        if below is None:
+            if command is group:
+                return [] if not re.fullmatch(r"[a-z]+", rest[0]) else [rest[0]]
+            break  # what is no subcommand is data
+        command, rest = below, rest[1:]
+    members = command.commands.values() if isinstance(command, click.Group) and command is not group else ()
+    return _unknown_options([command, *members], rest)
+
+
+def _unknown_options(commands: list[click.Command], rest: list[str]) -> list[str]:
+    parameters = [parameter for command in commands for parameter in command.params]
+    known = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
+    known |= {"-h", "--help", "--version"}
+    words = [word.strip("[],").split("=")[0] for word in rest]
+    return [word for word in words if re.fullmatch(r"--?[a-z][a-z-]*", word) and word not in known]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_what_a_page_names_exists(page):
+    text = page.read_text(encoding="utf-8")
+    assert missing_files(text) == []
+    assert missing_names(text) == []
+    unknown = {" ".join(words): parts for words in calls(text) if (parts := unknown_parts(words))}
+    assert unknown == {}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page):
+    for target in LINK.findall(page.read_text(encoding="utf-8")):
+        if "://" not in target and "_made/" not in target and "gallery/" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def test_the_checks_find_what_is_planted():
+    assert missing_files("see `src/armsight/nothing.py` and docs/index.md") == ["src/armsight/nothing.py"]
+    assert missing_names("armsight.vision.nothing and armsight.vision.rig.StereoRig") == ["armsight.vision.nothing"]
+    assert missing_names("from armsight.data import Shot, Nothing") == ["armsight.data.Nothing"]
+    planted = calls("    armsight measure rig.json --nothing 3\n`armsight calibrate --left a`\n$ armsight nowhere x\n")
+    assert [unknown_parts(words) for words in planted] == [["--nothing"], [], ["nowhere"]]
+    assert set(COMMANDS) >= {"measure", "calibrate"}
