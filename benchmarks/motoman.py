@@ -58,7 +58,7 @@ def tracker() -> None:
     print("\n4. Motoman right_hand_6x6x6: even shots fitted and registered to the tracker, odd ones of the 43 measured")
     print(
         "  (where the reflector sits on the body is not known. The arm holds the orientation, so its position follows "
-        "from the scatter of the measured orientations alone, and leans towards the point of the body that is measured best)"
+        "from the scatter of the measured orientations alone; it leans towards the point of the body that is measured best)"
     )
     body, shots, cameras, truth = read("right_hand_6x6x6")
     measurable = [s for s in shots if common(s) >= 3]

@@ -3,7 +3,7 @@
 In: the nominal :class:`~armsight.robot.arm.Arm` and :class:`Measured` poses (``read`` has them from a CSV file). Out:
 :class:`Identified`, every parameter with its sigma, and :class:`Corrected`, the arm in use.
 
-    measured -> diagnose -> placement -> observable -> fit -> selection -> identify -> corrected, toml_write
+    measured -> diagnose -> placement -> observable -> fit -> selection -> identify -> corrected
 
 ``identify.identify`` runs the line on the parameters of ``model``. ``joint_noise`` and ``backlash`` estimate what scatters
 from pose to pose, ``validate`` evaluates the result on other poses, ``plan`` chooses the next poses to measure. Equations
