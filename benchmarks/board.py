@@ -78,9 +78,9 @@ def paced(name, ticks, prepare, run):
 
 def swinging(link):
     configured(link)
-    bench = BoardTestRig.connect(link, None, [])
-    bench.enable()
-    return bench
+    test_rig = BoardTestRig.connect(link, None, [])
+    test_rig.enable()
+    return test_rig
 
 
 def metric_1():
@@ -88,7 +88,7 @@ def metric_1():
     print(f"{'':9}{'':24}{'by the clock':>16}{'':9}{'by processor time':>20}")
     kinds = {
         "at rest": (10_000, configured, lambda _, link, n: link.step(n)),
-        "driven, telemetry read": (5_000, swinging, lambda bench, _, n: bench.swing(n * 1e-3)),
+        "driven, telemetry read": (5_000, swinging, lambda test_rig, _, n: test_rig.swing(n * 1e-3)),
     }
     for name in emulators():
         for what, (ticks, prepare, run) in kinds.items():
@@ -221,11 +221,11 @@ def replayed():
 
     link = EmulatedLink(open_emulator("unicorn"), Heard())
     configured(link)
-    bench = BoardTestRig.connect(link, None, [])
+    test_rig = BoardTestRig.connect(link, None, [])
     link._watch = lambda _: outputs.append(link.answer["outputs"].copy())
-    bench.readings(0.2)  # both speed filters forget how they began
-    bench.enable()
-    bench.swing(2.0)
+    test_rig.readings(0.2)  # both speed filters forget how they began
+    test_rig.enable()
+    test_rig.swing(2.0)
     link.close()
     counts = np.array(counts[-len(outputs) :])[:, 0]
     config = lab_configuration()

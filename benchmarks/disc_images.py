@@ -145,7 +145,7 @@ def add_region(
     slope: np.ndarray | None = None,
     about: np.ndarray | None = None,
 ) -> None:
-    """Add ``step`` + ``slope`` . (x - about) inside a border to a linear image (HEIGHT, WIDTH), blurred, in-place."""
+    """Add ``step`` + ``slope`` . (x - about) inside a border to a linear image (HEIGHT, WIDTH); blurred; overwrites it."""
     x, y, dy = border
     u0, v0, w, h = window(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]), _REACH * sigma + 1)
     about = np.array([x.mean(), y.mean()]) if about is None else about

@@ -99,7 +99,7 @@ def light_of(
 
 
 def cover_up(light: np.ndarray, polygon: np.ndarray, blur: float) -> None:
-    """Lay a polygon (M, 2) of the background's level over an image, in-place."""
+    """Lay a polygon (M, 2) of the background's level over an image, which it overwrites."""
     share = np.zeros_like(light)
     add_region(share, polygon_border(polygon, blur), blur, 1.0)
     light += share * (BACKGROUND - light)

@@ -96,7 +96,7 @@ def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: 
 
 
 def _rotate(R: Array, k: int, angle: Array) -> None:
-    """Rotate frames (N, 3, 3) in-place about their own axis ``k`` by angles (N,), rad."""
+    """Overwrite frames (N, 3, 3), rotated about their own axis ``k`` by angles (N,), rad."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     u, v = R[:, :, (k + 1) % 3].copy(), R[:, :, (k + 2) % 3].copy()
     R[:, :, (k + 1) % 3] = c * u + s * v
