@@ -1,6 +1,6 @@
 """The ``armsight`` command: the group of commands, and how errors are reported.
 
-Every command takes ``--json`` (machine-readable on stdout); progress and warnings go to stderr. A mistake in the input
+Every command takes ``--json`` (JSON on stdout); progress and warnings go to stderr. A mistake in the input
 is one line on stderr and exit code 2; an interrupt is exit code 130.
 """
 

@@ -187,7 +187,7 @@ def run(monkeypatch, capsys, *arguments):
     return caught.value.code, *capsys.readouterr()
 
 
-def test_the_command_lists_for_people_and_machines(computer, monkeypatch, capsys):
+def test_the_command_lists_for_people_and_programs(computer, monkeypatch, capsys):
     code, out, err = run(monkeypatch, capsys)
     assert (code, err) == (0, "")
     assert out.splitlines()[:7] == [

@@ -51,7 +51,7 @@ def some(count, shape=(24, 32, 3)):
 
 
 def read_back(folder):
-    source, found = FolderSource(folder), []
+    source, found = FolderSource.open(folder), []
     while (shot := source.read()) is not None:
         found.append(shot)
     return found
@@ -200,9 +200,9 @@ def test_a_folder_in_use_is_not_touched(tmp_path):
     (tmp_path / "file").write_text("here")
     with pytest.raises(InputError, match="is not empty; record into a new folder"):
         record(Played(some(1)), tmp_path)
-    for place in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match=f"{place}: no recording can be made here: Not a directory"):
-            record(Played(some(1)), place)
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match=f"{folder}: no recording can be made here: Not a directory"):
+            record(Played(some(1)), folder)
     result = record(Played(some(1)), "/proc/none")  # where nothing can be made, found out with the first shot
     assert result.stopped == "/proc/none: no recording can be made here: No such file or directory"
 
@@ -232,7 +232,7 @@ def test_the_command_stores_and_says_so(monkeypatch, capsys, stored, tmp_path):
     code, out, err = run(monkeypatch, capsys, "record", stored, "-o", tmp_path / "a")
     assert (code, out) == (
         0,
-        f"5 shots are stored in {tmp_path / 'a'}, 1 of them without images: shots.csv says why\n",
+        f"5 shots are stored in {tmp_path / 'a'}, 1 of them without images: shots.csv has the reasons\n",
     )
     assert "Traceback" not in err
     code, out, _ = run(monkeypatch, capsys, "record", stored, "-o", tmp_path / "b", "--shots", 2, "--json")

@@ -1,4 +1,4 @@
-"""A figure that is laid out once looks as matplotlib would have drawn it."""
+"""A figure that is laid out once looks as matplotlib renders it."""
 
 import io
 

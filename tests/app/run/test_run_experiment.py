@@ -10,7 +10,7 @@ from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.data import JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement
-from armsight.loop.servo import PoseServo, Timing
+from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault, Reaction
@@ -152,7 +152,7 @@ def close_the_loop():
         arm = open_arm(name)
         warm_up(arm)
         before = compiled()
-        estimator, servo = KalmanEstimator(arm, delay=Delay(0.013, 2e-3)), PoseServo(arm, Timing(0.016, 0.033, 0.045))
+        estimator, servo = KalmanEstimator(arm, delay=Delay(0.013, 2e-3)), PoseServo(arm, LoopTiming(0.016, 0.033, 0.045))
         way = point_to_point(arm, arm.home, arm.home + 0.2)
         for tick in range(1, 400):
             t_s = 1e-3 * tick

@@ -1,5 +1,5 @@
 """``armsight measure``: a rig and shots of a target in; the target's pose shot by shot out, with its uncertainty.
 
-``poses.py`` has a shot's pose as a record, as JSON and as a line of CSV. ``--view`` draws: ``view.py`` writes a folder of
+``poses.py`` has a shot's pose as a record, as JSON and as a line of CSV. For ``--view``, ``view.py`` writes a folder of
 pictures, ``picture.py`` one shot with its residuals, ``chart.py`` the whole run over time.
 """

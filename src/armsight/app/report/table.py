@@ -1,6 +1,6 @@
 """Tables for people: one record, shown as HTML in a page, and in the terminal.
 
-On a terminal a table is drawn with rich; elsewhere (a pipe, a file) it is plain text with aligned columns.
+On a terminal a table is printed with rich; elsewhere (a pipe, a file) it is plain text with aligned columns.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
 
 @dataclass(frozen=True)
 class Devices:
-    """What the command line says of the devices.
+    """The devices as the command line names them.
 
     Attributes:
         source: the cameras, such as usb:0,1; or sim:.

@@ -119,10 +119,10 @@ class Watch:
 def steady(*, in_time: bool) -> Iterator[None]:
     """Configure the interpreter for a control loop within the block; both settings are restored afterwards.
 
-    Python's cyclic garbage collector is off within the block. A full collection visits every object of the process
-    (numpy, scipy, numba and matplotlib alone are several hundred thousand) and takes 0.1 s or more, at a time nobody
-    chooses; a board that receives no command for 100 ms stops its arm. The loop does without it because its records form
-    no reference cycles: reference counting frees them at once.
+    Python's cyclic garbage collector is off within the block. A full collection visits every object of the process (the
+    modules that a run imports make more than a hundred thousand) and takes 0.1 s or more, at an arbitrary time; a board
+    that receives no command for 100 ms stops its arm. The loop does without it because its records form no reference
+    cycles: reference counting frees them at once.
 
     Args:
         in_time: whether time passes by itself; then threads alternate more often (``SWITCH_S``), at some cost.

@@ -189,7 +189,7 @@ def _study_json(study: Study) -> dict[str, Any]:
 
 
 def _known(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value as JSON can hold it: None, there null, in place of every number that is not known."""
+    """Return a value as JSON can hold it: None (null) replaces every number that is not known."""
     if isinstance(value, Mapping):
         return {key: _known(one) for key, one in value.items()}
     if isinstance(value, list):
