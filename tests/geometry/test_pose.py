@@ -4,8 +4,18 @@ import numpy as np
 import scipy.linalg
 from hypothesis import given
 
-from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, pose, transform
-from armsight.geometry.rotation import exp_so3, skew
+from armsight.geometry.pose import (
+    adjoint,
+    exp_se3,
+    inverse,
+    left_jacobian,
+    log_se3,
+    mean_pose,
+    pose,
+    small_adjoint,
+    transform,
+)
+from armsight.geometry.rotation import exp_so3, log_so3, skew
 from asserts import assert_jacobian, assert_rotation
 from strategies import poses, rotation_vectors, vectors
 
@@ -56,12 +66,33 @@ def test_perturbation_on_the_right(T, p):
     assert_jacobian(J, lambda xi: transform(T @ exp_se3(xi), p), np.zeros(6), 1e-3)
 
 
+@given(poses(), vectors(-2, 2), rotation_vectors())
+def test_the_adjoint_carries_a_tangent(T, rho, phi):
+    xi = np.concatenate([rho, phi])
+    np.testing.assert_allclose(T @ hat(xi) @ inverse(T), hat(adjoint(T) @ xi), atol=16 * TIGHT)
+
+
+@given(vectors(-1, 1), rotation_vectors(1.0))
+def test_the_small_adjoint_generates_the_adjoint(rho, phi):
+    xi = np.concatenate([rho, phi])
+    np.testing.assert_allclose(adjoint(exp_se3(xi)), scipy.linalg.expm(small_adjoint(xi)), atol=8 * TIGHT)
+
+
+@given(rotation_vectors())
+def test_the_left_jacobian_is_that_of_exp(phi):
+    # exp(phi + d) exp(phi)^T = exp(V d) to first order; log is the identity to first order about no rotation.
+    assert_jacobian(left_jacobian(phi), lambda v: log_so3(exp_so3(v) @ exp_so3(phi).T), phi, 1e-3)
+
+
 def test_leading_axes():
     xi = np.random.default_rng(2).normal(size=(5, 6))
     Ts = exp_se3(xi)
     np.testing.assert_allclose(Ts[3], exp_se3(xi[3]), atol=TIGHT)
     np.testing.assert_allclose(inverse(Ts)[3], inverse(Ts[3]), atol=TIGHT)
-    np.testing.assert_allclose(log_se3(Ts)[3], log_se3(Ts[3]), atol=TIGHT)
+    for f in (adjoint, log_se3):
+        np.testing.assert_allclose(f(Ts)[3], f(Ts[3]), atol=TIGHT)
+    for g in (small_adjoint, lambda x: left_jacobian(x[..., 3:])):
+        np.testing.assert_allclose(g(xi)[3], g(xi[3]), atol=TIGHT)
     p = np.random.default_rng(3).normal(size=(7, 3))
     np.testing.assert_allclose(transform(Ts[:, None], p)[3, 4], transform(Ts[3], p[4]), atol=TIGHT)
 

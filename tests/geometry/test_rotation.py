@@ -12,6 +12,7 @@ from armsight.geometry.rotation import (
     from_euler_zyx,
     from_quaternion_wxyz,
     log_so3,
+    nearest_rotation,
     quaternion_wxyz,
     skew,
 )
@@ -110,3 +111,23 @@ def test_singular_pitch_is_reported_and_roll_carries_what_is_left(sign):
     assert pitch == pytest.approx(sign * np.pi / 2, abs=1e-12)
     assert found == pytest.approx(roll - sign * yaw, abs=1e-12)
     assert not euler_zyx(from_euler_zyx(roll, sign * (np.pi / 2 - 1e-5), yaw))[1]
+
+
+@given(rotations(), vectors(0.5, 2.0), rotation_vectors())
+def test_the_nearest_rotation_undoes_a_scaling(R, scale, phi):
+    """R times a symmetric positive matrix is nearest to R (polar decomposition)."""
+    Q = exp_so3(phi)
+    found = nearest_rotation(R @ Q @ np.diag(scale) @ Q.T)
+    assert_rotation(found)
+    np.testing.assert_allclose(found, R, atol=1e-13)
+
+
+def test_the_nearest_rotation_is_the_nearest_and_mirrored_is_a_reflection():
+    rng = np.random.default_rng(6)
+    for M in rng.normal(size=(50, 3, 3)):
+        found, mirrored = nearest_rotation(M), nearest_rotation(M, mirrored=True)
+        assert_rotation(found)
+        assert_rotation(-mirrored)
+        for small in exp_so3(rng.normal(0, 0.05, (20, 3))):
+            assert np.linalg.norm(found - M) <= np.linalg.norm(small @ found - M)
+            assert np.linalg.norm(mirrored - M) <= np.linalg.norm(small @ mirrored - M)
