@@ -132,7 +132,7 @@ def test_one_truncated_image_is_a_rejected_pair(few, armsight, tmp_path, keep):
 
 def test_the_wrong_board(few, armsight, tmp_path):
     said = armsight("calibrate", *images(few), "--target", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
-    refused(said, "0 of 5 pairs are usable", "Is --target the target in the images")
+    refused(said, "0 of 5 pairs are usable", "Is --target the board in the images")
     assert not (tmp_path / "rig.json").exists()
 
 
