@@ -1,4 +1,4 @@
-"""What two cameras find of a body's discs, without images: exact ellipses, noise and clutter from a seed."""
+"""What two cameras find of a body's discs, without images: ellipses through rims by OpenCV's projection, noise, clutter."""
 
 import numpy as np
 
@@ -6,9 +6,10 @@ from armsight.data import Body, Discs
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.discs.bias import project_discs
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
+from disc_rims import disc_ellipses
+from views import pixels
 
 SIZE = (1280, 720)
 SIGMA = 0.03
@@ -71,7 +72,7 @@ def views(rig, target, Ts, rng=None, sigma=SIGMA, clutter=0, hidden=(), radii=(4
             T = T if side == 0 else inverse(rig.T_left_right) @ T
             normals = np.where(np.isnan(target.normals), [0.0, 0.0, -1.0], target.normals)
             p = target.body.points @ T[:3, :3].T + T[:3, 3]
-            at, ellipse, _, _ = project_discs(camera, p, normals @ T[:3, :3].T, target.radii_m)
+            at, ellipse = disc_ellipses(lambda q, camera=camera: pixels(camera, q), p, normals @ T[:3, :3].T, target.radii_m)
             keep = [
                 m
                 for m in range(len(p))
