@@ -21,10 +21,10 @@ class Said:
     @property
     def lines(self):
         """The JSON objects on stdout, one a line; NaN and infinity are no JSON."""
-        return [json.loads(line, parse_constant=_refused) for line in self.out.splitlines()]
+        return [json.loads(line, parse_constant=_not_json) for line in self.out.splitlines()]
 
 
-def _refused(text):
+def _not_json(text):
     raise AssertionError(f"{text} is not JSON")
 
 
@@ -37,7 +37,7 @@ def run(*arguments):
     return end.value.code
 
 
-def refused(said, *words):
+def assert_rejected(said, *words):
     """Hold a run to the manners of a mistake: code 2, one line on stderr that has the words, nothing on stdout."""
     assert said.code == 2, said
     lines = said.err.splitlines()

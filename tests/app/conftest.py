@@ -52,9 +52,9 @@ class Bench:
 
 
 @pytest.fixture(scope="session")
-def bench(tmp_path_factory):
+def rendered(tmp_path_factory):
     """Record 12 pairs of a board and 16 shots of an end-effector, 640x360, and calibrate."""
-    folder = tmp_path_factory.mktemp("bench")
+    folder = tmp_path_factory.mktemp("rendered")
     of_board, of_arm = demo_recording(folder, seed=3, image_size_px=(640, 360), boards=12, shots=16, rate_hz=4.0)
     here = Bench(folder, of_board, of_arm)
     assert run("calibrate", *here.board, "--lens-model", "brown5", "--folds", 4, "-o", here.rig) == 0

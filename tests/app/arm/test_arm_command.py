@@ -10,7 +10,7 @@ from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.models import MODELS
 from armsight.robot.reach import reach
 from armsight.robot.urdf_write import write_urdf
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 SIX_R = MODELS["six_r"]
 Q_DEG = (10, -20, 30, 0, -90, 5)
@@ -225,7 +225,7 @@ def test_a_toml_file_is_an_arm_as_well(tmp_path, armsight):
 )
 def test_mistakes_are_one_line_and_exit_code_2(arguments, said, armsight, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    refused(armsight("arm", *arguments), *said)
+    assert_rejected(armsight("arm", *arguments), *said)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -234,8 +234,8 @@ def test_a_malformed_urdf_is_named_with_its_element(armsight, tmp_path):
     write_urdf(SIX_R, path)
     whole = path.read_text()
     path.write_text(whole[:700])
-    refused(armsight("arm", "show", path), path, "not XML")
+    assert_rejected(armsight("arm", "show", path), path, "not XML")
     path.write_text(whole.replace('<axis xyz="0 0 1" />', '<axis xyz="0 0" />', 1))
-    refused(armsight("arm", "ik", path, 400, 0, 500, 0, 0, 0), path, "joint 'joint1'", '<axis xyz="0 0">')
-    refused(armsight("arm", "urdf", path, "-o", path), "given twice, or is read as well as written")
+    assert_rejected(armsight("arm", "ik", path, 400, 0, 500, 0, 0, 0), path, "joint 'joint1'", '<axis xyz="0 0">')
+    assert_rejected(armsight("arm", "urdf", path, "-o", path), "given twice, or is read as well as written")
     assert '<axis xyz="0 0" />' in path.read_text()

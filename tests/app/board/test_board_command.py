@@ -13,7 +13,7 @@ from armsight.firmware import build, host_library
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.host import HostEmulator
 from armsight.robot.boards.opening import EMULATORS
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 HOST = ("--board", "emulated:host")
 
@@ -133,7 +133,7 @@ def test_gains_are_printed_and_changed(armsight):
     ],
 )
 def test_a_mistake_is_one_line(armsight, arguments, parts):
-    refused(armsight("board", *arguments), *parts)
+    assert_rejected(armsight("board", *arguments), *parts)
 
 
 def test_an_image_is_built_with_its_pieces(armsight, tmp_path):
@@ -178,10 +178,10 @@ def test_without_a_programmer_the_message_says_what_to_install_and_where_the_ima
     programmers()
     said = armsight("board", "flash", "-o", tmp_path / "out")
     piece = tmp_path / "out" / "stm32f4-08000000.bin"
-    refused(said, "none of st-flash, openocd, dfu-util is installed", "apt install", f"{piece} (to 0x08000000)")
+    assert_rejected(said, "none of st-flash, openocd, dfu-util is installed", "apt install", f"{piece} (to 0x08000000)")
     assert piece.stat().st_size > 0
     said = armsight("board", "flash", "-o", tmp_path / "out", "--programmer", "openocd")
-    refused(said, "openocd is not installed")
+    assert_rejected(said, "openocd is not installed")
 
 
 @pytest.mark.parametrize("name", PROGRAMMERS)
@@ -203,7 +203,9 @@ def test_a_programmer_writes_every_piece_to_its_address(armsight, programmers, t
 def test_a_programmer_that_fails_is_reported_by_its_own_message(armsight, programmers, tmp_path):
     programmers("st-flash", code=1)
     said = armsight("board", "flash", "-o", tmp_path / "out")
-    refused(said, "st-flash could not write the board (no probe found)", "is it plugged in", "stm32f4-08000000.bin")
+    assert_rejected(
+        said, "st-flash could not write the board (no probe found)", "is it plugged in", "stm32f4-08000000.bin"
+    )
 
 
 def test_what_was_built_reads_well(armsight, programmers, tmp_path):
@@ -214,4 +216,4 @@ def test_what_was_built_reads_well(armsight, programmers, tmp_path):
 
 def test_only_a_real_board_is_flashed(armsight, programmers, tmp_path):
     assert FLASHED == ("stm32f4",)
-    refused(armsight("board", "flash", "--board", "pil", "-o", tmp_path), "pil is no board to plug in")
+    assert_rejected(armsight("board", "flash", "--board", "pil", "-o", tmp_path), "pil is no board to plug in")

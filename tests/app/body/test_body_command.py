@@ -20,7 +20,7 @@ from armsight.vision.discs.identify import identify
 from armsight.vision.discs.predict import plain_rig, view
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 PLATE = Path(__file__).resolve().parents[3] / "examples" / "plate.toml"
 TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
@@ -220,10 +220,10 @@ def test_one_hidden_disc_is_looked_into(armsight, body):
     assert any("where P4 is hidden" in (f["text"] or "") for f in got["findings"])
 
 
-def test_a_better_rig_knows_more_and_a_rigs_own_uncertainty_counts(armsight, bench):
+def test_a_better_rig_knows_more_and_a_rigs_own_uncertainty_counts(armsight, rendered):
     plain = answer(armsight("body", "check", PLATE, "--distance", "0.5", "--json"))["expected"][0]
-    got = answer(armsight("body", "check", PLATE, "--rig", bench.rig, "--distance", "0.5", "--json"))
-    assert str(bench.rig) in got["cameras"]
+    got = answer(armsight("body", "check", PLATE, "--rig", rendered.rig, "--distance", "0.5", "--json"))
+    assert str(rendered.rig) in got["cameras"]
     assert got["expected"][0]["sigma_depth_mm"] > plain["sigma_depth_mm"]
 
 
@@ -259,30 +259,36 @@ def test_a_wrong_body_file_is_one_clear_line(armsight, tmp_path, command, text, 
     if text is not None:
         path.write_text(text)
     arguments = [str(tmp_path / "out.pdf") if a == "OUT" else a for a in command]
-    refused(armsight("body", *arguments, path), "wrong.toml", *parts)
+    assert_rejected(armsight("body", *arguments, path), "wrong.toml", *parts)
     assert not (tmp_path / "out.pdf").exists()
 
 
 def test_what_else_is_typed_wrongly_is_one_clear_line(armsight, tmp_path, body):
-    refused(armsight("body", "check", "points.csv"), "points.csv", "TOML")
-    refused(armsight("body", "check", PLATE, "--distance", "0"), "--distance 0", "metres")
-    refused(armsight("body", "check", PLATE, "--distance", "nan"), "--distance nan", "metres")
-    refused(armsight("body", "check", PLATE, "--rig", tmp_path / "no.json"), "no.json", "no such file")
-    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "plate.docx"), "plate.docx", ".pdf")
-    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "plate"), ".pdf")
-    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "no" / "plate.pdf"), "no folder")
-    refused(armsight("body", "draw", PLATE, "-o", PLATE), "given twice")
+    assert_rejected(armsight("body", "check", "points.csv"), "points.csv", "TOML")
+    assert_rejected(armsight("body", "check", PLATE, "--distance", "0"), "--distance 0", "metres")
+    assert_rejected(armsight("body", "check", PLATE, "--distance", "nan"), "--distance nan", "metres")
+    assert_rejected(armsight("body", "check", PLATE, "--rig", tmp_path / "no.json"), "no.json", "no such file")
+    assert_rejected(armsight("body", "draw", PLATE, "-o", tmp_path / "plate.docx"), "plate.docx", ".pdf")
+    assert_rejected(armsight("body", "draw", PLATE, "-o", tmp_path / "plate"), ".pdf")
+    assert_rejected(armsight("body", "draw", PLATE, "-o", tmp_path / "no" / "plate.pdf"), "no folder")
+    assert_rejected(armsight("body", "draw", PLATE, "-o", PLATE), "given twice")
     wide = body([(10 * x, 10 * y, z) for x, y, z in TRIANGLE])
-    refused(armsight("body", "draw", wide, "-o", tmp_path / "wide.pdf"), "P1, P2, P3", "a4 is 210 x 297", "--paper fit")
-    refused(armsight("body", "draw", wide, "-o", tmp_path / "wide.png", "--paper", "fit", "--dpi", "2400"), "--dpi")
+    assert_rejected(
+        armsight("body", "draw", wide, "-o", tmp_path / "wide.pdf"), "P1, P2, P3", "a4 is 210 x 297", "--paper fit"
+    )
+    assert_rejected(
+        armsight("body", "draw", wide, "-o", tmp_path / "wide.png", "--paper", "fit", "--dpi", "2400"), "--dpi"
+    )
     bent = body(TRIANGLE, disc("Q", (0, 0, 40), normal=""))
-    refused(armsight("body", "draw", bent, "-o", tmp_path / "bent.pdf"), "not flat", "Q needs its normal")
+    assert_rejected(armsight("body", "draw", bent, "-o", tmp_path / "bent.pdf"), "not flat", "Q needs its normal")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["body.toml"]
 
 
 def test_without_matplotlib_drawing_says_what_to_install(armsight, monkeypatch, tmp_path):
     monkeypatch.setattr(body_draw.importlib.util, "find_spec", lambda name: None)
-    refused(armsight("body", "draw", PLATE, "-o", tmp_path / "p.pdf"), "matplotlib", 'pip install "armsight[report]"')
+    assert_rejected(
+        armsight("body", "draw", PLATE, "-o", tmp_path / "p.pdf"), "matplotlib", 'pip install "armsight[report]"'
+    )
 
 
 DPI = 300
@@ -410,7 +416,7 @@ def test_names_that_are_not_plain_are_drawn(armsight, body, tmp_path):
 
 def test_a_drawing_that_fails_leaves_nothing_behind(armsight, tmp_path, full_disk, body):
     shutil.copy(PLATE, tmp_path / "plate.toml")
-    refused(armsight("body", "draw", tmp_path / "plate.toml", "-o", full_disk / "plate.png"), "plate.png")
+    assert_rejected(armsight("body", "draw", tmp_path / "plate.toml", "-o", full_disk / "plate.png"), "plate.png")
     assert [p.name for p in full_disk.iterdir()] == ["ballast"]
 
 

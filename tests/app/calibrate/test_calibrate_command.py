@@ -13,7 +13,7 @@ import pytest
 from armsight.app.calibrate import command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
-from cli_runs import listening, refused
+from cli_runs import listening, assert_rejected
 
 pytestmark = pytest.mark.opencv
 
@@ -21,13 +21,13 @@ QUICK = ("--lens-model", "brown5", "--folds", "3", "--flat-target")
 
 
 @pytest.fixture
-def few(bench, tmp_path):
+def few(rendered, tmp_path):
     """A folder of its own with five pairs of the board, to be spoilt."""
     folder = tmp_path / "few"
     folder.mkdir()
     for n in range(0, 10, 2):
         for side in ("left", "right"):
-            shutil.copy(bench.folder / "board" / f"{side}{n:03d}.png", folder)
+            shutil.copy(rendered.folder / "board" / f"{side}{n:03d}.png", folder)
     return folder
 
 
@@ -38,8 +38,8 @@ def images(folder):
 CHESS = ("--target", "chessboard:9x6:25mm")
 
 
-def test_the_rendered_rig_is_recovered(bench):
-    true, rig = bench.of_board.rig, StereoRig.load(bench.rig)
+def test_the_rendered_rig_is_recovered(rendered):
+    true, rig = rendered.of_board.rig, StereoRig.load(rendered.rig)
     # The truth's middle coefficient order is brown5, the model asked for.
     error, sigma = rig_error(rig, true), np.sqrt(np.diag(rig.cov))
     assert (np.abs(error) < 4 * sigma).all(), error / sigma
@@ -51,9 +51,9 @@ def test_the_rendered_rig_is_recovered(bench):
     assert rig.provenance["heldout_epipolar_rms_px"] < 0.05
 
 
-def test_json_has_what_was_promised(bench, armsight, tmp_path):
+def test_json_has_what_was_promised(rendered, armsight, tmp_path):
     out = tmp_path / "rig.json"
-    said = armsight("calibrate", *bench.board, *QUICK, "-o", out, "--json")
+    said = armsight("calibrate", *rendered.board, *QUICK, "-o", out, "--json")
     assert said.code == 0, said.err
     (summary,) = said.lines
     promised = {
@@ -98,7 +98,9 @@ def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monk
 
 def test_a_missing_file(few, armsight, tmp_path):
     (few / "left004.png").unlink()
-    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "4 left and 5 right", "004")
+    assert_rejected(
+        armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "4 left and 5 right", "004"
+    )
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -106,13 +108,15 @@ def test_an_empty_glob(few, armsight, tmp_path):
     said = armsight(
         "calibrate", "--left", tmp_path / "no*.png", "--right", few / "right*.png", *CHESS, "-o", tmp_path / "rig.json"
     )
-    refused(said, "no*.png", "no such file")
+    assert_rejected(said, "no*.png", "no such file")
 
 
 def test_no_image_can_be_read(few, armsight, tmp_path):
     for path in few.glob("*.png"):
         path.write_bytes(b"not an image")
-    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "none of 5 pairs can be read")
+    assert_rejected(
+        armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json"), "none of 5 pairs can be read"
+    )
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -132,7 +136,7 @@ def test_one_truncated_image_is_a_rejected_pair(few, armsight, tmp_path, keep):
 
 def test_the_wrong_board(few, armsight, tmp_path):
     said = armsight("calibrate", *images(few), "--target", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
-    refused(said, "0 of 5 pairs are usable", "Is --target the board in the images")
+    assert_rejected(said, "0 of 5 pairs are usable", "Is --target the board in the images")
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -151,14 +155,14 @@ def test_two_image_sizes(few, armsight, tmp_path):
     path = few / "right006.png"
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
     said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json")
-    refused(said, path, "320x180", "640x360")
+    assert_rejected(said, path, "320x180", "640x360")
 
 
 def test_the_same_images_on_both_sides(few, armsight, tmp_path):
     said = armsight(
         "calibrate", "--left", few / "left*.png", "--right", few / "left*.png", *CHESS, "-o", tmp_path / "rig.json"
     )
-    refused(said, "both a left and a right image")
+    assert_rejected(said, "both a left and a right image")
 
 
 def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
@@ -176,19 +180,19 @@ def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
      "chessboard:9x6:-25mm", "chessboard:9x6:nanmm", "", "charuco:9x6:25mm:30mm:DICT_4X4_50"],
 )  # fmt: skip
 def test_a_bad_board_spec(few, armsight, tmp_path, spec):
-    refused(armsight("calibrate", *images(few), "--target", spec, "-o", tmp_path / "rig.json"))
+    assert_rejected(armsight("calibrate", *images(few), "--target", spec, "-o", tmp_path / "rig.json"))
 
 
 def test_no_folder_for_the_result(few, armsight, tmp_path):
     out = tmp_path / "nowhere" / "rig.json"
-    refused(armsight("calibrate", *images(few), *CHESS, "-o", out), out, "there is no folder")
-    refused(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path), tmp_path, "is a folder")
+    assert_rejected(armsight("calibrate", *images(few), *CHESS, "-o", out), out, "there is no folder")
+    assert_rejected(armsight("calibrate", *images(few), *CHESS, "-o", tmp_path), tmp_path, "is a folder")
 
 
 def test_a_report_where_a_file_stands(few, armsight, tmp_path):
     (tmp_path / "taken").write_text("mine")
     said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "r.json", "--report", tmp_path / "taken")
-    refused(said, "taken")
+    assert_rejected(said, "taken")
     assert (tmp_path / "taken").read_text() == "mine"
 
 
@@ -204,7 +208,7 @@ def test_a_report_where_a_file_stands(few, armsight, tmp_path):
     ],
 )
 def test_options_that_do_not_go_together(armsight, tmp_path, options):
-    refused(armsight("calibrate", *options, "-o", tmp_path / "rig.json"))
+    assert_rejected(armsight("calibrate", *options, "-o", tmp_path / "rig.json"))
 
 
 @pytest.mark.parametrize(
@@ -254,12 +258,12 @@ with mock.patch("{module}.{name}", waiting):
     ],
     ids=["adjusting", "reading", "writing"],
 )
-def test_an_interrupt_leaves_nothing(bench, tmp_path, module, name, wait):
+def test_an_interrupt_leaves_nothing(rendered, tmp_path, module, name, wait):
     out = tmp_path / "rig.json"
     out.write_text("what stood there")
     script = INTERRUPTED.format(module=module, name=name, wait=wait)
     process = subprocess.Popen(
-        [sys.executable, "-c", script, "calibrate", *bench.board, *QUICK, "-o", out],
+        [sys.executable, "-c", script, "calibrate", *rendered.board, *QUICK, "-o", out],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listening,
     )  # fmt: skip
     assert process.stdout.readline() == "there\n"
@@ -274,11 +278,11 @@ def test_an_interrupt_leaves_nothing(bench, tmp_path, module, name, wait):
 
 def test_a_full_disk(few, armsight, full_disk):
     out = full_disk / "rig.json"
-    refused(armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", out), out, "No space left on device")
+    assert_rejected(armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", out), out, "No space left on device")
     assert os.listdir(full_disk) == ["ballast"]
 
 
-def test_the_rig_is_json_that_others_can_read(bench):
-    document = json.loads(bench.rig.read_text())
+def test_the_rig_is_json_that_others_can_read(rendered):
+    document = json.loads(rendered.rig.read_text())
     assert document["format"] == "armsight-rig"
     assert np.shape(document["covariance"]) == (len(document["parameters"]),) * 2

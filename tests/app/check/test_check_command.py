@@ -11,7 +11,7 @@ from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import Said, refused, run
+from cli_runs import Said, assert_rejected, run
 
 COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 COMMAND = ["command_x_m", "command_y_m", "command_z_m", "command_qw", "command_qx", "command_qy", "command_qz"]
@@ -123,15 +123,15 @@ def test_the_plan(tmp_path, capsys):
     assert answer.code == 0
     assert "cycles: 30" in answer.out
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
-    refused(said(capsys, "plan", "--arm", "six_r", "--centre", "5000", "0", "0"), "within reach")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--centre", "5000", "0", "0"), "within reach")
     nowhere = said(capsys, "plan", "--arm", "six_r", "--test", "line", "--centre", "nan", "0", "0")
-    refused(nowhere, "finite numbers")
+    assert_rejected(nowhere, "finite numbers")
     assert "--speed" not in nowhere.err
-    refused(said(capsys, "plan", "--arm", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
-    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
-    refused(said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
-    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
-    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "rig.json", "no such file")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--test", "line", "--speed", "9999"), "lower --speed")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.txt"), "plan.txt", ".toml")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "plan.csv"), ".toml")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "none" / "plan.toml"), "no folder")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "rig.json", "no such file")
     assert "--test" in said(capsys, "plan", "--help").out
     assert "RUN|POSES.csv" in said(capsys, "--help").out
 
@@ -184,9 +184,11 @@ def test_a_plan_is_seen_by_the_cameras(tmp_path, capsys):
     assert share_seen() < 0.95  # else it would say nothing that all of it is seen:
     assert share_seen("--visible-in", tmp_path) == 1
     (tmp_path / "handeye.json").write_text("{}")
-    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_base_rig")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_base_rig")
     (tmp_path / "handeye.json").write_text(json.dumps(mounting | {"T_tool_body": [1, 2, 3]}))
-    refused(said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)")
+    assert_rejected(
+        said(capsys, "plan", "--arm", "six_r", "--visible-in", tmp_path), "handeye.json", "T_tool_body", "(4, 4)"
+    )
 
 
 def test_without_a_sigma_errors_have_no_interval(tmp_path, capsys):
@@ -213,46 +215,46 @@ def test_another_reports_page_is_not_written_over(tmp_path, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "report.html").write_text("another's")
     file = file_of(tmp_path / "c.csv", rows_of())
-    refused(said(capsys, file, "-o", tmp_path / "other"), "another command's report.html", "another folder")
+    assert_rejected(said(capsys, file, "-o", tmp_path / "other"), "another command's report.html", "another folder")
     assert (tmp_path / "other" / "report.html").read_text() == "another's"
 
 
 def test_paths_whose_path_points_differ(tmp_path, capsys):
     rows, bad = [row for row in rows_of() if row[0] == "path"], tmp_path / "bad.csv"
     moved = [[*row[:12], row[12] + 1e-3 * (row[1] == 4 and row[2] == 2), *row[13:]] for row in rows]
-    refused(said(capsys, file_of(bad, moved)), "path path", "same path points", "cycle 2")
+    assert_rejected(said(capsys, file_of(bad, moved)), "path path", "same path points", "cycle 2")
     exchanged = [[row[0], {3: 4, 4: 3}.get(row[1], row[1]) if row[2] == 1 else row[1], *row[2:]] for row in rows]
-    refused(said(capsys, file_of(bad, exchanged)), "same path points", "cycle 1")
-    refused(said(capsys, file_of(bad, rows[:-1])), "same path points", "19 rows")
+    assert_rejected(said(capsys, file_of(bad, exchanged)), "same path points", "cycle 1")
+    assert_rejected(said(capsys, file_of(bad, rows[:-1])), "same path points", "19 rows")
     still = [[*row[:12], 0.4 if row[1] in (4, 5, 6) else row[12], *row[13:]] for row in rows]
-    refused(said(capsys, file_of(bad, still)), "path path", "path point 6", "does not go on")
+    assert_rejected(said(capsys, file_of(bad, still)), "path path", "path point 6", "does not go on")
 
 
 def test_mistakes(tmp_path, capsys):
     assert said(capsys).code == 2
-    refused(said(capsys, tmp_path / "none.csv"), "none.csv", "no such file")
+    assert_rejected(said(capsys, tmp_path / "none.csv"), "none.csv", "no such file")
     good = rows_of()
-    refused(said(capsys, file_of(tmp_path / "a.csv", good), "--closed"), "--closed", "run's folder")
+    assert_rejected(said(capsys, file_of(tmp_path / "a.csv", good), "--closed"), "--closed", "run's folder")
     (tmp_path / "file").write_text("")
-    refused(said(capsys, tmp_path / "a.csv", "-o", tmp_path / "file"), "file", "no report")
+    assert_rejected(said(capsys, tmp_path / "a.csv", "-o", tmp_path / "file"), "file", "no report")
     bad = tmp_path / "bad.csv"
     file_of(bad, [["dance", *good[0][1:]]])
-    refused(said(capsys, bad), "line 2", "'dance'", "pose, path, circle")
+    assert_rejected(said(capsys, bad), "line 2", "'dance'", "pose, path, circle")
     file_of(bad, [[*good[0][:5], "x", *good[0][6:]]])
-    refused(said(capsys, bad), "line 2", "x_m")
+    assert_rejected(said(capsys, bad), "line 2", "x_m")
     file_of(bad, [[*good[0][:5], "nan", *good[0][6:]]])
-    refused(said(capsys, bad), "line 2", "x_m", "finite")
+    assert_rejected(said(capsys, bad), "line 2", "x_m", "finite")
     file_of(bad, good[:1])
-    refused(said(capsys, bad), "3 times", "repeatability")
+    assert_rejected(said(capsys, bad), "3 times", "repeatability")
     file_of(bad, [row for row in good if row[0] == "pose" and row[2] == 0])
-    refused(said(capsys, bad, "-o", tmp_path / "none"), "5 poses", "3 times")
+    assert_rejected(said(capsys, bad, "-o", tmp_path / "none"), "5 poses", "3 times")
     assert not (tmp_path / "none").exists()
     file_of(bad, [[*good[0][:8], 2, *good[0][9:]]] * 3)
-    refused(said(capsys, bad), "line 2", "quaternion")
+    assert_rejected(said(capsys, bad), "line 2", "quaternion")
     file_of(bad, [row for row in good if row[0] == "circle" and row[3] == 1])
-    refused(said(capsys, bad), "circle", "clockwise")
+    assert_rejected(said(capsys, bad), "circle", "clockwise")
     bad.write_text("pose,x_m\nP1,0\n")
-    refused(said(capsys, bad), "y_m", "missing")
+    assert_rejected(said(capsys, bad), "y_m", "missing")
 
 
 def changed(row, **entries):
@@ -277,7 +279,7 @@ def changed(row, **entries):
 )
 def test_what_no_arm_attains_is_rejected(tmp_path, capsys, change, parts):
     rows = [row for row in rows_of() if row[0] == "pose" and row[2] < 5]
-    refused(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *parts)
+    assert_rejected(said(capsys, file_of(tmp_path / "bad.csv", change(rows))), "bad.csv", *parts)
 
 
 def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp_path, capsys):
@@ -290,7 +292,7 @@ def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp
 
 def test_a_motion_file_is_distinguished_from_attained_poses(tmp_path, capsys):
     assert said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
-    refused(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
+    assert_rejected(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
 
 
 def test_a_row_far_from_its_pose_is_named_and_the_sequence_of_rows_has_no_effect(tmp_path, capsys):

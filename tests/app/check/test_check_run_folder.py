@@ -10,7 +10,7 @@ from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
 from armsight.app.check.run_folder import _reversal_times
-from cli_runs import Said, refused, run
+from cli_runs import Said, assert_rejected, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
 OFF_M = np.array([1.5e-3, -8e-4, 4e-4])
@@ -120,8 +120,10 @@ def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):
     assert all(p["count"] == 5 for p in closed["poses"].values())
     assert closed["poses"]["P1"]["AP_m"]["raw"] < 0.5 * true
     assert said(capsys, tmp_path / "report", "--json").code == 0  # its check.csv
-    refused(said(capsys, tmp_path, "-o", tmp_path), "holds a run", "another folder")
-    refused(said(capsys, tmp_path / "report", "-o", tmp_path / "report"), "check.csv", "read as well as written")
+    assert_rejected(said(capsys, tmp_path, "-o", tmp_path), "holds a run", "another folder")
+    assert_rejected(
+        said(capsys, tmp_path / "report", "-o", tmp_path / "report"), "check.csv", "read as well as written"
+    )
 
 
 def test_a_repeatability_below_the_noise(tmp_path, capsys, monkeypatch):
@@ -257,7 +259,7 @@ def test_circles_that_differ_are_no_pair(tmp_path, capsys):
     for mine, other in ((made.reference, lone.reference), (made.seen, lone.seen)):
         mine += [[late + row[0], *row[1:]] for row in other if row[-1] == "small cw cycle 1"]
     made.motions.append(("circle", "small cw cycle 1"))
-    refused(said(capsys, made.write()), "nothing can be evaluated", "ccw, followed too seldom (1)")
+    assert_rejected(said(capsys, made.write()), "nothing can be evaluated", "ccw, followed too seldom (1)")
 
 
 def test_visits_are_counted_by_pose_and_ways_over_all_rests(tmp_path, capsys):
@@ -317,11 +319,11 @@ def test_where_joints_reverse(tmp_path, capsys):
         assert reversal["jump_m"]["sigma"] < 5e-5
     assert "joint 2 at 180 deg, counter-clockwise" in said(capsys, tmp_path).out
     (tmp_path / "joints.csv").write_text("t_s\n1\n")
-    refused(said(capsys, tmp_path), "joints.csv", "q1_ref_rad")
+    assert_rejected(said(capsys, tmp_path), "joints.csv", "q1_ref_rad")
 
 
 def test_folders_that_cannot_be_evaluated(tmp_path, capsys):
-    refused(said(capsys, tmp_path), tmp_path, "no run", "reference.csv")
+    assert_rejected(said(capsys, tmp_path), tmp_path, "no run", "reference.csv")
     made = Folder(tmp_path)
     made.poses("open_loop", 1)
     circle(made, "open_loop")
@@ -330,12 +332,14 @@ def test_folders_that_cannot_be_evaluated(tmp_path, capsys):
     answer = said(capsys, whole, "--json")  # one cycle: of the poses nothing, of the circle all
     assert set(answer.lines[0]) == {"circle", "notes"}
     assert "left out: all poses, as none was attained 3 times" in answer.lines[0]["notes"]
-    refused(said(capsys, whole, "--closed"), "no motions with the loop closed")
+    assert_rejected(said(capsys, whole, "--closed"), "no motions with the loop closed")
     (whole / "motion.toml").write_text("motion = 3")
-    refused(said(capsys, whole), "motion.toml", "not a motion file")
+    assert_rejected(said(capsys, whole), "motion.toml", "not a motion file")
     made = Folder(tmp_path)
     made.poses("open_loop", 1)
-    refused(said(capsys, made.write(), "-o", tmp_path / "report"), "5 poses", "no repeatability", "armsight check plan")
+    assert_rejected(
+        said(capsys, made.write(), "-o", tmp_path / "report"), "5 poses", "no repeatability", "armsight check plan"
+    )
     assert not (tmp_path / "report").exists()
     lines = (tmp_path / "vision.csv").read_text().splitlines()
     for bad, parts in (
@@ -346,13 +350,13 @@ def test_folders_that_cannot_be_evaluated(tmp_path, capsys):
     ):
         first = "line 1" in parts
         (tmp_path / "vision.csv").write_text("\n".join([bad, *lines[1:]] if first else [lines[0], bad, *lines[2:]]))
-        refused(said(capsys, tmp_path), "vision.csv", *parts)
+        assert_rejected(said(capsys, tmp_path), "vision.csv", *parts)
     (tmp_path / "vision.csv").write_text("\n".join([*lines[:4], lines[2], *lines[4:]]))
-    refused(said(capsys, tmp_path), "vision.csv", "line 5", "times must rise")
+    assert_rejected(said(capsys, tmp_path), "vision.csv", "line 5", "times must rise")
     (tmp_path / "vision.csv").write_text(lines[0] + "\n")
-    refused(said(capsys, tmp_path), "vision.csv", "no rows")
+    assert_rejected(said(capsys, tmp_path), "vision.csv", "no rows")
     (tmp_path / "vision.csv").write_text("\n".join(lines[:3]))
-    refused(said(capsys, tmp_path), "hardly seen")
+    assert_rejected(said(capsys, tmp_path), "hardly seen")
 
 
 def test_json_has_no_nan(tmp_path, capsys):

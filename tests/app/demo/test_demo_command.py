@@ -14,7 +14,7 @@ from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
 from armsight.sim.workcell.cameras import open_timing
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 SHORT = """
 [[motion]]
@@ -231,5 +231,5 @@ def test_an_arm_model_that_cannot_be_read_leaves_nothing_behind(armsight, tmp_pa
         ("lost.toml", "lost.toml"),
         ("lost.urdf", "lost.urdf"),
     ):
-        refused(armsight("demo", "--nominal-arm", tmp_path / name, "-o", tmp_path / "run"), said)
+        assert_rejected(armsight("demo", "--nominal-arm", tmp_path / name, "-o", tmp_path / "run"), said)
         assert not (tmp_path / "run").exists()

@@ -80,7 +80,7 @@ def test_a_study_changes_what_it_names_and_nothing_else(by_law, name):
 @pytest.mark.parametrize("name", POWERS)
 def test_the_measured_error_is_that_of_the_law_and_misses_are_counted(by_law, name):
     study = by_law[0][name]
-    # 396 shots of two errors each tell a deviation to 1 / sqrt(4 * 396) = 2.5 %.
+    # 396 shots of two errors each determine a deviation to 1 / sqrt(4 * 396) = 2.5 %.
     np.testing.assert_allclose(study.position_rms_m, study.predicted_m, rtol=5 * 0.025)
     assert study.missed.tolist() == [4] * len(study.values)
 

@@ -1,4 +1,4 @@
-"""``armsight dense`` as a user types it: files, figures, and what is said about mistakes."""
+"""``armsight dense`` as a user types it: files, numbers, and what is said about mistakes."""
 
 import shutil
 
@@ -13,7 +13,7 @@ from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense.methods import METHODS
 from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
-from cli_runs import Said, refused, run
+from cli_runs import Said, assert_rejected, run
 
 pytestmark = pytest.mark.opencv
 
@@ -47,7 +47,7 @@ def flat(tmp_path):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_pair_in_standard_form(dense, flat, tmp_path, method):
+def test_a_rectified_pair(dense, flat, tmp_path, method):
     left, right, truth = flat
     out = tmp_path / "out"
     said = dense("--rectified", "--max-disparity", 32, left, right, "--method", method, "-o", out, "--json")
@@ -80,7 +80,7 @@ def test_floats_are_read_as_grey_levels(dense, flat, tmp_path):
     assert np.median(np.abs(read_pfm(out / "disparity.pfm") - truth)) < 0.1
 
 
-def test_people_are_told_how_much_is_measured(dense, flat, tmp_path):
+def test_the_text_says_how_much_is_measured(dense, flat, tmp_path):
     said = dense(*flat[:2], "--rectified", "--max-disparity", 32, "-o", tmp_path / "out")
     assert said.code == 0
     for word in ("% measured", "hidden", "filled", "written to"):
@@ -97,22 +97,22 @@ def test_every_mistake_is_one_line(dense, flat, tmp_path):
     floats = image.astype(np.float32)
     floats[3, 4] = np.nan
     cv2.imwrite(str(tmp_path / "nan.tiff"), floats)
-    refused(dense(*ready, right, left, *out), "exchanged", "right.png, ", "left.png")
-    refused(dense(*ready, left, tmp_path / "shifted.png", *out), "not in standard form", "px", "shifted.png")
-    refused(dense(*ready, left, tmp_path / "small.png", *out), "320x200", "320x198", "small.png")
-    refused(dense(*ready, left, tmp_path / "nan.tiff", *out), "nan.tiff", "1 values are NaN")
-    refused(dense(*ready, "--source", tmp_path / "nowhere", *out), "nowhere", "not a source")
-    refused(dense("--rectified", "--max-disparity", 321, left, right, *out), "outside the image")
-    refused(dense("--rectified", "--max-disparity", 0, left, right, *out), "outside the image")
-    refused(dense("--rectified", left, right, *out), "--max-disparity")
-    refused(dense(*ready, left, *out), "LEFT RIGHT")
-    refused(dense(*ready, left, tmp_path / "none.png", *out), "none.png", "no such file")
-    refused(dense(left, right, *out), "RIG.json LEFT RIGHT")
-    refused(dense(left, left, right, *out), "left.png")
-    refused(dense(*ready, "--near", 0.5, left, right, *out), "--near")
-    refused(dense(*ready, left, right, "-o", left), "folder")
-    refused(dense(*ready, left, right, "-o", left / "in"), "folder")
-    refused(dense("evaluate", tmp_path, *out), "neither a scene nor a folder of scenes")
+    assert_rejected(dense(*ready, right, left, *out), "exchanged", "right.png, ", "left.png")
+    assert_rejected(dense(*ready, left, tmp_path / "shifted.png", *out), "not rectified", "px", "shifted.png")
+    assert_rejected(dense(*ready, left, tmp_path / "small.png", *out), "320x200", "320x198", "small.png")
+    assert_rejected(dense(*ready, left, tmp_path / "nan.tiff", *out), "nan.tiff", "1 values are NaN")
+    assert_rejected(dense(*ready, "--source", tmp_path / "nowhere", *out), "nowhere", "not a source")
+    assert_rejected(dense("--rectified", "--max-disparity", 321, left, right, *out), "outside the image")
+    assert_rejected(dense("--rectified", "--max-disparity", 0, left, right, *out), "outside the image")
+    assert_rejected(dense("--rectified", left, right, *out), "--max-disparity")
+    assert_rejected(dense(*ready, left, *out), "LEFT RIGHT")
+    assert_rejected(dense(*ready, left, tmp_path / "none.png", *out), "none.png", "no such file")
+    assert_rejected(dense(left, right, *out), "RIG.json LEFT RIGHT")
+    assert_rejected(dense(left, left, right, *out), "left.png")
+    assert_rejected(dense(*ready, "--near", 0.5, left, right, *out), "--near")
+    assert_rejected(dense(*ready, left, right, "-o", left), "folder")
+    assert_rejected(dense(*ready, left, right, "-o", left / "in"), "folder")
+    assert_rejected(dense("evaluate", tmp_path, *out), "neither a scene nor a folder of scenes")
     assert not (tmp_path / "out").exists()
 
 
@@ -137,10 +137,10 @@ def seen(tmp_path_factory):
     rng = np.random.default_rng(0)
     wall = box(np.array([4.0, 4.0, 0.02]), grain_m=0.08, seed=1)
     near = box(np.array([0.25, 0.2, 0.1]), grain_m=0.03, seed=2)
-    placed = [(wall, pose(exp_so3(np.array([0.1, 0.2, 0.0])), np.array([0, 0, 1.6])))]
-    placed.append((near, pose(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.05, 0.0, 0.9]))))
+    posed = [(wall, pose(exp_so3(np.array([0.1, 0.2, 0.0])), np.array([0, 0, 1.6])))]
+    posed.append((near, pose(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.05, 0.0, 0.9]))))
     for name, camera, T in (("left", rig.left, np.eye(4)), ("right", rig.right, inverse(rig.T_left_right))):
-        image, depth, _ = see(camera, [(s, T @ P) for s, P in placed])
+        image, depth, _ = see(camera, [(s, T @ P) for s, P in posed])
         cv2.imwrite(str(folder / f"{name}_00.png"), with_noise(image, 1.0, rng))
         if name == "left":
             truth = depth
@@ -203,14 +203,14 @@ def test_a_sequence_is_one_folder_a_shot(dense, seen, tmp_path):
     assert (tmp_path / "out" / first["shot"] / "cloud.ply").is_file()
 
 
-def test_a_depth_too_near_is_told(dense, seen, tmp_path):
+def test_a_depth_too_near_is_reported(dense, seen, tmp_path):
     folder, _, _ = seen
     pair = folder / "left_00.png", folder / "right_00.png"
-    refused(dense(folder / "rig.json", *pair, "--near", 0.05, "-o", tmp_path / "out"), "--near", "outside")
-    refused(dense(folder / "rig.json", *pair[::-1], "-o", tmp_path / "out"), "by the rig")
+    assert_rejected(dense(folder / "rig.json", *pair, "--near", 0.05, "-o", tmp_path / "out"), "--near", "outside")
+    assert_rejected(dense(folder / "rig.json", *pair[::-1], "-o", tmp_path / "out"), "by the rig")
 
 
-def test_evaluation_has_every_method_and_figure(dense, flat, tmp_path):
+def test_evaluation_has_every_method_and_metric(dense, flat, tmp_path):
     left, right, truth = flat
     scene = tmp_path / "scenes" / "Wall"
     scene.mkdir(parents=True)
@@ -237,4 +237,4 @@ def test_evaluation_has_every_method_and_figure(dense, flat, tmp_path):
     text = dense("evaluate", scene, "--method", "block").out
     assert "bad-0.5" in text
     assert "block" in text
-    refused(dense("evaluate", tmp_path / "nothing"), "no such folder")
+    assert_rejected(dense("evaluate", tmp_path / "nothing"), "no such folder")

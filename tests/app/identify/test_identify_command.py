@@ -16,7 +16,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm, read_arm_toml
-from cli_runs import Said, refused, run
+from cli_runs import Said, assert_rejected, run
 
 
 def said(capsys, *arguments):
@@ -100,8 +100,8 @@ def test_plan(tmp_path, capsys):
     assert len(found["q_rad"]) == 5
     assert (np.diff(found["sigma_m"]) < 0).all()
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6
-    refused(said(capsys, "plan", "--arm", "six_r", "--rig", tmp_path / "rig.json"), "--data")
-    refused(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.toml"), "plan.toml", ".csv")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "--rig", tmp_path / "rig.json"), "--data")
+    assert_rejected(said(capsys, "plan", "--arm", "six_r", "-o", tmp_path / "plan.toml"), "plan.toml", ".csv")
     printed = said(capsys, "plan", "--arm", "six_r", "-n", "5", "-o", tmp_path / "plan.csv").out
     for q in np.degrees(found["q_rad"]):
         assert all(f"{v:.2f}" in printed for v in q)
@@ -120,7 +120,7 @@ def test_plan(tmp_path, capsys):
 def test_columns_that_are_missing_are_named(tmp_path, capsys, header, rows, parts):
     path = tmp_path / "bad.csv"
     path.write_text("\n".join([header, *rows]) + "\n")
-    refused(said(capsys, "--arm", "six_r", "--data", path), "bad.csv", *parts)
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "bad.csv", *parts)
 
 
 def test_an_entry_that_is_no_number_is_named(tmp_path, capsys):
@@ -128,7 +128,7 @@ def test_an_entry_that_is_no_number_is_named(tmp_path, capsys):
     lines = path.read_text().splitlines()
     lines[4] = "x" + lines[4]
     path.write_text("\n".join(lines))
-    refused(said(capsys, "--arm", "six_r", "--data", path), "line 5", "q1_rad")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "line 5", "q1_rad")
 
 
 def test_degrees_under_the_name_of_radians_are_reported(tmp_path, capsys):
@@ -137,17 +137,17 @@ def test_degrees_under_the_name_of_radians_are_reported(tmp_path, capsys):
     for row in rows[1:]:
         row[:6] = [str(np.degrees(float(entry))) for entry in row[:6]]
     path.write_text("\n".join(",".join(row) for row in rows))
-    refused(said(capsys, "--arm", "six_r", "--data", path), "degrees", "q1_deg")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "degrees", "q1_deg")
 
 
 def test_mistakes_at_the_command_line(tmp_path, capsys):
     data = poses_csv(tmp_path / "p.csv")
-    refused(said(capsys, "--data", data), "--arm")
-    refused(said(capsys, "--arm", "six_rr", "--data", data), "six_rr", "six_r, puma560")
-    refused(said(capsys, "--arm", "six_r", "--data", tmp_path / "none.csv"), "none.csv", "no such file")
-    refused(said(capsys, "--arm", "six_r", "--data", data, "--prior", "a2"), "NAME=SIGMA")
-    refused(said(capsys, "--arm", "six_r", "--data", data, "--prior", "b2=1"), "b2")
-    refused(said(capsys, "--arm", "six_r", "--data", poses_csv(tmp_path / "few.csv", n=4)), "4 poses", "6")
+    assert_rejected(said(capsys, "--data", data), "--arm")
+    assert_rejected(said(capsys, "--arm", "six_rr", "--data", data), "six_rr", "six_r, puma560")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", tmp_path / "none.csv"), "none.csv", "no such file")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--prior", "a2"), "NAME=SIGMA")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--prior", "b2=1"), "b2")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", poses_csv(tmp_path / "few.csv", n=4)), "4 poses", "6")
 
 
 def test_fewer_numbers_than_parameters_are_said_and_still_fitted(tmp_path, capsys):
@@ -178,24 +178,24 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
         row[1] = str(-float(row[1]))
     other.write_text("\n".join(",".join(row) for row in rows))
     parts = ("to validate with", "the sign is turned of joint 2")
-    refused(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
 
 
 def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):
     few, there = poses_csv(tmp_path / "few.csv", n=4), tmp_path / "there"
-    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / "deep"), "4 poses")
     assert not (tmp_path / "new").exists()
     there.mkdir()
-    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", there), "4 poses")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", few, "-o", there), "4 poses")
     assert there.is_dir()
-    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", few), "cannot be made")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", few, "-o", few), "cannot be made")
     empty = tmp_path / "empty"
     empty.mkdir()
     # A name too long, and a file in the way, come up only after the folder before them is made.
     for out in (tmp_path / "new" / "deep" / ("x" * 300), tmp_path / "new" / ".." / "few.csv" / "deep"):
-        refused(said(capsys, "--arm", "six_r", "--data", few, "-o", out), "cannot be made")
+        assert_rejected(said(capsys, "--arm", "six_r", "--data", few, "-o", out), "cannot be made")
         assert not (tmp_path / "new").exists()
-    refused(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / ".." / "empty"), "4 poses")
+    assert_rejected(said(capsys, "--arm", "six_r", "--data", few, "-o", tmp_path / "new" / ".." / "empty"), "4 poses")
     assert not (tmp_path / "new").exists()
     assert empty.is_dir()
 
@@ -214,7 +214,7 @@ def test_what_is_wrong_in_an_arm_file_is_reported(tmp_path, capsys, change, part
     path = arm_toml(tmp_path / "arm.toml", open_arm("six_r"))
     path.write_text(change(path.read_text()))
     data = poses_csv(tmp_path / "p.csv")
-    refused(said(capsys, "--arm", path, "--data", data), "arm.toml", *parts)
+    assert_rejected(said(capsys, "--arm", path, "--data", data), "arm.toml", *parts)
 
 
 def test_an_arm_file_is_the_arm(tmp_path):

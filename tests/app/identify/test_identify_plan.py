@@ -13,7 +13,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
-from cli_runs import Said, refused, run
+from cli_runs import Said, assert_rejected, run
 
 T_FLANGE_BODY = exp_se3(np.array([0.02, -0.01, 0.05, 0.1, 0.2, -0.3]))
 
@@ -97,12 +97,12 @@ def said(capsys, *arguments):
 
 
 def test_poses_that_cannot_locate_the_arm_are_rejected_as_identify_rejects_them(tmp_path, capsys):
-    refused(said(capsys, "--data", poses_csv(tmp_path / "few.csv", n=5)), "5 poses are fewer than 6")
+    assert_rejected(said(capsys, "--data", poses_csv(tmp_path / "few.csv", n=5)), "5 poses are fewer than 6")
     path = poses_csv(tmp_path / "alike.csv")
     with path.open() as file:
         head, first, *rest = list(csv.reader(file))
     path.write_text("\n".join(",".join(row) for row in [head, first, *(first[:6] + row[6:] for row in rest)]))
-    refused(said(capsys, "--data", path), "the poses are too alike")
+    assert_rejected(said(capsys, "--data", path), "the poses are too alike")
     exchanged = [head, *(row[1::-1] + row[2:] for row in [first, *rest])]
     path.write_text("\n".join(",".join(row) for row in exchanged))
-    refused(said(capsys, "--data", path), "order is q2, q1")
+    assert_rejected(said(capsys, "--data", path), "order is q2, q1")

@@ -18,7 +18,7 @@ from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 pytestmark = pytest.mark.opencv
 
@@ -29,11 +29,21 @@ KEYS = {
 
 
 @pytest.fixture(scope="module")
-def measured(bench, tmp_path_factory):
+def measured(rendered, tmp_path_factory):
     """The arm's recording measured once, as a program reads it: JSON lines and the CSV."""
     out = tmp_path_factory.mktemp("measured") / "poses.csv"
     script = "from armsight.app.main import main; main()"
-    arguments = ["measure", bench.rig, "--target", bench.plate, "--source", bench.folder / "arm", "--json", "-o", out]
+    arguments = [
+        "measure",
+        rendered.rig,
+        "--target",
+        rendered.plate,
+        "--source",
+        rendered.folder / "arm",
+        "--json",
+        "-o",
+        out,
+    ]
     done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -45,10 +55,10 @@ def measured(bench, tmp_path_factory):
         return records, list(csv.DictReader(file)), done.stderr
 
 
-def tangents(bench, records):
+def tangents(rendered, records):
     """Errors (N, 6) and covariances (N, 6, 6) in the body's axes."""
     errors, covs = [], []
-    for record, true in zip(records, bench.of_arm.Ts_left_body, strict=True):
+    for record, true in zip(records, rendered.of_arm.Ts_left_body, strict=True):
         w, x, y, z = record["quaternion_wxyz"]
         T = pose(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(record["position_m"]))
         errors.append(log_se3(inverse(T) @ true))
@@ -56,12 +66,12 @@ def tangents(bench, records):
     return np.array(errors), np.array(covs)
 
 
-def test_every_shot_is_measured_within_its_uncertainty(bench, measured):
+def test_every_shot_is_measured_within_its_uncertainty(rendered, measured):
     records, _, complained = measured
-    assert [r["shot"] for r in records] == list(bench.of_arm.shots)
+    assert [r["shot"] for r in records] == list(rendered.of_arm.shots)
     assert {r["status"] for r in records} == {"ok"}
     assert "measured 16 of 16 shots" in complained
-    errors, covs = tangents(bench, records)
+    errors, covs = tangents(rendered, records)
     sigma = np.sqrt(np.einsum("nii->ni", covs))
     assert (np.abs(errors) < 4 * sigma).all(), np.abs(errors / sigma).max(axis=0)
     nees = np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, covs, strict=True)])
@@ -71,8 +81,8 @@ def test_every_shot_is_measured_within_its_uncertainty(bench, measured):
     assert low < nees.mean() < high, nees
 
 
-def test_a_record_has_what_was_promised(bench, measured):
-    body = open_body(str(bench.plate))
+def test_a_record_has_what_was_promised(rendered, measured):
+    body = open_body(str(rendered.plate))
     for record in measured[0]:
         assert set(record) >= KEYS
         assert record["reason"] is None
@@ -115,20 +125,20 @@ def test_the_csv_says_the_same(measured):
 
 
 @pytest.fixture
-def arm(bench, tmp_path):
+def arm(rendered, tmp_path):
     """A folder of its own with three shots of the arm, to be spoilt."""
     folder = tmp_path / "arm"
     folder.mkdir()
     for n in (0, 5, 10):
         for side in ("left", "right"):
-            shutil.copy(bench.folder / "arm" / f"{side}{n:03d}.png", folder)
+            shutil.copy(rendered.folder / "arm" / f"{side}{n:03d}.png", folder)
     return folder
 
 
 @pytest.fixture
-def start(bench):
+def start(rendered):
     """How every measurement of the arm begins."""
-    return "measure", bench.rig, "--target", bench.plate
+    return "measure", rendered.rig, "--target", rendered.plate
 
 
 def images(folder):
@@ -143,10 +153,10 @@ def test_people_read_millimetres_and_a_sigma(start, arm, armsight):
     assert said.err.startswith("measured 3 of 3 shots")
 
 
-def test_a_board_is_a_target(bench, armsight):
-    said = armsight("measure", bench.rig, "--target", "chessboard:9x6:25mm", *bench.images("board"), "--json")
+def test_a_board_is_a_target(rendered, armsight):
+    said = armsight("measure", rendered.rig, "--target", "chessboard:9x6:25mm", *rendered.images("board"), "--json")
     assert said.code == 0, said.err
-    for record, true in zip(said.lines, bench.of_board.Ts_left_body, strict=True):
+    for record, true in zip(said.lines, rendered.of_board.Ts_left_body, strict=True):
         gap = np.array(record["position_m"]) - true[:3, 3]
         assert gap @ np.linalg.solve(np.array(record["covariance"])[:3, :3], gap) < chi2.ppf(1 - 1e-5, 3)
 
@@ -160,7 +170,7 @@ def test_a_shot_that_cannot_be_read_is_missed_and_the_rest_measured(start, arm, 
     if what == "missing":
         path.unlink()
         path.mkdir()  # the name is there, a file is not: a glob of files does not see it
-        refused(armsight(*start, *images(arm)), "do not pair up")
+        assert_rejected(armsight(*start, *images(arm)), "do not pair up")
         return
     if what == "another size":
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
@@ -178,8 +188,8 @@ def test_a_shot_that_cannot_be_read_is_missed_and_the_rest_measured(start, arm, 
         assert [row["status"] for row in csv.DictReader(file)] == ["ok", "missed", "ok"]
 
 
-def test_nothing_in_view_is_an_error_after_its_lines(start, bench, armsight):
-    said = armsight(*start, *bench.images("board"))
+def test_nothing_in_view_is_an_error_after_its_lines(start, rendered, armsight):
+    said = armsight(*start, *rendered.images("board"))
     assert said.code == 2
     assert len(said.out.splitlines()) == 12
     assert all(": missed: " in line for line in said.out.splitlines())
@@ -197,15 +207,15 @@ def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
 def test_a_rig_of_another_image_size(start, arm, armsight):
     for path in arm.glob("*.png"):
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
-    refused(armsight(*start, *images(arm)), "320x180", "640x360", "rig.json")
+    assert_rejected(armsight(*start, *images(arm)), "320x180", "640x360", "rig.json")
 
 
 def test_an_empty_glob(start, tmp_path, armsight):
-    refused(armsight(*start, *images(tmp_path)), "left*.png", "no such file")
+    assert_rejected(armsight(*start, *images(tmp_path)), "left*.png", "no such file")
 
 
 def test_a_missing_source(start, tmp_path, armsight):
-    refused(armsight(*start, "--source", tmp_path / "nowhere"), "nowhere")
+    assert_rejected(armsight(*start, "--source", tmp_path / "nowhere"), "nowhere")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +229,7 @@ def test_a_missing_source(start, tmp_path, armsight):
     ],
 )
 def test_shots_given_no_way_or_two(start, armsight, options):
-    refused(armsight(*start, *options), "give the shots one way")
+    assert_rejected(armsight(*start, *options), "give the shots one way")
 
 
 @pytest.mark.parametrize(
@@ -233,38 +243,40 @@ def test_shots_given_no_way_or_two(start, armsight, options):
         (b"\xff\xfe\x00", "not a text file"),
     ],
 )
-def test_a_damaged_rig(bench, arm, tmp_path, armsight, text, said):
+def test_a_damaged_rig(rendered, arm, tmp_path, armsight, text, said):
     path = tmp_path / "rig.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, said)
+    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, said)
 
 
-def test_half_a_rig_and_a_newer_one_and_one_with_nan(bench, arm, tmp_path, armsight):
-    path, text = tmp_path / "rig.json", bench.rig.read_text()
+def test_half_a_rig_and_a_newer_one_and_one_with_nan(rendered, arm, tmp_path, armsight):
+    path, text = tmp_path / "rig.json", rendered.rig.read_text()
     path.write_text(text[: len(text) // 2])
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "not JSON")
+    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "not JSON")
     document = json.loads(text)
     path.write_text(json.dumps({**document, "version": 99}))
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "version 99", "update armsight")
+    assert_rejected(
+        armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "version 99", "update armsight"
+    )
     path.write_text(json.dumps({**document, "sigma_px": math.nan}))
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path)
+    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path)
     path.unlink()
-    refused(armsight("measure", path, "--target", bench.plate, *images(arm)), path, "no such file")
+    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "no such file")
 
 
 @pytest.mark.parametrize("target", ["", "plate", "nowhere.toml", "nowhere.csv", "chessboard:9x6", "tag:1:2"])
-def test_a_target_that_is_none(bench, arm, armsight, target):
-    refused(armsight("measure", bench.rig, "--target", target, *images(arm)))
+def test_a_target_that_is_none(rendered, arm, armsight, target):
+    assert_rejected(armsight("measure", rendered.rig, "--target", target, *images(arm)))
 
 
-def test_a_csv_body_cannot_be_found_in_images(bench, arm, tmp_path, armsight):
-    save_body_csv(open_body(str(bench.plate)), tmp_path / "plate.csv")
-    refused(armsight("measure", bench.rig, "--target", tmp_path / "plate.csv", *images(arm)), "--detections")
+def test_a_csv_body_cannot_be_found_in_images(rendered, arm, tmp_path, armsight):
+    save_body_csv(open_body(str(rendered.plate)), tmp_path / "plate.csv")
+    assert_rejected(armsight("measure", rendered.rig, "--target", tmp_path / "plate.csv", *images(arm)), "--detections")
 
 
 def test_no_folder_for_the_result(start, arm, tmp_path, armsight):
     out = tmp_path / "nowhere" / "poses.csv"
-    refused(armsight(*start, *images(arm), "-o", out), out, "there is no folder")
+    assert_rejected(armsight(*start, *images(arm), "-o", out), out, "there is no folder")
 
 
 def test_a_full_disk(start, arm, armsight, full_disk):
@@ -280,13 +292,13 @@ def test_a_full_disk(start, arm, armsight, full_disk):
 
 
 @pytest.fixture
-def seen(bench, tmp_path):
+def seen(rendered, tmp_path):
     """The plate's corners as a CSV body and their true pixels in two shots; shot 9 has only two."""
-    body = open_body(str(bench.plate))
+    body = open_body(str(rendered.plate))
     save_body_csv(body, tmp_path / "plate.csv")
-    rig, lines = StereoRig.load(bench.rig), ["shot,camera,marker,u_px,v_px"]
+    rig, lines = StereoRig.load(rendered.rig), ["shot,camera,marker,u_px,v_px"]
     for shot, names in (("3", 16), ("7", 16), ("9", 2)):
-        T = bench.of_arm.Ts_left_body[int(shot)]
+        T = rendered.of_arm.Ts_left_body[int(shot)]
         p = body.points[:names] @ T[:3, :3].T + T[:3, 3]
         T_right_left = inverse(rig.T_left_right)
         for side, camera, q in (("left", rig.left, p), ("right", rig.right, transform(T_right_left, p))):
@@ -296,18 +308,18 @@ def seen(bench, tmp_path):
     return tmp_path
 
 
-def by_detections(bench, folder):
-    return "measure", bench.rig, "--target", folder / "plate.csv", "--detections", folder / "d.csv"
+def by_detections(rendered, folder):
+    return "measure", rendered.rig, "--target", folder / "plate.csv", "--detections", folder / "d.csv"
 
 
-def test_detections_are_measured_and_too_few_points_missed(bench, seen, armsight):
-    said = armsight(*by_detections(bench, seen), "--json")
+def test_detections_are_measured_and_too_few_points_missed(rendered, seen, armsight):
+    said = armsight(*by_detections(rendered, seen), "--json")
     assert said.code == 0, said.err
     assert [(r["shot"], r["status"]) for r in said.lines] == [("3", "ok"), ("7", "ok"), ("9", "missed")]
     assert "2" in said.lines[2]["reason"]
     for record in said.lines[:2]:
         # Pixels are written to a millionth: 1e-6 px is below a nanometre here, three decimals of room.
-        assert record["position_m"] == pytest.approx(bench.of_arm.Ts_left_body[int(record["shot"])][:3, 3], abs=1e-6)
+        assert record["position_m"] == pytest.approx(rendered.of_arm.Ts_left_body[int(record["shot"])][:3, 3], abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -323,16 +335,16 @@ def test_detections_are_measured_and_too_few_points_missed(bench, seen, armsight
         ("plate.csv", "x_m", "left_m", "line 1"),
     ],
 )
-def test_a_wrong_line_in_a_table(bench, seen, armsight, file, old, new, said):
+def test_a_wrong_line_in_a_table(rendered, seen, armsight, file, old, new, said):
     text = (seen / file).read_text()
     assert old in text
     (seen / file).write_text(text.replace(old, new, 1))
-    result = armsight(*by_detections(bench, seen), "-o", seen / "poses.csv")
-    refused(result, seen / file, said)
+    result = armsight(*by_detections(rendered, seen), "-o", seen / "poses.csv")
+    assert_rejected(result, seen / file, said)
     assert not (seen / "poses.csv").exists()
 
 
 @pytest.mark.parametrize("text", ["", "shot,camera,marker,u_px,v_px\n"])
-def test_empty_tables(bench, seen, armsight, text):
+def test_empty_tables(rendered, seen, armsight, text):
     (seen / "d.csv").write_text(text)
-    refused(armsight(*by_detections(bench, seen)), seen / "d.csv")
+    assert_rejected(armsight(*by_detections(rendered, seen)), seen / "d.csv")

@@ -33,7 +33,7 @@ from armsight.vision.discs.bias import expect
 from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
-from cli_runs import refused
+from cli_runs import assert_rejected
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 
 pytestmark = pytest.mark.opencv
@@ -322,9 +322,9 @@ def test_a_chart_of_any_run(records):
 
 
 @pytest.fixture
-def start(bench):
+def start(rendered):
     """How every measurement of the arm begins."""
-    return "measure", bench.rig, "--target", bench.plate
+    return "measure", rendered.rig, "--target", rendered.plate
 
 
 def images(folder):
@@ -332,13 +332,13 @@ def images(folder):
 
 
 @pytest.fixture
-def arm(bench, tmp_path):
+def arm(rendered, tmp_path):
     """Two shots of the arm."""
     folder = tmp_path / "arm"
     folder.mkdir()
     for n in (0, 5):
         for side in ("left", "right"):
-            (folder / f"{side}{n:03d}.png").symlink_to(bench.folder / "arm" / f"{side}{n:03d}.png")
+            (folder / f"{side}{n:03d}.png").symlink_to(rendered.folder / "arm" / f"{side}{n:03d}.png")
     return folder
 
 
@@ -363,15 +363,15 @@ def test_every_shot_has_its_picture_and_foreign_files_stay(start, arm, armsight,
         assert picture.std() > 1
 
 
-def test_nothing_measured_has_pictures_too(bench, start, armsight, tmp_path):
-    where = f"{bench.folder}/board/left00[01].png", f"{bench.folder}/board/right00[01].png"
+def test_nothing_measured_has_pictures_too(rendered, start, armsight, tmp_path):
+    where = f"{rendered.folder}/board/left00[01].png", f"{rendered.folder}/board/right00[01].png"
     said = armsight(*start, "--left", where[0], "--right", where[1], "--view", tmp_path / "v")
     assert said.code == 2
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-left000.png", "view-left001.png"}
 
 
-def test_detections_are_shown_on_empty_images(bench, start, armsight, tmp_path):
-    rig, body, T = StereoRig.load(bench.rig), open_body(str(bench.plate)), bench.of_arm.Ts_left_body[3]
+def test_detections_are_shown_on_empty_images(rendered, start, armsight, tmp_path):
+    rig, body, T = StereoRig.load(rendered.rig), open_body(str(rendered.plate)), rendered.of_arm.Ts_left_body[3]
     lines = ["shot,camera,marker,u_px,v_px"]
     for side, camera, to in zip(SIDES, rig.cameras, (T, inverse(rig.T_left_right) @ T), strict=True):
         for name, (u, v) in zip(body.point_names, camera.project(transform(to, body.points)), strict=True):
@@ -404,14 +404,16 @@ def test_an_interrupt_keeps_the_pictures(start, arm, armsight, tmp_path, monkeyp
 
 def test_without_matplotlib_nothing_is_begun(start, arm, armsight, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    refused(armsight(*start, *images(arm), "--view", tmp_path / "v"), "pip install", "armsight[report]", "--view")
+    assert_rejected(
+        armsight(*start, *images(arm), "--view", tmp_path / "v"), "pip install", "armsight[report]", "--view"
+    )
     assert not (tmp_path / "v").exists()
 
 
 def test_a_folder_that_cannot_be(start, arm, armsight, tmp_path):
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "v"):
-        refused(armsight(*start, *images(arm), "--view", folder), folder, "no pictures can be written here")
+        assert_rejected(armsight(*start, *images(arm), "--view", folder), folder, "no pictures can be written here")
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -425,7 +427,7 @@ def test_a_folder_without_leave_to_write(tmp_path, monkeypatch):
 
 
 def test_the_poses_may_not_be_the_chart(start, arm, armsight, tmp_path):
-    refused(armsight(*start, *images(arm), "--view", tmp_path, "-o", tmp_path / CHART), CHART, "given twice")
+    assert_rejected(armsight(*start, *images(arm), "--view", tmp_path, "-o", tmp_path / CHART), CHART, "given twice")
 
 
 def test_a_full_disk_leaves_nothing_by_half(start, arm, armsight, full_disk):

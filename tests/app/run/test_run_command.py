@@ -10,7 +10,7 @@ import pytest
 from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import command
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 MOTION = """
 [[motion]]
@@ -57,7 +57,7 @@ def test_the_workcell_by_name_is_run_as_devices_are(armsight, files, tmp_path, m
 )
 def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, board):
     said = armsight(*arguments(files, tmp_path / "run", source=source, board=board))
-    refused(said, f"--source {source} --board {board}", "go together")
+    assert_rejected(said, f"--source {source} --board {board}", "go together")
 
 
 @pytest.mark.parametrize(
@@ -73,27 +73,27 @@ def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, boar
     ],
 )
 def test_what_is_not_there_is_named(armsight, files, tmp_path, given, said):
-    refused(armsight(*arguments(files, tmp_path / "run", **given)), *said)
+    assert_rejected(armsight(*arguments(files, tmp_path / "run", **given)), *said)
 
 
 def test_a_rig_that_was_never_calibrated(armsight, files, tmp_path):
     rig = json.loads((files / "rig.json").read_text())
     (tmp_path / "half.json").write_text(json.dumps({key: rig[key] for key in list(rig)[:2]}))
     said = armsight(*arguments(files, tmp_path / "run", rig=tmp_path / "half.json"))
-    refused(said, "half.json")
+    assert_rejected(said, "half.json")
 
 
 def test_another_arm_than_the_boards(armsight, files, tmp_path):
     (tmp_path / "far.toml").write_text("start_deg = [40, 0, 0, 0, -90, 0]\n" + MOTION)
     said = armsight(*arguments(files, tmp_path / "run", "--motion", tmp_path / "far.toml"))
-    refused(said, "joint 1 reads", "the motion starts at 40.0", "--arm six_r")
+    assert_rejected(said, "joint 1 reads", "the motion starts at 40.0", "--arm six_r")
 
 
 def test_a_run_where_a_file_stands_and_one_over_a_strangers_shots(armsight, files, tmp_path):
     (tmp_path / "run").write_text("mine")
-    refused(armsight(*arguments(files, tmp_path / "run")), tmp_path / "run")
+    assert_rejected(armsight(*arguments(files, tmp_path / "run")), tmp_path / "run")
     (tmp_path / "other" / "shots").mkdir(parents=True)
-    refused(armsight(*arguments(files, tmp_path / "other")), "holds shots that are not of an earlier run")
+    assert_rejected(armsight(*arguments(files, tmp_path / "other")), "holds shots that are not of an earlier run")
 
 
 @pytest.mark.parametrize("stage", ["opening the devices", "preparing to follow", "hand-eye: pose 1 "])

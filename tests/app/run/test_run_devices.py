@@ -21,7 +21,7 @@ from armsight.app.run.setup import HostClock
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.opening import open_board
-from cli_runs import refused
+from cli_runs import assert_rejected
 
 pytestmark = [
     pytest.mark.usefixtures("host_firmware"),
@@ -116,7 +116,7 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     _agrees_with_the_truth(far, loop, tmp_path)
     # The next run finds the arm where the last motion ended, not where the first begins.
     again = armsight(*arguments(far, tmp_path))
-    refused(again, "the motion starts at", "bring the arm to the start")
+    assert_rejected(again, "the motion starts at", "bring the arm to the start")
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary  # the first run's is not lost for it
 
 
@@ -194,7 +194,9 @@ def test_an_interrupt_stops_the_arm_and_saves_and_a_held_arm_is_taken_over(armsi
 def test_a_cable_that_is_pulled(armsight, far, tmp_path, monkeypatch):
     done = meanwhile(monkeypatch, "hand-eye: pose 2", far.pull)
     said = armsight(*arguments(far, tmp_path))
-    refused(said, f"{far.port} is gone", "holds the arm", f"what was measured until then is in {tmp_path / 'run'}")
+    assert_rejected(
+        said, f"{far.port} is gone", "holds the arm", f"what was measured until then is in {tmp_path / 'run'}"
+    )
     assert done
     summary, _ = left(tmp_path)
     assert summary["ended_by"] in said.err
@@ -206,7 +208,7 @@ def test_a_camera_that_breaks_in_a_way_nobody_thought_of(armsight, far, tmp_path
 
     meanwhile(monkeypatch, "hand-eye: pose 2", breaks)
     said = armsight(*arguments(far, tmp_path))
-    refused(said, "reading the cameras failed: ZeroDivisionError", "the arm was stopped", tmp_path / "run")
+    assert_rejected(said, "reading the cameras failed: ZeroDivisionError", "the arm was stopped", tmp_path / "run")
     left(tmp_path)
     silent(far)
 
@@ -216,5 +218,5 @@ def test_a_fault_that_an_earlier_run_left_is_reported_before_anything_moves(arms
         earlier.stop()
         earlier.receive(0.1)
     said = armsight(*arguments(far, tmp_path))
-    refused(said, "the board is not ready: emergency stop", "switch the board off and on again")
+    assert_rejected(said, "the board is not ready: emergency stop", "switch the board off and on again")
     assert state(far)[0] is BoardState.STOPPED
