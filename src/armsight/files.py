@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import math
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -149,3 +150,12 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
     folder = _target(path).parent
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: cannot be written: no permission to write in {folder}")
+
+
+def finite_json(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return a value as JSON can hold it: None (null) replaces every NaN and infinity in it."""
+    if isinstance(value, Mapping):
+        return {key: finite_json(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [finite_json(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -24,7 +24,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import circle_metrics, path_metrics, plane_axes
-from armsight.loop.iso9283.statistic import Figure
+from armsight.loop.iso9283.statistic import Metric
 
 #: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
 _WIDE = 10
@@ -75,7 +75,7 @@ def evaluate(attained: Attained) -> CheckResult:
     notes = list(attained.notes)
     seldom = _too_seldom(by_test["pose"])
     groups = _groups(by_test["pose"], lambda row: row.pose) if seldom is None else {}
-    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.LEAST}
+    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
     if often:
         notes += [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
         notes += [note for group in often.values() for note in _outliers(group)]
@@ -88,17 +88,17 @@ def evaluate(attained: Attained) -> CheckResult:
     circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
     if not (poses or workspace or followed or circle):
         raise InputError("; ".join(["nothing can be evaluated", *([seldom] if seldom else []), *notes]))
-    notes += [f"left out: all poses, as none was attained {iso9283.LEAST} times"] if seldom else []
+    notes += [f"left out: all poses, as none was attained {iso9283.MIN_POSES} times"] if seldom else []
     return CheckResult(poses, workspace, distance, drift, followed, circle, notes)
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
     """Return why there is neither a repeatability nor enough of the workspace; None where there is, or no pose at all."""
     counts = Counter(row.pose for row in rows).values()
-    if not rows or max(counts) >= iso9283.LEAST or len(counts) >= _WIDE:
+    if not rows or max(counts) >= iso9283.MIN_POSES or len(counts) >= _WIDE:
         return None
     return (
-        f"{len(counts)} poses, none attained {iso9283.LEAST} times and more (the most: {max(counts)}), so there is no "
+        f"{len(counts)} poses, none attained {iso9283.MIN_POSES} times and more (the most: {max(counts)}), so there is no "
         f"repeatability: 30 times are the standard's, or {_WIDE} poses and more once (armsight check plan)"
     )
 
@@ -182,7 +182,7 @@ def _pose(rows: list[Row]) -> PoseResult:
     )
 
 
-def _multi_directional(rows: list[Row]) -> Figure | None:
+def _multi_directional(rows: list[Row]) -> Metric | None:
     """Return vAP of a pose; None where it was approached repeatedly from one direction only."""
     ways = [way for way in _groups(rows, lambda row: row.approach).values() if len(way) > 1]
     return iso9283.multi_directional([_positions(way) for way in ways]) if len(ways) > 1 else None
@@ -192,7 +192,7 @@ def _distance(first: str, first_rows: list[Row], last: str, last_rows: list[Row]
     """Return AD and RD between two poses, in the cycles that have both."""
     there = {row.cycle: row for row in last_rows}
     pairs = [(row, there[row.cycle]) for row in first_rows if row.cycle and row.cycle in there]
-    if len(pairs) < iso9283.LEAST:
+    if len(pairs) < iso9283.MIN_POSES:
         return None
     a, b = (_positions([p[k] for p in pairs]) for k in (0, 1))
     commanded = float(np.linalg.norm((first_rows[0].T_command - last_rows[0].T_command)[:3, 3]))

@@ -20,7 +20,7 @@ from armsight.app.report.page import text as escaped
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, nice, png
 from armsight.data import Array
 from armsight.loop.iso9283.paths import square_to
-from armsight.loop.iso9283.statistic import Figure as Metric
+from armsight.loop.iso9283.statistic import Metric
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

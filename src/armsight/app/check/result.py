@@ -8,7 +8,7 @@ from typing import Any
 
 from armsight.data import Array
 from armsight.loop.iso9283.paths import CircleMetrics, PathMetrics
-from armsight.loop.iso9283.statistic import Figure
+from armsight.loop.iso9283.statistic import Metric
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class PoseResult:
     """
 
     count: int
-    accuracy: Figure
+    accuracy: Metric
     accuracy_xyz: Array
     accuracy_rotation: Array | None
-    repeatability: Figure
+    repeatability: Metric
     repeatability_rotation: Array | None
-    multi_directional: Figure | None
+    multi_directional: Metric | None
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class WorkspaceResult:
     """
 
     count: int
-    mean: Figure
-    largest: Figure
+    mean: Metric
+    largest: Metric
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class DistanceResult:
     first: str
     last: str
     commanded_m: float
-    accuracy: Figure
-    repeatability: Figure
+    accuracy: Metric
+    repeatability: Metric
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class DriftResult:
     pose: str
     t_s: Array
     dAP_m: Array
-    largest: Figure
+    largest: Metric
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class JumpResult:
     joints: tuple[int, ...]
     way: float
     angle_deg: float
-    jump: Figure
+    jump: Metric
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def check_json(result: CheckResult) -> dict[str, Any]:
     return document | {"notes": list(result.notes)}
 
 
-def _metric_json(metric: Figure) -> dict[str, float | None]:
+def _metric_json(metric: Metric) -> dict[str, float | None]:
     return {**asdict(metric), "sigma": metric.sigma}
 
 

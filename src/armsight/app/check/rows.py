@@ -1,4 +1,4 @@
-"""What a test of ISO 9283 attained, row by row: read from a CSV and written as one; docs/howto/iso9283.md has its columns."""
+"""What a test of ISO 9283 attained, row by row: read from a CSV and written as one (columns: docs/howto/iso9283.md)."""
 
 from __future__ import annotations
 

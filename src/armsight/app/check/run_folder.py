@@ -30,7 +30,7 @@ from armsight.errors import InputError
 from armsight.files import read_table, read_text
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
-from armsight.loop.iso9283.poses import LEAST
+from armsight.loop.iso9283.poses import MIN_POSES
 
 #: A rest is evaluated over its last part, this long, s: longer averages more shots, and more of the settling.
 WINDOW_S = 0.3
@@ -177,7 +177,7 @@ def noise_of(segments: list[PathSegment]) -> Noise:
             steps.append(np.diff(Ts[:, :3, 3], axis=0))
             sigmas.append(sigma)
     d, sigma = np.concatenate(steps), np.concatenate(sigmas)
-    if len(d) < LEAST:
+    if len(d) < MIN_POSES:
         raise InputError("the arm was hardly seen at rest: rests of half a second in view of both cameras are needed")
     own = d.T @ d / (2 * len(d))
     claimed = (sigma**2).mean(axis=0)
@@ -216,13 +216,13 @@ def _rests(segments: list[PathSegment], run: set[str], noise: Noise) -> tuple[li
         unseen += len(Ts) < _REST_SHOTS
         before = name
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
-    often = any(len(came) >= LEAST for came in visits.values())
+    often = any(len(came) >= MIN_POSES for came in visits.values())
     attained: Counter[str] = Counter()
     for (name, _), came in visits.items():
         attained[name] += len(came)
     rows = []
     for (name, before), came in visits.items():
-        if often and len(came) < LEAST <= attained[name]:
+        if often and len(came) < MIN_POSES <= attained[name]:
             notes.append(f"left out: {name} approached from {before}, too seldom ({len(came)})")
         else:
             rows += came
@@ -259,7 +259,7 @@ def path_rows(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set
         names.append(short if (short := plain(group[0].name)) not in names else group[0].name)
         cycles, unseen = _path(names[-1], group, noise)
         notes += unseen
-        if len(cycles) < LEAST:
+        if len(cycles) < MIN_POSES:
             notes.append(f"left out: {names[-1]}, followed too seldom ({len(cycles)})")
             continue
         rows += [row for cycle in cycles for row in cycle]

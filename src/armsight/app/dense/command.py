@@ -1,17 +1,16 @@
-"""``armsight dense``: a disparity, and with a rig a depth, for every pixel; and how good the methods are."""
+"""``armsight dense``: a disparity, and with a rig a depth, for every pixel; and the evaluation of the methods."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 from pathlib import Path
-from typing import Any
 
 import click
 
-from armsight.app.dense.evaluate import Line, evaluate_scene, evaluation_json, table_text, write_evaluation
+from armsight.app.dense.evaluate import SceneResult, evaluate_scene, evaluation_json, table_text, write_evaluation
 from armsight.app.dense.files import check_folder, make_folder
-from armsight.app.dense.run import compile_apart, read_pair, result_line, run_shot, search_of
+from armsight.app.dense.run import PairResult, compile_apart, problem_line, read_pair, result_line, run_shot, search_of
 from armsight.app.progress import bar
 from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
@@ -34,13 +33,13 @@ class _Dense(click.Group):
 
 @click.group(cls=_Dense)
 def command() -> None:
-    """Find a disparity for every pixel of a pair, or judge the methods by scenes with a truth.
+    """Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.
 
     \b
     armsight dense RIG.json LEFT RIGHT -o OUT        depth, point cloud
     armsight dense RIG.json --source SOURCE -o OUT   every shot of a sequence
     armsight dense --rectified --max-disparity N LEFT RIGHT -o OUT
-    armsight dense evaluate DIR                      the Middlebury benchmark's figures
+    armsight dense evaluate DIR                      the Middlebury benchmark's metrics
 
     More: armsight dense match -h, armsight dense evaluate -h.
     """  # noqa: D301 - click keeps the lines of a paragraph that begins so
@@ -52,17 +51,17 @@ def command() -> None:
     "--method", "name", default="semiglobal", show_default=True, type=click.Choice(list(METHODS)), help="How."
 )
 @click.option(
-    "-o", "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."
+    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."
 )
-@click.option("--source", metavar="SOURCE", help="A sequence in place of LEFT RIGHT (see armsight record -h).")
-@click.option("--rectified", is_flag=True, help="The pair is in standard form already; no RIG.json.")
+@click.option("--source", metavar="SOURCE", help="A sequence instead of LEFT RIGHT (see armsight record -h).")
+@click.option("--rectified", is_flag=True, help="The pair is rectified already; no RIG.json.")
 @click.option("--max-disparity", type=int, metavar="N", help="Disparities below N px are tried.")
-@click.option("--near", type=float, metavar="M", help="Nearest depth, m, in place of N; 3 baselines by default.")
+@click.option("--near", type=float, metavar="M", help="Nearest depth, m, instead of N; 3 baselines by default.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object a pair.")
 def match(
     paths: tuple[Path, ...],
     name: str,
-    out: Path,
+    output: Path,
     source: str | None,
     rectified: bool,
     max_disparity: int | None,
@@ -73,32 +72,32 @@ def match(
 
     In OUT: disparity.pfm (px, left image, filled), valid.png (255 where it was measured), disparity.png (16 bits, 64
     steps a px), state.png (1 measured, 2 hidden from the right camera, 3 filled), sigma.pfm (px), picture.png; with a
-    rig left.png and right.png in standard form, depth_mm.pfm, depth_sigma_mm.pfm and cloud.ply (m, left camera's
+    rig left.png and right.png, rectified, depth_mm.pfm, depth_sigma_mm.pfm and cloud.ply (m, left camera's
     frame).
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
-    check_folder(out)
+    check_folder(output)
     compile_apart(name)
     method = open_method(name)
 
-    def run(shot: Shot, where: Path) -> dict[str, Any]:
+    def run(shot: Shot, where: Path) -> PairResult:
         search = search_of(form, max_disparity, near, shot)
-        record = run_shot(shot, where, form, method, search, lambda line: click.echo(f"note: {line}", err=True))
-        click.echo(json.dumps(record) if as_json else result_line(record))
-        return record
+        result = run_shot(shot, where, form, method, search, lambda line: click.echo(f"note: {line}", err=True))
+        click.echo(json.dumps(result.to_json()) if as_json else result_line(result))
+        return result
 
     if pair is not None:
-        run(read_pair(*pair), out)
+        run(read_pair(*pair), output)
         return
     done, total = 0, 0
     with contextlib.closing(open_source(str(source))) as opened, bar("matching", None) as advance:
         while (shot := opened.read()) is not None:
             total += 1
             if shot.problem is not None:
-                record = {"shot": shot.name, "problem": shot.problem}
-                click.echo(json.dumps(record) if as_json else result_line(record))
+                problem = {"shot": shot.name, "problem": shot.problem}
+                click.echo(json.dumps(problem) if as_json else problem_line(shot.name, shot.problem))
             else:
-                done += run(shot, out / shot.name)["problem"] is None
+                done += run(shot, output / shot.name).summary.problem is None
             advance()
     if not done:
         raise ArmsightError(f"{source}: none of {total} shots could be matched; their lines say why")
@@ -107,17 +106,17 @@ def match(
 def _arguments(
     paths: tuple[Path, ...], source: str | None, rectified: bool, max_disparity: int | None, near: float | None
 ) -> tuple[Rectification | None, tuple[Path, Path] | None]:
-    """Tell what was given apart: how to rectify, and the pair."""
+    """Return how to rectify (None: rectified already), and the pair (None: a source was given)."""
     if rectified and max_disparity is None:
         raise InputError("--rectified needs --max-disparity N: nothing else says how near the scene is")
     if rectified and near is not None:
-        raise InputError("--near needs a RIG.json: a pair in standard form alone has no depth; give --max-disparity")
+        raise InputError("--near needs a RIG.json: a rectified pair alone has no depth; give --max-disparity")
     if max_disparity is not None and near is not None:
         raise InputError("give --max-disparity or --near, not both")
     if near is not None and not 0.01 <= near <= 1000:
         raise InputError(f"--near {near:g}: expected metres, between 0.01 and 1000")
-    wanted = (0 if rectified else 1) + (0 if source is not None else 2)
-    if len(paths) != wanted:
+    needed = (0 if rectified else 1) + (0 if source is not None else 2)
+    if len(paths) != needed:
         form = ("" if rectified else "RIG.json ") + ("and --source" if source is not None else "LEFT RIGHT")
         raise InputError(f"expected {form.strip()}, got {len(paths)} path{'' if len(paths) == 1 else 's'}")
     rig = None if rectified else StereoRig.load(paths[0])
@@ -133,28 +132,28 @@ def _arguments(
     "--method", "names", multiple=True, type=click.Choice(list(METHODS)), help="May be repeated; all by default."
 )
 @click.option(
-    "-o", "--out", metavar="OUT", type=click.Path(path_type=Path), help="Write the table and error maps there."
+    "-o", "--output", metavar="OUT", type=click.Path(path_type=Path), help="Write the table and error maps there."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def evaluate(folder: Path, names: tuple[str, ...], out: Path | None, as_json: bool) -> None:
-    """Judge the methods by scenes with a truth, in the folder layouts of the Middlebury benchmark.
+def evaluate(folder: Path, names: tuple[str, ...], output: Path | None, as_json: bool) -> None:
+    """Evaluate the methods on scenes with a truth, in the folder layouts of the Middlebury benchmark.
 
-    DIR is a scene or a folder of scenes. Figures: share of pixels off by more than 0.5, 1, 2 and 4 px, mean, RMS, and
+    DIR is a scene or a folder of scenes. Metrics: share of pixels off by more than 0.5, 1, 2 and 4 px, mean, RMS, and
     the errors that 50, 90, 95 and 99% stay below, over all pixels and over those both cameras see. Gaps are filled.
     With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)
     for path in scenes:
         load_scene(path)  # all can be read, before anything is written
-    if out is not None:
-        make_folder(out)
-    lines: list[Line] = []
-    with bar("judging", len(scenes) * len(chosen)) as advance:
+    if output is not None:
+        make_folder(output)
+    lines: list[SceneResult] = []
+    with bar("evaluating", len(scenes) * len(chosen)) as advance:
         for path in scenes:
             scene = load_scene(path)
             for name in chosen:
-                lines.append(evaluate_scene(scene, name, out))
+                lines.append(evaluate_scene(scene, name, output))
                 advance()
-    if out is not None:
-        write_evaluation(out, lines)
+    if output is not None:
+        write_evaluation(output, lines)
     click.echo(json.dumps(evaluation_json(lines)) if as_json else table_text(lines))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.dense.files import paint_disparity, paint_errors, write_png
-from armsight.files import write_text
+from armsight.files import finite_json, write_text
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.middlebury import MiddleburyScene
@@ -20,14 +20,14 @@ from armsight.vision.dense.rectified import plain_grey
 
 
 @dataclass(frozen=True)
-class Line:
-    """What a method reached on a scene.
+class SceneResult:
+    """The errors and the speed of a method on a scene.
 
     Attributes:
         scene: its name.
         method: its name.
         weight: the scene's, in averages.
-        all_pixels: judged over all pixels with a truth.
+        all_pixels: errors over all pixels with a truth.
         nonocc: over those that both cameras see.
         measured: over those that the method measured, of the ones both cameras see.
         density_percent: share of the pixels with a truth that was measured, not filled.
@@ -54,7 +54,7 @@ class Line:
             "scene": self.scene,
             "method": self.method,
             "weight": self.weight,
-            **{name: judgement.to_json() for name, judgement in sets.items()},
+            **{name: errors.to_json() for name, errors in sets.items()},
             "density_percent": self.density_percent,
             "within_95_percent": self.within_percent,
             "seconds": self.seconds,
@@ -62,8 +62,14 @@ class Line:
         }
 
 
-def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Line:
-    """Match a scene by a method and judge it; with a folder, paint where it is wrong."""
+def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> SceneResult:
+    """Match a scene by a method and evaluate the result; with a folder, write its error map there.
+
+    Args:
+        scene: with its true disparity.
+        name: of the method.
+        out: folder of the error maps; None for none.
+    """
     method, truth = open_method(name), scene.truth
     left, right = plain_grey(scene.left, "left"), plain_grey(scene.right, "right")
     method.match(left, right, scene.search)  # once before the clock runs: what is compiled, is compiled now
@@ -76,7 +82,7 @@ def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Line:
     sure = result.measured & truth.seen & truth.known
     off = np.abs(result.disparity - truth.disparity)[sure]
     within = 100 * float(np.mean(off <= 1.96 * result.sigma_px[sure])) if off.size else float("nan")
-    return Line(
+    return SceneResult(
         scene.name,
         name,
         scene.weight,
@@ -90,7 +96,7 @@ def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Line:
     )
 
 
-def averages(lines: list[Line]) -> dict[str, dict[str, float]]:
+def averages(lines: list[SceneResult]) -> dict[str, dict[str, float]]:
     """Return each method's bad shares (%) over all pixels and both-seen ones, averaged over scenes with their weights."""
     found: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys(line.method for line in lines):
@@ -105,50 +111,41 @@ def averages(lines: list[Line]) -> dict[str, dict[str, float]]:
     return found
 
 
-def evaluation_json(lines: list[Line]) -> dict[str, Any]:
+def evaluation_json(lines: list[SceneResult]) -> dict[str, Any]:
     """Return an evaluation as one object; numbers that are not there are null."""
     whole = {"scenes": [line.to_json() for line in lines], "weighted_average": averages(lines)}
-    cleaned: dict[str, Any] = _cleaned(whole)
-    return cleaned
+    document: dict[str, Any] = finite_json(whole)
+    return document
 
 
-def _cleaned(value: Any) -> Any:  # noqa: ANN401
-    """Return JSON with null in place of NaN."""
-    if isinstance(value, dict):
-        return {key: _cleaned(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_cleaned(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def table_text(lines: list[Line]) -> str:
+def table_text(lines: list[SceneResult]) -> str:
     """Return a table for people: shares in %, errors in px, over all pixels / those both cameras see."""
     titles = ("bad-0.5", "bad-1", "bad-2", "bad-4", "mean", "RMS", "A50", "A90", "A95", "A99")
     head = f"{'scene':<12}{'method':<12}" + "".join(f"{t:>14}" for t in titles)
     text = [head + f"{'density':>9}{'within':>8}{'s':>8}{'Mpx*d/s':>9}"]
     for line in lines:
-        a, b = (_numbers(j) for j in (line.all_pixels, line.nonocc))
-        cells = "".join(f"{x:>7.2f}/{y:<6.2f}" for x, y in zip(a, b, strict=True))
+        a, b = (_numbers(errors) for errors in (line.all_pixels, line.nonocc))
+        columns = "".join(f"{x:>7.2f}/{y:<6.2f}" for x, y in zip(a, b, strict=True))
         text.append(
-            f"{line.scene:<12}{line.method:<12}{cells}{line.density_percent:>8.1f}%{line.within_percent:>7.1f}%"
+            f"{line.scene:<12}{line.method:<12}{columns}{line.density_percent:>8.1f}%{line.within_percent:>7.1f}%"
             f"{line.seconds:>8.3f}{line.rate:>9.0f}"
         )
     for name, means in averages(lines).items():
         keys = [key.removeprefix("all_") for key in means if key.startswith("all_")]
-        cells = "".join(f"{means['all_' + k]:>7.2f}/{means['nonocc_' + k]:<6.2f}" for k in keys)
-        text.append(f"{'(average)':<12}{name:<12}{cells}")
+        columns = "".join(f"{means['all_' + k]:>7.2f}/{means['nonocc_' + k]:<6.2f}" for k in keys)
+        text.append(f"{'(average)':<12}{name:<12}{columns}")
     text.append(
         "all pixels with a truth / those both cameras see, gaps filled; within: measured ones inside 1.96 sigma"
     )
     return "\n".join(text)
 
 
-def _numbers(judgement: DisparityErrors) -> list[float]:
-    """Return a judgement's figures in the table's order."""
-    return [*judgement.bad_percent, judgement.average_px, judgement.rms_px, *judgement.quantiles_px]
+def _numbers(errors: DisparityErrors) -> list[float]:
+    """Return the numbers of a row of the table, by column."""
+    return [*errors.bad_percent, errors.average_px, errors.rms_px, *errors.quantiles_px]
 
 
-def write_evaluation(out: Path, lines: list[Line]) -> None:
+def write_evaluation(out: Path, lines: list[SceneResult]) -> None:
     """Write table.csv: one row a scene and method."""
     text = io.StringIO()
     rows = []

@@ -1,10 +1,12 @@
-"""The files of a dense result: what ``armsight dense`` leaves in its folder.
+"""The files of a dense result, and pictures of disparity maps.
 
-Pictures of disparity maps: colours with a scale, what was not measured set apart; and where a map is wrong.
+In: a disparity map, with a rig its rectification. Out: the files that ``armsight dense`` leaves in its folder, and a
+:class:`DenseSummary`; a picture in colours with a scale, where what was not measured is marked; a map of errors.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +18,20 @@ from armsight.data import Image
 from armsight.errors import InputError
 from armsight.files import replacing
 from armsight.vision.dense.depth import Depth, depth_of
-from armsight.vision.dense.evaluate import Truth
+from armsight.vision.dense.evaluate import TrueDisparity
 from armsight.vision.dense.method import FILLED, MEASURED, NOTHING, OCCLUDED, Disparity
 from armsight.vision.dense.middlebury import write_pfm
 from armsight.vision.rectify import Rectification
 
+#: Width of the scale, of the space for its numbers, and height of the caption, px.
 _BAR_PX, _MARGIN_PX, _CAPTION_PX = 18, 62, 26
 _INK, _PAPER = (41, 31, 31), (255, 255, 255)
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 #: Colours (BGR) of an error map: right, off by more than each threshold, and no truth.
 _RIGHT, _OFF_1, _OFF_2, _OFF_4, _UNKNOWN = (225, 225, 225), (120, 200, 250), (40, 130, 235), (30, 30, 170), (90, 60, 40)
-#: How much darker what only the left camera sees is drawn, and what is right there.
+#: Factor of the colours of pixels that only the left camera sees.
 _DARKER = 0.75
+#: Colour of such a pixel without an error, in the legend.
 _HIDDEN = (169, 169, 169)
 
 
@@ -37,9 +41,9 @@ def _colours(values: NDArray[np.floating[Any]], low: float, high: float) -> Imag
     return np.asarray(cv2.applyColorMap(np.clip(share, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO))
 
 
-def _write(canvas: Image, text: str, place: tuple[int, int]) -> None:
+def _write(canvas: Image, text: str, at: tuple[int, int]) -> None:
     """Put a line of text on a canvas; it is plain ASCII, for OpenCV's font has nothing else."""
-    cv2.putText(canvas, text, place, _FONT, _SIZE, _INK, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, _FONT, _SIZE, _INK, 1, cv2.LINE_AA)
 
 
 def paint_disparity(result: Disparity) -> Image:
@@ -66,7 +70,7 @@ def paint_disparity(result: Disparity) -> Image:
 
 
 def _bar(canvas: Image, height: int, width: int, low: float, high: float) -> None:
-    """Draw the scale with round numbers beside the picture."""
+    """Paint the scale with round numbers beside the picture."""
     left = width + 10
     values = np.linspace(high, low, height)[:, None]
     canvas[:height, left : left + _BAR_PX] = np.repeat(_colours(values, low, high), _BAR_PX, axis=1)
@@ -86,7 +90,7 @@ def _round_values(low: float, high: float) -> list[float]:
     return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
-def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
+def paint_errors(disparity: NDArray[np.float32], truth: TrueDisparity) -> Image:
     """Return a picture (BGR) of where a map is off by more than 1, 2 and 4 px; what only the left camera sees is darker."""
     height, width = disparity.shape
     error = np.abs(disparity - truth.disparity)
@@ -116,10 +120,47 @@ def paint_errors(disparity: NDArray[np.float32], truth: Truth) -> Image:
 
 #: Steps of a pixel in the 16-bit disparity image: 1023 px at most.
 PNG_STEPS = 64
-#: What a point of a cloud holds, and rows of the image whose points are written at a time.
+#: Fields of a point of a cloud.
 _FIELDS = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
+#: Rows of the image whose points are written at a time.
 _ROWS_AT_ONCE = 64
-_STATES = {"measured": MEASURED, "hidden": OCCLUDED, "filled": FILLED, "not_in_view": NOTHING}
+
+
+@dataclass(frozen=True)
+class DenseSummary:
+    """A dense result in numbers; the fields are the keys of its JSON object.
+
+    Attributes:
+        measured_percent: share of the pixels that were measured.
+        hidden_percent: share that the right camera does not see.
+        filled_percent: share that was filled from its neighbours.
+        not_in_view_percent: share that the left camera does not see.
+        median_sigma_px: of the measured disparities; None where there are none.
+        disparities_px: first and last disparity that was tried.
+        problem: why nothing was measured; None where something was.
+        points: of the cloud; None where there is no depth.
+        median_depth_mm: of the measured pixels; None where there is no depth.
+        median_depth_sigma_mm: the same of the depth's standard deviation.
+    """
+
+    measured_percent: float
+    hidden_percent: float
+    filled_percent: float
+    not_in_view_percent: float
+    median_sigma_px: float | None
+    disparities_px: tuple[int, int]
+    problem: str | None
+    points: int | None = None
+    median_depth_mm: float | None = None
+    median_depth_sigma_mm: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the summary as JSON has it; without a depth its keys are absent."""
+        document = asdict(self)
+        if self.points is None:
+            for key in ("points", "median_depth_mm", "median_depth_sigma_mm"):
+                del document[key]
+        return document
 
 
 def make_folder(path: Path) -> Path:
@@ -136,7 +177,7 @@ def make_folder(path: Path) -> Path:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse what cannot become a folder, without making it: a result that is none must leave nothing behind.
+    """Check that a path can become a folder, without making it: a pair without a result must leave nothing behind.
 
     Raises:
         InputError: something that is no folder stands there, or in the way.
@@ -160,10 +201,10 @@ def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth
 
     Args:
         path: where to.
-        form: how the images became standard form.
+        form: how the images were rectified.
         result: the disparities.
         depth: their depths.
-        image: (H, W) grey or (H, W, 3) BGR, the left image in standard form.
+        image: (H, W) grey or (H, W, 3) BGR, the rectified left image.
     """
     chosen = result.measured & np.isfinite(depth.depth_m)
     count = int(np.count_nonzero(chosen))
@@ -197,14 +238,14 @@ def _vertices(
     return rows.tobytes()
 
 
-def write_result(folder: Path, result: Disparity, form: Rectification | None, image: Image) -> dict[str, Any]:
-    """Write all files of a result and return what there is to say about it.
+def write_result(folder: Path, result: Disparity, form: Rectification | None, image: Image) -> DenseSummary:
+    """Write all files of a result.
 
     Args:
         folder: where to; it exists.
         result: the disparities.
-        form: how the images became standard form; None where they came so, and there is no depth.
-        image: the left image in standard form, for colours.
+        form: how the images were rectified; None where they came so, and there is no depth.
+        image: the rectified left image, for colours.
     """
     write_pfm(folder / "disparity.pfm", result.disparity)
     steps = np.nan_to_num(result.disparity, posinf=0) * PNG_STEPS
@@ -213,27 +254,27 @@ def write_result(folder: Path, result: Disparity, form: Rectification | None, im
     write_png(folder / "state.png", result.state)
     write_pfm(folder / "sigma.pfm", result.sigma_px)
     write_png(folder / "picture.png", paint_disparity(result))
-    said = facts(result)
+    summary = summary_of(result)
     if form is None or result.problem is not None:
-        return said
+        return summary
     depth = depth_of(form, result)
     write_pfm(folder / "depth_mm.pfm", depth.depth_m, 1e3)
     write_pfm(folder / "depth_sigma_mm.pfm", depth.sigma_m, 1e3)
-    said["points"] = write_cloud(folder / "cloud.ply", form, result, depth, image)
-    said["median_depth_mm"] = _median(depth.depth_m[result.measured], 1e3)
-    said["median_depth_sigma_mm"] = _median(depth.sigma_m[result.measured], 1e3)
-    return said
+    return replace(
+        summary,
+        points=write_cloud(folder / "cloud.ply", form, result, depth, image),
+        median_depth_mm=_median(depth.depth_m[result.measured], 1e3),
+        median_depth_sigma_mm=_median(depth.sigma_m[result.measured], 1e3),
+    )
 
 
-def facts(result: Disparity) -> dict[str, Any]:
-    """Return what there is to say about a result: shares in percent, the median sigma, the search."""
-    said: dict[str, Any] = {
-        f"{name}_percent": 100 * float(np.mean(result.state == state)) for name, state in _STATES.items()
-    }
-    said["median_sigma_px"] = _median(result.sigma_px)
-    said["disparities_px"] = [result.search.first, result.search.last]
-    said["problem"] = result.problem
-    return said
+def summary_of(result: Disparity) -> DenseSummary:
+    """Return the summary of a result without its depths."""
+    measured, hidden, filled, outside = (
+        100 * float(np.mean(result.state == state)) for state in (MEASURED, OCCLUDED, FILLED, NOTHING)
+    )
+    disparities_px = (result.search.first, result.search.last)
+    return DenseSummary(measured, hidden, filled, outside, _median(result.sigma_px), disparities_px, result.problem)
 
 
 def _median(values: NDArray[np.floating[Any]], scale: float = 1.0) -> float | None:

@@ -1,9 +1,9 @@
-"""One pair of ``armsight dense``: from images to files and what is said about them.
+"""One pair of ``armsight dense``, from images to files; and a method compiled in another process.
 
-A method compiled in a process of its own.
+In: the images of a pair, how to rectify them, a method and its search. Out: the files and a :class:`PairResult`.
 
-The first run of a method compiles it, and the compiler keeps about 100 MB for as long as its process lives. Here another
-process does that and ends; this one reads what is compiled from numba's cache.
+The first run of a method compiles it, and the compiler keeps about 100 MB for as long as its process lives.
+:func:`compile_apart` has another process do that and end; this one reads what is compiled from numba's cache::
 
     python -m armsight.app.dense.run METHOD
 """
@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 from numba.core import event
 from numpy.typing import NDArray
 
-from armsight.app.dense.files import make_folder, write_png, write_result
+from armsight.app.dense.files import DenseSummary, make_folder, write_png, write_result
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
@@ -30,47 +31,6 @@ from armsight.vision.dense.middlebury import read_pfm, read_tiff
 from armsight.vision.dense.rectified import match_pair, plain_grey
 from armsight.vision.image import read_image
 from armsight.vision.rectify import Rectification
-
-
-class _NotYetError(Exception):
-    """Something is about to be compiled here."""
-
-
-class _Watch(event.Listener):
-    """Stops what would compile."""
-
-    def on_start(self, event: event.Event) -> None:
-        """Refuse."""
-        raise _NotYetError
-
-    def on_end(self, event: event.Event) -> None:
-        """Nothing was begun."""
-
-
-def _run(name: str) -> None:
-    """Match a small pair, so that all of a method is compiled or read."""
-    noise = np.random.default_rng(0).integers(0, 256, (64, 140)).astype(np.uint8)
-    left, right = noise[:, :128].copy(), noise[:, 4:132].copy()  # a disparity of 4: matched, smoothed and filled
-    for image in (left, right):
-        image.setflags(write=False)  # as a shot's images are: to the compiler that is another type
-    open_method(name).match(left, right, Search(0, 16))
-
-
-def compile_apart(name: str) -> None:
-    """Have a method compiled elsewhere, unless numba's cache holds it already.
-
-    Where the cache cannot be written, this process will compile when it matches: only its memory is more.
-    """
-    try:
-        with event.install_listener("numba:compile", _Watch()):
-            _run(name)
-    except _NotYetError:
-        subprocess.run([sys.executable, "-m", __name__, name], check=False, capture_output=True)
-
-
-if __name__ == "__main__":
-    _run(sys.argv[1])
-
 
 #: Without a nearest depth or a greatest disparity: the nearest depth, in baselines.
 _NEAREST_BASELINES = 3.0
@@ -104,7 +64,7 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
     """Return the disparities to try for a shot.
 
     Args:
-        form: how its images become standard form; None where they are.
+        form: how its images are rectified; None where they are already.
         max_disparity: disparities below it are tried; or None.
         near: the nearest depth, m; or None.
         shot: the shot.
@@ -144,6 +104,27 @@ def _in_view(result: Disparity, form: Rectification) -> Disparity:
     )
 
 
+@dataclass(frozen=True)
+class PairResult:
+    """The result of one pair.
+
+    Attributes:
+        shot: name of the pair.
+        summary: shares, medians and the search.
+        seconds: of matching, on the clock.
+        folder: of its files.
+    """
+
+    shot: str
+    summary: DenseSummary
+    seconds: float
+    folder: Path
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        return {"shot": self.shot, **self.summary.to_json(), "seconds": self.seconds, "output": str(self.folder)}
+
+
 def run_shot(
     shot: Shot,
     folder: Path,
@@ -151,11 +132,11 @@ def run_shot(
     method: Method,
     search: Search,
     note: Callable[[str], None],
-) -> dict[str, Any]:
-    """Match a shot, make a folder, write its files there, and return what there is to say.
+) -> PairResult:
+    """Match a shot, make a folder and write its files there.
 
     Raises:
-        InputError: the images are no pair in standard form, or are not of the rig's size.
+        InputError: the images are no rectified pair, or are not of the rig's size.
     """
     if shot.left is None or shot.right is None:
         raise InputError(f"{shot.name}: {shot.problem or 'no image'}")
@@ -166,7 +147,7 @@ def run_shot(
             left, right = form.images(left, right)
         result = match_pair(method, left, right, search, note)
     except InputError as error:
-        where = shot.name if form is None else f"{shot.name}, put into standard form by the rig"
+        where = shot.name if form is None else f"{shot.name}, rectified by the rig"
         raise InputError(f"{where}: {error}") from None
     seconds = time.perf_counter() - begun
     make_folder(folder)
@@ -174,21 +155,67 @@ def run_shot(
         result = _in_view(result, form)
         write_png(folder / "left.png", left)
         write_png(folder / "right.png", right)
-    return {"shot": shot.name, **write_result(folder, result, form, left), "seconds": seconds, "out": str(folder)}
+    return PairResult(shot.name, write_result(folder, result, form, left), seconds, folder)
 
 
-def result_line(record: dict[str, Any]) -> str:
-    """Format one pair for people."""
-    if record["problem"] is not None:
-        return f"{record['shot']}: nothing measured: {record['problem']}"
+def problem_line(shot: str, problem: str) -> str:
+    """Return a pair without a result as a line of text."""
+    return f"{shot}: nothing measured: {problem}"
+
+
+def result_line(result: PairResult) -> str:
+    """Return one pair as a line of text."""
+    summary = result.summary
+    if summary.problem is not None:
+        return problem_line(result.shot, summary.problem)
     line = (
-        f"{record['shot']}: {record['measured_percent']:.1f}% measured (median sigma "
-        f"{record['median_sigma_px']:.2f} px), {record['hidden_percent']:.1f}% hidden from the right camera and "
-        f"{record['filled_percent']:.1f}% unsure, filled"
+        f"{result.shot}: {summary.measured_percent:.1f}% measured (median sigma "
+        f"{summary.median_sigma_px:.2f} px), {summary.hidden_percent:.1f}% hidden from the right camera and "
+        f"{summary.filled_percent:.1f}% unsure, filled"
     )
-    if record["not_in_view_percent"] > 0:
-        line += f", {record['not_in_view_percent']:.1f}% not in view"
-    if record.get("median_depth_mm") is not None:
-        line += f"; depth {record['median_depth_mm']:.0f} mm ± {record['median_depth_sigma_mm']:.1f} (medians)"
-        line += f", {record['points']} points"
-    return line + f"; {record['seconds']:.2f} s; written to {record['out']}"
+    if summary.not_in_view_percent > 0:
+        line += f", {summary.not_in_view_percent:.1f}% not in view"
+    if summary.median_depth_mm is not None:
+        line += f"; depth {summary.median_depth_mm:.0f} mm ± {summary.median_depth_sigma_mm:.1f} (medians)"
+        line += f", {summary.points} points"
+    return line + f"; {result.seconds:.2f} s; written to {result.folder}"
+
+
+class _NotYetError(Exception):
+    """Something is about to be compiled here."""
+
+
+class _CompileListener(event.Listener):
+    """Raises where something would be compiled."""
+
+    def on_start(self, event: event.Event) -> None:
+        """Raise before anything is compiled."""
+        raise _NotYetError
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing was begun."""
+
+
+def compile_method(name: str) -> None:
+    """Match a small pair, so that all of a method is compiled, or read from the cache."""
+    noise = np.random.default_rng(0).integers(0, 256, (64, 140)).astype(np.uint8)
+    left, right = noise[:, :128].copy(), noise[:, 4:132].copy()  # a disparity of 4: matched, smoothed and filled
+    for image in (left, right):
+        image.setflags(write=False)  # as a shot's images are: to the compiler that is another type
+    open_method(name).match(left, right, Search(0, 16))
+
+
+def compile_apart(name: str) -> None:
+    """Have a method compiled elsewhere, unless numba's cache holds it already.
+
+    Where the cache cannot be written, this process will compile when it matches: only its memory is more.
+    """
+    try:
+        with event.install_listener("numba:compile", _CompileListener()):
+            compile_method(name)
+    except _NotYetError:
+        subprocess.run([sys.executable, "-m", __name__, name], check=False, capture_output=True)
+
+
+if __name__ == "__main__":
+    compile_method(sys.argv[1])
