@@ -13,7 +13,7 @@ import pytest
 from armsight.app.calibrate import command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
-from cli_runs import listening, assert_rejected
+from cli_runs import assert_rejected, listening
 
 pytestmark = pytest.mark.opencv
 

@@ -27,7 +27,7 @@ class MadeUp:
     def render_pair(self, cameras, T_left_right, placed, behind, *, sensor=None, rng):
         images = np.zeros((2, 1, 1), np.uint8)
         left = images[0]
-        self.shown[id(left)] = left, placed[0].T_left_body, sensor.read_noise if sensor else 0.0
+        self.shown[id(left)] = left, placed[0].T_camera_body, sensor.read_noise if sensor else 0.0
         return left, images[1]
 
     def calibrate_boards(self, board, pairs, sizes, **options):
