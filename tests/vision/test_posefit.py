@@ -68,14 +68,14 @@ def test_bundle_adjustment_finds_the_same(model, robust):
     rig, points, T_true, observations, rng = shot(model, 2)
     start = T_true @ exp_se3(0.02 * rng.normal(size=6))
     order = np.lexsort((observations.point, observations.camera))
-    observations = Observations(
+    flattened = Observations(
         np.zeros(len(order), np.int64), observations.camera[order], observations.point[order], observations.uv[order],
         observations.cov_uv[order] - SIGMA_PX**2 * np.eye(2), 1,
     )  # fmt: skip
     state = BundleState(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
     held = np.zeros(sum(camera.parameters.size for camera in rig.cameras) + 6, bool)
     model_ = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False)
-    slow = minimise(model_, state, observations, SIGMA_PX, robust=robust, free=held)
+    slow = minimise(model_, state, flattened, SIGMA_PX, robust=robust, free=held)
     fast = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=robust)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-7)
     gap = log_se3(inverse(slow.state.Ts_left_body[0]) @ fast.T_left_body)
