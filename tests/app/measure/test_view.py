@@ -129,7 +129,7 @@ def test_what_neither_camera_sees_is_shown_too_but_not_on_the_far_side():
     ("reasons", "sides", "said"),
     [
         (["left: outside the image", "right: outside the image"], [True, True], "both: outside the image"),
-        (["right: turned away"], [False, True], "right: turned away"),
+        (["right: facing away"], [False, True], "right: facing away"),
         (["7.0 px off its epipolar line (gate 2.0 px)"], [True, True], "7.0 px off its epipolar line (gate 2.0 px)"),
         (["3.1 px off the body in the left image"], [True, False], "3.1 px off the body in the left image"),
         (["left: a", "right: b"], [True, True], "left: a; right: b"),

@@ -34,7 +34,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.robot.arm import Arm
 
-#: Version of the files of a run's folder: 2 has reference.csv and q1_ref_rad for version 1's wanted.csv and q1_wanted_rad.
+#: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.
 VERSION = 2
 #: Track -> its name in tables.
 TRACKS = {
