@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
-from armsight.app.check.run_folder import _reversal_times
+from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, reversals_of, segments_of
 from cli_runs import Said, assert_rejected, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
@@ -364,3 +365,35 @@ def test_json_has_no_nan(tmp_path, capsys):
     made.poses("open_loop", 3)
     found = said(capsys, made.write(), "--json").lines[0]  # read strictly
     assert json.dumps(found, allow_nan=False)
+
+
+#: A run's folder as version 1 wrote it, cut down: names of files and columns that have changed since.
+VERSION_1 = Path(__file__).parent / "written_by_version_1"
+
+
+def test_a_folder_of_version_1_is_read_as_version_1_read_it():
+    assert is_run(VERSION_1)
+    attained = attained_in(VERSION_1, closed=False)
+    assert [(row.pose, row.cycle, row.approach, row.t_s) for row in attained.rows] == [
+        ("line", "1", "pose 1", 26.641),
+        ("line", "2", "line", 30.341),
+        ("pose 1", "1", "the start", 24.641),
+    ]
+    expected = [  # as version 1 computed them from this folder
+        [0.529576546, -0.14048700416666668, 0.49977340149999994],
+        [0.5296098871666667, -0.14036367833333332, 0.49978951099999996],
+        [0.4876840593333333, 0.200964638, 0.519729746],
+    ]
+    np.testing.assert_allclose([row.T[:3, 3] for row in attained.rows], expected, rtol=1e-12)
+    assert attained.rows[0].cov[0, 0] == pytest.approx(2.0483213388858718e-11, rel=1e-12)
+
+
+def test_the_joints_of_version_1_are_read_as_version_1_read_them():
+    circle = [segment for segment in segments_of(VERSION_1, False) if segment.kind == "circle"]
+    reversals = reversals_of(VERSION_1, circle)
+    assert [reversal.joints for reversal in reversals] == [(1, 5), (3,), (2, 4), (1, 5, 6), (3, 4), (2,)]
+    np.testing.assert_allclose(reversals[0].p, [0.52770854, -0.14471832, 0.46398389], atol=5e-9)
+
+
+def test_check_says_of_a_folder_of_version_1_what_it_holds(capsys):
+    assert_rejected(said(capsys, VERSION_1), "2 poses, none attained 3 times", "line, seen in 0 shots")
