@@ -74,8 +74,9 @@ class Host:
         self.out.seq = (self.out.seq + 1) % 256
         return data
 
-    def hello(self, *, dialect=1, config=1, nonce=7) -> bytes:
-        return self.pack("hello", dialect, config, nonce)
+    def hello(self, *, dialect=None, config=1, nonce=7) -> bytes:
+        version = self.dialect.ARMSIGHT_DIALECT_VERSION if dialect is None else dialect
+        return self.pack("hello", version, config, nonce)
 
     def next(self) -> int:
         self.sequence += 1

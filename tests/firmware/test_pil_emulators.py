@@ -146,7 +146,7 @@ def outputs_of(answer: bytes):
     return c.pil_answer.from_buffer_copy(answer).outputs
 
 
-def test_an_image_reported_nonsense_says_so_on_every_emulator(images, library_files):
+def test_an_image_that_receives_nonsense_says_so_on_every_emulator(images, library_files):
     """No tick is run on it, and the next frame is served."""
     good = c.pil_request(magic=c.FRAME_REQUEST, version=c.FRAME_VERSION, supply_mv=12000)
     image = next(iter(images.values()))

@@ -138,7 +138,7 @@ def test_a_truth_that_is_none_is_rejected_by_name(tmp_path, recording):
             Truth.load(tmp_path)
 
 
-def test_a_folder_that_cannot_be_is_reported(tmp_path, recording, board):
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path, recording, board):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
         record(tmp_path / "file" / "below", recording[1], [board])

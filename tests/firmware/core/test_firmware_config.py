@@ -12,7 +12,7 @@ COPY_BYTES = ctypes.sizeof(c.config_copy)
 
 
 def config_of(library, silence_ticks):
-    """A configuration that can be reported from others."""
+    """A configuration that can be distinguished from others."""
     config = lab_config(library)
     config.silence_ticks = silence_ticks
     return config

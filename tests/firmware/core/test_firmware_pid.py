@@ -115,7 +115,7 @@ def test_the_duty_stays_within_its_limit_and_says_so(library, gains):
     assert held == c.LIMITED_DUTY
 
 
-def test_a_current_limit_is_reported_apart_from_a_duty_limit(library):
+def test_a_current_limit_is_distinguished_from_a_duty_limit(library):
     pid = Pid(library, 10, 0, 0, 0, 0, 0, limit=0.8, cap=0.2)
     assert pid.step(1.0) == ctypes.c_float(0.2).value
     assert pid.limited == c.LIMITED_CURRENT

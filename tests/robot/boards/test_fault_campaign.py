@@ -32,7 +32,7 @@ def test_nothing_is_violated_by_any_kind_of_fault(campaign):
 
 
 class Changed:
-    """The firmware with something wrong: its answers, or what it is reported, are changed."""
+    """The firmware with something wrong: its answers, or the requests to it, are changed."""
 
     def __init__(self, *, answer=lambda frame: None, request=lambda frame: None):
         self.emulator, self.answer, self.request = open_emulator("host"), answer, request
@@ -83,7 +83,7 @@ def test_a_firmware_with_a_mistake_is_found(campaign, monkeypatch, change, kind,
     assert any(found in each for each in outcome.violations), outcome.violations[:5]
 
 
-def test_noise_strikes_as_it_is_reported(campaign):
+def test_noise_strikes_as_it_is_set(campaign):
     noise = campaign.Noise(np.random.default_rng(1))
     data = bytes(range(60))
     assert noise.to_board(1, data) == noise.to_host(1, data) == data

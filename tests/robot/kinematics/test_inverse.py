@@ -76,7 +76,7 @@ def test_any_pose_is_answered(arm, p, phi):
 
 
 @pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
-def test_configurations_are_all_different_and_reported_right(arm):
+def test_configurations_are_all_different_and_right(arm):
     for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
         answer = arm.inverse(arm.forward(q))
         reported = answer.configurations
@@ -113,7 +113,7 @@ def test_poses_near_singularities_are_answered_as_well(arm):
 
 
 @pytest.mark.parametrize("arm", arms.IDENTIFIED, ids=arms.names(arms.IDENTIFIED))
-def test_an_identified_arm_is_hardly_ever_reported_that_a_pose_it_is_in_is_out_of_reach(arm):
+def test_a_pose_that_an_identified_arm_is_in_is_hardly_ever_out_of_reach(arm):
     Ts = arm.forward(arms.near_singular(arm, 300, np.random.default_rng(11)))
     many = arm.inverse_batch(Ts)
     assert (many.count > 0).mean() > 0.99  # beside a singularity descent may end at a pose nearby

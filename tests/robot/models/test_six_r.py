@@ -45,7 +45,7 @@ def test_a_misprint_matters(row, column, worst):
     assert max(abs(jacobian(q, printed=True) - ARM.jacobian(q))[row, column] for q in ANGLES) > worst
 
 
-def test_the_chapters_steps_give_each_solution():
+def test_the_printed_steps_give_each_solution():
     """theta_5 of either sign from c5, theta_234 and theta_6 by the source's formulas, of every solution found."""
     for q in ANGLES[:40]:
         T = ARM.forward(q)

@@ -57,12 +57,12 @@ def test_what_can_be_asked_for():
     "spec",
     ["", "1280x720", "1280@60", "1280x720@0", "1280x720@1000", "10x10@60", "9999x9999@60", "usb:1280x720@60", "webcam"],
 )
-def test_what_cannot_is_reported(spec):
+def test_what_cannot_be_is_rejected(spec):
     with pytest.raises(InputError, match="cameras"):
         open_timing(spec)
 
 
-def test_rigs_are_the_chapters_or_verge():
+def test_rigs_are_parallel_or_verge():
     parallel, verging = (open_rig(name, (1280, 720)) for name in ("parallel", "verging"))
     assert parallel.baseline_m == pytest.approx(0.2)
     assert verging.baseline_m == pytest.approx(0.2)

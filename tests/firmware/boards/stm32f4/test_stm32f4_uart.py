@@ -73,7 +73,7 @@ def test_a_ring_that_came_round_is_reported_and_read_on_afresh(emulator):
     assert take(emulator, 1000) == (b"next", 0)
 
 
-def test_a_ring_just_full_is_lost_as_it_cannot_be_reported_from_an_empty_one(emulator):
+def test_a_ring_just_full_is_lost_as_it_cannot_be_distinguished_from_an_empty_one(emulator):
     emulator.chip.receive(bytes(RING))
     assert take(emulator, 2000) == (b"", RING)
 
