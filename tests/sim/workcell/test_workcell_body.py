@@ -35,4 +35,4 @@ def test_the_check_calls_it_usable(tmp_path, capsys):
     path = tmp_path / "body.toml"
     path.write_text(body_text())
     assert run("body", "check", path, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["verdict"] == "usable"
+    assert json.loads(capsys.readouterr().out)["assessment"] == "usable"
