@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
+from enum import Enum
+from functools import cached_property
 from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +43,8 @@ nitpick_ignore_regex = [
 ]
 suppress_warnings = ["config.cache"]  # sphinx-gallery keeps functions in its configuration
 
+smartquotes_action = "qe"  # quotes and ellipses; two hyphens begin an option
+
 # MyST: the pages are CommonMark with tables; headings to the third level can be linked to.
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
@@ -50,6 +54,7 @@ autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "undoc-members": False, "show-inheritance": False}
 autodoc_preserve_defaults = True
+autodoc_type_aliases = {name: name for name in ("Array", "Ids", "Image", "Side")}
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
@@ -102,11 +107,18 @@ def fill_in_pictures(app: Sphinx) -> None:
 
 
 def skip_plain_fields(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
-    """Leave out the fields of named tuples: the section Attributes of the class describes them."""
-    return True if type(member).__name__ == "_tuplegetter" else None
+    """Leave out the fields of records: the section Attributes of the class describes them."""
+    documented = callable(member) or isinstance(member, (property, cached_property, staticmethod, classmethod, Enum))
+    return True if what == "class" and not documented else None
+
+
+def read_again(app: Sphinx, *_: object) -> list[str]:
+    """Return the pages that depend on more than Sphinx sees: the commands are imported when they are named."""
+    return ["reference/cli"]
 
 
 def setup(app: Sphinx) -> None:
     """Hook what the site needs beyond its extensions."""
     app.connect("builder-inited", fill_in_pictures)
     app.connect("autodoc-skip-member", skip_plain_fields)
+    app.connect("env-get-outdated", read_again)
