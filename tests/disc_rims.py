@@ -19,7 +19,7 @@ def rim(p, normal, radius_m, points=POINTS):
 def ellipse_through(uv):
     """Return centre (2,) and shape (2, 2) of the ellipse (uv - c)^T S^-1 (uv - c) = 1 through points (N, 2), px.
 
-    A conic by least squares. A lens that distorts bends the ellipse: what is left of that is of the fourth order in its size.
+    A conic by least squares. A lens that distorts bends the ellipse; what that leaves is of the fourth order in its size.
     """
     middle, scale = uv.mean(axis=0), uv.std()
     x, y = ((uv - middle) / scale).T

@@ -1,5 +1,7 @@
 """What two cameras find of a body's discs, without images: ellipses through rims by OpenCV's projection, noise, clutter."""
 
+from functools import partial
+
 import numpy as np
 
 from armsight.data import Body, Discs
@@ -72,7 +74,7 @@ def views(rig, target, Ts, rng=None, sigma=SIGMA, clutter=0, hidden=(), radii=(4
             T = T if side == 0 else inverse(rig.T_left_right) @ T
             normals = np.where(np.isnan(target.normals), [0.0, 0.0, -1.0], target.normals)
             p = target.body.points @ T[:3, :3].T + T[:3, 3]
-            at, ellipse = disc_ellipses(lambda q, camera=camera: pixels(camera, q), p, normals @ T[:3, :3].T, target.radii_m)
+            at, ellipse = disc_ellipses(partial(pixels, camera), p, normals @ T[:3, :3].T, target.radii_m)
             keep = [
                 m
                 for m in range(len(p))
