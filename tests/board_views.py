@@ -6,7 +6,7 @@ import numpy as np
 
 from armsight.data import Detections
 from armsight.geometry.pose import inverse, log_se3
-from armsight.sim.example_rig import example_rig, board_poses
+from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
 from armsight.vision.calibrate.boards import Pair
 from armsight.vision.markers.board import open_board
@@ -17,7 +17,7 @@ SIZES = (SIZE, SIZE)
 
 
 @cache
-def bench(model="brown5", focal_px=450.0, count=20, spec="chessboard:9x6:25mm", seed=5):
+def rig_and_board(model="brown5", focal_px=450.0, count=20, spec="chessboard:9x6:25mm", seed=5):
     """Return the true rig, the board and poses (count, 4, 4) that both cameras see whole."""
     rig, board = example_rig(SIZE, focal_px=focal_px, model=model), open_board(spec)
     columns, rows = (int(n) for n in spec.split(":")[1].split("x"))

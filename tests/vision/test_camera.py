@@ -159,7 +159,7 @@ def test_arrays_cannot_be_written():
         ("none", np.array([-1.0, 1, 1, 1]), np.zeros(0), "focal lengths must be positive"),
     ],
 )
-def test_refusals(model, intrinsics, distortion, message):
+def test_rejected_cameras(model, intrinsics, distortion, message):
     with pytest.raises(InputError, match=message):
         Camera(SIZE, model, intrinsics, distortion)
 

@@ -10,7 +10,7 @@ from armsight.vision.detections import SeenShot
 from armsight.vision.markers.marker import Target
 from armsight.vision.match import renamed
 from armsight.vision.measure import measure, measure_detections, measure_seen, size_problem
-from board_views import SIZE, bench, board_pairs, detections
+from board_views import SIZE, board_pairs, detections, rig_and_board
 
 SIGMA = 0.1
 
@@ -35,7 +35,7 @@ class Scripted(Target):
 
 def known(spec="chessboard:9x6:25mm"):
     """A true rig that knows the detector's noise, the board, one pose and what is seen of it."""
-    rig, board, Ts = bench(spec=spec)
+    rig, board, Ts = rig_and_board(spec=spec)
     rig = replace(rig, sigma_px=SIGMA)
     (pair,) = board_pairs(rig, board.body.points, Ts[:1], sigma=SIGMA)
     return rig, board, Ts[0], pair
@@ -47,7 +47,7 @@ def grey_shot(width=SIZE[0]):
 
 def test_the_pose_is_found_within_its_covariance():
     rig, board, _, _ = known()
-    _, _, Ts = bench()
+    _, _, Ts = rig_and_board()
     nees = []
     for n, pair in enumerate(board_pairs(rig, board.body.points, Ts, sigma=SIGMA, seed=1)):
         estimate = measure(rig, Scripted(board.body, pair.left, pair.right), grey_shot())

@@ -10,12 +10,12 @@ from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.vision.calibrate.boards import LEAST_PAIRS, MODELS, Pair, calibrate_boards
 from armsight.vision.match import renamed
-from board_views import SIZES, bench, board_pairs, detections, rig_error
+from board_views import SIZES, board_pairs, detections, rig_and_board, rig_error
 
 
 @pytest.mark.parametrize("flat", [True, False], ids=["drawing", "estimated board"])
 def test_the_true_rig_is_found_within_its_covariance(flat):
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), flat=flat, folds=4)
     error = rig_error(c.rig, true)
     assert (np.abs(error) < 4 * np.sqrt(np.diag(c.rig.cov))).all(), error / np.sqrt(np.diag(c.rig.cov))
@@ -33,7 +33,7 @@ def test_the_true_rig_is_found_within_its_covariance(flat):
 
 
 def test_a_perfect_board_stays_perfect():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), folds=2)
     # One corner is triangulated from twenty pairs to 0.1 px * 0.6 m / 450 px / sqrt(40) = 0.02 mm at best.
     assert c.deviation_m < 2e-5
@@ -47,7 +47,7 @@ def bowed(points):
 
 
 def test_a_bowed_board_is_found_and_taken_out_of_the_cameras():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     nominal = board.body.points
     printed = bowed(nominal)
     pairs = board_pairs(true, printed, Ts, sigma=0.01)
@@ -70,7 +70,7 @@ def test_a_bowed_board_is_found_and_taken_out_of_the_cameras():
     [("fisheye", 230.0, ("brown5", "fisheye")), ("brown4", 450.0, MODELS)],
 )
 def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
-    true, board, Ts = bench(model, focal_px, 14)
+    true, board, Ts = rig_and_board(model, focal_px, 14)
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts, sigma=0.05), SIZES, models=tried, folds=2)
     assert c.rig.left.model == c.rig.right.model == model
     assert set(c.models) == set(tried)
@@ -80,7 +80,7 @@ def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
 
 
 def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     clean = board_pairs(true, board.body.points, Ts)
     dirty = list(clean)
     for n, corner in ((2, 7), (5, 20), (11, 50)):
@@ -102,7 +102,7 @@ def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
 
 
 def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
-    true, board, Ts = bench(spec="chessboard:9x7:25mm")
+    true, board, Ts = rig_and_board(spec="chessboard:9x7:25mm")
     assert board.symmetries, "a board of odd counts can be read from both ends"
     clean = board_pairs(true, board.body.points, Ts)
     dirty = [
@@ -121,7 +121,7 @@ def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
 
 
 def test_pairs_without_a_board_are_rejected_with_their_reason():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     pairs = board_pairs(true, board.body.points, Ts)
     pairs[1] = replace(pairs[1], left=Detections.none("too dark"))
     few = detections(np.arange(5), pairs[4].right.uv[:5])
@@ -136,7 +136,7 @@ def test_pairs_without_a_board_are_rejected_with_their_reason():
 
 
 def test_too_few_pairs_say_how_many_are_needed_and_why_there_are_not():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     pairs = board_pairs(true, board.body.points, Ts[: LEAST_PAIRS - 1])
     pairs += [Pair("dark", Detections.none("too dark"), Detections.none("too dark"))]
     with pytest.raises(CalibrationError, match=r"2 of 3 pairs are usable, at least 3 are needed.*dark: left: too dark"):
@@ -144,7 +144,7 @@ def test_too_few_pairs_say_how_many_are_needed_and_why_there_are_not():
 
 
 def test_corners_in_random_positions_are_no_calibration():
-    _, board, Ts = bench()
+    _, board, Ts = rig_and_board()
     rng = np.random.default_rng(0)
     ids = np.arange(54)
     pairs = [Pair(f"p{n}", *(detections(ids, rng.uniform(0, 360, (54, 2))) for _ in "lr")) for n in range(len(Ts) // 2)]

@@ -9,14 +9,14 @@ from scipy.stats import chi2
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
-from armsight.vision.calibrate import choose
+from armsight.vision.calibrate import boards
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.match import join, renamed
 from armsight.vision.measure import measure_detections
 from armsight.vision.triangulate import optimal_points
-from board_views import SIZES, bench, board_pairs, rig_error
+from board_views import SIZES, board_pairs, rig_and_board, rig_error
 from views import both_pixels
 
 WAY_M, ROTATION_RAD, SIGMA_PX = 3e-4, 2e-3, 0.05
@@ -44,14 +44,14 @@ def unsynchronised(true, board, Ts, motions, seed=0):
 
 @pytest.fixture(scope="module")
 def moved():
-    true, board, Ts = bench(count=24)
+    true, board, Ts = rig_and_board(count=24)
     motions = motions_of(len(Ts), far=(4, 13))
     pairs = unsynchronised(true, board, Ts, motions)
     return true, motions, calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=True)
 
 
 def test_boards_that_stood_still_have_no_motion():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), folds=2, flat=True)
     assert c.motion is None
     assert c.heldout.motion_rms_m == c.heldout.motion_rms_rad == 0
@@ -78,8 +78,8 @@ def test_the_rig_of_moving_boards_is_within_its_covariance_and_better_than_witho
     true, _, c = moved
     error, sigma = rig_error(c.rig, true), np.sqrt(np.diag(c.rig.cov))
     assert (np.abs(error) < 4 * sigma).all(), error / sigma
-    monkeypatch.setattr(choose, "MOTION_WORTH", 1.0)
-    true, board, Ts = bench(count=24)
+    monkeypatch.setattr(boards, "MOTION_WORTH", 1.0)
+    true, board, Ts = rig_and_board(count=24)
     pairs = unsynchronised(true, board, Ts, motions_of(len(Ts), far=(4, 13)))
     assumed = calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=True)
     assert assumed.motion is None
@@ -91,7 +91,7 @@ def test_the_rig_of_moving_boards_is_within_its_covariance_and_better_than_witho
 
 def test_what_is_predicted_for_other_pairs_holds_their_motion(moved):
     true, _, c = moved
-    _, board, Ts = bench(count=24, seed=8)
+    _, board, Ts = rig_and_board(count=24, seed=8)
     pairs = unsynchronised(true, board, Ts, motions_of(len(Ts), seed=12, far=(0, 9)), seed=1)
     rows = Observations.from_shots([join(p.left, p.right) for p in pairs])
     corners = replace(c.rig, sigma_px=c.solution.sigma_px)
@@ -108,7 +108,7 @@ def test_what_is_predicted_for_other_pairs_holds_their_motion(moved):
 
 def test_a_body_at_rest_is_measured_within_the_sigma_of_a_rig_of_moving_boards(moved):
     true, _, c = moved
-    _, board, Ts = bench(count=24, seed=8)
+    _, board, Ts = rig_and_board(count=24, seed=8)
     nees = []
     for T, pair in zip(Ts, unsynchronised(true, board, Ts, 0 * motions_of(len(Ts)), seed=2), strict=True):
         r = measure_detections(c.rig, board.body, pair.left, pair.right)
@@ -119,7 +119,7 @@ def test_a_body_at_rest_is_measured_within_the_sigma_of_a_rig_of_moving_boards(m
 
 
 def test_a_motion_seen_from_a_camera_moves_points_as_it_does():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     points, T = board.body.points, Ts[3]
     middle, motion = points.mean(axis=0), ExposureMotion(1.0, 1.0, np.ones(1), 2e-6, 3e-5)
     T_right_board = np.linalg.inv(true.T_left_right) @ T
@@ -140,7 +140,7 @@ def test_a_motion_seen_from_a_camera_moves_points_as_it_does():
 
 
 def test_a_board_far_apart_in_the_two_images_is_no_motion():
-    true, board, Ts = bench(count=24)
+    true, board, Ts = rig_and_board(count=24)
     pairs = unsynchronised(true, board, Ts, motions_of(len(Ts)))
     order = np.arange(54).reshape(6, 9)[::-1, ::-1].ravel()
     pairs[7] = replace(pairs[7], right=renamed(pairs[7].right, order))
@@ -151,7 +151,7 @@ def test_a_board_far_apart_in_the_two_images_is_no_motion():
 
 def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
     rng = np.random.default_rng(4)
-    true, board, Ts = bench(count=3)
+    true, board, Ts = rig_and_board(count=3)
     points = board.body.points
     rows = Observations.from_shots([join(p.left, p.right) for p in board_pairs(true, points, Ts)])
     model = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)

@@ -14,7 +14,7 @@ from armsight.vision.calibrate.screen import correct_symmetries, noise_px, robus
 from armsight.vision.calibrate.start import pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, weaknesses
 from armsight.vision.match import join, renamed
-from board_views import SIZES, bench, board_pairs
+from board_views import SIZES, board_pairs, rig_and_board
 
 
 def observed(pairs):
@@ -37,7 +37,7 @@ def truth(rig, Ts):
     [("brown4", "brown4", 450.0), ("brown4", "none", 900.0), ("fisheye", "fisheye", 230.0)],
 )
 def test_cameras_are_found_from_nothing(model, true_model, focal_px):
-    true, board, Ts = bench(true_model, focal_px, 8)
+    true, board, Ts = rig_and_board(true_model, focal_px, 8)
     found = start_board(board.body.points, SIZES, observed(board_pairs(true, board.body.points, Ts)), model)
     for camera, real in zip(found.state.cameras, true.cameras, strict=True):
         # Eight boards fix the focal length to half a percent or better; the start's job is the right minimum.
@@ -52,7 +52,7 @@ def test_a_pinhole_looks_from_the_middle():
 
 
 def test_most_shots_decide_the_relative_pose():
-    rng, (true, _, Ts) = np.random.default_rng(0), bench()
+    rng, (true, _, Ts) = np.random.default_rng(0), rig_and_board()
     left = [[T] for T in Ts[:10]]
     right = [[inverse(true.T_left_right) @ T] for T in Ts[:10]]
     for j in (1, 4, 7):  # three shots are wrong
@@ -70,7 +70,7 @@ def test_most_shots_decide_the_relative_pose():
 
 
 def test_the_noise_is_read_off_the_residuals():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     observations = observed(board_pairs(true, board.body.points, Ts, sigma=0.2))
     solution = minimise(flat(board.body.points), truth(true, Ts), observations, 0.2)
     # 4320 residuals: sqrt(1 / 8640) is 1.1%; four times that. The median is 1.44 times as vague as the mean square.
@@ -79,7 +79,7 @@ def test_the_noise_is_read_off_the_residuals():
 
 
 def test_only_what_is_wrong_is_thrown_out():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     pairs = board_pairs(true, board.body.points, Ts)
     observations = observed(pairs)
     names = tuple(p.name for p in pairs)
@@ -100,7 +100,7 @@ def test_only_what_is_wrong_is_thrown_out():
 
 
 def test_a_reversed_board_is_found_by_shot():
-    true, board, Ts = bench(spec="chessboard:9x7:25mm")
+    true, board, Ts = rig_and_board(spec="chessboard:9x7:25mm")
     pairs = board_pairs(true, board.body.points, Ts[:4])
     pairs[2] = replace(pairs[2], right=renamed(pairs[2].right, board.symmetries[0]))
     found = correct_symmetries(board.body.points, truth(true, Ts[:4]), observed(pairs), board.symmetries)
@@ -112,7 +112,7 @@ def test_a_reversed_board_is_found_by_shot():
 
 
 def test_a_perfect_rig_has_no_error_and_a_large_board_shows_as_scale():
-    true, board, Ts = bench(count=6)
+    true, board, Ts = rig_and_board(count=6)
     points = board.body.points
     exact = summary(pair_errors(true, points, observed(board_pairs(true, points, Ts, sigma=0.0))), 1)
     assert exact.epipolar_rms_px < 1e-6
@@ -129,14 +129,14 @@ def test_a_perfect_rig_has_no_error_and_a_large_board_shows_as_scale():
 
 
 def test_the_epipolar_error_is_that_of_the_noise():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     observations = observed(board_pairs(true, board.body.points, Ts, sigma=0.1))
     # Either image's distance from its line holds both images' noise: sqrt(2) times 0.1 px where the scales are equal.
     assert residual_epipolar_rms(true, observations) == pytest.approx(0.1 * np.sqrt(2), rel=0.06)
 
 
 def test_every_shot_is_held_out_once_and_never_fitted_then():
-    true, board, Ts = bench(count=7)
+    true, board, Ts = rig_and_board(count=7)
     observations, asked = observed(board_pairs(true, board.body.points, Ts)), []
 
     def fit(rows):
@@ -156,7 +156,7 @@ def test_every_shot_is_held_out_once_and_never_fitted_then():
 
 @pytest.fixture(scope="module")
 def calibration():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     return calibrate_boards(
         board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), folds=3, flat=True
     )
@@ -200,7 +200,7 @@ def test_each_weakness_is_reported_where_it_is_and_only_there(calibration):
 
 
 def test_exchanged_cameras_are_suspected():
-    true, board, Ts = bench()
+    true, board, Ts = rig_and_board()
     pairs = [replace(p, left=p.right, right=p.left) for p in board_pairs(true, board.body.points, Ts[:8])]
     c = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2, flat=True)
     assert said(c, "are left and right exchanged?")
@@ -208,9 +208,9 @@ def test_exchanged_cameras_are_suspected():
 
 
 def test_random_corners_start_nothing_or_nothing_good():
-    _, board, _ = bench()
+    _, board, _ = rig_and_board()
     rng = np.random.default_rng(1)
-    true, _, Ts = bench(count=6)
+    true, _, Ts = rig_and_board(count=6)
     observations = observed(board_pairs(true, board.body.points, Ts))
     noise = replace(observations, uv=rng.uniform(0, 360, observations.uv.shape))
     try:

@@ -30,7 +30,7 @@ def tool():
 
 
 def cloud(T_left_body, rng):
-    """Render the tool before a wall with a bench's rig, match it, and return its points and sigmas."""
+    """Render the tool before a wall with the example rig, match it, and return its points and sigmas."""
     rig = example_rig((640, 480), focal_px=640.0)
     wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, contrast=25.0, seed=9)
     behind = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.3]))

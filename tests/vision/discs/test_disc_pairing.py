@@ -145,7 +145,7 @@ def test_triples_are_those_of_trying_every_one(seed):
             return False
         gap, side = p[i] - p[j], np.linalg.norm(MIXED.body.points[a] - MIXED.body.points[b])
         u = gap / np.linalg.norm(gap)
-        variance = u @ (pairs.cov[i] + pairs.cov[j]) @ u + ((u @ (root[i] - root[j])) ** 2).sum() + view.unmade_m**2
+        variance = u @ (pairs.cov[i] + pairs.cov[j]) @ u + ((u @ (root[i] - root[j])) ** 2).sum() + view.made_sigma_m**2
         return (np.linalg.norm(gap) - side) ** 2 <= DISTANCE_SIGMAS**2 * variance
 
     nodes = [(int(a), int(i)) for i, a in np.argwhere(pairs.fits)]

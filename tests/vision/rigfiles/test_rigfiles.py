@@ -138,7 +138,7 @@ def test_a_full_disk_replaces_neither_file_of_a_pair(tmp_path, monkeypatch, full
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
         return real(file, data)
 
-    monkeypatch.setattr("armsight.files._Named.write", write)
+    monkeypatch.setattr("armsight.files._NamedFile.write", write)
     with pytest.raises(InputError, match=rf"{targets[full].name}: cannot be written: No space left"):
         export_rig(ordinary_rig("brown5", seed=9), "ros", targets)
     assert [path.read_bytes() for path in targets] == before

@@ -172,7 +172,7 @@ def test_an_index_is_followed(tmp_path, store, read_back):
     assert (z.t_s, z.problem) == (None, f"{tmp_path}/gone.png: no such file")
 
 
-@pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/place", "usbcam", ""])
+@pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/folder", "usbcam", ""])
 def test_an_unknown_source_lists_the_known_ones(spec):
     with pytest.raises(InputError, match=r"not a source: known are folder:..., video:..., url:..., usb:..."):
         open_source(spec)

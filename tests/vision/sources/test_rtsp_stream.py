@@ -55,7 +55,7 @@ class Handler(socketserver.StreamRequestHandler):
                 self.answer(request[0])
             if request:
                 self.answer("PLAY")
-                self.play()
+                self.send_frames()
 
     def answer(self, method):
         lines = iter(lambda: self.rfile.readline().decode().strip(), "")
@@ -65,7 +65,7 @@ class Handler(socketserver.StreamRequestHandler):
         length = f"Content-Length: {len(body)}\r\n" if body else ""
         self.wfile.write(f"RTSP/1.0 200 OK\r\nCSeq:{number}\r\n{extra}{length}\r\n{body}".encode())
 
-    def play(self):
+    def send_frames(self):
         number = 0
         for k in itertools.count():
             for packet in packets(self.server.frames[k % len(self.server.frames)], number, int(90_000 * PERIOD * k)):

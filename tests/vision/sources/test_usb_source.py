@@ -89,10 +89,10 @@ class FakeCapture:
 
 
 @pytest.fixture
-def bench(monkeypatch, tmp_path):
+def usb_pair(monkeypatch, tmp_path):
     """Open two cameras that are files here, and captures made to order."""
 
-    class Bench:
+    class UsbPair:
         def __init__(self):
             self.clock, self.log = Clock(), []
             self.devices = [tmp_path / "cam0", tmp_path / "cam1"]
@@ -109,60 +109,60 @@ def bench(monkeypatch, tmp_path):
 
             return usb.open_usb(f"{self.devices[0]},{self.devices[1]}{tail}", capture)
 
-    made = Bench()
+    made = UsbPair()
     monkeypatch.setattr(usb, "time", made.clock)
     return made
 
 
-def test_both_are_grabbed_before_either_is_decoded(bench):
-    source = bench.open()
+def test_both_are_grabbed_before_either_is_decoded(usb_pair):
+    source = usb_pair.open()
     source.read()
-    bench.log.clear()
+    usb_pair.log.clear()
     shot = source.read()
-    assert bench.log == ["grab", "grab", "retrieve", "retrieve"]
+    assert usb_pair.log == ["grab", "grab", "retrieve", "retrieve"]
     assert shot.left.shape == shot.right.shape == (480, 640, 3)
     assert shot.name == "000001"
     source.close()
     source.close()
-    assert all(capture.released for capture in bench.captures)
+    assert all(capture.released for capture in usb_pair.captures)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.004, 0.012, 0.02, 0.03])
 @pytest.mark.parametrize("pause", [0.0, 0.02, 0.05, 0.5])
-def test_shots_are_fresh_and_their_frames_belong_together(bench, phase, pause):
+def test_shots_are_fresh_and_their_frames_belong_together(usb_pair, phase, pause):
     """However the two cameras' phases lie and however slow the user is; the queues of a start-up do not stay behind."""
-    source = bench.open(right={"phase": phase})
+    source = usb_pair.open(right={"phase": phase})
     last_s = -np.inf
     for _ in range(12):
         shot = source.read()
-        left, right = (capture.stamp for capture in bench.captures)
+        left, right = (capture.stamp for capture in usb_pair.captures)
         assert abs(left - right) <= PERIOD / 2 + 1e-6
-        assert bench.clock.now - shot.t_s <= 2.5 * PERIOD  # two periods a frame, half of one between the cameras
+        assert usb_pair.clock.now - shot.t_s <= 2.5 * PERIOD  # two periods a frame, half of one between the cameras
         assert shot.t_s == pytest.approx((left + right) / 2, abs=1e-6)
         assert shot.t_s > last_s
         last_s = shot.t_s
-        bench.clock.now += pause
+        usb_pair.clock.now += pause
 
 
-def test_a_driver_without_time_stamps_gets_the_time_after_the_grab(bench):
-    source = bench.open(left={"stamps": False}, right={"stamps": False})
+def test_a_driver_without_time_stamps_gets_the_time_after_the_grab(usb_pair):
+    source = usb_pair.open(left={"stamps": False}, right={"stamps": False})
     shot = source.read()
-    assert shot.t_s == pytest.approx(bench.clock.now, abs=PERIOD)
+    assert shot.t_s == pytest.approx(usb_pair.clock.now, abs=PERIOD)
 
 
-def test_cameras_of_rates_that_never_meet_are_reported(bench):
-    source = bench.open(left={"period": PERIOD}, right={"period": PERIOD})
-    bench.captures[1].clock = Clock()  # the right one's stamps stand on a clock that stays behind
-    bench.captures[1].clock.now -= 5.0
+def test_cameras_of_rates_that_never_meet_are_reported(usb_pair):
+    source = usb_pair.open(left={"period": PERIOD}, right={"period": PERIOD})
+    usb_pair.captures[1].clock = Clock()  # the right one's stamps stand on a clock that stays behind
+    usb_pair.captures[1].clock.now -= 5.0
     with pytest.raises(
         DeviceError, match=r"cam0 and .*cam1: frames stay \d\.\d+ s apart, more than half a frame period"
     ):
         source.read()
 
 
-def test_all_settings_arrive_at_both_cameras(bench):
-    bench.open("@1280x720@60,exposure=5ms,format=MJPG")
-    for capture in bench.captures:
+def test_all_settings_arrive_at_both_cameras(usb_pair):
+    usb_pair.open("@1280x720@60,exposure=5ms,format=MJPG")
+    for capture in usb_pair.captures:
         assert capture.props[cv2.CAP_PROP_FOURCC] == cv2.VideoWriter.fourcc(*"MJPG")
         assert capture.props[cv2.CAP_PROP_FRAME_WIDTH] == 1280
         assert capture.props[cv2.CAP_PROP_FRAME_HEIGHT] == 720
@@ -171,11 +171,11 @@ def test_all_settings_arrive_at_both_cameras(bench):
         assert capture.props[cv2.CAP_PROP_EXPOSURE] == 50  # V4L2 counts in 0.1 ms
 
 
-def test_what_is_not_asked_for_stays(bench):
-    bench.open()
-    assert bench.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
-    assert bench.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
-    assert bench.captures[0].props[cv2.CAP_PROP_FRAME_WIDTH] == 640
+def test_what_is_not_asked_for_stays(usb_pair):
+    usb_pair.open()
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_FRAME_WIDTH] == 640
 
 
 @pytest.mark.parametrize(
@@ -189,57 +189,57 @@ def test_what_is_not_asked_for_stays(bench):
         (",exposure=5ms", cv2.CAP_PROP_EXPOSURE, "did not take exposure 50 (x 0.1 ms), it says 156"),
     ],
 )
-def test_a_setting_not_taken_is_named_and_both_cameras_let_go(bench, tail, stubborn, said):
+def test_a_setting_not_taken_is_named_and_both_cameras_let_go(usb_pair, tail, stubborn, said):
     with pytest.raises(DeviceError) as caught:
-        bench.open(tail, right={"stubborn": (stubborn,)})
-    assert str(caught.value) == f"{bench.devices[1]}: {said}; `armsight cameras` lists what it can do"
-    assert [capture.released for capture in bench.captures] == [1, 1]
+        usb_pair.open(tail, right={"stubborn": (stubborn,)})
+    assert str(caught.value) == f"{usb_pair.devices[1]}: {said}; `armsight cameras` lists what it can do"
+    assert [capture.released for capture in usb_pair.captures] == [1, 1]
 
 
-def test_exposure_can_be_set_back_to_automatic(bench):
-    bench.open(",exposure=auto")
-    assert bench.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
-    assert bench.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
+def test_exposure_can_be_set_back_to_automatic(usb_pair):
+    usb_pair.open(",exposure=auto")
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
 
 
-def test_a_stall_is_reported_and_who_stalled(bench):
-    source = bench.open()
+def test_a_stall_is_reported_and_who_stalled(usb_pair):
+    source = usb_pair.open()
     source.read()
-    bench.captures[1].dead = True
+    usb_pair.captures[1].dead = True
     with pytest.raises(DeviceError) as caught:
         source.read()
-    assert str(caught.value) == f"{bench.devices[1]}: no frame for 5 s: stalled; two cameras may need two USB ports"
+    assert str(caught.value) == f"{usb_pair.devices[1]}: no frame for 5 s: stalled; two cameras may need two USB ports"
 
 
-def test_an_unplugged_camera_is_reported(bench):
-    source = bench.open()
+def test_an_unplugged_camera_is_reported(usb_pair):
+    source = usb_pair.open()
     source.read()
-    bench.captures[0].dead = True
-    bench.devices[0].unlink()
+    usb_pair.captures[0].dead = True
+    usb_pair.devices[0].unlink()
     with pytest.raises(DeviceError, match=r"cam0: the camera is gone: unplugged"):
         source.read()
 
 
-def test_a_hiccup_shorter_than_a_stall_is_waited_out(bench):
-    source = bench.open()
+def test_a_hiccup_shorter_than_a_stall_is_waited_out(usb_pair):
+    source = usb_pair.open()
     source.read()
-    grab, misses = bench.captures[0].grab, iter([False, False])
-    bench.captures[0].grab = lambda: next(misses, None) is None and grab()
+    grab, misses = usb_pair.captures[0].grab, iter([False, False])
+    usb_pair.captures[0].grab = lambda: next(misses, None) is None and grab()
     assert source.read().problem is None
 
 
-def test_a_frame_that_does_not_decode_is_a_shot_with_a_problem(bench):
-    source = bench.open()
-    bench.captures[1].undecodable = True
+def test_a_frame_that_does_not_decode_is_a_shot_with_a_problem(usb_pair):
+    source = usb_pair.open()
+    usb_pair.captures[1].undecodable = True
     shot = source.read()
     assert (shot.left, shot.right) == (None, None)
-    assert shot.problem == f"{bench.devices[1]}: the frame cannot be decoded"
-    bench.captures[1].undecodable = False
+    assert shot.problem == f"{usb_pair.devices[1]}: the frame cannot be decoded"
+    usb_pair.captures[1].undecodable = False
     assert source.read().problem is None
 
 
-def test_a_frame_of_another_size_is_reported(bench):
-    source = bench.open("@1280x720", right={"size": (640, 480)})
+def test_a_frame_of_another_size_is_reported(usb_pair):
+    source = usb_pair.open("@1280x720", right={"size": (640, 480)})
     with pytest.raises(DeviceError, match=r"cam1: sends frames of 640x480 px, agreed on 1280x720"):
         source.read()
 

@@ -67,7 +67,7 @@ def test_an_uneven_surround_and_uneven_light_do_not_pull():
     kinds = {
         "surround": 70 + slope * (1 - window) + 110 * window,
         "light": (40 + 120 * window) * (1 + slope / 100),
-        "stray": 60 + 110 * window + slope,
+        "glare": 60 + 110 * window + slope,
     }
     for light in kinds.values():
         e = np.array([BRIGHT.find(grey(light, 1.0, rng)).uv[0] - c for _ in range(60)])
@@ -185,7 +185,7 @@ def test_an_image_with_too_many_positions_is_said_to_be():
     image = (255 * np.random.default_rng(12).integers(0, 2, (2160, 3840))).astype(np.uint8)
 
     def full(part):
-        return "no more are looked at" in BRIGHT.find(part).rejected[0].reason
+        return "no more are examined" in BRIGHT.find(part).rejected[0].reason
 
     row = round(BRIGHT.find(image).rejected[0].uv[1])
     assert full(image)
