@@ -25,7 +25,7 @@ def rig_and_board(model="brown5", focal_px=450.0, count=20, spec="chessboard:9x6
 
 
 def detections(ids, uv):
-    """Detections whose image tells no covariance."""
+    """Detections whose image gives no covariance."""
     return Detections(np.asarray(ids), np.asarray(uv), np.zeros((len(ids), 2, 2)))
 
 

@@ -1,4 +1,4 @@
-"""What tests share: one fixed hypothesis profile, the place of the real recordings, the firmware of this computer."""
+"""What tests share: one fixed hypothesis profile, the folder of the real recordings, the firmware of this computer."""
 
 import os
 import signal
@@ -52,18 +52,18 @@ def small_disk(tmp_path):
     mounted = []
 
     def mount(size):
-        place = tmp_path / f"disk{len(mounted)}"
-        place.mkdir()
-        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place]
+        folder = tmp_path / f"disk{len(mounted)}"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             pytest.skip(f"cannot mount a small tmpfs here: {done.stderr.strip()}")
-        mounted.append(place)
-        return place
+        mounted.append(folder)
+        return folder
 
     yield mount
-    for place in mounted:
-        subprocess.run(["umount", place], check=True)
+    for folder in mounted:
+        subprocess.run(["umount", folder], check=True)
 
 
 @pytest.fixture

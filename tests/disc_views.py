@@ -89,8 +89,8 @@ def views(rig, target, Ts, rng=None, sigma=SIGMA, clutter=0, hidden=(), radii=(4
             bright.append(target.bright[keep])
             owner.append(np.column_stack([np.full(len(keep), b), keep]).reshape(-1, 2))
         uv.append(rng.uniform(0, 1, (clutter, 2)) * (np.array(SIZE) - 1))
-        r, squeeze, turn = rng.uniform(*radii, clutter), rng.uniform(0.5, 1, clutter), rng.uniform(0, np.pi, clutter)
-        c, s = np.cos(turn), np.sin(turn)
+        r, squeeze, angle = rng.uniform(*radii, clutter), rng.uniform(0.5, 1, clutter), rng.uniform(0, np.pi, clutter)
+        c, s = np.cos(angle), np.sin(angle)
         a, b2 = r**2, (r * squeeze) ** 2
         shape.append(np.column_stack([a * c**2 + b2 * s**2, (a - b2) * c * s, a * s**2 + b2 * c**2]))
         bright.append(rng.random(clutter) < 0.5 if len(set(target.bright)) > 1 else np.full(clutter, target.bright[0]))

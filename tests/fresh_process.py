@@ -1,4 +1,4 @@
-"""What only a process that has compiled nothing yet can tell: whether a warm-up compiles all that is called afterwards."""
+"""What only a process that has compiled nothing yet can show: whether a warm-up compiles all that is called afterwards."""
 
 import os
 import subprocess

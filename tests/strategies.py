@@ -1,4 +1,4 @@
-"""What tests draw from: rotations near nothing and near pi, poses, cameras, rigs. One place, used everywhere."""
+"""What tests draw from: rotations near nothing and near pi, poses, cameras, rigs. One file, used everywhere."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -68,7 +68,7 @@ def poses(draw, reach: float = 2.0) -> np.ndarray:
 
 @st.composite
 def verging_rigs(draw) -> VergingRig:
-    """The chapter's cameras, unequal and anywhere a table top would have them."""
+    """Cameras as in the method's setup, unequal and anywhere a table top would have them."""
     return VergingRig(
         F1=draw(finite(2e-3, 16e-3)),
         F2=draw(finite(2e-3, 16e-3)),

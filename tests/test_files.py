@@ -83,7 +83,7 @@ def test_a_link_stays_a_link(tmp_path):
 @pytest.mark.parametrize("old", [None, "old\n"])
 @pytest.mark.parametrize("pieces", [1, 100])
 @pytest.mark.parametrize("size", [0, 3, 200_000])
-def test_a_disk_without_room_is_told_of_the_file_and_leaves_what_was(tmp_path, old, pieces, size):
+def test_a_disk_without_room_is_reported_with_the_file_and_leaves_what_was(tmp_path, old, pieces, size):
     path = tmp_path / "file.txt"
     if old is not None:
         path.write_text(old)
@@ -93,7 +93,7 @@ def test_a_disk_without_room_is_told_of_the_file_and_leaves_what_was(tmp_path, o
     assert [p.read_text() for p in tmp_path.iterdir()] == ([] if old is None else [old])
 
 
-def test_no_space_is_told(tmp_path, monkeypatch):
+def test_no_space_is_reported(tmp_path, monkeypatch):
     def write(self, data):
         with self._named():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -108,11 +108,11 @@ def test_no_space_is_told(tmp_path, monkeypatch):
 @pytest.mark.parametrize("full", ["first", "second"])
 @pytest.mark.parametrize("content", [SMALL * 100, LARGE])
 @pytest.mark.parametrize("flush", [False, True])
-def test_nested_files_are_each_told_by_name(tmp_path, full, content, flush):
+def test_nested_files_are_each_reported_by_name(tmp_path, full, content, flush):
     contents = {tmp_path / name: [content if name == full else SMALL] for name in ("first", "second")}
     with room(300), pytest.raises(InputError, match=f"{full}: cannot be written: File too large"):
         write(contents, flush)
-    # What is small and not flushed shows its trouble only on closing, when the second file is already in its place.
+    # What is small and not flushed shows its trouble only on closing, when the second file already stands.
     late = full == "first" and content != LARGE and not flush
     assert os.listdir(tmp_path) == (["second"] if late else [])
 
@@ -135,7 +135,7 @@ def test_errors_of_other_files_keep_their_name(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["nowhere/file", "nowhere/deeper/file", "text/file"])
-def test_a_missing_folder_is_told(tmp_path, where):
+def test_a_missing_folder_is_reported(tmp_path, where):
     (tmp_path / "text").write_text("no folder")
     with pytest.raises(InputError) as caught:
         write_text(tmp_path / where, SMALL)
@@ -158,7 +158,7 @@ def test_a_folder_or_a_device_is_no_file(tmp_path):
     assert os.listdir(tmp_path) == ["pipe"]
 
 
-def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
+def test_a_folder_without_permission_is_reported(tmp_path, monkeypatch):
     check_writable(tmp_path / "file")
     assert os.listdir(tmp_path) == []
     monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # root may write anywhere
@@ -166,12 +166,12 @@ def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
         check_writable(tmp_path / "file")
 
 
-def test_a_folder_that_refuses_is_told(forbidden):
+def test_a_folder_that_refuses_is_reported(forbidden):
     with pytest.raises(InputError, match="file: cannot be written: Permission denied"):
         write_text(forbidden / "file", SMALL)
 
 
-def test_a_name_that_is_too_long_is_told(tmp_path):
+def test_a_name_that_is_too_long_is_reported(tmp_path):
     with pytest.raises(InputError, match="cannot be written: File name too long"):
         write_text(tmp_path / ("x" * 256), SMALL)
 
@@ -179,7 +179,7 @@ def test_a_name_that_is_too_long_is_told(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"), [(None, "no such file"), (b"\xff\xfe", "not a text file"), (..., "cannot be read: Is a dir")]
 )
-def test_reading_tells_what_is_wrong(tmp_path, content, said):
+def test_reading_says_what_is_wrong(tmp_path, content, said):
     path = tmp_path / "file"
     if content is ...:
         path.mkdir()

@@ -24,7 +24,7 @@ def armsight(capsys):
 
 
 @dataclass(frozen=True)
-class Bench:
+class Files:
     """Where the recording lies, and what is true of it."""
 
     folder: Path
@@ -56,7 +56,7 @@ def rendered(tmp_path_factory):
     """Record 12 pairs of a board and 16 shots of an end-effector, 640x360, and calibrate."""
     folder = tmp_path_factory.mktemp("rendered")
     of_board, of_arm = demo_recording(folder, seed=3, image_size_px=(640, 360), boards=12, shots=16, rate_hz=4.0)
-    here = Bench(folder, of_board, of_arm)
+    here = Files(folder, of_board, of_arm)
     assert run("calibrate", *here.board, "--lens-model", "brown5", "--folds", 4, "-o", here.rig) == 0
     return here
 
@@ -64,6 +64,6 @@ def rendered(tmp_path_factory):
 @pytest.fixture
 def full_disk(small_disk):
     """A file system of one page, full."""
-    place = small_disk("4k")
-    (place / "ballast").write_bytes(bytes(4096))
-    return place
+    disk = small_disk("4k")
+    (disk / "ballast").write_bytes(bytes(4096))
+    return disk

@@ -24,6 +24,6 @@ def test_lists_of_numbers_pass():
         ([1, -np.inf], (2,), "points contains NaN or infinity"),
     ],
 )
-def test_refusals_say_what_is_wrong(value, shape, message):
+def test_errors_say_what_is_wrong(value, shape, message):
     with pytest.raises(InputError, match=message):
         checked(value, shape, "points")

@@ -88,13 +88,13 @@ def test_manipulability_is_the_volume_of_the_velocity_ellipsoid(arm):
 
 
 @given(st.floats(-4000, 4000))
-def test_sine_and_cosine_are_within_two_units_in_the_last_place(x):
+def test_sine_and_cosine_are_within_two_units_of_the_last_digit(x):
     s, c = sincos(x)
     assert abs(s - np.sin(x)) <= 2 * np.spacing(max(abs(np.sin(x)), 1e-300)) + 1e-19
     assert abs(c - np.cos(x)) <= 2 * np.spacing(max(abs(np.cos(x)), 1e-300)) + 1e-19
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-def test_the_angle_of_a_point_is_within_two_units_in_the_last_place(y, x):
+def test_the_angle_of_a_point_is_within_two_units_of_the_last_digit(y, x):
     y, x = (0.0 if abs(v) < 1e-150 else v for v in (y, x))
     assert abs(angle_of(y, x) - np.arctan2(y + 0.0, x + 0.0)) <= 2 * np.spacing(abs(np.arctan2(y, x)))

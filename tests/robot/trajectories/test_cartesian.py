@@ -204,7 +204,7 @@ def test_a_long_motion_is_looked_through_in_pieces():
     assert found.value.t_s == pytest.approx(40.0, abs=0.01)
 
 
-# Refusals: where and when.
+# Rejections: where and when.
 
 
 def said_of(found, arm, motion_start, step):
