@@ -177,7 +177,7 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
     for row in rows[1:]:
         row[1] = str(-float(row[1]))
     other.write_text("\n".join(",".join(row) for row in rows))
-    parts = ("to validate with", "the sign is turned of joint 2")
+    parts = ("to validate with", "the sign is wrong of joint 2")
     assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
 
 
