@@ -97,7 +97,7 @@ def test_without_normals_the_same_plate_is_ambiguous_and_normals_are_asked_for(a
 
 
 @pytest.mark.parametrize(("count", "rotations"), [(3, 2), (4, 3), (5, 4)])
-def test_a_regular_body_is_ambiguous_by_each_of_its_turns_and_the_move_that_is_advised_mends_it(
+def test_a_regular_body_is_ambiguous_by_each_of_its_rotations_and_the_move_that_is_advised_mends_it(
     armsight, body, tmp_path, count, rotations
 ):
     path = body(regular(count))
@@ -325,7 +325,7 @@ def blobs(image, bright, radius_px):
 
 @pytest.mark.parametrize("bright", [True, False])
 @pytest.mark.parametrize("paper", ["a4", "letter", "fit"])
-def test_discs_are_drawn_to_scale(armsight, body, tmp_path, bright, paper):
+def test_discs_are_plotted_to_scale(armsight, body, tmp_path, bright, paper):
     path = body(((-50, -10, 0), (55, 0, 0), (5, 85, 0)), radius=6.35, bright=str(bright).lower())
     (image,) = pages_of(armsight, path, tmp_path, "--paper", paper)
     if paper != "fit":
@@ -352,7 +352,7 @@ def test_the_bar_is_as_long_as_it_says(armsight, tmp_path):
 @pytest.mark.parametrize(
     "spec", ["tag", "chessboard:7x4:10mm", "charuco:8x5:15mm:11mm:DICT_5X5_100", "aprilgrid:3x2:20mm:0.3"]
 )
-def test_tags_and_boards_are_drawn_to_scale_and_found_where_the_body_has_them(armsight, body, tmp_path, spec):
+def test_tags_and_boards_are_plotted_to_scale_and_found_where_the_body_has_them(armsight, body, tmp_path, spec):
     path = body(more=TAG if spec == "tag" else BOARD.replace("SPEC", spec))
     if spec != "tag":
         path = body(((-80, 0, 0), (55, 0, 0)), more=BOARD.replace("SPEC", spec))
@@ -408,7 +408,7 @@ def test_pdf_and_svg_have_the_papers_size_and_are_the_same_each_time(armsight, t
     assert [float(width), float(height)] == pytest.approx([210 / 25.4 * 72, 297 / 25.4 * 72], abs=0.01)
 
 
-def test_names_that_are_not_plain_are_drawn(armsight, body, tmp_path):
+def test_names_that_are_not_plain_are_plotted(armsight, body, tmp_path):
     path = body()
     path.write_text(path.read_text().replace('"P1"', '"$x^2$"').replace('"P2"', '"\\u6e2c\\u5b9a"'))
     assert armsight("body", "draw", path, "-o", tmp_path / "names.pdf").code == 0

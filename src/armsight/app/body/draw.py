@@ -155,7 +155,7 @@ def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[_PosedMar
     if unknown.any():
         normals[unknown] = _face(path, layout, discs, unknown)
         notes.append(
-            f"{', '.join(np.array(discs.body.point_names)[unknown][:4])}: no normal given; drawn as seen from "
+            f"{', '.join(np.array(discs.body.point_names)[unknown][:4])}: no normal given; plotted as seen from "
             f"({', '.join(f'{c + 0.0:.2g}' for c in normals[unknown][0])}), the other side is the mirror image"
         )
     return [
@@ -173,7 +173,7 @@ def _face(path: str | Path, layout: Layout, discs: DiscTarget, unknown: NDArray[
     level = 1e3 * (points - points.mean(axis=0)) @ normal
     if np.abs(level).max() > _LEVEL_MM or (len(known) and (known @ normal).min() < _PARALLEL):
         name = discs.body.point_names[int(np.flatnonzero(unknown)[0])]
-        raise InputError(f"{path}: the body is not flat, so {name} needs its normal to be drawn: normal = [x, y, z]")
+        raise InputError(f"{path}: the body is not flat, so {name} needs its normal to be plotted: normal = [x, y, z]")
     return normal
 
 

@@ -21,13 +21,12 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
-from armsight.loop.identify.corrected import Corrected
+from armsight.loop.identify.corrected import Corrected, table_text, zeros_text
 from armsight.loop.identify.diagnose import BAD_M, BAD_RAD, check_plausible, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Parameter
-from armsight.loop.identify.toml_write import table_text, zeros_text
-from armsight.loop.identify.validate import LEAST, Errors, Validation, validate
+from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, validate
 from armsight.robot.arm import Arm
 
 #: Parts of the poses that are left out, one after the other, where nothing is given to validate with.
@@ -106,7 +105,7 @@ def _validated(found: Identified, arm: Arm, other: Measured) -> Validation:
     held_out = validate(found, other)
     off = held_out.identified
     rotated = bool(off.angle_rad.size) and float(np.median(off.angle_rad)) > BAD_RAD
-    if len(other) >= LEAST and (rotated or float(np.median(off.position_m)) > BAD_M):
+    if len(other) >= MIN_POSES and (rotated or float(np.median(off.position_m)) > BAD_M):
         try:
             check_plausible(without_tool(arm), other)
         except InputError as error:
