@@ -6,7 +6,6 @@ In: what a run measured. Out: a :class:`RunSummary`; its JSON is made in :meth:`
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from armsight.app.run.metrics import (
 )
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
+from armsight.files import finite_json
 from armsight.robot.arm import Arm
 
 #: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.
@@ -144,7 +144,7 @@ class RunSummary:
         if self.handeye is not None:
             found["studies"] = [_study_json(study) for study in self.studies]
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
-        known: dict[str, Any] = _known(found)
+        known: dict[str, Any] = finite_json(found)
         return known
 
 
@@ -186,15 +186,6 @@ def _study_json(study: Study) -> dict[str, Any]:
         "position_rms_m": study.position_rms_m.tolist(),
         "predicted_m": study.predicted_m.tolist(),
     }
-
-
-def _known(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value as JSON can hold it: None (null) replaces every number that is not known."""
-    if isinstance(value, Mapping):
-        return {key: _known(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_known(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def summary_of(
