@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# The environment's Python with OpenCV 4, which lies in a folder of its own, before the newer one.
+OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
 
 .PHONY: demo test lint docs bench clean
 
@@ -10,8 +12,8 @@ demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held
 
 test: $(VENV)/.armsight-test $(VENV)/.opencv4 lint  ## everything that must hold
 	$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile
-	PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
-	PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile -m opencv
+	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
+	$(OPENCV4) -m pytest -n auto --maxprocesses=4 --dist=loadfile -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
 
 lint: $(VENV)/.armsight-test
 	$(BIN)/ruff check .
@@ -36,7 +38,6 @@ $(VENV)/.armsight-test: $(VENV)/.armsight
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
 	touch $@
 
-# OpenCV 4 in a folder of its own, which PYTHONPATH puts before the newer one; everything else is the environment's.
 $(VENV)/.opencv4: $(VENV)/.armsight-test
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"
 	touch $@

@@ -1,8 +1,9 @@
-"""A world for the tests of the loop: an arm with known errors, its potentiometers, and cameras that see it late.
+"""A test rig for the loop: an arm with known errors, its potentiometers, and cameras that see it late.
 
-Nothing here uses the code under test: the true arm is a product of 4x4 matrices by the convention's definition, small
-motions are scipy's matrix exponential, backlash is the backlash operator stepped at 1 kHz, and seen poses are built from
-true ones.
+Nothing here computes with the code under test: the true arm is a product of 4x4 matrices by the convention's definition,
+small motions are scipy's matrix exponential, backlash is its operator stepped at 1 kHz, measured poses are built from
+true ones and carried to the tool with adjoints written out here. Of the package it takes records (Mounting, Track, ...),
+the numbers of the arm's table and those of the prior.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from armsight.data import JointStates, PoseEstimate
-from armsight.loop.estimators import Mounting, Prior, Track
+from armsight.loop.estimators import Mounting, PoseMeasurement, Prior, Track
 from armsight.robot.models import MODELS
 
 ARM = MODELS["six_r"]
@@ -195,6 +196,23 @@ def seen(rng, T_base_tool, true, sigma=SHOT):
     return PoseEstimate(T, cov, cov, 0.0, 0.0, 1.0, None)
 
 
+def adjoint_of(T):
+    """The matrix (6, 6) of T exp(xi) T^-1 = exp(Ad xi), for tangents [translation; rotation]."""
+    R, (x, y, z) = T[:3, :3], T[:3, 3]
+    return np.block([[R, np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R], [np.zeros((3, 3)), R]])
+
+
+def measured(mounting, pose, t_s):
+    """What a mounting makes of a measured body: the tool's pose, and covariances to first order.
+
+    With Z exp(z) X exp(b) (B exp(x))^-1 = Z X B^-1 exp(Ad(B) (Ad(X^-1) z + b - x)).
+    """
+    Z, B, X = mounting.T_base_rig, mounting.T_tool_body, pose.T_left_body
+    A, D = adjoint_of(B), np.hstack([adjoint_of(np.linalg.inv(X)), -np.eye(6)])
+    common = pose.cov - pose.cov_noise + D @ mounting.cov @ D.T
+    return PoseMeasurement(t_s, Z @ X @ np.linalg.inv(B), A @ pose.cov_noise @ A.T, A @ common @ A.T)
+
+
 def states(t, q):
     return JointStates(np.asarray(t), np.asarray(q))
 
@@ -236,7 +254,7 @@ def run(rng, estimator, arm, shaft, *, rate_hz=60.0, late_s=0.0, jitter_s=0.0, b
         u = real / TICK_S - k
         step = np.linalg.inv(Ts[k]) @ Ts[k + 1]
         between = Ts[k] @ small(u * off(np.eye(4), step))
-        events.append((s + arrives_s, mounting.pose_measurement(seen(rng, between, true), s + late_s)))
+        events.append((s + arrives_s, measured(mounting, seen(rng, between, true), s + late_s)))
     tracks, done = [], 0
     chunk = 16
     for begin in range(0, len(t), chunk):
@@ -286,7 +304,7 @@ class Workcell:
                 self.next_shot_s += 1 / self.rate_hz
                 if not self.blind:
                     pose = seen(self.rng, Ts[n], self.true)
-                    self.coming.append((self.t_s + self.delay_s, self.mounting.pose_measurement(pose, self.t_s)))
+                    self.coming.append((self.t_s + self.delay_s, measured(self.mounting, pose, self.t_s)))
         t = (self.tick - ticks + 1 + np.arange(ticks)) * TICK_S
         self.estimator.joints(states(t, shafts + self.rng.normal(size=shafts.shape) * Prior().reading_rad))
         while self.coming and self.coming[0][0] <= self.t_s:

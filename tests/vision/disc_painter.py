@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 
 from armsight.geometry.pose import inverse
+from disc_rims import rim
+from views import pixels
 
 SAMPLES = 16
 
@@ -46,15 +48,10 @@ def grey(light, noise, rng):
 
 
 def rims_of(camera, T_camera_body, target, points=360):
-    """Rims in the image of a body's discs, through the lens point by point."""
-    t = 2 * np.pi * np.arange(points) / points
-    out = []
-    for p, n, r in zip(target.body.points, target.normals, target.radii_m, strict=True):
-        x = np.cross(n, [0.3, 1.0, 0.2])
-        x /= np.linalg.norm(x)
-        rim = p + r * (np.cos(t)[:, None] * x + np.sin(t)[:, None] * np.cross(n, x))
-        out.append(camera.project(rim @ T_camera_body[:3, :3].T + T_camera_body[:3, 3]))
-    return out
+    """Rims in the image of a body's discs, by OpenCV's projection point by point."""
+    R, t = T_camera_body[:3, :3], T_camera_body[:3, 3]
+    discs = zip(target.body.points, target.normals, target.radii_m, strict=True)
+    return [pixels(camera, rim(p, n, r, points) @ R.T + t) for p, n, r in discs]
 
 
 def light_of(rig, target, T_left_body, *, hidden=(), base=45.0, contrast=130.0, blur=0.8):
@@ -64,12 +61,12 @@ def light_of(rig, target, T_left_body, *, hidden=(), base=45.0, contrast=130.0, 
         width, height = camera.image_size_px
         light = np.full((height, width), base)
         T = T_left_body if side == 0 else inverse(rig.T_left_right) @ T_left_body
-        for m, rim in enumerate(rims_of(camera, T, target)):
+        for m, outline_px in enumerate(rims_of(camera, T, target)):
             if (m, side) in hidden:
                 continue
-            corner = np.floor(rim.min(axis=0)).astype(int) - 6
-            size = int(np.ceil(np.ptp(rim, axis=0).max())) + 13
-            window = share([rim], blur, corner, size)
+            corner = np.floor(outline_px.min(axis=0)).astype(int) - 6
+            size = int(np.ceil(np.ptp(outline_px, axis=0).max())) + 13
+            window = share([outline_px], blur, corner, size)
             low, high = np.maximum(corner, 0), np.minimum(corner + size, (width, height))
             if (high > low).all():
                 part = window[low[1] - corner[1] : high[1] - corner[1], low[0] - corner[0] : high[0] - corner[0]]

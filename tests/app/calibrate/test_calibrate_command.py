@@ -15,8 +15,6 @@ from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import assert_rejected, listening
 
-pytestmark = pytest.mark.opencv
-
 QUICK = ("--lens-model", "brown5", "--folds", "3", "--flat-target")
 
 

@@ -131,7 +131,7 @@ def broken(tmp_path, monkeypatch, mend):
     monkeypatch.setattr(demo, "Workcell", Mended)
     monkeypatch.setattr(demo, "_AMOUNTS", {True: (6, 12, 0)})
     with pytest.raises(ArmsightError) as caught:
-        run_demo(Demo(tmp_path, emulator="host", quick=True, seed=1))
+        run_demo(Demo(tmp_path, emulator="host", cameras="640x360@30", quick=True, seed=1))
     assert json.loads((tmp_path / "summary.json").read_text())["ended_by"] in str(caught.value)
     return str(caught.value)
 

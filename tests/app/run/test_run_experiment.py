@@ -152,7 +152,10 @@ def close_the_loop():
         arm = open_arm(name)
         warm_up(arm)
         before = compiled()
-        estimator, servo = KalmanEstimator(arm, delay=Delay(0.013, 2e-3)), PoseServo(arm, LoopTiming(0.016, 0.033, 0.045))
+        estimator, servo = (
+            KalmanEstimator(arm, delay=Delay(0.013, 2e-3)),
+            PoseServo(arm, LoopTiming(0.016, 0.033, 0.045)),
+        )
         way = point_to_point(arm, arm.home, arm.home + 0.2)
         for tick in range(1, 400):
             t_s = 1e-3 * tick

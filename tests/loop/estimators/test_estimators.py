@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arm_rig import ARM, MIDDLE, MOUNT, SHOT, TICK_S, mounts, off, seen, small, states
+from arm_rig import ARM, MIDDLE, MOUNT, SHOT, TICK_S, measured, mounts, off, seen, small, states
 
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse
@@ -101,7 +101,10 @@ def test_a_measurement_is_the_measurement_carried_to_the_tool_with_its_covarianc
     for _ in range(4000):
         true, mounting = mounts(rng)
         samples.append(off(mounting.pose_measurement(seen(rng, T_tool, true), 0.0).T_base_tool, T_tool))
-    pose_measurement = mounting.pose_measurement(seen(rng, T_tool, true), 0.0)
+    pose = seen(rng, T_tool, true)
+    pose_measurement, by_hand = mounting.pose_measurement(pose, 0.0), measured(mounting, pose, 0.0)
+    for name in ("T_base_tool", "cov_noise", "cov_common"):
+        assert np.allclose(getattr(pose_measurement, name), getattr(by_hand, name), rtol=1e-9, atol=1e-15)
     claimed, found = pose_measurement.cov_noise + pose_measurement.cov_common, np.cov(np.array(samples).T)
     # An element of the covariance of N samples is off by at most 5 / sqrt(N) of the root of its diagonals, 1 in 1e6.
     scale = np.sqrt(np.diag(claimed))
