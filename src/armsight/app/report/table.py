@@ -42,9 +42,17 @@ def print_table(table: TextTable) -> None:
     if not console.is_terminal:
         click.echo(plain_text(table))
         return
-    shown = Table(title=table.title, title_justify="left", show_header=any(table.columns))
+    shown = Table(
+        title=table.title,
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        show_header=any(table.columns),
+    )
     for number, column in enumerate(table.columns):
-        shown.add_column(column, justify="right" if number else "left", no_wrap=not number)
+        title = "\n".join(column.rsplit(" ", 1))
+        shown.add_column(title, justify="right" if number else "left", no_wrap=True)
     for row in table.rows:
         shown.add_row(*row)
     console.print(shown)

@@ -40,7 +40,7 @@ VERSION = 2
 TRACKS = {
     "potentiometers": "potentiometers",
     "vision": "vision",
-    "fused": "fused, smoothed (0.6 s later)",
+    "fused": "fused, smoothed",
     "live": "fused, live",
 }
 _DEG = float(np.degrees(1.0))
