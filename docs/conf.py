@@ -10,6 +10,8 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from docutils import nodes
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
@@ -112,6 +114,21 @@ def skip_plain_fields(app: Sphinx, what: str, name: str, member: object, skip: b
     return True if what == "class" and not documented else None
 
 
+def name_types(
+    app: Sphinx, what: str, name: str, member: object, options: object, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Show type aliases by their names also where Sphinx shows its own class for them: ``Image | None``."""
+    short = [text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returned)]
+    return short[0], short[1]
+
+
+def set_dashes(app: Sphinx, doctree: nodes.document) -> None:
+    """Set a dash where Sphinx puts two hyphens between a name and its description."""
+    for text in list(doctree.findall(nodes.Text)):
+        if " -- " in text and not isinstance(text.parent, (nodes.literal, nodes.literal_block)):
+            text.parent.replace(text, nodes.Text(text.replace(" -- ", " \N{EN DASH} ")))
+
+
 def read_again(app: Sphinx, *_: object) -> list[str]:
     """Return the pages that depend on more than Sphinx sees: the commands are imported when they are named."""
     return ["reference/cli"]
@@ -121,4 +138,6 @@ def setup(app: Sphinx) -> None:
     """Hook what the site needs beyond its extensions."""
     app.connect("builder-inited", fill_in_pictures)
     app.connect("autodoc-skip-member", skip_plain_fields)
+    app.connect("autodoc-process-signature", name_types)
+    app.connect("doctree-read", set_dashes)
     app.connect("env-get-outdated", read_again)

@@ -6,8 +6,8 @@ Every line of a ``console`` block that begins with ``$`` is a command; it ends w
 comment before a block says how it runs:
 
 - ``<!-- run: no -->``: needs a device or is the user's own; not run.
-- ``<!-- run: shared -->``: expensive, and the same on several pages: run once in a folder of its own, whose contents are then
-  linked into the folder of every page that has it.
+- ``<!-- run: shared -->``: expensive, and the same on several pages: run once in a folder of its own, whose contents are
+  then linked into the folder of every page that has it.
 
 All other blocks run in the page's own folder. A picture ``_made/PAGE/FILE`` of a page is FILE in that folder after its
 commands have run. A page whose commands, and the program behind them, have not changed is not run again.
