@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
+import disc_rims
 from armsight.geometry.pose import inverse
-from disc_rims import rim
 from views import pixels
 
 SAMPLES = 16
@@ -51,7 +51,7 @@ def rims_of(camera, T_camera_body, target, points=360):
     """Rims in the image of a body's discs, by OpenCV's projection point by point."""
     R, t = T_camera_body[:3, :3], T_camera_body[:3, 3]
     discs = zip(target.body.points, target.normals, target.radii_m, strict=True)
-    return [pixels(camera, rim(p, n, r, points) @ R.T + t) for p, n, r in discs]
+    return [pixels(camera, disc_rims.rim(p, n, r, points) @ R.T + t) for p, n, r in discs]
 
 
 def light_of(rig, target, T_left_body, *, hidden=(), base=45.0, contrast=130.0, blur=0.8):
