@@ -188,7 +188,7 @@ def path(
 
 def tag_plate() -> tuple[tuple[Pattern, ...], str]:
     """Return the demo's end-effector: its patterns, and the text of the body file that describes it."""
-    patterns, lines = [plate(*PLATE_M, value=0.12)], ['name = "plate"']
+    patterns, lines = [plate(*PLATE_M, value=0.12)], ["version = 2", 'name = "plate"']
     for k, (x, y) in enumerate(TAG_MIDDLES_M):
         patterns.append(tag(marker_bits(TAG_FAMILY, k), TAG_M).on_body(pose(np.eye(3), np.array([x, y, 0.0]))))
         lines += [

@@ -24,7 +24,7 @@ from armsight.vision.detections import read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import Composite, open_body, open_target
+from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
@@ -94,7 +94,7 @@ def command(
             total = len(shots)
         else:
             found = open_target(target)
-            body, discs = found.body, found.discs if isinstance(found, Composite) else None
+            body, discs = found.body, found.discs
             opened = (
                 PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
             )

@@ -80,7 +80,7 @@ def body_text() -> str:
     """Return the body's file (docs/targets.md)."""
     discs = body_target().discs
     assert discs is not None
-    lines = [f'name = "{NAME}"']
+    lines = ["version = 2", f'name = "{NAME}"']
     for name, p, normal, radius in zip(
         discs.body.point_names, discs.body.points, discs.normals, discs.radii_m, strict=True
     ):
