@@ -57,6 +57,11 @@ LEGITIMATE = (
     ),
     (r"tests/vision/sources/", r"\bPLAY\b|Connection refused", "the words of RTSP and of the operating system"),
     (r"tests/app/run/test_run_folder\.py", r"wanted\.(csv|parquet)", "what version 1 wrote is read"),
+    (
+        r"src/armsight/app/run/motion_file\.py|tests/app/run/test_motion_file\.py",
+        r"\bturn_deg\b",
+        "what version 1 wrote is read",
+    ),
     (r"", r"\bin[- ]place\b|\bin turn\b", "plain English"),
     (r"src/armsight/robot/kinematics/", r"\bstandard form\b", "of Denavit-Hartenberg parameters"),
     (

@@ -47,11 +47,12 @@ def test_a_line_goes_to_a_position_and_an_orientation(tmp_path, key):
     assert T1[:3, :3] == pytest.approx(T0[:3, :3], abs=1e-9)
 
 
-def test_a_line_goes_by_a_step_and_rotates(tmp_path):
+@pytest.mark.parametrize("key", ["rotation_deg", "turn_deg"])  # the older key is still read
+def test_a_line_goes_by_a_step_and_rotates(tmp_path, key):
     path = write(
         tmp_path,
         'start_deg = [10, -60, 80, 5, -80, 20]\n[[motion]]\nkind = "line"\nby_mm = [30, -40, 10]\n'
-        "rotation_deg = [0, 0, 15]\nrest_s = 0\n",
+        f"{key} = [0, 0, 15]\nrest_s = 0\n",
     )
     plan = read_motions(ARM, path)
     T0 = ARM.forward(plan.start)

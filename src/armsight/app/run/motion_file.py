@@ -36,7 +36,7 @@ _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
 }
 _COMMON = {"kind": 0, "name": 0, "duration_s": 1, "rest_s": 1}
 #: Older name of a key -> its name.
-_OLD_KEYS = {"roll_pitch_yaw_deg": "euler_zyx_deg"}
+_OLD_KEYS = {"roll_pitch_yaw_deg": "euler_zyx_deg", "turn_deg": "rotation_deg"}
 
 
 @dataclass(frozen=True, eq=False)
