@@ -139,7 +139,7 @@ MUTANTS = (
     Mutant("identify-body", "off by one", f"{IDENTIFY}/model.py",
            "J[:, 3:, at - 3 : at] =", "J[:, 3:, at - 2 : at + 1] =", "test_identify_model.py", IDENTIFIED),
     Mutant("identify-gravity", "sign", f"{IDENTIFY}/model.py",
-           "at[:-1], -up_base)", "at[:-1], up_base)", "test_identify_model.py", IDENTIFIED),
+           "at[:-1], -up_base)", "at[:-1], up_base)", "test_identify_model.py", "torque"),
     Mutant("identify-backlash", "unit", f"{IDENTIFY}/backlash.py",
            "float(np.sqrt(max(", "float((max(", "test_identify_backlash.py"),
     Mutant("kinematics-jacobian", "sign", f"{KINEMATICS}/chain.py",
