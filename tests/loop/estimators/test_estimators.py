@@ -104,7 +104,8 @@ def test_a_measurement_is_the_measurement_carried_to_the_tool_with_its_covarianc
     pose = seen(rng, T_tool, true)
     pose_measurement, by_hand = mounting.pose_measurement(pose, 0.0), measured(mounting, pose, 0.0)
     for name in ("T_base_tool", "cov_noise", "cov_common"):
-        assert np.allclose(getattr(pose_measurement, name), getattr(by_hand, name), rtol=1e-9, atol=1e-15)
+        ours, theirs = getattr(pose_measurement, name), getattr(by_hand, name)
+        assert np.abs(ours - theirs).max() <= 1e-12 * np.abs(theirs).max()
     claimed, found = pose_measurement.cov_noise + pose_measurement.cov_common, np.cov(np.array(samples).T)
     # An element of the covariance of N samples is off by at most 5 / sqrt(N) of the root of its diagonals, 1 in 1e6.
     scale = np.sqrt(np.diag(claimed))
