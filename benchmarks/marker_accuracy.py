@@ -10,12 +10,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from armsight.data import Discs, Missed
+from armsight.vision.discs.identify import identify
 from armsight.vision.markers.disc.target import DiscTarget
 from disc_bound import picture_bound
 from disc_images import WIDTH, Picture, disc_picture, exposed
 from disc_surround import ITEMS, TEXTURES, clutter, one_kind
 from marker_plate import parallel_rig
-from marker_report import Report, disc_target, lacking, without_numbers
+from marker_report import Report, disc_target, without_numbers
 
 BINS = {
     "radius px": (4, 6, 9, 14, 20),
@@ -245,9 +246,6 @@ def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
     """Clutter on a wall before a stereo rig, so that all of it keeps the epipolar line; no disc and no plate is there."""
     rig, target = parallel_rig(), disc_target()
     targets = (target, disc_target(False))
-    no_identify = lacking("identify")
-    if no_identify is None:
-        from armsight.vision.discs.identify import identify
     for label, number, loose in (("", pairs, 0), (", 12 loose discs of the plate's size in each", pairs // 5, 12)):
         rng, discs, poses = np.random.default_rng(seed + 2 + loose), 0, 0
         for _ in range(number):
@@ -259,21 +257,13 @@ def cluttered(seed: int, report: Report, pairs: int = 500) -> None:
             for which in targets:
                 found = [which.find(view) for view in views]
                 discs += sum(len(f.uv) for f in found)
-                if no_identify is None:
-                    poses += not isinstance(identify(rig, which, *found), Missed)
+                poses += not isinstance(identify(rig, which, *found), Missed)
         said = f"{2 * number} cluttered images{label}"
         report.say(f"  {said}: {discs / (2 * number):.1f} accepted as discs an image")
-        if no_identify is not None:
-            report.say(f"  accepted into a pose: {no_identify}")
-        else:
-            report.metric(f"{said}: poses", poses, "0", form="d", good=poses == 0)
+        report.metric(f"{said}: poses", poses, "0", form="d", good=poses == 0)
 
 
 def metric(seed: int, report: Report) -> None:
-    missing = lacking("find")
-    if missing is not None:
-        report.say(f"  {missing}")
-        return
     plain(seed, report)
     textured(seed, report)
     by_kind(seed, report)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from armsight import measure
 from armsight.data import Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
+from armsight.vision.follow.follower import Follower
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import exposed
 from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, parallel_rig, views
-from marker_report import Report, disc_target, lacking, opened, without_numbers
+from marker_report import Report, disc_target, opened, without_numbers
 
 RATE_HZ, SPEED, NOISE = 60.0, 0.5, 2.0
 #: A pose is wrong where its squared distance from truth in sigmas is beyond chance, or it is rotated by so much.
@@ -32,17 +32,11 @@ class Following:
 
     def __init__(self, rig: StereoRig, target: DiscTarget) -> None:
         self.way = "searched"
-        self._rig, self._target, self._count, self.follower = rig, opened(target), 0, None
-        if lacking("follow") is None:
-            from armsight.vision.follow.follower import Follower
-
-            self.follower = Follower(rig, self._target)
+        self._count, self.follower = 0, Follower(rig, opened(target))
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> PoseEstimate | Missed:
         self._count += 1
         shot = Shot(str(self._count), left, right, self._count / RATE_HZ)
-        if self.follower is None:
-            return measure(self._rig, self._target, shot)
         result = self.follower.measure(shot)
         self.way = self.follower.way
         return result
@@ -120,13 +114,6 @@ def moments(rig: StereoRig, target: DiscTarget, shots: int, rng: np.random.Gener
 
 
 def metric(seed: int, report: Report, shots: int = 900) -> None:
-    missing = lacking("find", "identify")
-    if missing is not None:
-        report.say(f"  {missing}")
-        return
-    without = lacking("follow")
-    if without is not None:
-        report.say(f"  {without}: every shot is searched anew")
     rng, rig, target = np.random.default_rng(seed), parallel_rig(LENS, 3.0), disc_target()
     follow = Following(rig, target)
     limit = chi2.ppf(WRONG_QUANTILE, 6)

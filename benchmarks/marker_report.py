@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import tempfile
 import time
@@ -76,19 +75,6 @@ def opened(target: DiscTarget) -> Target:
         file = Path(folder) / "plate.toml"
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return open_target(str(file))
-
-
-def lacking(*needs: str) -> str | None:
-    """Say which of ``find``, ``identify``, ``measure`` and ``follow`` armsight does not have yet, or None."""
-    for need in needs:
-        if need == "find":
-            try:
-                disc_target().find(np.zeros((64, 64), np.uint8))
-            except NotImplementedError:
-                return "finding discs is not there yet"
-        elif importlib.util.find_spec(f"armsight.vision.{need}") is None:
-            return f"armsight.vision.{need} is not there yet"
-    return None
 
 
 def without_numbers(reason: str) -> str:

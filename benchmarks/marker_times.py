@@ -15,7 +15,7 @@ from armsight.vision.rig import StereoRig
 from disc_images import disc_picture
 from marker_follow import Following
 from marker_plate import LENS, parallel_rig, poses, project, shot, views
-from marker_report import Report, disc_target, lacking, last_level_cache_bytes, read_us, ring, timed
+from marker_report import Report, disc_target, last_level_cache_bytes, read_us, ring, timed
 
 #: Discs on the images between which the time of one more disc is measured.
 COUNTS = (0, 4, 16, 48, 96)
@@ -36,10 +36,6 @@ def whole_image(seed: int, report: Report) -> None:
     }
     read = read_us(ring(images[4]))
     report.metric("reading an HD image once, cold", read, form=".1f", unit="us")
-    missing = lacking("find")
-    if missing is not None:
-        report.say(f"  search and fit: {missing}")
-        return
     target = disc_target()
     medians = []
     for n in COUNTS:
@@ -122,10 +118,6 @@ def pairs(seed: int, report: Report, count: int = 24) -> None:
     library = float(np.median(times))
     report.metric("library route, windows known, pair to pose", library, form=".0f", unit="us")
     report.say(f"  {'its error':62s} {accuracy(xi)}")
-    missing = lacking("find", "identify", "follow")
-    if missing is not None:
-        report.say(f"  following: {missing}")
-        return
     times, ways, xi = [], [], []
     for k, T in enumerate(Ts):
         # The same still scene again and again: the first shots find it, the rest follow. Cold copies of the images.

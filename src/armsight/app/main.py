@@ -34,11 +34,10 @@ class _Sections(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands, section by section, each with the first sentence of its help."""
-        longest = max(map(len, COMMANDS))
+        longest, whole = max(map(len, COMMANDS)), 1000  # no sentence is cut
         for title, names in SECTIONS.items():
             commands = [(name, self.get_command(ctx, name)) for name in names]
-            limit = formatter.width - 6 - longest
-            rows = [(name, command.get_short_help_str(limit)) for name, command in commands if command is not None]
+            rows = [(name, command.get_short_help_str(whole)) for name, command in commands if command is not None]
             with formatter.section(title):
                 formatter.write_dl([(name.ljust(longest), text) for name, text in rows])
 
