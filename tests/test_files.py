@@ -98,7 +98,7 @@ def test_no_space_is_reported(tmp_path, monkeypatch):
         with self._named():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(files._Named, "write", write)
+    monkeypatch.setattr(files._NamedFile, "write", write)
     with pytest.raises(InputError) as caught:
         write_text(tmp_path / "file", SMALL)
     assert str(caught.value) == f"{tmp_path / 'file'}: cannot be written: No space left on device"

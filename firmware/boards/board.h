@@ -1,5 +1,5 @@
 /* The contract of a board: one struct literal. To add a board: fill one in, call loop_start, loop_tick from its 1 kHz
- * timer and loop_poll from its main loop (docs/add_a_board.md). */
+ * timer and loop_poll from its main loop (docs/howto/add_a_board.md). */
 #ifndef ARMSIGHT_BOARD_H
 #define ARMSIGHT_BOARD_H
 

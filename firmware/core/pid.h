@@ -1,4 +1,4 @@
-/* The control law of one joint (docs/firmware.md, "Control law"). Float32, 1 kHz, no state but pid_state.
+/* The control law of one joint (docs/reference/firmware.md, "Control law"). Float32, 1 kHz, no state but pid_state.
  * All functions: tick context, one caller per state. */
 #ifndef ARMSIGHT_PID_H
 #define ARMSIGHT_PID_H

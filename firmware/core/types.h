@@ -16,7 +16,7 @@
 #define TICK_S 0.001f
 #define NO_JOINT 255u
 
-/* X(name, code, reaction, text): the faults. A fault latches; docs/firmware.md says when each comes. */
+/* X(name, code, reaction, text): the faults. A fault latches; docs/reference/firmware.md says when each comes. */
 #define FAULT_LIST(X)                                                                                 \
     X(POT_OPEN, 1, RELEASE, "potentiometer open: the reading is above its band")                      \
     X(POT_SHORT, 2, RELEASE, "potentiometer short: the reading is below its band")                    \

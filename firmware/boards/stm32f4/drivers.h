@@ -1,4 +1,4 @@
-/* What the Nucleo-F446RE's drivers give. docs/add_a_board.md has the pin table and the wiring. */
+/* What the Nucleo-F446RE's drivers give. docs/howto/add_a_board.md has the pin table and the wiring. */
 #ifndef ARMSIGHT_STM32F4_DRIVERS_H
 #define ARMSIGHT_STM32F4_DRIVERS_H
 

@@ -1,4 +1,4 @@
-/* Which pin does what. docs/add_a_board.md shows the same table, and a test holds them together. */
+/* Which pin does what. docs/howto/add_a_board.md shows the same table, and a test holds them together. */
 #include "drivers.h"
 #include "registers.h"
 

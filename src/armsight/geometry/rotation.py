@@ -75,7 +75,7 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def euler_zyx(R: Array) -> tuple[Array, bool]:
-    """Split a rotation into Euler angles about z, y, x: the source's roll, pitch, yaw (18.16 with atan2).
+    """Split a rotation into Euler angles about z, y, x: roll, pitch, yaw of docs/concepts/method.md (18.16 with atan2; in ROS roll is about x).
 
     Args:
         R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).

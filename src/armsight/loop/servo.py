@@ -4,7 +4,7 @@ In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joint
 The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
 is the joint error, by the estimator's model, that must be made up for at the next pose to be reached; at rest, c integrates
 the tool's error itself. Tool errors become joint errors through the Jacobian, except in directions in which the arm is near
-a singularity. Gain, its margin, and what happens when vision is lost: docs/loop.md.
+a singularity. Gain, its margin, and what happens when vision is lost: docs/concepts/loop.md.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | Non
 def measure_detections(
     rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[np.ndarray, ...] = ()
 ) -> PoseEstimate | Missed:
-    """Measure a body from what each camera detected; ``flips`` as in :func:`~armsight.vision.match.match`."""
+    """Measure a body from what each camera detected; ``symmetries`` as in :func:`~armsight.vision.match.match`."""
     seen = match(rig, body, left, right, symmetries=symmetries)
     result = locate(rig, body, triangulate(rig, body, seen))
     if isinstance(result, Missed) and _exchanged(rig, body, left, right):

@@ -227,7 +227,7 @@ def test_paths_whose_path_points_differ(tmp_path, capsys):
     assert_rejected(said(capsys, file_of(bad, exchanged)), "same path points", "cycle 1")
     assert_rejected(said(capsys, file_of(bad, rows[:-1])), "same path points", "19 rows")
     still = [[*row[:12], 0.4 if row[1] in (4, 5, 6) else row[12], *row[13:]] for row in rows]
-    assert_rejected(said(capsys, file_of(bad, still)), "path path", "path point 6", "does not go on")
+    assert_rejected(said(capsys, file_of(bad, still)), "path path", "at its point 6", "does not advance")
 
 
 def test_mistakes(tmp_path, capsys):

@@ -15,7 +15,7 @@ FULL_RANGE_RAD = 5.2  # full scale of a joint; full scale of a duty is 1
 
 @dataclass
 class Law:
-    """The law of docs/firmware.md in float64: the oracle, written from the equations."""
+    """The law of docs/reference/firmware.md in float64: the oracle, written from the equations."""
 
     kp: float
     ki: float

@@ -113,7 +113,7 @@ def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
         calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True) for pairs in (dirty, clean)
     )
     assert [note.split(":")[0] for note in c.notes] == ["p03", "p09"]
-    assert all("mended" in note for note in c.notes)
+    assert all("corrected" in note for note in c.notes)
     assert not c.rejected
     # The same observations: the two differ by where the iterations stop.
     sigma = np.sqrt(np.diag(best.rig.cov))

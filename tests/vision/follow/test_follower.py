@@ -236,13 +236,13 @@ def test_fast_motion_is_followed_once_two_searches_have_reported_its_velocity():
 
 
 def test_where_it_is_expected_it_is_found_without_a_search_of_the_whole_image(monkeypatch):
-    searches = []
+    searches, follower = [], Follower(RIG, BODY)  # made before: its warm-up measures, too
     monkeypatch.setattr(
         "armsight.vision.follow.follower.measure", lambda *a: (searches.append(a[2].name), measure(*a))[1]
     )
     hidden = {k: [(m, c) for m in range(3) for c in range(2)] for k in range(2, 12)}
     off = exp_se3(np.array([0.01, -0.01, 0.01, 0.02, 0.0, 0.05]))  # some 15 px
-    follower, ways = Follower(RIG, BODY), []
+    ways = []
     for truth, shot in shots(PLATE, 15, 6, hidden):
         result = follower.measure(shot, truth @ off)
         ways.append(follower.way)

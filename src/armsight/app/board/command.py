@@ -30,7 +30,9 @@ _WATCH_S = 2.0
 
 def _board(action: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options that name a board."""
-    baud = click.option("--baud", type=click.IntRange(min=1), default=BAUD, show_default=True, help="Of a serial port.")
+    baud = click.option(
+        "--baud", type=click.IntRange(min=1), default=BAUD, show_default=True, help="Baud rate of a serial port."
+    )
     what = "emulated:unicorn, emulated:qemu, emulated:host or serial:PORT."
     return click.option("--board", "name", default=_DEFAULT, show_default=True, metavar="BOARD", help=what)(
         baud(action)

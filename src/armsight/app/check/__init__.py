@@ -3,7 +3,7 @@
 In: a run's folder or a CSV of attained poses. Out: metrics of poses, distance, paths, drift and a circle, as text, JSON and
 a report.
 
-- ``command``: the command line, ``armsight check DATA`` and ``armsight check plan``.
+- ``command``: the command line, ``armsight check RUN`` and ``armsight check plan``.
 - ``rows``: one attained pose a row, and the CSV of rows.
 - ``run_folder``: a run's folder to rows.
 - ``evaluate``: rows to metrics; ``result``: the records that hold the metrics, and their JSON.

@@ -23,7 +23,7 @@ _KINDS = (".toml", ".csv")
 
 
 class _Check(click.Group):
-    """``armsight check DATA`` and ``armsight check plan``: what is no subcommand is data to evaluate."""
+    """``armsight check RUN`` and ``armsight check plan``: what is no subcommand is data to evaluate."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         return super().parse_args(ctx, args if args and args[0] in self.commands else ["evaluate", *args])
@@ -54,7 +54,7 @@ def command() -> None:
 def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> None:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
-    DATA is a run's folder (armsight run, armsight demo) or a CSV (docs/howto/iso9283.md). Metrics stand without the
+    RUN is a folder of armsight run or armsight demo, POSES.csv a table of attained poses (docs/howto/iso9283.md). Metrics stand without the
     instrument's own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
     """
     if output is not None and output.is_dir():

@@ -48,7 +48,12 @@ def command() -> None:
 @command.command("match")
 @click.argument("paths", nargs=-1, metavar="[RIG.json] [LEFT RIGHT]", type=click.Path(path_type=Path))
 @click.option(
-    "--method", "name", default="semiglobal", show_default=True, type=click.Choice(list(METHODS)), help="How."
+    "--method",
+    "name",
+    default="semiglobal",
+    show_default=True,
+    type=click.Choice(list(METHODS)),
+    help="Matching method.",
 )
 @click.option(
     "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."

@@ -6,7 +6,7 @@ Out: :class:`ArmEstimate` and :class:`Track`, poses with covariances.
 ``estimator`` is the contract of the family; its members are ``kalman`` (fuses both) and ``latest`` (vision alone). The
 Kalman filter's model is in ``armerror`` (what makes potentiometers wrong, as one vector) and ``errormodel`` (how motion
 changes it); ``readings`` and ``parabola`` smooth the potentiometers, ``backlash_dynamics`` follows links inside their
-backlash, and ``smoothing`` computes a track in retrospect. Equations: docs/loop.md.
+backlash, and ``smoothing`` computes a track in retrospect. Equations: docs/concepts/loop.md.
 """
 
 from __future__ import annotations

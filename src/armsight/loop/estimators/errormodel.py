@@ -1,7 +1,7 @@
 """The filter's process and measurement model: the tool's poses by a state, and what motion makes the state forget.
 
 In: the vector of ``armerror`` with its covariance, and the joints as ``readings`` has them. Out: poses with derivatives,
-and what first-order Gauss-Markov processes in travel keep and add. Equations: docs/loop.md.
+and what first-order Gauss-Markov processes in travel keep and add. Equations: docs/concepts/loop.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ what joint motion makes it forget, so between measurements there is nothing to i
 at that time's readings. For a late measurement the filter returns to the state kept before it, and applies it and those
 after it again. What all measurements share (calibration) is no noise and is not averaged: the state is learned as vision
 measures it, and the shared covariance is added to the output (Schmidt, 1966: considered, not estimated). Equations:
-docs/loop.md.
+docs/concepts/loop.md.
 """
 
 from __future__ import annotations

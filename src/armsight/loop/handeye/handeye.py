@@ -3,7 +3,7 @@
 In: poses of the flange in the base (from the joints) and of the body in the rig (from vision, with covariance), pairwise.
 Out: :class:`HandEye` with both unknown transforms, their covariance, and the error on poses left out of the fit. Eye to
 hand, T_base_flange T_flange_body = T_base_rig T_rig_body; eye in hand, T_base_flange T_flange_rig T_rig_body =
-T_base_body. Both are A_i X = Z B_i. Equations: docs/handeye.md. The file in order:
+T_base_body. Both are A_i X = Z B_i. Equations: docs/howto/handeye.md. The file in order:
 
 1. Maximum likelihood (:func:`fit`). The residual of a pose is the tangent of the motion left over, in the axes of what the
    camera measured. Its covariance is the one given, plus that of an unknown share (``SHARES``): of the flange, about the

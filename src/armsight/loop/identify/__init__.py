@@ -7,5 +7,5 @@ In: the nominal :class:`~armsight.robot.arm.Arm` and :class:`Measured` poses (``
 
 ``identify.identify`` runs the line on the parameters of ``model``. ``joint_noise`` and ``backlash`` estimate what scatters
 from pose to pose, ``validate`` evaluates the result on other poses, ``plan`` chooses the next poses to measure. Equations
-and formats: docs/identify.md.
+and formats: docs/howto/identify.md.
 """

@@ -109,6 +109,8 @@ MIN_GAIN = 1.0
 SURE = 8.0
 #: A fall by less than this part is rounding's.
 ROUNDING = 1e-6
+#: Mean squared errors, in squared sigmas of the noise, below which an error is no longer noise but rounding: (1e-4)^2.
+NOISELESS = 1e-8
 #: Added to squares, so that the logarithm of none is a number.
 _NONE = 1e-200
 #: The kinds that say where the arm is: base in the rig, tool on the flange.
@@ -125,7 +127,7 @@ class SelectionStep(NamedTuple):
     """One step of the forward selection.
 
     Attributes:
-        cause: what was added or, with a minus, removed.
+        source: the error source that was added or, with a minus, removed.
         names: its parameters.
         rms: held-out RMS of the weighted residuals after it: the geometric mean over the folds.
     """
@@ -306,7 +308,7 @@ def _rms(losses: Array, folds: _Folds) -> float:
 
 def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
     """Return whether the fall of the held-out squares' logarithms is more than chance over the folds."""
-    fall = np.log((without + _NONE) / (with_it + _NONE)) * folds.numbers
+    fall = np.log(np.maximum(without, NOISELESS) / np.maximum(with_it, NOISELESS)) * folds.numbers
     return bool(fall.sum() > max(MIN_GAIN * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
 
 

@@ -77,7 +77,7 @@ def body_target() -> Composite:
 
 
 def body_text() -> str:
-    """Return the body's file (docs/targets.md)."""
+    """Return the body's file (docs/howto/targets.md)."""
     discs = body_target().discs
     assert discs is not None
     lines = ["version = 2", f'name = "{NAME}"']
