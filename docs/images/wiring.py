@@ -2,8 +2,8 @@
 
     python docs/images/wiring.py        (needs matplotlib)
 
-The pins are those of firmware/boards/stm32f4/pins.c; docs/howto/add_a_board.md has them as a table, which a test holds to the
-code.
+The pins are those of firmware/boards/stm32f4/pins.c; docs/howto/add_a_board.md has them as a table, which a test
+holds to the code.
 """
 
 from __future__ import annotations

@@ -75,7 +75,9 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def euler_zyx(R: Array) -> tuple[Array, bool]:
-    """Split a rotation into Euler angles about z, y, x: roll, pitch, yaw of docs/concepts/method.md (18.16 with atan2; in ROS roll is about x).
+    """Split a rotation into Euler angles about z, y, x (18.16 with atan2).
+
+    docs/concepts/method.md calls them roll, pitch, yaw; in ROS roll is the one about x.
 
     Args:
         R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).

@@ -54,8 +54,9 @@ def command() -> None:
 def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> None:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
-    RUN is a folder of armsight run or armsight demo, POSES.csv a table of attained poses (docs/howto/iso9283.md). Metrics stand without the
-    instrument's own noise; what is below it is called not resolvable. The motions of a test: armsight check plan --help.
+    RUN is a folder of armsight run or armsight demo, POSES.csv a table of attained poses (docs/howto/iso9283.md).
+    Metrics are without the instrument's own noise; one below that noise is called not resolvable. The motions of a test:
+    armsight check plan --help.
     """
     if output is not None and output.is_dir():
         if is_run(output):
