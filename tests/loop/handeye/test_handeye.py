@@ -59,6 +59,13 @@ def test_the_held_out_error_is_what_new_poses_show():
     assert h.held_out.rms()[0] == pytest.approx(np.sqrt(np.mean(new**2)), rel=0.25)  # 90 numbers each: 7 % sigma a side
 
 
+def test_the_closed_form_start_is_exact_without_noise():
+    A, _, _, Z, X = recording(3)
+    found_X, found_Z = handeye_start.kronecker(A, inverse(Z) @ A @ X)
+    np.testing.assert_allclose(found_X, X, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found_Z, Z, rtol=0, atol=1e-9)
+
+
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV has no calibrateHandEye")
 def test_the_own_start_is_as_good_as_opencvs():
     A, B, _, _, _ = recording(2)
