@@ -37,7 +37,7 @@ def _arm_argument(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.argument("arm_name", metavar="ARM")(link(command))
 
 
-@click.group()
+@click.group("arm")
 def command() -> None:
     """Print an arm's table and kinematics: mm and degrees here, m and rad in --json.
 

@@ -45,7 +45,7 @@ _folder = click.option(
 )
 
 
-@click.group()
+@click.group("board")
 def command() -> None:
     """Build and flash the arm's firmware, watch a board, tune its gains, test it.
 

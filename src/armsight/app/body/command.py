@@ -22,7 +22,7 @@ from armsight.vision.rig import StereoRig
 _DISTANCES = 15
 
 
-@click.group()
+@click.group("body")
 def command() -> None:
     """Check a body file's geometry before the body is built, and print its markers to scale.
 

@@ -31,7 +31,7 @@ class _Dense(click.Group):
         return super().parse_args(ctx, args)
 
 
-@click.group(cls=_Dense)
+@click.group("dense", cls=_Dense)
 def command() -> None:
     """Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.
 

@@ -21,7 +21,7 @@ from armsight.robot.arm_file import open_arm
 from armsight.vision.rig import StereoRig
 
 
-@click.group(invoke_without_command=True)
+@click.group("identify", invoke_without_command=True)
 @click.option(
     "--arm", "arm_name", metavar="ARM", help="The nominal arm: a name (armsight arm list), a .toml or a .urdf file."
 )

@@ -18,7 +18,7 @@ from armsight.vision.rigfiles.rigfile import ASSUMED_SIGMA_PX
 _FORMAT = click.option("--format", "name", required=True, type=click.Choice(list(FORMATS)), help="The other program.")
 
 
-@click.group()
+@click.group("rig")
 def command() -> None:
     """Show a rig file, import a rig of another program, or export one.
 
