@@ -12,8 +12,6 @@ from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, ordinary_rig
 from views import both_pixels
 
-pytestmark = pytest.mark.opencv
-
 
 def scene_points(count=200):
     return np.array([0.1, 0.0, 0.7]) + np.random.default_rng(0).uniform(-1, 1, (count, 3)) * [0.2, 0.15, 0.2]

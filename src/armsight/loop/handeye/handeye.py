@@ -293,7 +293,8 @@ def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
         with contextlib.suppress(cv2.error):
             R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
             X = pose(R, t.ravel())
-            yield X, mean_pose(A @ X @ back)
+            if np.isfinite(X).all():  # OpenCV 4 answers degenerate poses with NaN
+                yield X, mean_pose(A @ X @ back)
     for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
         with contextlib.suppress(cv2.error):
             RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
