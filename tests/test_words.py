@@ -107,7 +107,7 @@ def retired_words(text: str, name: str) -> list[str]:
         for pattern in legitimate:
             rest = pattern.sub(" ", rest)
         hits = {word: RETIRED[word] for word in parts(rest) & RETIRED.keys()}
-        hits |= {phrase: term for phrase, term in PHRASES.items() if phrase in rest.lower()}
+        hits |= {phrase: term for phrase, term in PHRASES.items() if phrase in rest.lower().replace("_", " ")}
         found += [f"{name}:{number}: {word} -> {term}: {line.strip()[:100]}" for word, term in sorted(hits.items())]
     return found
 
@@ -143,6 +143,7 @@ def test_no_retired_word_comes_back():
         ('"turn_deg": 3', "turn"),
         ("as The Chapter says", "the chapter"),
         ("MOST_TOLD = 2", "told"),
+        ("def in_standard_form(", "standard form"),
     ],
 )
 def test_a_planted_word_is_found(line, word):

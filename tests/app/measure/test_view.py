@@ -156,8 +156,9 @@ def test_a_missed_shot_is_shown_with_its_reason_in_red_and_without_images_too():
         canvas = draw_shot(["shot 3"], "the plate is not there", pictures, (SIZE, SIZE), None)
         assert canvas.dtype == np.uint8
         assert canvas.shape[1] == WIDTH
-        # The reason is red; how far the edges of letters blend with the ground differs between OpenCV 4 and 5.
-        assert (np.abs(canvas.astype(int) - (40, 40, 200)).max(axis=2) < 40).any()
+        # OpenCV 4 blends letters with the ground, and none of their pixels is quite as red.
+        blended = 0 if int(cv2.__version__.split(".")[0]) >= 5 else 39
+        assert (np.abs(canvas.astype(int) - (40, 40, 200)).max(axis=2) <= blended).any()
 
 
 @pytest.mark.parametrize("shape", [(120, 160), (120, 160, 3), (3000, 4000), (900, 90), (1, 1)])

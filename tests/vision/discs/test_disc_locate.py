@@ -168,7 +168,7 @@ def test_a_shot_is_measured_from_its_discs():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_three_discs_in_the_chapters_frame_report_its_angles(seed):
+def test_three_discs_in_the_published_frame_report_its_angles(seed):
     """x along P1 P2 and z from P3 to their middle: the pose's roll, pitch, yaw are those of 18.11 to 18.16."""
     rig, rng = hd_rig(known=True), np.random.default_rng(seed)
     published = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0, -0.085]], normal=(0.0, 1.0, 0.0))
