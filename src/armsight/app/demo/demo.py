@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.demo.studies import Study, rate_study, vision_studies
+from armsight.app.demo.studies import rate_study, vision_studies
 from armsight.app.run.calibrate import calibrated, handeye_poses
 from armsight.app.run.experiment import Progress, RunResult, run_experiment
 from armsight.app.run.folder import Finished, finish, make_room, open_folder
+from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, MotionPlan, read_motions
 from armsight.app.run.setup import Setup
 from armsight.app.run.summary import RunSummary

@@ -18,7 +18,7 @@ from scipy.special import chdtri
 from armsight.app.run.controllers import closed_on, drive
 from armsight.app.run.experiment import PRIOR, Progress, RunResult, timing
 from armsight.app.run.loop import Loop
-from armsight.app.run.metrics import track_metrics
+from armsight.app.run.metrics import Study, track_metrics
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, assembled
 from armsight.app.run.setup import Setup
@@ -44,31 +44,6 @@ _BOARD = "chessboard:9x6:25mm"
 _TILT = np.radians(30.0)
 _SIZE, _FOCAL, _BASELINE, _DISTANCE, _NOISE = (1280, 720), 900.0, 0.2, 0.8, 2.0
 _REPEATS = 3  # calibrations of each size
-
-
-@dataclass(frozen=True, eq=False)
-class Study(Record):
-    """The error of the position as a function of one quantity.
-
-    Attributes:
-        name: the quantity.
-        unit: its unit.
-        values: (N,) its values.
-        position_rms_m: (N,) measured RMS error of the position, m.
-        low_m: (N,) lower end of its 95% interval, from the number of shots, m.
-        high_m: (N,) upper end, m.
-        predicted_m: (N,) error predicted by the covariance, m.
-        missed: (N,) number of shots without a pose.
-    """
-
-    name: str
-    unit: str
-    values: Array
-    position_rms_m: Array
-    low_m: Array
-    high_m: Array
-    predicted_m: Array
-    missed: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from armsight.app.demo.studies import Study
 from armsight.app.interrupts import uninterrupted
 from armsight.app.measure.poses import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.app.record.recording import record
 from armsight.app.report.page import PAGE, writable_folder
 from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.experiment import RunResult
+from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, RunReport, write_run_report

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from armsight.app.run.record import RunData, ToolTrack, errors
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.loop.servo import CORRECTED_ABOVE
 from armsight.robot.arm import Arm
 
@@ -24,6 +24,31 @@ PATHS = ("line", "circle")
 _SETTLED_S = 0.2  # at the end of a rest
 #: A path's points lie so close, m, that the distance to the nearest one is the distance to the path.
 _PATH_STEP_M = 2e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Study(Record):
+    """The error of the position as a function of one quantity.
+
+    Attributes:
+        name: the quantity.
+        unit: its unit.
+        values: (N,) its values.
+        position_rms_m: (N,) measured RMS error of the position, m.
+        low_m: (N,) lower end of its 95% interval, from the number of shots, m.
+        high_m: (N,) upper end, m.
+        predicted_m: (N,) error predicted by the covariance, m.
+        missed: (N,) number of shots without a pose.
+    """
+
+    name: str
+    unit: str
+    values: Array
+    position_rms_m: Array
+    low_m: Array
+    high_m: Array
+    predicted_m: Array
+    missed: Array
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.demo.studies import Study
 from armsight.app.report.table import TextTable, print_table
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import (
     Spread,
+    Study,
     TrackMetrics,
     evaluated_track,
     partly_uncorrected,
