@@ -1,5 +1,10 @@
-"""Build the firmware with the package: no binary is in the repository. All else is in pyproject.toml."""
+"""Build the kernels and the firmware with the package: no binary is in the repository. All else is in pyproject.toml.
 
+ARMSIGHT_TARGET=linux-aarch64 (kernels/build.py has the list) makes a wheel for another kind of machine.
+"""
+
+import dataclasses
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -11,28 +16,44 @@ from setuptools.command.build_py import build_py
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT / "src"))
 
-from armsight.firmware import build  # noqa: E402 - it is found once src is in the path
+from armsight.firmware import build as firmware  # noqa: E402 - it is found once src is in the path
+from armsight.kernels import build as kernels  # noqa: E402
+
+#: The kind of machine that is built for; kernels/build.py names them.
+TARGET = os.environ.get("ARMSIGHT_TARGET") or None
+#: What pip calls them; Linux needs the C library of 2014 or later.
+PLATFORMS = {
+    "linux-x86_64": "manylinux_2_17_x86_64",
+    "linux-aarch64": "manylinux_2_17_aarch64",
+    "macos-arm64": "macosx_11_0_arm64",
+    "windows-x86_64": "win_amd64",
+}
 
 
-class BuildFirmware(build_py):
-    """Puts ``armsight/firmware/built`` beside the modules, and the C sources into a wheel, for boards built later."""
+class BuildNative(build_py):
+    """Puts compiled kernels and ``armsight/firmware/built`` beside the modules, and the firmware's sources into a wheel."""
 
     def run(self) -> None:
         """Copy the modules, then build."""
         super().run()
         package = ROOT / "src" / "armsight" if self.editable_mode else Path(self.build_lib) / "armsight"
-        build.build_package(package / "firmware" / "built", build.open_compiler())
+        kernels.build(package / "kernels", TARGET)
+        compiler = firmware.open_compiler()
+        if TARGET:
+            host = (*compiler.host, "-target", kernels.TARGETS[TARGET].zig)
+            compiler = dataclasses.replace(compiler, host=host)
+        firmware.build_package(package / "firmware" / "built", compiler)
         if not self.editable_mode:
             shutil.rmtree(package / "firmware" / "source", ignore_errors=True)
             shutil.copytree(ROOT / "firmware", package / "firmware" / "source")
 
 
 class PlatformWheel(bdist_wheel):
-    """A wheel for this machine and any Python 3: the host library is native code, but no extension module."""
+    """A wheel for one kind of machine and, by Python's stable binary interface, for every Python from 3.11 on."""
 
     def get_tag(self) -> tuple[str, str, str]:
         """Return the tags of Python, its binary interface and the platform."""
-        return "py3", "none", super().get_tag()[2]
+        return "cp311", "abi3", PLATFORMS[TARGET or kernels.this_machine()]
 
 
 class NativeDistribution(Distribution):
@@ -43,4 +64,4 @@ class NativeDistribution(Distribution):
         return True
 
 
-setup(distclass=NativeDistribution, cmdclass={"build_py": BuildFirmware, "bdist_wheel": PlatformWheel})
+setup(distclass=NativeDistribution, cmdclass={"build_py": BuildNative, "bdist_wheel": PlatformWheel})

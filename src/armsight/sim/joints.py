@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.kernels import kernel
 from armsight.robot.boards.link import Sensed
 
 JOINTS = 6
@@ -46,7 +46,7 @@ class PotFault(IntEnum):
 _JUMP_COUNTS = 4000
 
 
-@numba.njit(cache=True)
+@kernel("f8[::1], f8[::1], f8[::1], b1, f8, b1[::1]")
 def _move(q: Array, qd: Array, duty: Array, drives_on: bool, supply_v: float, blocked: NDArray[np.bool_]) -> None:
     """Move the joints by one tick, in-place: q, qd (6,) rad, rad/s."""
     h = _TICK_S / _SUBSTEPS
@@ -64,7 +64,7 @@ def _move(q: Array, qd: Array, duty: Array, drives_on: bool, supply_v: float, bl
                 qd[i] = 0.0
 
 
-@numba.njit(cache=True)
+@kernel("f8[::1], u8[::1], i8[::1], i8[::1], u4[::1]")
 def _read(
     q: Array, noise: NDArray[np.uint64], fault: NDArray[np.int64], kept: NDArray[np.int64], counts: NDArray[np.uint32]
 ) -> None:

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.errors import CalibrationError
+from armsight.kernels import kernel
 from armsight.vision.projection import BundleModel, BundleState, Observations, moved, predict
 
 
@@ -196,7 +196,7 @@ def _normal(
     return replace(arrow, H_shared=H_shared, g_shared=g_shared, H_shots=H_shots, g_shots=g_shots), residuals
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, :, ::1], f8[:, :, ::1]", "f8[:, :, ::1], f8[:, :, :]")
 def _weigh(W: Array, J: Array) -> None:
     """Replace matrices J (N, 2, K) by W @ J for W (N, 2, 2), where they stand."""
     for n in range(J.shape[0]):

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.kernels import kernel
 
 #: Distortion models and how many coefficients each has. Brown's are k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye's k1..k4.
 DISTORTION_MODELS = {"none": 0, "brown4": 4, "brown5": 5, "brown8": 8, "fisheye": 4}
@@ -26,7 +26,7 @@ _CONVERGED = 1e-12  # Newton's last step, in focal lengths; the error is its squ
 _STRAIGHT_BACK = 1e-9
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Array) -> None:
     """Distort one point p (3,) of the camera's frame into xy (2,), with Jacobians J_p (2, 3) and J_d (2, 8)."""
     J_d[:, :] = 0.0
@@ -78,7 +78,7 @@ def distort(fisheye: bool, d: Array, p: Array, xy: Array, J_p: Array, J_d: Array
     J_d[1, 2], J_d[1, 3] = r2 + 2 * y * y, 2 * x * y
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("b1, const f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]")
 def _project(fisheye: bool, k: Array, d: Array, p: Array, uv: Array, J_p: Array, J_k: Array) -> None:
     """Project points p (N, 3) into uv (N, 2) with J_p (N, 2, 3) and J_k (N, 2, 12): fx fy cx cy and eight coefficients.
 
@@ -104,7 +104,7 @@ def _project(fisheye: bool, k: Array, d: Array, p: Array, uv: Array, J_p: Array,
             J_k[n, i, 2 + i] = 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("b1, const f8[::1], const f8[::1], const f8[:, ::1], f8[:, ::1]")
 def _unproject(fisheye: bool, k: Array, d: Array, uv: Array, rays: Array) -> None:
     """Convert raw pixels uv (N, 2) to unit rays (N, 3) by Newton's method; NaN where the distortion has no inverse."""
     xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))

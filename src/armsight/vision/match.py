@@ -6,10 +6,10 @@ contradict the rig. Distances are measured in undistorted pixels of each camera.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
+from armsight.kernels import kernel
 from armsight.vision.rig import StereoRig
 
 #: The gate in standard deviations of the epipolar distance, and the least it may be, px. A wrong identity is many
@@ -47,7 +47,7 @@ def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def _gaps(rays_left: Array, rays_right: Array, T_left_right: Array, focal: Array, out: Array) -> None:
     """Fill what :func:`epipolar_distances` returns from rays (N, 3) and focal lengths (2, 2), px."""
     t, E, line = T_left_right[:3, 3], np.empty((3, 3)), np.empty((2, 2))  # x_left^T E x_right = 0

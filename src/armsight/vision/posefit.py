@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Ids, Record
+from armsight.geometry.matrix import product, solved_vector
 from armsight.geometry.pose import inverse
+from armsight.kernels import kernel
 from armsight.vision.bundle import CAUCHY_SCALE
 from armsight.vision.camera import Camera, distort, pair_arguments
 
@@ -103,10 +104,7 @@ def fit_pose(
         *pair_arguments(cameras), inverse(T_left_right), p, np.array(observations.camera), np.array(observations.uv),
         weight, T, robust, steps, residuals, d2, H,
     )  # fmt: skip
-    try:
-        cost = _fit(*arguments)
-    except np.linalg.LinAlgError:
-        return None
+    cost = _fit(*arguments)
     return PoseFit(T, residuals, d2, H, cost) if np.isfinite(cost) else None
 
 
@@ -139,7 +137,7 @@ def whitened(
     return W, by_pose, by_rig
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, :, ::1], f8[:, :, ::1]")
 def _invert(cov: Array, weight: Array) -> None:
     """Fill the inverses of covariances (N, 2, 2)."""
     for n in range(len(cov)):
@@ -148,14 +146,14 @@ def _invert(cov: Array, weight: Array) -> None:
         weight[n, 0, 1], weight[n, 1, 0] = -cov[n, 0, 1] / det, -cov[n, 1, 0] / det
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _to_camera(M: Array, p: Array, q: Array) -> None:
     """Fill q (3,), a point p (3,) of the body in the frame of the camera with T_camera_body M (4, 4)."""
     for i in range(3):
         q[i] = M[i, 0] * p[0] + M[i, 1] * p[1] + M[i, 2] * p[2] + M[i, 3]
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _by_rotation(J: Array, p: Array) -> None:
     """Fill the last three of J (6,), a pixel's derivative by the rotation of the body, from the first three."""
     J[3] = J[2] * p[1] - J[1] * p[2]
@@ -163,14 +161,17 @@ def _by_rotation(J: Array, p: Array) -> None:
     J[5] = J[1] * p[0] - J[0] * p[1]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
+    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1]",
+)
 def _differentiate(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array,
     T: Array, W: Array, by_pose: Array, by_rig: Array,
 ) -> None:  # fmt: skip
     """Fill what :func:`whitened` returns."""
     xy, J_p, J_d, q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3)
-    Ts, starts, rig = np.stack((T, T_right_left @ T)), (0, 4 + counts[0]), 8 + counts[0] + counts[1]
+    Ts, starts, rig = np.stack((T, product(T_right_left, T))), (0, 4 + counts[0]), 8 + counts[0] + counts[1]
     for n in range(len(p)):
         c = camera[n]
         M = Ts[c]
@@ -202,7 +203,7 @@ def _differentiate(
                 J[0, j] *= W[n, 0, 0]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _assemble(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
     T: Array, robust: bool, residuals: Array, d2: Array, H: Array, g: Array,
@@ -212,7 +213,7 @@ def _assemble(
     g[:] = 0.0
     cost, c2 = 0.0, CAUCHY_SCALE * CAUCHY_SCALE
     xy, J_p, J_d, q, J = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3), np.empty((2, 6))
-    Ts = np.stack((T, T_right_left @ T))
+    Ts = np.stack((T, product(T_right_left, T)))
     for n in range(p.shape[0]):
         c = camera[n]
         M = Ts[c]
@@ -242,7 +243,7 @@ def _assemble(
     return cost
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const f8[:, ::1], f8[::1], f8[:, ::1]")
 def moved(T: Array, xi: Array, out: Array) -> None:
     """Move a pose by a tangent, on the right: T exp(xi) to first order, and an exact rotation matrix."""
     angle = np.sqrt(xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5])
@@ -263,7 +264,10 @@ def moved(T: Array, xi: Array, out: Array) -> None:
     out[3, :] = T[3, :]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
+    "b1, i8, f8[:, ::1], f8[::1], f8[:, ::1]",
+)
 def _fit(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
     T: Array, robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
@@ -279,7 +283,9 @@ def _fit(
         damped[:, :] = H
         for i in range(6):
             damped[i, i] += damping * H[i, i] + 1e-300
-        xi = np.linalg.solve(damped, g).astype(np.float64)
+        xi = solved_vector(damped, g)
+        if np.isnan(xi[0]):
+            return np.inf
         moved(T, xi, trial)
         new = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, trial, robust, new_r, new_d2, new_H, new_g)
         if new <= cost:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.geometry.rotation import exp_so3, skew
+from armsight.kernels import kernel
 from armsight.vision.camera import Camera
 
 
@@ -160,7 +160,10 @@ class BundleModel(Record):
         return np.asarray(self.points + np.tensordot(shape, self.modes, axes=1))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "i8[::1], i8, f8[:, :, ::1], i8, f8[:, :, ::1], f8[:, :, ::1], i8[::1], const f8[:, :, ::1], f8[:, :, ::1]",
+    "i8[::1], i8, f8[:, :, :], i8, f8[:, :, ::1], f8[:, :, ::1], i8[::1], const f8[:, :, ::1], f8[:, :, ::1]",
+)
 def _fill(
     rows: NDArray[np.intp],
     start: int,

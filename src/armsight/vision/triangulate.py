@@ -6,12 +6,12 @@ Minimises the covariance-weighted pixel distance in both images (the maximum-lik
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Correspondences, Dropped, Ids, Points
 from armsight.geometry.pose import inverse
+from armsight.kernels import kernel
 from armsight.vision.camera import distort, pair_arguments
 from armsight.vision.rig import StereoRig
 
@@ -41,7 +41,7 @@ def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
     return p
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def _between(rays_left: Array, rays_right: Array, T: Array, p: Array) -> None:
     """Fill p (N, 3) with the points halfway between rays (N, 3), each in its camera's frame; T is T_left_right."""
     for n in range(len(p)):
@@ -86,14 +86,14 @@ def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Arr
     return p, cov, by_rig
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _to_right(T_right_left: Array, p: Array, q: Array) -> None:
     """Fill q (3,), a point p (3,) of the left frame in the right one."""
     for i in range(3):
         q[i] = T_right_left[i, 0] * p[0] + T_right_left[i, 1] * p[1] + T_right_left[i, 2] * p[2] + T_right_left[i, 3]
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _linearise(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, uv: Array, r: Array, J: Array, q: Array,
     xy: Array, J_p: Array, J_d: Array,
@@ -122,7 +122,7 @@ def _linearise(
                         J[c, i, j] += J_p[c, i, m] * T_right_left[m, j]
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _step(weight: Array, r: Array, J: Array, JW: Array, H: Array, L: Array, g: Array, step: Array) -> bool:
     """Fill the normal equations of one point and solve them; False where they do not determine it."""
     for j in range(3):
@@ -154,7 +154,7 @@ def _step(weight: Array, r: Array, J: Array, JW: Array, H: Array, L: Array, g: A
     return bool(np.isfinite(step.sum()))
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _back(L: Array, g: Array, x: Array) -> None:
     """Solve L L^T x = g of three unknowns."""
     x[0] = g[0] / L[0, 0]
@@ -164,7 +164,10 @@ def _back(L: Array, g: Array, x: Array) -> None:
     x[0] = (x[0] - L[1, 0] * x[1] - L[2, 0] * x[2]) / L[0, 0]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], const f8[:, :, ::1], const f8[:, :, :, ::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]",
+)
 def _minimise(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array,
     rays_left: Array, rays_right: Array, p: Array, cov: Array, by_rig: Array,
@@ -212,7 +215,7 @@ def _minimise(
                     by_rig[n, j, m] -= gain * J_rig[i, m]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _rig_jacobian(counts: Ids, q: Array, xy: Array, J_p: Array, J_d: Array, J_rig: Array) -> None:
     """Fill J_rig (4, P), the pixels of a point, q (3,) in the right frame, by the rig's parameters."""
     J_rig[:] = 0.0
@@ -230,7 +233,7 @@ def _rig_jacobian(counts: Ids, q: Array, xy: Array, J_p: Array, J_d: Array, J_ri
         row[start + 3], row[start + 4], row[start + 5] = b * q[2] - c_ * q[1], c_ * q[0] - a * q[2], a * q[1] - b * q[0]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
     """Whether a point lies along the rays of its pixels, not behind a camera or where the distortion folds back."""
     left = ray_left[0] * p[0] + ray_left[1] * p[1] + ray_left[2] * p[2]

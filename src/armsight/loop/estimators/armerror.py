@@ -22,10 +22,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, sincos
 
 #: Harmonics of a potentiometer's linearity: an eccentric wiper makes the first, its bow the second.
@@ -42,8 +42,6 @@ SIZE = DELAY + 1
 ZEROS = np.arange(6) * 6 + 5
 #: The trace of a rotation by 3 rad.
 _MIN_TRACE = 1.0 + 2.0 * math.cos(3.0)
-
-_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ class Prior:
         return np.concatenate([links, linearity, joints, rest, [sigma_delay_s]])
 
 
-@_kernel
+@kernel
 def _small_motions(x: Array, motions: Array) -> None:
     """Write exp of the seven tangents at the head of x into motions (7 * 12,), row by row; angles below 0.3 rad."""
     for i in range(7):
@@ -130,7 +128,7 @@ def _small_motions(x: Array, motions: Array) -> None:
         m[11] = rz + g * kz + h * (a * ky - b * kx)
 
 
-@_kernel
+@kernel
 def _loads(table: Array, q: Array, g: Array) -> None:
     """Write the gravity torques (6,) about the joints of unit loads spread over the links beyond them, m."""
     axes = np.empty((7, 6))
@@ -150,7 +148,7 @@ def _loads(table: Array, q: Array, g: Array) -> None:
         g[i] = table[6 * i + 5] * torque
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]")
 def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
     """Write the derivative (6, SIZE) of what the joints are beyond their readings by the vector x, the zeros left out.
 
@@ -171,7 +169,7 @@ def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
         B[i, COMPLIANCE + i], B[i, REST + i], B[i, READING + i] = g[i] + unseen[2, i], 1.0, 1.0
 
 
-@_kernel
+@kernel
 def _adjoint(F: Frame, G: Frame, out: Array) -> None:
     """Write Ad(F^-1 G), (6, 6), which maps small motions in the axes of G to those in the axes of F.
 
@@ -188,7 +186,7 @@ def _adjoint(F: Frame, G: Frame, out: Array) -> None:
             out[row, 3 + col] = fx * (py * gz - pz * gy) + fy * (pz * gx - px * gz) + fz * (px * gy - py * gx)
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Array, H: Array) -> None:
     """Write the tool's pose (4, 4) at readings q (6,), unseen (3, 6), and its derivative (6, SIZE) by the vector x.
 
@@ -222,7 +220,7 @@ def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Arra
     _store_moved(F, x[POSE : POSE + 6], T)
 
 
-@_kernel
+@kernel
 def _store_moved(F: Frame, x: Array, T: Array) -> None:
     """Write a frame, moved by a tangent (6,) of less than some mrad (third powers left out), into T (4, 4)."""
     a, b, c = x[3], x[4], x[5]
@@ -241,7 +239,7 @@ def _store_moved(F: Frame, x: Array, T: Array) -> None:
     T[3, 3] = 1.0
 
 
-@_kernel
+@kernel("f8[:, ::1], const f8[:, ::1], f8[::1]")
 def tangent(T: Array, T_to: Array, xi: Array) -> None:
     """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for rotations of less than 3 rad, to xi.
 
@@ -274,7 +272,7 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
     xi[3], xi[4], xi[5] = a, b, c
 
 
-@_kernel
+@kernel("const f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]")
 def poses_and_derivatives(table: Array, x: Array, q: Array, unseen: Array, Ts: Array, Hs: Array) -> None:
     """Write the same for readings q (N, 6), unseen (N, 3, 6) and vectors x (N, SIZE) into (N, 4, 4) and (N, 6, SIZE)."""
     for n in range(len(q)):

@@ -15,10 +15,10 @@ table's d and a. That does, as only ratios count: of one torque to another, and 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
@@ -37,8 +37,6 @@ _SWEEPS = 8
 
 #: A longer time than this between two readings counts as so much, s.
 _LONGEST_STEP_S = 0.01
-
-_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 def rods(arm: Arm) -> Array:
@@ -84,7 +82,7 @@ def _thickness(arm: Arm) -> float:
     return float(_THICK * np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum())
 
 
-@_kernel
+@kernel("const f8[::1], f8[:, ::1], f8[::1], const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]")
 def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd: Array, M: Array, tau: Array) -> None:
     """Write the inertia (6, 6) of the links, and the torques that they need against gravity and to move so, (2, 6).
 
@@ -133,7 +131,7 @@ def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd:
             M[k, j] = M[j, k]
 
 
-@_kernel
+@kernel
 def _beyond(
     wx: float, wy: float, wz: float, bx: float, by: float, bz: float, rx: float, ry: float, rz: float
 ) -> tuple[float, float, float]:
@@ -146,7 +144,7 @@ def _beyond(
     )
 
 
-@_kernel
+@kernel
 def _step(
     table: Array,
     points: Array,
@@ -181,7 +179,7 @@ def _step(
         position[i] += dt * speed[i]
 
 
-@_kernel
+@kernel("const f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1]")
 def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> None:
     """Write 1 where the bearing of a link holds it against gravity at angles q (6,), else 0, to out (6,)."""
     M, tau, none = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6)
@@ -190,7 +188,7 @@ def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> N
         out[i] = 1.0 if abs(tau[0, i]) <= beside[1, i] else 0.0
 
 
-@_kernel
+@kernel
 def float_on(
     t: Array,
     q: Array,

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import BACKLASH, COMPLIANCE, FLOAT, POSE, READING, REST, SIZE, ZEROS, Prior
 from armsight.loop.estimators.estimator import PoseMeasurement
@@ -151,7 +151,10 @@ class ErrorModel:
         return own
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[:, ::1], "
+    "f8[:, ::1]",
+)
 def _forget(
     time: Array,
     travel: Array,
@@ -188,7 +191,7 @@ def _forget(
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]", fastmath={"contract"})
 def _covariances(Hs: Array, kept: Array, added: Array, P: Array, own: Array) -> None:
     """Write H (K P K + A) H' into own (N, 6, 6): Hs (N, 6, SIZE), kept, added (N, SIZE).
 
@@ -217,7 +220,7 @@ def _covariances(Hs: Array, kept: Array, added: Array, P: Array, own: Array) -> 
                     own[n, row, column] += H[row, k] * added[n, k] * H[column, k]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1]")
 def symmetric(P: Array) -> None:
     """Overwrite a covariance (N, N) with the mean of it and its transpose."""
     for i in range(len(P)):
@@ -225,7 +228,7 @@ def symmetric(P: Array) -> None:
             P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], f8[::1]")
 def chi_square(S: Array, z: Array) -> float:
     """Return z' S^-1 z of an innovation (6,) with covariance (6, 6), by Cholesky's factors; NaN where S is none."""
     L, y, total = np.zeros((6, 6)), np.empty(6), 0.0

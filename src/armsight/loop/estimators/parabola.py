@@ -5,10 +5,10 @@ Local polynomial fit (Savitzky and Golay, Anal. Chem. 36, 1964), for readings at
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 
 #: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
 #: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
@@ -19,16 +19,14 @@ LONG_SPAN_S = 2 * SPAN_S
 #: Fewest readings for a parabola; fewer are averaged.
 PARABOLA = 5
 
-_kernel = numba.njit(cache=True, error_model="numpy")
 
-
-@_kernel
+@kernel
 def span(at: float, newest: float) -> float:
     """Return the span of readings, s, that are smoothed for a time when the newest reading is of another, s."""
     return min(max(2 * (newest - at), SPAN_S), LONG_SPAN_S)
 
 
-@_kernel
+@kernel
 def window(t: Array, first: int, count: int, at: float, length: float) -> tuple[int, int]:
     """Return the rows of a span of time around a time, s: around it as far as there are any, else before or after."""
     last = first + count - 1
@@ -38,7 +36,7 @@ def window(t: Array, first: int, count: int, at: float, length: float) -> tuple[
     return min(low, high), high
 
 
-@_kernel
+@kernel
 def fit(t: Array, q: Array, low: int, high: int, at: float, motion: Array) -> float:
     """Lay parabolas through rows low to high of q (N, 6); write angles, speeds, accelerations at a time to motion (3, 6).
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.geometry.check import checked
+from armsight.kernels import kernel
 from armsight.loop.estimators.backlash_dynamics import float_on, loose, masses
 from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
 from armsight.robot.arm import Arm
@@ -50,7 +50,6 @@ _MIN_PERIOD_S = 1e-3
 _ROWS = 4096
 
 # Kernels of some microseconds keep the interpreter: to get it back from a busy thread takes longer.
-_kernel = numba.njit(cache=True, error_model="numpy")
 
 
 class Smoothed(NamedTuple):
@@ -77,7 +76,7 @@ class Smoothed(NamedTuple):
     flips: Array
 
 
-@_kernel
+@kernel
 def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
     """Write travel, flips, side, and the position behind the dead zone, of rows begin to end into memory (N, 8, 6)."""
     motion = np.empty((3, 6))
@@ -99,7 +98,7 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
             memory[k, 2, i], memory[k, 3, i] = now, moved
 
 
-@_kernel
+@kernel
 def _rest(
     t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array
 ) -> None:
@@ -122,7 +121,10 @@ def _rest(
             speeds[i] = 2 * drift / (t[high] - t[low]) if abs(drift) > noise else 0.0
 
 
-@_kernel
+@kernel(
+    "f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1], f8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], "
+    "f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]",
+)
 def _smooth(
     t: Array,
     q: Array,
@@ -161,7 +163,7 @@ def _smooth(
     return True
 
 
-@_kernel
+@kernel("f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, i8, i8, f8, f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], f8")
 def _take_on(
     t: Array,
     q: Array,
@@ -183,7 +185,7 @@ def _take_on(
     return max(int(np.searchsorted(t[:end], t[end - 1] - 0.5 * LONG_SPAN_S)), settled)
 
 
-@_kernel
+@kernel("f8[::1], f8[:, ::1], i8, i8, f8")
 def _rising(t: Array, q: Array, begin: int, end: int, before: float) -> bool:
     """Return whether rows begin to end are numbers and their times rise from the one before."""
     for k in range(begin, end):

@@ -15,10 +15,10 @@ is a variable on purpose: a loop whose length is known is unrolled instead.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.robot.kinematics.table import TOOL
 
 Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
@@ -39,10 +39,9 @@ _TAN_8TH = np.sqrt(2.0) - 1.0
 _BEYOND_4TH, _BEYOND_HALF = 3.061616997868383e-17, 6.123233995736766e-17
 
 # Kernels of some microseconds keep the interpreter: to get it back from a busy thread takes longer.
-_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 
-@_kernel
+@kernel("f8", fastmath={"contract", "nsz"})
 def sincos(x: float) -> tuple[float, float]:
     """Return sin(x), cos(x), x in rad."""
     k = np.floor(x * _QUARTERS + 0.5)
@@ -61,7 +60,7 @@ def sincos(x: float) -> tuple[float, float]:
     return (-sin if quarter & 2 else sin), (-cos if (quarter + 1) & 2 else cos)
 
 
-@_kernel
+@kernel("f8, f8", fastmath={"contract", "nsz"})
 def angle_of(y: float, x: float) -> float:
     """Return the angle of the point (x, y), rad in [-pi, pi]; 0 at the origin."""
     across, along = abs(y), abs(x)
@@ -86,21 +85,21 @@ def angle_of(y: float, x: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def sincos_each(angles: Array, sines: Array, cosines: Array, n: int) -> None:
     """Write the sines and cosines of the first n angles, rad."""
     for k in range(n):
         sines[k], cosines[k] = sincos(angles[k])
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def angle_of_each(y: Array, x: Array, angles: Array, n: int) -> None:
     """Write the angles of the first n points (x, y), rad."""
     for k in range(n):
         angles[k] = angle_of(y[k], x[k])
 
 
-@_kernel
+@kernel("f8[::1]", fastmath={"contract", "nsz"})
 def validity(q: Array) -> int:
     """Return whether joint angles (6,) are finite and can be radians: GOOD, NOT_FINITE or NOT_RADIANS."""
     largest = 0.0
@@ -111,14 +110,14 @@ def validity(q: Array) -> int:
     return NOT_RADIANS if largest > MOST_RADIANS else GOOD
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def first_frame(table: Array) -> Frame:
     """Return frame 0 in the base."""
     t = table
     return (t[36], t[40], t[44], t[37], t[41], t[45], t[38], t[42], t[46], t[39], t[43], t[47])
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def after_rotation(table: Array, i: int, c: float, s: float, F: Frame) -> Frame:
     """Carry a frame over joint i's rotation and its shift d along the axis: Rz(theta) Tz(d)."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
@@ -139,7 +138,7 @@ def after_rotation(table: Array, i: int, c: float, s: float, F: Frame) -> Frame:
     )
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def after_link(table: Array, i: int, F: Frame) -> Frame:
     """Carry a frame over link i's length and twist: Tx(a) Rx(alpha)."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
@@ -160,7 +159,7 @@ def after_link(table: Array, i: int, F: Frame) -> Frame:
     )
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def after(table: Array, k: int, F: Frame) -> Frame:
     """Carry a frame over the constant transform that stands at index k of the table: F @ T."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
@@ -183,7 +182,7 @@ def after(table: Array, k: int, F: Frame) -> Frame:
     )
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def before(table: Array, k: int, F: Frame) -> Frame:
     """Carry a frame into where the constant transform at index k of the table maps to: T @ F."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = F
@@ -206,7 +205,7 @@ def before(table: Array, k: int, F: Frame) -> Frame:
     )
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def store(F: Frame, T: Array) -> None:
     """Write a frame into a transform (4, 4)."""
     T[0, 0], T[1, 0], T[2, 0], T[3, 0] = F[0], F[1], F[2], 0.0
@@ -215,7 +214,7 @@ def store(F: Frame, T: Array) -> None:
     T[0, 3], T[1, 3], T[2, 3], T[3, 3] = F[9], F[10], F[11], 1.0
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def tool_frame(table: Array, q: Array) -> Frame:
     """Return the tool's frame at joint angles (6,)."""
     F = first_frame(table)
@@ -225,14 +224,14 @@ def tool_frame(table: Array, q: Array) -> Frame:
     return after(table, TOOL, F)
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], f8[:, ::1]", fastmath={"contract", "nsz"})
 def forward(table: Array, q: Array, T: Array) -> int:
     """Write the tool's pose at joint angles (6,) into T_base_tool (4, 4); returns the validity of q."""
     store(tool_frame(table, q), T)
     return validity(q)
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], f8[:, :, ::1]", fastmath={"contract", "nsz"})
 def links(table: Array, q: Array, Ts: Array) -> int:
     """Write frame 0, the frames of links 1 to 6 and the tool's into (8, 4, 4); returns the validity of q."""
     modified = table[60] != 0.0
@@ -247,7 +246,7 @@ def links(table: Array, q: Array, Ts: Array) -> int:
     return validity(q)
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def _axes(table: Array, q: Array, J: Array) -> Frame:
     """Write the joints' axes into rows 3 to 5 of J and points on them into rows 0 to 2; return the tool's frame."""
     F = first_frame(table)
@@ -260,7 +259,7 @@ def _axes(table: Array, q: Array, J: Array) -> Frame:
     return after(table, TOOL, F)
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def jacobian_base(table: Array, q: Array, J: Array) -> Frame:
     """Write the Jacobian (6, 6) in base axes; return the tool's frame."""
     F = _axes(table, q, J)
@@ -271,7 +270,7 @@ def jacobian_base(table: Array, q: Array, J: Array) -> Frame:
     return F
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def _into_tool_axes(F: Frame, J: Array) -> None:
     """Express the columns of J, given in base axes, in the axes of a frame."""
     for i in range(6):
@@ -282,7 +281,7 @@ def _into_tool_axes(F: Frame, J: Array) -> None:
             J[k + 2, i] = F[6] * x + F[7] * y + F[8] * z
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], b1, f8[:, ::1]", fastmath={"contract", "nsz"})
 def jacobian(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
     """Write the Jacobian (6, 6) of the tool's point, [linear; angular] rows; returns the validity of q."""
     F = jacobian_base(table, q, J)
@@ -291,7 +290,7 @@ def jacobian(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
     return validity(q)
 
 
-@_kernel
+@kernel("const f8[::1], f8[:, ::1], b1, f8[:, :, ::1]", fastmath={"contract", "nsz"})
 def jacobian_batch(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
     """Write the Jacobians at joint angles (N, 6) into (N, 6, 6); returns the worst validity."""
     worst = GOOD
@@ -300,7 +299,7 @@ def jacobian_batch(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
     return worst
 
 
-@_kernel
+@kernel("const f8[::1], f8[::1], f8[::1], b1, f8[:, ::1]", fastmath={"contract", "nsz"})
 def jacobian_rate(table: Array, q: Array, qd: Array, in_tool_axes: bool, J: Array) -> int:
     """Write the time derivative of the Jacobian (6, 6); returns the validity of q."""
     F = jacobian_base(table, q, J)
@@ -324,13 +323,13 @@ def jacobian_rate(table: Array, q: Array, qd: Array, in_tool_axes: bool, J: Arra
     return validity(q)
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def _joint(table: Array, i: int, sines: Array, cosines: Array, k: int, F: Frame) -> Frame:
     """Carry the frame of the batch's configuration k over joint i and its link."""
     return after_link(table, i, after_rotation(table, i, cosines[8 * i + k], sines[8 * i + k], F))
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def frames(table: Array, sines: Array, cosines: Array, out: Array, n: int) -> None:
     """Write the tool's frames (96,) for sines and cosines (48,) of theta."""
     first = first_frame(table)
@@ -348,7 +347,7 @@ def frames(table: Array, sines: Array, cosines: Array, out: Array, n: int) -> No
         out[72 + k], out[80 + k], out[88 + k] = F[9], F[10], F[11]
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def thetas(table: Array, q: Array, theta: Array, n: int) -> None:
     """Write theta (48,) of joint angles (48,), rad."""
     for i in range(6):
@@ -357,7 +356,7 @@ def thetas(table: Array, q: Array, theta: Array, n: int) -> None:
             theta[8 * i + k] = way * q[8 * i + k] + offset
 
 
-@_kernel
+@kernel(fastmath={"contract", "nsz"})
 def errors(out: Array, G: Frame, position: Array, angle: Array, n: int) -> None:
     """Write how far frames (96,) are off a frame: position, m, and the sine of the angle, or 1 beyond 90 degrees."""
     for k in range(n):
@@ -373,7 +372,7 @@ def errors(out: Array, G: Frame, position: Array, angle: Array, n: int) -> None:
         angle[k] = 0.5 * np.sqrt(ex * ex + ey * ey + ez * ez) if trace > 1.0 else 1.0
 
 
-@_kernel
+@kernel("const f8[::1], f8[:, ::1], f8[:, :, ::1], f8[::1], i8", fastmath={"contract", "nsz"})
 def forward_batch(table: Array, q: Array, Ts: Array, work: Array, n: int) -> int:
     """Write the tool's poses at joint angles (N, 6) into (N, 4, 4); work is (240,), n is 8. Returns the worst validity."""
     worst, count = 0, q.shape[0]

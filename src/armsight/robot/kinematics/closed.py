@@ -20,10 +20,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, angle_of, sincos
 from armsight.robot.kinematics.structure import PARALLEL
 from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND
@@ -50,36 +50,34 @@ _TRIES, _TRY_RAD = 144, 2.0 * np.pi / 144.0
 #: Two solutions whose half difference has a sine below this are one: rounding alone parts a double one by 2e-8.
 _SAME = 1e-7
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
-
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _in_link1(x: float, y: float, z: float, c1: float, s1: float, sa: float) -> tuple[float, float, float]:
     """Return a vector of frame 0 in the axes of link 1, whose z axis is perpendicular to frame 0's."""
     return c1 * x + s1 * y, sa * z, sa * (s1 * x - c1 * y)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _at(table: Array, i: int, near: Array) -> Point:
     """Return joint i's theta at ``near`` as a point."""
     s, c = sincos(table[6 * i + 5] * near[i] + table[6 * i + 4])
     return c, s
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _put(y: Array, x: Array, i: int, slot: int, c: float, s: float) -> None:
     """Write joint i's angle into a slot of the batch."""
     x[8 * i + slot], y[8 * i + slot] = c, s
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _tag(tags: Array, slot: int, front: float, up: float, wrist: float, state: int) -> None:
     """Write the configuration and state of a slot."""
     tags[slot], tags[8 + slot] = front, 1.0 if up >= 0.0 else -1.0
     tags[16 + slot], tags[24 + slot] = 1.0 if wrist >= 0.0 else -1.0, state
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _bend(table: Array, tx: float, ty: float, tolerance: float) -> tuple[bool, float, float]:
     """Return whether the planar arm reaches a point within a tolerance, m, and the angle between its links, s >= 0."""
     upper, fore = table[6], table[FOREARM]
@@ -90,7 +88,7 @@ def _bend(table: Array, tx: float, ty: float, tolerance: float) -> tuple[bool, f
     return least - tolerance <= far <= most + tolerance, c, math.sqrt((1.0 - c) * (1.0 + c))
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _upper_arm(table: Array, tx: float, ty: float, c: float, s: float, near: Array) -> Point:
     """Return theta2 for the planar arm's end and the angle between its links."""
     along, across = table[6] + table[FOREARM] * c, table[FOREARM] * s
@@ -101,7 +99,7 @@ def _upper_arm(table: Array, tx: float, ty: float, c: float, s: float, near: Arr
     return x / length, y / length
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _lower_arm(table: Array, c2: float, s2: float, c: float, s: float) -> tuple[float, float, float, float]:
     """Return theta3, and theta2 + theta3, as points: the angle between the links less the forearm's own bend."""
     cb, sb = table[BEND + 1], table[BEND + 2]
@@ -109,7 +107,7 @@ def _lower_arm(table: Array, c2: float, s2: float, c: float, s: float) -> tuple[
     return c3, s3, c2 * c3 - s2 * s3, s2 * c3 + c2 * s3
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _spherical(
     table: Array,
     B: Frame,
@@ -155,7 +153,7 @@ def _spherical(
     return slot, 0
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _helpful_rotation(table: Array, wx: float, wy: float, c: float, s: float) -> float:
     """Return the least change of theta2 + theta3 + theta4 that brings a PARALLEL arm's planar end within reach; 10 if none.
 
@@ -177,7 +175,7 @@ def _helpful_rotation(table: Array, wx: float, wy: float, c: float, s: float) ->
     return (-edge_angle if now < 0.0 else edge_angle) - now
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _parallel(
     table: Array,
     B: Frame,
@@ -234,7 +232,7 @@ def _parallel(
     return slot, missed
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _one_shoulder(
     table: Array,
     M: Frame,
@@ -265,7 +263,7 @@ def _one_shoulder(
     return slot, missed
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: Array, tags: Array) -> tuple[int, int]:
     """Write the thetas of all solutions into a batch, one after the other.
 

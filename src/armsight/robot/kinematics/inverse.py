@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from armsight.data import Array, Ids
+from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import (
     Frame,
     after,
@@ -48,10 +48,8 @@ _NONE = 1e-30
 #: A step that takes off less than this share of the error ends the descent; so does this much damping.
 _SLOW, _STIFF = 1e-9, 1e6
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
-
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def rigid(T: Array) -> tuple[int, Frame]:
     """Return the validity of a transform (4, 4), and its frame with the rotation made orthonormal."""
     total = 0.0
@@ -83,7 +81,7 @@ def rigid(T: Array) -> tuple[int, Frame]:
     return validity, (xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def pose_error(F: Frame, G: Frame, error: Array) -> float:
     """Write what moves F onto G, [translation; rotation vector] in base axes; return its squared length."""
     x = 0.5 * (F[1] * G[2] - F[2] * G[1] + F[4] * G[5] - F[5] * G[4] + F[7] * G[8] - F[8] * G[7])
@@ -106,7 +104,7 @@ def pose_error(F: Frame, G: Frame, error: Array) -> float:
     return total
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _solve(A: Array, g: Array, damping: float, step: Array) -> bool:
     """Solve (A + damping I) step = g by Cholesky; False where that cannot be done.
 
@@ -138,7 +136,7 @@ def _solve(A: Array, g: Array, damping: float, step: Array) -> bool:
     return True
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _normal(J: Array, e: Array, q: Array, low: Array, high: Array, A: Array, g: Array) -> None:
     """Write the upper half of J^T J (6, 6), and J^T e (6,); a joint at a bound and pulled beyond it is left out."""
     for i in range(6):
@@ -159,7 +157,7 @@ def _normal(J: Array, e: Array, q: Array, low: Array, high: Array, A: Array, g: 
             A[i, j] = total
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int, work: Array) -> float:
     """Move joint angles (6,) in-place towards a requested frame, within bounds.
 
@@ -222,14 +220,14 @@ _REVOLUTION = 2.0 * np.pi
 _LAST = 1e9
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def wrap(q: float) -> float:
     """Bring an angle into (-pi, pi]."""
     revolutions: float = np.ceil((q - np.pi) / _REVOLUTION)
     return q - _REVOLUTION * revolutions
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def unwrapped(q: float, low: float, high: float, goal: float) -> tuple[float, bool]:
     """Return the angle, whole revolutions from q, within the limits and nearest a goal; and whether there is one."""
     least, most = (np.ceil((low - q) / _REVOLUTION - 1e-13), np.floor((high - q) / _REVOLUTION + 1e-13))
@@ -241,7 +239,7 @@ def unwrapped(q: float, low: float, high: float, goal: float) -> tuple[float, bo
     return (min(high, max(low, angle)) if inside else angle), inside
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def known(rows: Array, count: int) -> bool:
     """Return whether row ``count`` stands among the rows before it."""
     for k in range(count):
@@ -256,7 +254,7 @@ def known(rows: Array, count: int) -> bool:
     return False
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def bring_within(limits: Array, near: Array, ordered: bool, row: Array) -> None:
     """Move a row's joints by whole revolutions into the limits, and write its state and key."""
     outside, distance = False, 0.0
@@ -269,7 +267,7 @@ def bring_within(limits: Array, near: Array, ordered: bool, row: Array) -> None:
     row[KEY] = (distance if ordered else 0.0) + (_LAST if outside else 0.0)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def sort(rows: Array, count: int) -> None:
     """Sort rows by their keys; equal ones keep their order."""
     for k in range(1, count):
@@ -292,7 +290,7 @@ _STARTS, _NEAREST_STARTS, _STEPS, _LONG_STEPS = 64, 8, 20, 200
 _FAR = 1e9
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool:
     """Move a row onto the pose, measure what is left, and return whether it brings the tool there."""
     q, e = work[16], work[12]
@@ -307,7 +305,7 @@ def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool
     return bool(max(row[POSITION], row[ANGLE]) < _WRONG)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _start(n: int, near: Array, q: Array) -> None:
     """Write the n-th configuration to start from: ``near``, then points spread evenly over a revolution of every joint."""
     # The fractional parts of n times powers of the root of x^7 = x + 1 spread best (Roberts, 2018).
@@ -316,7 +314,7 @@ def _start(n: int, near: Array, q: Array) -> None:
         q[i] = near[i] if n == 0 else np.pi * (2.0 * spread - 1.0)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _from_everywhere(table: Array, F: Frame, near: Array, most: int, rows: Array, work: Array) -> int:
     """Write what damped least squares finds from many starts, at most so many; returns how many rows."""
     count = 0
@@ -330,7 +328,7 @@ def _from_everywhere(table: Array, F: Frame, near: Array, most: int, rows: Array
     return count
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _to_rows(batch: Array, found: int, rows: Array) -> None:
     """Copy angles, errors and tags of the batch into rows."""
     q, tags, off = batch[96:144], batch[288:320], batch[320:336]
@@ -342,7 +340,7 @@ def _to_rows(batch: Array, found: int, rows: Array) -> None:
             rows[k, CONFIGURATION + i] = tags[8 * i + k]
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _batch_angles(closed: Array, limits: Array, near: Array, batch: Array, n: int) -> None:
     """Convert the batch's points (cosine, sine) into joint angles, within the limits where that can be."""
     y, x, q, theta = batch[:48], batch[48:96], batch[96:144], batch[144:192]
@@ -353,7 +351,7 @@ def _batch_angles(closed: Array, limits: Array, near: Array, batch: Array, n: in
             q[8 * i + k], _ = unwrapped(way * (theta[8 * i + k] - offset), low, high, goal)
 
 
-@_kernel
+@kernel(nogil=True, fastmath={"contract", "nsz"})
 def _from_closed_form(
     table: Array,
     closed: Array,
@@ -393,7 +391,11 @@ def _from_closed_form(
     return count, missed
 
 
-@_kernel
+@kernel(
+    "const f8[::1], const f8[::1], const f8[:, ::1], f8[:, ::1], f8[::1], b1, f8[:, ::1], f8[::1], i8",
+    nogil=True,
+    fastmath={"contract", "nsz"},
+)
 def inverse(
     table: Array,
     closed: Array,
@@ -449,7 +451,12 @@ def inverse(
     return count, missed, bits
 
 
-@_kernel
+@kernel(
+    "const f8[::1], const f8[::1], const f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], f8[::1], i8, "
+    "f8[:, :, ::1], i8[::1]",
+    nogil=True,
+    fastmath={"contract", "nsz"},
+)
 def inverse_batch(
     table: Array,
     closed: Array,
@@ -474,7 +481,11 @@ def inverse_batch(
     return worst
 
 
-@_kernel
+@kernel(
+    "const f8[::1], const f8[::1], const f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], i8",
+    nogil=True,
+    fastmath={"contract", "nsz"},
+)
 def nearest(
     table: Array, closed: Array, limits: Array, T: Array, near: Array, q: Array, rows: Array, scratch: Array, n: int
 ) -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from armsight.data import Array, Ids, Image
+from armsight.kernels import kernel
 from armsight.sim.render.optics import Radiance, Window, gather_parts, spread_down
 from armsight.sim.render.paint import SUB, Slots, paint, paint_disc
 from armsight.sim.render.scene import CLEAR, Pattern
@@ -34,6 +34,7 @@ class Palette(NamedTuple):
     values: Array
     discs: Array
     first: Ids
+    kernel_types = "f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[:, ::1]"
 
 
 @lru_cache(maxsize=64)
@@ -71,6 +72,7 @@ class Exposure(NamedTuple):
     order: Ids
     Ms: Array
     boxes: Ids
+    kernel_types = "Palette, f8[::1], i8[:, ::1], f8[:, :, :, :, ::1], i8[:, ::1]"
 
     def shown(self) -> Ids:
         """Return the boxes (N, 4) of the patterns that face the camera."""
@@ -78,13 +80,13 @@ class Exposure(NamedTuple):
         return np.asarray(self.boxes[self.palette.first[seen, 3] + seen])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _nearness(rays: Radiance, M: Array, v: int, u: int) -> float:
     """Return 1 / distance, 1/m, at which a pixel's ray meets a pattern's plane."""
     return float(M[2, 0] * rays[0, v, u] + M[2, 1] * rays[1, v, u] + M[2, 2] * rays[2, v, u])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _put_back(
     rays: Radiance,
     Ms: Array,
@@ -109,7 +111,7 @@ def _put_back(
                 slot[v, u] = -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+@kernel(nogil=True, fastmath={"nnan", "nsz"})
 def _nearest(depth: Radiance, ids: Image, out: Radiance) -> None:
     """Write how near the nearest pixel that has an id is in each row (H,), m."""
     for v in range(out.size):
@@ -120,7 +122,11 @@ def _nearest(depth: Radiance, ids: Image, out: Radiance) -> None:
         out[v] = least
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f8[:, :, ::1], f4[:, :, ::1], Exposure, (i8, i8), (f4[:, :], f4[:, :], i2[:, :]), f4[:, ::1], f4[:, ::1], "
+    "f4[:, ::1]",
+    nogil=True,
+)
 def paint_faces(
     corners: Array,
     rays: Radiance,

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Image, Record
 from armsight.geometry.pose import inverse, transform
+from armsight.kernels import kernel
 from armsight.vision.camera import Camera
 
 #: Samples along each side of a pixel; an odd number, so that one is the centre.
@@ -66,7 +66,7 @@ def moved(solid: Solid, T: Array) -> Solid:
     return Solid(transform(T, solid.vertices), solid.triangles, solid.grain_m, solid.contrast, solid.seed)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, :, ::1], f8[:, ::1], (i8, i8, i8, i8), f8[:, ::1], i4[:, ::1], i8")
 def _cast(
     rays: Array, corners: Array, box: tuple[int, int, int, int], depth: Array, owner: NDArray[np.int32], k: int
 ) -> None:
@@ -87,7 +87,7 @@ def _cast(
                 depth[y, x], owner[y, x] = t, k
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _lattice(x: int, y: int, z: int, seed: int) -> float:
     """Return a number of -1 to 1 for a point of a lattice: a hash."""
     h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791) ^ (seed * 2654435761)
@@ -96,7 +96,7 @@ def _lattice(x: int, y: int, z: int, seed: int) -> float:
     return ((h ^ (h >> 15)) & 0xFFFF) / 32767.5 - 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], f8, i8, f8[::1]")
 def _grain(p: Array, grain_m: float, seed: int, out: Array) -> None:
     """Write value noise of three octaves at points (N, 3), of unit spread about."""
     for n in range(p.shape[0]):

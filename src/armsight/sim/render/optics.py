@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from armsight.data import Array, Image
 from armsight.errors import InputError
+from armsight.kernels import kernel
 from armsight.sim.render.paint import SUB, Slots
 
 Radiance = NDArray[np.float32]
@@ -92,7 +92,7 @@ def psf_taps(sigma: float, parts: int) -> Array:
     return np.asarray(taps / taps.sum(axis=1, keepdims=True))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("i4[:, ::1], f8[:, :, ::1], f4[:, ::1], f8, f8[:, ::1], f4[:, ::1]", nogil=True)
 def gather_parts(slot: Slots, fine: Array, taps: Radiance, weight: float, coarse: Array, across: Radiance) -> None:
     """Give every edge pixel the mean of its parts, and spread across each line of parts what these send beyond it.
 
@@ -124,7 +124,7 @@ def gather_parts(slot: Slots, fine: Array, taps: Radiance, weight: float, coarse
                     line[c] += p0 * t0[c] + p1 * t1[c] + p2 * t2[c] + p3 * t3[c]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:, ::1], f4[:, ::1], f4[:, ::1]", nogil=True)
 def spread_down(across: Radiance, taps: Radiance, out: Radiance) -> None:
     """Add to an image (H, W) what :func:`gather_parts` has gathered, spread down."""
     radius = taps.shape[1] // 2
@@ -226,7 +226,7 @@ _STRIP = 1 << 22  # indices where an image's noise may begin
 _STEP, _MASK = 0x9E3779B97F4A7C15, (1 << 64) - 1  # of the hash that chooses one
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _rounded(grey: Radiance, noise: Radiance, sensor: tuple[float, float, float], out: Image) -> None:
     """Write the grey levels of a part of a row."""
     offset, read, shot = np.float32(sensor[0]), np.float32(sensor[1]), np.float32(sensor[2])
@@ -240,7 +240,10 @@ def _rounded(grey: Radiance, noise: Radiance, sensor: tuple[float, float, float]
             out[u] = np.uint8(min(max(np.rint(grey[u] + offset + read * noise[u]), zero), most))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f4[:, ::1], f4[:, ::1], (i8, i8, i8, i8), (i8, i8, i8, i8), f4[:, ::1], f4[::1], i8, (f8, f8, f8), u1[:, ::1]",
+    nogil=True,
+)
 def exposed_window(
     still: Radiance,
     light: Radiance,

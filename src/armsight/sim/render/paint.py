@@ -15,11 +15,11 @@ change here, delete the cache of ``faces`` too.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.kernels import kernel
 
 #: Parts of an edge pixel along each side.
 SUB = 4
@@ -28,7 +28,7 @@ Slots = NDArray[np.int32]
 Box = tuple[int, int, int, int]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def half(c: float, u: float, v: float) -> float:
     """Return in which share of the square with sides from -1/2 to 1/2 the plane c + u x + v y is above zero."""
     u, v = abs(u), abs(v)
@@ -43,7 +43,7 @@ def half(c: float, u: float, v: float) -> float:
     return 1.0 - share if c > 0.0 else share
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def square_of(top: Array, bottom: Array, k: int, out: Array) -> None:
     """Write out (4, 3), what interpolates the area between points k and k + 1 of two lines: middle, slopes, twist."""
     for c in range(3):
@@ -54,7 +54,7 @@ def square_of(top: Array, bottom: Array, k: int, out: Array) -> None:
         out[3, c] = a - b - d + e
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> bool:
     """Cast n pixel corners of row v from column u0 on to the plane of M, out (3, n) homogeneous; return if all see it."""
     least = np.inf
@@ -66,13 +66,13 @@ def plane_row(rays: Array, M: Array, v: int, u0: int, n: int, out: Array) -> boo
     return least > 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def ahead_of(top: Array, bottom: Array, k: int) -> bool:
     """Return whether points k and k + 1 of two lines see the plane before them."""
     return bool(min(min(top[2, k], top[2, k + 1]), min(bottom[2, k], bottom[2, k + 1])) > 0.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: int) -> tuple[Array, int, int]:
     """Return the parts of a pixel, making them from its one value where it has none yet: parts, slot, count."""
     if slot[v, u] >= 0:
@@ -95,7 +95,7 @@ Grid = tuple[Array, Array, Array]
 Span = tuple[int, int, int, int]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _area(p: Array, n: int) -> float:
     """Return the area of the polygon p (n, 5) in its first two columns."""
     twice = 0.0
@@ -105,7 +105,7 @@ def _area(p: Array, n: int) -> float:
     return 0.5 * abs(twice)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _split(p: Array, n: int, axis: int, edge: float, low: Array, high: Array) -> tuple[int, int]:
     """Split the convex polygon p (n, 5) where homogeneous coordinate ``axis`` equals ``edge``; return both counts."""
     n_low = n_high = 0
@@ -130,7 +130,7 @@ def _split(p: Array, n: int, axis: int, edge: float, low: Array, high: Array) ->
     return n_low, n_high
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def cell_of(edges: Array, x: float, w: float, i: int) -> int:
     """Return which cell x / w lies in, starting to look at i: 0 before the first edge, len(edges) past the last."""
     while i > 0 and x < edges[i - 1] * w:
@@ -140,7 +140,7 @@ def cell_of(edges: Array, x: float, w: float, i: int) -> int:
     return i
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def cells_of(points: Array, xe: Array, ye: Array, n: int, out: Slots) -> None:
     """Write out (n,) in which cell each homogeneous plane point (3, n) lies: its row times the columns, and its column."""
     i = j = 0
@@ -149,7 +149,7 @@ def cells_of(points: Array, xe: Array, ye: Array, n: int, out: Slots) -> None:
         out[k] = j * (xe.size + 1) + i
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def span_of(a: Slots, b: Slots, k: int, columns: int) -> Span:
     """Return the first and last column and row of the cells of points k and k + 1 of two lines a, b (n,)."""
     i0, i1 = min(a[k] % columns, a[k + 1] % columns), max(a[k] % columns, a[k + 1] % columns)
@@ -160,7 +160,7 @@ def span_of(a: Slots, b: Slots, k: int, columns: int) -> Span:
     return i0, i1, j0 // columns, j1 // columns
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def uniform(values: Array, span: Span) -> bool:
     """Return whether all cells of a span have one value."""
     i0, i1, j0, j1 = span
@@ -172,7 +172,7 @@ def uniform(values: Array, span: Span) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _clip(c: Array, grid: Grid, span: Span, old: float, b: Array) -> float:
     """Return the mean value over the area between corners c (4, 3) that spans several cells; ``old`` where clear."""
     xe, ye, values = grid
@@ -195,7 +195,7 @@ def _clip(c: Array, grid: Grid, span: Span, old: float, b: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def part_corners(top: Array, bottom: Array, k: int, out: Array) -> None:
     """Interpolate the corners of a pixel's parts, out (SUB + 1, 3, SUB + 1), from those of pixel k of a row."""
     for a in range(SUB + 1):
@@ -208,14 +208,14 @@ def part_corners(top: Array, bottom: Array, k: int, out: Array) -> None:
                 out[a, c, b] = upper + t * (lower - upper)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _corners(top: Array, bottom: Array, k: int, c: Array) -> None:
     """Gather c (4, 3), the corners, in cyclic order, of the area between points k and k + 1 of two lines (3, n)."""
     for n in range(3):
         c[0, n], c[1, n], c[2, n], c[3, n] = top[n, k], top[n, k + 1], bottom[n, k + 1], bottom[n, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def clip_parts(fan: Array, cells: Slots, grid: Grid, parts: Array, buffer: Array) -> None:
     """Repaint the parts (SUB, SUB) of a pixel whose part corners lie at fan (SUB + 1, 3, SUB + 1) of the plane."""
     xe, ye, values = grid
@@ -235,7 +235,7 @@ def clip_parts(fan: Array, cells: Slots, grid: Grid, parts: Array, buffer: Array
 Line = tuple[float, float, float]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
     """Return the ends of the line c + u x + v y = 0 within the square of :func:`half`; its middle where it misses."""
     steep = abs(u) < abs(v)
@@ -254,7 +254,7 @@ def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
     return (y0, x0, y1, x1) if steep else (x0, y0, x1, y1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _inside_rim(x: Line, y: Line, w: Line) -> float:
     """Return in which share of an area a disc is whose rim is nearly straight there.
 
@@ -274,7 +274,7 @@ def _inside_rim(x: Line, y: Line, w: Line) -> float:
     return half(c - 0.5 * max(way - c * c, 0.0) * per, u, v)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _inside(points: Array, disc: Array, out: Array) -> None:
     """Write out (n,), above zero where homogeneous plane points (3, n) lie in a disc: squares of distances within."""
     for k in range(out.size):
@@ -283,7 +283,7 @@ def _inside(points: Array, disc: Array, out: Array) -> None:
         out[k] = w * w - x * x - y * y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _bulge(square: Array, disc: Array) -> float:
     """Return twice by how much a point in a pixel may be further in a disc, as :func:`_inside` counts, than its corners."""
     total = 0.0
@@ -293,7 +293,7 @@ def _bulge(square: Array, disc: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _about(square: Array, n: int, scale: float, offset: float) -> tuple[float, float, float, float]:
     """Return ``scale`` times coordinate n of a pixel less ``offset`` times its last: middle, slopes, twist."""
     return (
@@ -304,7 +304,7 @@ def _about(square: Array, n: int, scale: float, offset: float) -> tuple[float, f
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _paint_rim(square: Array, disc: Array, fine: Array, s: int) -> None:
     """Repaint the parts fine[s] (SUB, SUB) of a pixel that a disc's rim crosses."""
     x, y, w = _about(square, 0, 1.0, disc[0]), _about(square, 1, 1.0, disc[1]), _about(square, 2, disc[2], 0.0)
@@ -331,7 +331,10 @@ def _paint_rim(square: Array, disc: Array, fine: Array, s: int) -> None:
                 fine[s, a, b] += share * (disc[3] - fine[s, a, b])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f8[:, :, ::1], f8[:, :, ::1], (i8, i8, i8, i8), (i8, i8), f8[::1], f8[:, ::1], i4[:, ::1], f8[:, :, ::1], i8",
+    nogil=True,
+)
 def paint_disc(
     rays: Array,
     Ms: Array,
@@ -398,7 +401,7 @@ _TILE = 8  # pixels on a side that are passed over together
 Corners = tuple[float, float, float, float]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _cut(corners: Corners, before: float, after: float, parts: Array) -> None:
     """Repaint the parts (SUB, SUB) of a pixel that one edge crosses.
 
@@ -422,7 +425,7 @@ def _cut(corners: Corners, before: float, after: float, parts: Array) -> None:
             parts[m, n] = low + share * (high - low)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _past(rays: Array, M: Array, at: tuple[int, int], axis: int, edge: float, out: Array) -> None:
     """Write how far past an edge, homogeneous, the pixel corners are that follow ``at`` (row, column), out (n,)."""
     x, y, z = M[axis, 0] - edge * M[2, 0], M[axis, 1] - edge * M[2, 1], M[axis, 2] - edge * M[2, 2]
@@ -430,7 +433,7 @@ def _past(rays: Array, M: Array, at: tuple[int, int], axis: int, edge: float, ou
         out[k] = x * rays[at[0], at[1] + k, 0] + y * rays[at[0], at[1] + k, 1] + z * rays[at[0], at[1] + k, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _paint_edge(
     rays: Array,
     Ms: Array,
@@ -471,7 +474,7 @@ def _paint_edge(
     return fine, count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _reach(rays: Array, Ms: Array, tile: Box, corner: tuple[int, int], grid: Grid) -> tuple[bool, Span]:
     """Return whether all of a tile of pixels sees the plane before it, and between which cells it lies at most.
 
@@ -495,7 +498,11 @@ def _reach(rays: Array, Ms: Array, tile: Box, corner: tuple[int, int], grid: Gri
     return True, (i0, i1, j0, j1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f8[:, :, ::1], f8[:, :, ::1], (i8, i8, i8, i8), (i8, i8), (f8[::1], f8[::1], f8[:, ::1]), f8[:, ::1], "
+    "i4[:, ::1], f8[:, :, ::1], i8",
+    nogil=True,
+)
 def paint(
     rays: Array,
     Ms: Array,

@@ -17,11 +17,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numba
 import numpy as np
 
 from armsight.data import Array, Ids, Image, Record
 from armsight.geometry.pose import exp_se3, inverse, pose, transform
+from armsight.kernels import kernel
 from armsight.sim.render.faces import Exposure, paint_faces, palette
 from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
 from armsight.sim.render.render import OUTLINE, Shutter, outline
@@ -57,7 +57,7 @@ _ZERO, _QUARTER, _HALF, _THREE_QUARTERS, _ONE, _TWO, _LEAST = (
 _AMBIENT, _LAMP, _GLOSS = np.float32(AMBIENT), np.float32(LAMP), np.float32(GLOSS)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _axis(a: Array, b: Array, radius: float, out: Light) -> None:
     """Write into out (14,) what of a capsule between a and b :func:`_side` and :func:`_row` ask for: all but the ray."""
     bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -71,7 +71,7 @@ def _axis(a: Array, b: Array, radius: float, out: Light) -> None:
     out[11], out[12], out[13] = a[0], a[1], a[2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _side(x: float, y: float, z: float, axis: Light) -> int:
     """Return on which side the unit ray x, y, z passes a cylinder without ends: 1, -1; 0 where it meets."""
     if axis[3] <= _BALL:
@@ -83,7 +83,7 @@ def _side(x: float, y: float, z: float, axis: Light) -> int:
     return 1 if past > 0.0 else -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _row(
     x: Light,
     y: Light,
@@ -134,7 +134,13 @@ def _row(
         ids[u] = shown[1] if seen else ids[u]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f4[:, :, ::1], (i8, i8, i8, i8), i8[:, ::1], (f8[:, :, ::1], f8[::1], f8[::1]), f4[::1], f4[:, ::1], "
+    "f4[:, ::1], i2[:, ::1]",
+    "f8[:, :, ::1], (i8, i8, i8, i8), i8[:, ::1], (f8[:, :, ::1], f8[::1], f8[::1]), f8[::1], f8[:, ::1], "
+    "f4[:, ::1], i2[:, ::1]",
+    nogil=True,
+)
 def moving(
     rays: Light,
     window: tuple[int, int, int, int],

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
+from armsight.kernels import kernel
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos, store
 
@@ -84,7 +84,7 @@ def solids(arm: Arm) -> Solids:
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const f8[::1], const f8[::1], f8[:, :, ::1]")
 def _row_frames(table: Array, q: Array, Ts: Array) -> None:
     """Write the row frames at joint angles q (6,) into Ts (7, 4, 4)."""
     Ts[0] = np.eye(4)
@@ -106,7 +106,7 @@ def row_frames(arm: Arm, q: Array) -> Array:
     return Ts
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, :, ::1], const i8[::1], f8[:, ::1], const f8[::1], f8[::1]")
 def _gravity(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
     """Add the gravity torque of solids at centre (K, 3) of their row frames about the joints' axes, N m, to out (6,)."""
     for k in range(link.size):

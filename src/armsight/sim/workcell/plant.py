@@ -17,13 +17,13 @@ tick's conversions are averaged: noise of a step or so compensates the rounding.
 from __future__ import annotations
 
 import mujoco
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
+from armsight.kernels import kernel
 from armsight.robot.arm import Arm
 from armsight.robot.boards.link import Sensed
 from armsight.robot.kinematics.table import BASE, TOOL, link
@@ -116,7 +116,7 @@ _BLOCK = 256  # ticks whose noise is sampled at once
 Counts = NDArray[np.uint32]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1], f8[::1], f8[:, ::1]")
 def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, out: Array) -> None:
     """Write what potentiometers say too much at shaft angles (N, 6) into out (N, 6)."""
     for n in range(shaft.shape[0]):
@@ -128,7 +128,7 @@ def _errors(shaft: Array, offset: Array, sines: Array, low: Array, span: Array, 
             out[n, i] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1], f8[::1], f4[:, :, ::1], i8, f8, u4[::1]")
 def _read(
     shaft: Array,
     offset: Array,

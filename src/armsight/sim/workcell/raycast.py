@@ -15,12 +15,13 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Image, Record
+from armsight.geometry.matrix import product
 from armsight.geometry.pose import inverse, transform
+from armsight.kernels import kernel
 from armsight.sim.workcell.motors import Solids
 from armsight.vision.camera import Camera
 
@@ -38,7 +39,7 @@ _WIDER = 1e-6  # rad
 Light = NDArray[np.float32]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _capsule(o: Array, d: Array, a: Array, b: Array, radius: float) -> float:
     """Return how far along the unit ray d (3,) from o a capsule between a and b is met; _FAR where it is not."""
     bax, bay, baz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -71,7 +72,7 @@ def _capsule(o: Array, d: Array, a: Array, b: Array, radius: float) -> float:
     return t if t > 0.0 else _FAR
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _capsule_normal(p: Array, a: Array, b: Array, radius: float, out: Array) -> None:
     """Write the outward unit normal of a capsule at a point of its surface."""
     baba = along = 0.0
@@ -83,7 +84,7 @@ def _capsule_normal(p: Array, a: Array, b: Array, radius: float, out: Array) -> 
         out[i] = (p[i] - a[i] - t * (b[i] - a[i])) / radius
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _box(o: Array, d: Array, box: Array) -> tuple[float, int]:
     """Return how far along a ray a box is met and through which face (1, 2, 3, negative: the lower); _FAR, 0 if not."""
     c, s = box[6], box[7]
@@ -108,7 +109,7 @@ def _box(o: Array, d: Array, box: Array) -> tuple[float, int]:
     return (near, face) if 0.0 < near < far else (_FAR, 0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _hash(i: int, j: int, k: int) -> float:
     """Return a number from 0 to 1 that looks random."""
     n = (i * 374761393 + j * 668265263 + k * 974711) & 0x7FFFFFFF
@@ -116,7 +117,7 @@ def _hash(i: int, j: int, k: int) -> float:
     return float((n ^ (n >> 16)) & 0xFFFF) / 65535.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _smooth(x: float, y: float, k: int) -> float:
     """Return noise, 0 to 1, that changes smoothly over a distance of one."""
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -127,7 +128,7 @@ def _smooth(x: float, y: float, k: int) -> float:
     return low + v * (high - low)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _texture(kind: int, x: float, y: float) -> float:
     """Return by how much a surface is brighter or darker at a point on it, m."""
     if kind == TILES:
@@ -145,7 +146,7 @@ def _texture(kind: int, x: float, y: float) -> float:
     return 0.97 + 0.06 * _smooth(x * 8.0, y * 8.0, 2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _balls(boxes: Array, ends: Array, radius: Array) -> Array:
     """Return a ball (middle, radius) around each surface, boxes, then capsules, with room for a shadow ray's step."""
     count = boxes.shape[0]
@@ -158,7 +159,7 @@ def _balls(boxes: Array, ends: Array, radius: Array) -> Array:
     return balls
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _ahead(o: Array, ways: Array, balls: Array, keep: NDArray[np.int64]) -> int:
     """Write to keep which balls rays from o along unit vectors (N, 3) may meet, and return how many: those in a cone."""
     axis = ways.sum(axis=0)
@@ -179,7 +180,7 @@ def _ahead(o: Array, ways: Array, balls: Array, keep: NDArray[np.int64]) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _meet(
     o: Array, d: Array, boxes: Array, ends: Array, radius: Array, keep: NDArray[np.int64]
 ) -> tuple[float, int, int]:
@@ -196,7 +197,7 @@ def _meet(
     return best, which, face
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _surface(p: Array, which: int, face: int, boxes: Array, ends: Array, radius: Array, n: Array) -> float:
     """Write a surface's normal at a point into n (3,) and return its texture's factor."""
     count = boxes.shape[0]
@@ -220,7 +221,11 @@ def _surface(p: Array, which: int, face: int, boxes: Array, ends: Array, radius:
     return _texture(int(box[9]), x, y)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], (f8[:, :, ::1], f8[::1], f8[::1]), f8[::1], f4[::1], f4[::1], "
+    "i2[::1]",
+    nogil=True,
+)
 def still(
     rays: Array,
     R_base_camera: Array,
@@ -252,7 +257,7 @@ def still(
     keep, from_lamp, to_lamp = np.empty(len(balls), np.int64), np.empty((BUNCH, 3)), np.empty(3)
     p, far, faces = np.empty((BUNCH, 3)), np.empty(BUNCH), np.empty(BUNCH, np.int64)
     for begin in range(0, rays.shape[0], BUNCH):
-        ways = rays[begin : begin + BUNCH] @ R_base_camera.T
+        ways = product(rays[begin : begin + BUNCH], R_base_camera.T)
         seen, lit = keep[: _ahead(p_base, ways, balls, keep)], 0
         for j in range(ways.shape[0]):
             t, which, face = _meet(p_base, ways[j], boxes, ends, radius, seen)

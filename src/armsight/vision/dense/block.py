@@ -15,37 +15,22 @@ First the planes of a pair and the compiled kernels, then the method :class:`Blo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
-import numba
 import numpy as np
 
 from armsight.data import Image
 from armsight.errors import InputError
+from armsight.kernels import kernel
 from armsight.vision.dense.cost import Bytes
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
-from armsight.vision.dense.simd import (
-    SIMD_WIDTH,
-    above,
-    as_in,
-    bits_set,
-    count_up,
-    differing,
-    half,
-    least,
-    load,
-    minus,
-    plus,
-    spread,
-    start,
-    store,
-    where_less,
-)
 from armsight.vision.dense.winner import NOWHERE, Counts, Winners, for_each_strip, make_winners
 
-ONE, THREE, BLOCK = np.uintp(1), np.uintp(3), np.uintp(SIMD_WIDTH)
+ONE, TWO, THREE, SIX = (np.uintp(n) for n in (1, 2, 3, 6))
+#: Rows are filled to whole vectors of the processor, so that no pixel is left to be done alone.
+_VECTOR = 32
 #: Distance of the neighbours in a census word from the middle, px, along rows, columns and diagonals.
 _CENSUS_REACH = 2
 #: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
@@ -75,9 +60,10 @@ class PairPlanes(NamedTuple):
     right_census: Bytes
     left_stride: np.uintp
     right_stride: np.uintp
+    kernel_types = "u1[::1], u1[::1], u1[::1], u1[::1], u8, u8"
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("u1[:, ::1], u1[:, ::1]", nogil=True)
 def _census(padded: Bytes, out: Bytes) -> None:
     """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
     height, width = out.shape
@@ -104,7 +90,7 @@ def prepare_planes(left: Image, right: Image, reach: int, further: int) -> PairP
 
     def widened(image: Image, before: int) -> Bytes:
         return np.asarray(
-            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * SIMD_WIDTH, cv2.BORDER_REPLICATE)
+            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * _VECTOR, cv2.BORDER_REPLICATE)
         )
 
     def census(image: Image) -> Bytes:
@@ -118,26 +104,12 @@ def prepare_planes(left: Image, right: Image, reach: int, further: int) -> PairP
     return PairPlanes(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _costs(g: Any, word: Any, r: Any, other: Any) -> Any:  # noqa: ANN401
-    """Return the costs of matching grey levels and census words."""
-    apart = least(plus(above(g, r), above(r, g)), spread(_CUT))
-    bits = bits_set(differing(word, other))
-    return plus(plus(bits, bits), half(apart))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _over(raw: Bytes, threes: Bytes, at: np.uintp, reach: int, kept: Bytes) -> Any:  # noqa: ANN401
-    """Return costs summed over 2 ``reach`` + 1 pixels, in as many bits as ``kept`` has; all are addresses of arrays."""
-    if reach == _USUAL:
-        a, b = load(threes, at), load(threes, at + np.uintp(3))
-        return as_in(plus(plus(a, b), load(threes, at + np.uintp(6))), kept)
-    total, size = as_in(load(threes, at), kept), np.uintp(2 * reach + 1)
-    for k in range(THREE, size - size % THREE, THREE):
-        total = plus(total, as_in(load(threes, at + k), kept))
-    for k in range(size - size % THREE, size):
-        total = plus(total, as_in(load(raw, at + k), kept))
-    return total
+@kernel(inline="always")
+def _bits_set(x: np.uint8) -> np.uint8:
+    """Count the bits that are set in a byte: sums of neighbours (Warren, "Hacker's Delight", 5-1)."""
+    x = np.uint8(x - ((x >> np.uint8(1)) & np.uint8(0x55)))
+    x = np.uint8((x & np.uint8(0x33)) + ((x >> np.uint8(2)) & np.uint8(0x33)))
+    return np.uint8((x + (x >> np.uint8(4))) & np.uint8(0x0F))
 
 
 class StripBuffers(NamedTuple):
@@ -146,6 +118,7 @@ class StripBuffers(NamedTuple):
     Attributes:
         raw: one row's costs at one disparity, with the windows' reach to either side.
         threes: sums of three of them, from each on: windows are made of these.
+        along: (T,) sums along the row.
         kept: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest.
         total: (count, T) sums over windows.
         least: (T,) least total of each left pixel so far.
@@ -155,6 +128,7 @@ class StripBuffers(NamedTuple):
 
     raw: Bytes
     threes: Bytes
+    along: Bytes
     kept: Bytes
     total: Counts
     least: Counts
@@ -164,11 +138,12 @@ class StripBuffers(NamedTuple):
 
 def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffers:
     """Return buffers for strips of images of a width."""
-    wide = -(-width // SIMD_WIDTH) * SIMD_WIDTH
+    wide = -(-width // _VECTOR) * _VECTOR
     kind = np.uint8 if reach <= BYTE_REACH else np.uint16
     return StripBuffers(
-        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
-        np.zeros(wide + 2 * reach + 2 * SIMD_WIDTH, np.uint8),
+        np.zeros(wide + 2 * reach + 2 * _VECTOR, np.uint8),
+        np.zeros(wide + 2 * reach + 2 * _VECTOR, np.uint8),
+        np.zeros(wide, kind),
         np.zeros((2 * reach + 1) * count * wide, kind),
         np.zeros(count * wide, np.uint16),
         np.zeros(wide, np.uint16),
@@ -177,25 +152,43 @@ def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffe
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
     """Write the costs of a row at disparity d, from ``reach`` pixels before it to ``reach`` after it."""
-    grey, word, r_grey, r_word = (
-        start(planes.left),
-        start(planes.left_census),
-        start(planes.right),
-        start(planes.right_census),
-    )
-    left = np.uintp(row) * planes.left_stride
-    right, out = np.uintp(row) * planes.right_stride + np.uintp(pad - d), start(raw)
-    for j in range(np.uintp(0), np.uintp(width + 2 * reach), BLOCK):
-        costs = _costs(load(grey, left + j), load(word, left + j), load(r_grey, right + j), load(r_word, right + j))
-        store(out, j, costs)
+    size = (width + 2 * reach + _VECTOR - 1) // _VECTOR * _VECTOR
+    left, right = row * np.int64(planes.left_stride), row * np.int64(planes.right_stride) + pad - d
+    grey, word = planes.left[left : left + size], planes.left_census[left : left + size]
+    r_grey, r_word = planes.right[right : right + size], planes.right_census[right : right + size]
+    for j in range(np.uintp(size)):
+        apart = np.uint8(max(grey[j], r_grey[j]) - min(grey[j], r_grey[j]))
+        bits = _bits_set(np.uint8(word[j] ^ r_word[j]))
+        raw[j] = np.uint8(np.uint8(bits + bits) + (min(apart, _CUT) >> np.uint8(1)))
     raw[: min(d, width) + reach] = _OUTSIDE if d > 0 else raw[reach]
     raw[width + reach : width + 2 * reach] = raw[width + reach - 1]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
+def _sum_along(raw: Bytes, threes: Bytes, reach: int, along: Bytes) -> None:
+    """Write sums over 2 ``reach`` + 1 pixels of a row; they fit the type of ``along``."""
+    size = np.uintp(len(along))
+    for x in range(size + np.uintp(2 * reach)):
+        threes[x] = np.uint8(np.uint8(raw[x] + raw[x + ONE]) + raw[x + TWO])
+    if reach == _USUAL:
+        for x in range(size):
+            along[x] = threes[x] + threes[x + THREE] + threes[x + SIX]
+        return
+    for x in range(size):
+        along[x] = threes[x]
+    wide = np.uintp(2 * reach + 1)
+    for k in range(THREE, wide - wide % THREE, THREE):
+        for x in range(size):
+            along[x] += threes[x + k]
+    for k in range(wide - wide % THREE, wide):
+        for x in range(size):
+            along[x] += raw[x + k]
+
+
+@kernel(nogil=True)
 def _add_row(
     planes: PairPlanes,
     row: int,
@@ -212,34 +205,28 @@ def _add_row(
     Pixels from which a disparity leads out of the right image do not choose it, nor do columns beyond the left one's
     end.
     """
-    stride, end = np.uintp(buffers.least.shape[0]), np.uintp(width)
-    slot = np.uintp(row % (2 * reach + 1)) * np.uintp(count) * stride
-    raw, threes, kept, total = start(buffers.raw), start(buffers.threes), start(buffers.kept), start(buffers.total)
-    lowest, where, right = start(buffers.least), start(buffers.where), start(buffers.right)
+    stride, along = len(buffers.least), buffers.along
+    slot = row % (2 * reach + 1) * count * stride
     for k in range(count):
         d = first + k
         _cost_row(planes, row, d, pad, width, reach, buffers.raw)
-        for x in range(np.uintp(0), stride + np.uintp(2 * reach), BLOCK):
-            store(threes, x, plus(plus(load(raw, x), load(raw, x + ONE)), load(raw, x + np.uintp(2))))
-        at, here, begin = np.uintp(k) * stride, spread(np.uint16(k)), np.uintp(d)
-        for x in range(begin // BLOCK * BLOCK, stride, BLOCK):
-            h = _over(raw, threes, np.uintp(x), reach, kept)
-            t = plus(load(total, at + x), as_in(h, total))
-            t = minus(t, as_in(load(kept, slot + at + x), total))
-            store(kept, slot + at + x, h)
-            store(total, at + x, t)
-            if choose:
-                if x < begin:
-                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(begin)), spread(NOWHERE), t)
-                if x + BLOCK > end:
-                    t = where_less(count_up(np.uint16(x)), spread(np.uint16(end)), t, spread(NOWHERE))
-                before, u = load(lowest, x), x + np.uintp(pad - d)
-                store(where, x, where_less(t, before, here, load(where, x)))
-                store(lowest, x, least(t, before))
-                store(right, u, least(t, load(right, u)))
+        _sum_along(buffers.raw, buffers.threes, reach, along)
+        total, kept = buffers.total[k * stride :], buffers.kept[slot + k * stride :]
+        for x in range(np.uintp(stride)):
+            total[x] = np.uint16(total[x] + np.uint16(np.uint16(along[x]) - np.uint16(kept[x])))
+        for x in range(np.uintp(stride)):
+            kept[x] = along[x]
+        if choose:
+            here, right = np.uint16(k), buffers.right[pad - d :]
+            least, where = buffers.least, buffers.where
+            for x in range(np.uintp(d), np.uintp(width)):
+                where[x] = here if total[x] < least[x] else where[x]
+            for x in range(np.uintp(d), np.uintp(width)):
+                least[x] = min(total[x], least[x])
+                right[x] = min(total[x], right[x])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _write_row(y: int, first: int, count: int, pad: int, buffers: StripBuffers, found: Winners) -> None:
     """Write the winners of row y: sub-pixel disparities, curvatures, and whether the right image agrees."""
     stride, total = np.uintp(buffers.least.shape[0]), buffers.total
@@ -265,7 +252,13 @@ def _write_row(y: int, first: int, count: int, pad: int, buffers: StripBuffers, 
         found.agreed[y, x] = around <= buffers.right[np.uintp(x - first + pad) - k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "PairPlanes, i8, i8, i8, i8, i8, i8, "
+    "StripBuffers(u1[::1], u1[::1], u1[::1], u1[::1], u2[::1], u2[::1], u2[::1], u2[::1]), Winners",
+    "PairPlanes, i8, i8, i8, i8, i8, i8, "
+    "StripBuffers(u1[::1], u1[::1], u2[::1], u2[::1], u2[::1], u2[::1], u2[::1], u2[::1]), Winners",
+    nogil=True,
+)
 def match_windows(
     planes: PairPlanes,
     begin: int,

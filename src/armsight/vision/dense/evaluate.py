@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
+from armsight.kernels import kernel
 
 THRESHOLDS_PX = (0.5, 1.0, 2.0, 4.0)
 QUANTILES = (50, 90, 95, 99)
@@ -97,7 +97,7 @@ def evaluate_disparity(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1]")
 def seen_by_right(disparity: Array) -> NDArray[np.bool_]:
     """Return which pixels of a true disparity map (H, W) the right camera sees.
 

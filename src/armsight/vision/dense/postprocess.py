@@ -26,11 +26,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
+from armsight.kernels import kernel
 from armsight.vision.dense.method import FILLED, MEASURED, OCCLUDED, Disparity, Search
 from armsight.vision.dense.winner import Singles, Winners, for_each_strip
 
@@ -54,7 +54,7 @@ def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]
     return np.asarray(near | bridged).astype(np.uint8)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:, ::1], const u1[:, ::1], u1[:, ::1], f4[::1], f4[::1], i8, i8, f4[:, ::1]", nogil=True)
 def _weighted_medians(
     disparity: Singles,
     image: Image,
@@ -91,7 +91,7 @@ def _weighted_medians(
             out[y, x] = _mean_of(disparity, image, alike, near, y, x, middle)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _mean_of(
     disparity: Singles, image: Image, alike: Singles, near: Singles, y: int, x: int, middle: int
 ) -> np.float32:
@@ -136,7 +136,7 @@ def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image)
 _HIDES = np.float32(1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _fill_row(d: Singles, state: NDArray[np.uint8], nearest: Singles) -> bool:
     """Fill a row from its measured neighbours and set the states; False where it holds nothing measured."""
     width, last = d.shape[0], np.float32(np.inf)
@@ -163,7 +163,7 @@ def _fill_row(d: Singles, state: NDArray[np.uint8], nearest: Singles) -> bool:
     return any_measured
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:, ::1], u1[:, ::1]", nogil=True)
 def _fill(d: Singles, state: NDArray[np.uint8]) -> None:
     """Fill all rows; a row without anything measured is like the nearest one that has something."""
     height, width = d.shape
@@ -204,7 +204,7 @@ _ROUNDS = (1.5, 1.0)
 _SMOOTH_STRIP_ROWS = 96
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _add(
     d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles
 ) -> None:
@@ -218,7 +218,7 @@ def _add(
         down[x] += weight
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
 def _rows(
     source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
 ) -> None:
@@ -236,7 +236,7 @@ def _rows(
             share[y, x] = down[x] / np.float32(2 * _SMOOTH_REACH)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
 def _columns(
     source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
 ) -> None:
@@ -307,7 +307,7 @@ class SigmaModel:
     gain: float = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("Winners, i8, i8, i2[:, ::1]", nogil=True)
 def _coarse(found: Winners, begin: int, end: int, out: NDArray[np.int16]) -> None:
     """Write disparities in steps of a pixel's sixteenth, below zero where the two images do not agree."""
     for y in range(begin, end):
@@ -316,7 +316,7 @@ def _coarse(found: Winners, begin: int, end: int, out: NDArray[np.int16]) -> Non
             out[y, x] = np.int16(found.disparity[y, x] * np.float32(_FINE)) if good else np.int16(-_FINE)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("Winners, i2[:, ::1], i8, i8, f4[:, ::1]", nogil=True)
 def _sure(found: Winners, kept: NDArray[np.int16], begin: int, end: int, out: Singles) -> None:
     """Write the disparities that are kept, NaN elsewhere."""
     for y in range(begin, end):
@@ -334,7 +334,7 @@ def without_speckles(found: Winners) -> Singles:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("Winners, u1[:, ::1], f8, f8, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
 def _write_sigmas(
     found: Winners,
     state: NDArray[np.uint8],

@@ -17,11 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
+from armsight.kernels import kernel
 from armsight.vision.dense.cost import BLOCK, ONE, Bytes, CensusPair, prepare, raw_row, smooth_row
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
@@ -33,7 +33,7 @@ _REACH, _ALIKE = 10, 8
 _STRIP_ROWS = 96
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("i2[:, ::1], const u1[:, ::1], f4[::1], i8, i8, i8, i8, i8, i2[:, ::1]", nogil=True)
 def _vote(
     d: Whole, image: Image, weights: NDArray[np.float32], dy: int, dx: int, count: int, begin: int, end: int, out: Whole
 ) -> None:
@@ -81,7 +81,7 @@ def vote(whole: Whole, image: Image, count: int) -> Whole:
     return whole
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("i2[:, ::1], i8", nogil=True)
 def seen(d: Whole, first: int) -> NDArray[np.bool_]:
     """Return which pixels (H, W) the right camera sees: no nearer pixel of the row is matched to the same column."""
     height, width = d.shape
@@ -128,19 +128,17 @@ class Table(NamedTuple):
     best: Whole
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _skip(table: Table, at: np.uintp, stride: np.uintp, size: np.uintp, taken: np.int16) -> None:
     """Write what it costs to have skipped the pixel before: one more skipped, or the first; disparity grows by one each."""
     matched, skipping = table.matched, table.skipping
     before, earlier = at - stride - ONE, at - stride - stride - ONE
-    for block in range(np.uintp(0), size, BLOCK):
-        for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
-            d = block + e
-            value = np.int16(min(skipping[before + d], matched[earlier + d]) + np.int16(_SKIPPED - taken))
-            skipping[at + d] = min(max(value, _LOW), _HIGH)
+    for d in range(size):
+        value = np.int16(min(skipping[before + d], matched[earlier + d]) + np.int16(_SKIPPED - taken))
+        skipping[at + d] = min(max(value, _LOW), _HIGH)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _ways(
     table: Table,
     at: np.uintp,
@@ -165,32 +163,28 @@ def _ways(
     """
     matched, skipping, before = table.matched, table.skipping, at - stride
     least = _HIGH
-    for block in range(np.uintp(0), size, BLOCK):
-        for e in range(BLOCK):
-            d = block + e
-            slanted = np.int16(min(matched[before + d - ONE], matched[before + d + ONE]) + _SLANT)
-            nearer = np.int16(0) if np.int16(d) < best else _HIGH
-            broken = np.int16(min(nearer, skipping[at + d]) + stop)
-            way = np.int16(min(min(matched[before + d], slanted), broken) + np.int16(costs[cost + d]))
-            matched[at + d] = way
-            least = min(least, way)
+    for d in range(size):
+        slanted = np.int16(min(matched[before + d - ONE], matched[before + d + ONE]) + _SLANT)
+        nearer = np.int16(0) if np.int16(d) < best else _HIGH
+        broken = np.int16(min(nearer, skipping[at + d]) + stop)
+        way = np.int16(min(min(matched[before + d], slanted), broken) + np.int16(costs[cost + d]))
+        matched[at + d] = way
+        least = min(least, way)
     return least
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _take_off(matched: Whole, at: np.uintp, size: np.uintp, least: np.int16) -> np.int16:
     """Take the least off a pixel's ways, and return the last disparity that has it."""
     best = np.int16(0)
-    for block in range(np.uintp(0), size, BLOCK):
-        for e in range(BLOCK):
-            d = block + e
-            way = np.int16(matched[at + d] - least)
-            matched[at + d] = way
-            best = max(best, np.int16(d) if way == 0 else np.int16(0))
+    for d in range(size):
+        way = np.int16(matched[at + d] - least)
+        matched[at + d] = way
+        best = max(best, np.int16(d) if way == 0 else np.int16(0))
     return best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _break_cost(image: Image, y: int, x: int) -> np.int16:
     """Return what a break before column x costs: less where the row's light changes within a pixel of it."""
     width = image.shape[1]
@@ -200,7 +194,7 @@ def _break_cost(image: Image, y: int, x: int) -> np.int16:
     return _BREAK_AT_EDGE if high - low >= _EDGE else _BREAK
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _forward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp) -> None:
     """Fill the table for row y."""
     stride = size + _GUARD
@@ -219,7 +213,7 @@ def _forward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp) -
             table.matched[at - stride : at - stride + size] = _HIGH
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _backward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp, out: Whole) -> None:
     """Follow the best way back and write row y's disparities, -1 where a pixel was skipped."""
     matched, skipping, stride = table.matched, table.skipping, size + _GUARD
@@ -249,7 +243,7 @@ def _backward(table: Table, image: Image, y: int, costs: Bytes, size: np.uintp, 
                     break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("CensusPair, i8, i8, i8, i8, u8, i2[:, ::1]", nogil=True)
 def _strip(pair: CensusPair, begin: int, end: int, first: int, count: int, size: np.uintp, out: Whole) -> None:
     """Match the rows from ``begin`` to ``end``, each by itself."""
     height, width = pair.left.shape

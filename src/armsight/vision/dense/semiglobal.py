@@ -16,12 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.errors import InputError
+from armsight.kernels import kernel
 from armsight.vision.dense.cost import BLOCK, ONE, TWO, Bytes, CensusPair, prepare, raw_row, smooth_row
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
@@ -56,7 +56,7 @@ class PathBuffers(NamedTuple):
     best_right: Counts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def make_work(width: int, size: int, pad: int, rows: int) -> PathBuffers:
     """Return room for a strip; ``rows`` totals are kept."""
     slot, n = size + int(_GUARD), width * size
@@ -73,13 +73,13 @@ def make_work(width: int, size: int, pad: int, rows: int) -> PathBuffers:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def cost_base(width: int, size: np.uintp) -> np.uintp:
     """Where in the arena a row's costs begin."""
     return np.uintp(6 * width + 3) * (size + _GUARD)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _step(
     arena: Bytes,
     before: np.uintp,
@@ -104,13 +104,13 @@ def _step(
     return smallest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _penalty(image: Bytes, y: int, x: int, from_y: int, from_x: int, p2: Bytes) -> np.uint8:
     """Return the penalty of a jump between two neighbouring pixels: less where the light jumps too."""
     return np.uint8(p2[abs(np.int32(image[y, x]) - np.int32(image[from_y, from_x]))])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _sum(arena: Bytes, slots: Starts, total: Counts, at: np.uintp, size: np.uintp, add: bool) -> None:
     """Sum four slots into a pixel's totals, or add them to what is there."""
     a, b, c, e = slots[0] + ONE, slots[1] + ONE, slots[2] + ONE, slots[3] + ONE
@@ -122,7 +122,7 @@ def _sum(arena: Bytes, slots: Starts, total: Counts, at: np.uintp, size: np.uint
             total[at + d] = np.uint16(four + total[at + d]) if add else four
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def forward(
     work: PathBuffers,
     image: Bytes,
@@ -178,7 +178,7 @@ def forward(
             _sum(work.arena, s, work.total, at + o, size, keep == ADD)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def leftward(
     work: PathBuffers,
     image: Bytes,
@@ -216,7 +216,7 @@ _P1, _P2, _EDGE = 12, 80, 16
 _SIGMA_MODEL = SigmaModel(0.15, 0.25)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _costs(
     pair: CensusPair, y: int, direction: int, begun: bool, first: int, count: int, size: np.uintp, work: PathBuffers
 ) -> None:
@@ -229,7 +229,7 @@ def _costs(
     smooth_row(y, height, size, work.raw, work.mixed, work.arena, cost_base(width, size))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("CensusPair, i8, i8, i8, i8, i8, u8, u1, u1[::1], Winners", nogil=True)
 def _strip(
     pair: CensusPair,
     begin: int,

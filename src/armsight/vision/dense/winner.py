@@ -8,20 +8,26 @@ totals: the least over all left pixels that could be its match.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.kernels import kernel
 from armsight.vision.dense.cost import BLOCK
 
 
+def processors() -> int:
+    """Return on how many processors this process may run."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def for_each_strip(height: int, rows: int, work: Callable[[int, int], None]) -> None:
-    """Call ``work(begin, end)`` for strips that cover all rows, on as many threads as numba may use.
+    """Call ``work(begin, end)`` for strips that cover all rows, on as many threads as the process has processors.
 
     Args:
         height: rows of the image.
@@ -30,7 +36,7 @@ def for_each_strip(height: int, rows: int, work: Callable[[int, int], None]) -> 
     """
     count = -(-height // rows)
     bounds = [height * k // count for k in range(count + 1)]
-    threads = min(count, numba.get_num_threads())
+    threads = min(count, processors())
     if threads == 1:
         for begin, end in pairwise(bounds):
             work(begin, end)
@@ -58,6 +64,7 @@ class Winners(NamedTuple):
     agreed: NDArray[np.bool_]
     curvature: Singles
     least: Singles
+    kernel_types = "f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]"
 
 
 def make_winners(height: int, width: int) -> Winners:
@@ -66,13 +73,13 @@ def make_winners(height: int, width: int) -> Winners:
     return Winners(single[0], np.zeros((height, width), np.bool_), single[1], single[2])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _tried(x: int, first: int, count: int) -> np.uintp:
     """Return how many disparities lead from column x to a pixel of the right image; one where none does."""
     return np.uintp(min(max(x - first + 1, 1), count))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(nogil=True, inline="always")
 def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, right: np.uintp) -> np.uint16:
     """Return the first disparity of least total, and let every right pixel, from ``right`` on, keep its own least."""
     least, whole = NOWHERE, count - count % BLOCK
@@ -97,7 +104,7 @@ def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, 
     return where
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def choose_row(
     total: Counts,
     at: np.uintp,
@@ -146,7 +153,7 @@ def choose_row(
         found.agreed[y, x] = _agreed(total, at, best_right, x, found.disparity[y, x], first, count, size, width)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(nogil=True)
 def _agreed(
     total: Counts,
     at: np.uintp,

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +29,7 @@ from armsight.data import Array, Correspondences, Record
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
+from armsight.kernels import kernel
 from armsight.vision.camera import Camera, distort
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
@@ -37,7 +37,7 @@ from armsight.vision.rig import StereoRig
 _STEP = 1e-4  # for the Hessian of the distortion, focal lengths
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def disc_image(
     fisheye: bool,
     k: Array,
@@ -122,7 +122,10 @@ def disc_image(
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "b1, const f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], const f8[::1], f8[:, ::1], f8[:, ::1], "
+    "f8[:, :, ::1], f8[:, :, ::1]",
+)
 def _each(
     fisheye: bool,
     k: Array,

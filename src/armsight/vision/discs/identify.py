@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
+from armsight.kernels import kernel
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
 from armsight.vision.markers.disc.target import MOST_REPORTED, DiscTarget
@@ -135,7 +135,7 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     return nodes, np.concatenate(first), np.concatenate(second), np.concatenate(chi2)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("i8[::1], i8[::1], i8[::1], i8, i8[:, ::1]")
 def _triangles(start: Ids, second: Ids, shared: Ids, enough: int, found: Ids) -> int:
     """List triangles of nodes a < b < c that are all shared by ``enough`` of them; return how many there are.
 

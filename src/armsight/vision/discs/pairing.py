@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -24,6 +23,7 @@ from scipy.spatial import cKDTree
 from armsight.data import Array, Discs, Ids, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
+from armsight.kernels import kernel
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import Expected
 from armsight.vision.markers.disc.target import DiscTarget
@@ -338,6 +338,7 @@ class _Side(NamedTuple):
     radius_px: Array
     tolerance_px: Array
     bright: NDArray[np.bool_]
+    kernel_types = "const f8[::1], const f8[::1], const f8[:, ::1], const f8[:, ::1], f8[::1], f8[::1], const b1[::1]"
 
 
 def _side(view: DiscView, of: _Lines, s: int) -> _Side:
@@ -345,7 +346,7 @@ def _side(view: DiscView, of: _Lines, s: int) -> _Side:
     return _Side(of.angle, of.along, of.out, of.scale, view.radius_px[s], view.tolerance_px[s], view.discs[s].bright)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[::1], i8[::1], f8[::1], _Side, _Side, f8[::1], f8[::1], b1[::1], i8[:, ::1]")
 def _sweep(
     gate: Array,
     order: Ids,

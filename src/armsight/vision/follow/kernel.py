@@ -13,11 +13,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.geometry.matrix import (
+    applied,
+    dot,
+    product,
+    solved,
+    solved_vector,
+    transposed_applied,
+    transposed_product,
+)
+from armsight.kernels import kernel
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
 from armsight.vision.markers.disc.fit import FitBuffers, factor, fit, shape_of, solve
@@ -65,6 +74,10 @@ class DiscScene(NamedTuple):
     faces: NDArray[np.bool_]
     radii: Array
     signs: NDArray[np.int64]
+    kernel_types = (
+        "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1], "
+        "b1[::1], f8[::1], i8[::1]"
+    )
 
 
 class DiscMeasurement(NamedTuple):
@@ -109,16 +122,21 @@ class DiscMeasurement(NamedTuple):
     J_rig: Array
     bias: Array
     squares: Array
+    kernel_types = (
+        "i8[:, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
+        "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
+        "f8[:, ::1], f8[:, :, ::1], f8[::1]"
+    )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _linearise(scene: DiscScene, T_left: Array, found: DiscMeasurement, rig: bool) -> float:
     """Fill residuals and whitened J at a pose, by the rig too if ``rig``; return the cost, inf behind a camera."""
     P, n, e = np.empty(3), np.empty(3), np.empty(3)
     uv, shape, J_P, J_n = np.empty(2), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
     xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))
     cost = 0.0
-    T_right = scene.T_right_left @ T_left
+    T_right = product(scene.T_right_left, T_left)
     last = scene.cov_rig.shape[0] - 6
     for m in range(len(scene.radii)):
         p, b = scene.points[m], scene.normals[m]
@@ -182,7 +200,7 @@ def _linearise(scene: DiscScene, T_left: Array, found: DiscMeasurement, rig: boo
     return cost
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def settle(scene: DiscScene, found: DiscMeasurement) -> float:
     """Minimise over the pose ``found.T``; return the sum of the squared whitened residuals, infinite without a minimum."""
     trial, H, g, xi = np.empty((4, 4)), found.H, np.empty(6), np.empty(6)
@@ -191,8 +209,8 @@ def settle(scene: DiscScene, found: DiscMeasurement) -> float:
     for _ in range(_STEPS):
         if not np.isfinite(cost):
             return np.inf
-        H[:, :] = found.J.T @ found.J
-        g[:] = found.J.T @ found.whitened
+        H[:, :] = transposed_product(found.J, found.J)
+        g[:] = transposed_applied(found.J, found.whitened)
         if not factor(H, L, scale):
             return np.inf
         solve(L, scale, g, xi)
@@ -208,7 +226,7 @@ def settle(scene: DiscScene, found: DiscMeasurement) -> float:
     return np.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def uncertainty(scene: DiscScene, found: DiscMeasurement, cov_noise: Array, chi_square: float, limit: float) -> float:
     """Fill covariances; return the residuals' chi-square, above ``limit`` less the part that a wrong calibration explains.
 
@@ -219,20 +237,19 @@ def uncertainty(scene: DiscScene, found: DiscMeasurement, cov_noise: Array, chi_
     for row in range(len(found.whitened)):
         if found.codes[row // 4, (row // 2) % 2] != SEEN:
             J_rig[row] = 0.0
-    found.H[:, :] = J.T @ J
-    cov_noise[:, :] = np.linalg.inv(found.H)
-    gain = cov_noise @ (J.T @ J_rig)
-    found.cov[:, :] = gain @ scene.cov_rig @ gain.T
+    found.H[:, :] = transposed_product(J, J)
+    cov_noise[:, :] = solved(found.H, np.eye(6))
+    gain = product(cov_noise, transposed_product(J, J_rig))
+    found.cov[:, :] = product(product(gain, scene.cov_rig), gain.T)
     if chi_square <= limit:
         return chi_square
-    B = J_rig - J @ gain
-    v = B.T @ found.whitened
-    M = np.eye(len(scene.cov_rig)) + scene.cov_rig @ (B.T @ B)
-    explained = v @ np.linalg.solve(M, scene.cov_rig @ v)
-    return float(chi_square - explained)
+    B = J_rig - product(J, gain)
+    v = transposed_applied(B, found.whitened)
+    M = np.eye(len(scene.cov_rig)) + product(scene.cov_rig, transposed_product(B, B))
+    return chi_square - dot(v, solved_vector(M, applied(scene.cov_rig, v)))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _inverse_normal(A: Array, out: Array) -> None:
     """Fill the inverse of A^T A, A (4, 3), by its adjugate."""
     a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -252,7 +269,7 @@ def _inverse_normal(A: Array, out: Array) -> None:
             out[i, j] /= det
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const f8[:, ::1], const f8[:, ::1], f8, f8[::1]")
 def velocity(T_from: Array, T_to: Array, seconds: float, twist: Array) -> None:
     """Fill the twist (6,), per second, by which :func:`~armsight.vision.posefit.moved` takes one pose to the other."""
     R = np.empty((3, 3))
@@ -268,7 +285,7 @@ def velocity(T_from: Array, T_to: Array, seconds: float, twist: Array) -> None:
     twist[3], twist[4], twist[5] = k * x, k * y, k * z
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def triangulated(scene: DiscScene, found: DiscMeasurement) -> None:
     """Fill the points of the discs that both cameras saw: Gauss-Newton on four whitened coordinates from the pose's."""
     xy, J_p, J_d = np.empty(2), np.empty((2, 3)), np.empty((2, 8))
@@ -320,7 +337,7 @@ def triangulated(scene: DiscScene, found: DiscMeasurement) -> None:
                     G[q] -= gain * found.J_rig[4 * m + j, q]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def sum_squares(scene: DiscScene, found: DiscMeasurement) -> None:
     """Fill ``found.squares``."""
     T, squares = found.T, found.squares
@@ -336,13 +353,15 @@ def sum_squares(scene: DiscScene, found: DiscMeasurement) -> None:
                 squares[1] += found.residual[m, side, 0] ** 2 + found.residual[m, side, 1] ** 2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def plausible(scene: DiscScene, found: DiscMeasurement) -> bool:
     """Return whether every residual is plausible: not larger than noise and calibration together allow."""
     C, J_rig = scene.cov_rig, found.J_rig
     for row in range(len(found.whitened)):
         r = found.whitened[row] * found.whitened[row]
-        if r > _OFF_SIGMAS * _OFF_SIGMAS and r > _OFF_SIGMAS * _OFF_SIGMAS * (1.0 + J_rig[row] @ (C @ J_rig[row])):
+        if r > _OFF_SIGMAS * _OFF_SIGMAS and r > _OFF_SIGMAS * _OFF_SIGMAS * (
+            1.0 + dot(J_rig[row], applied(C, J_rig[row]))
+        ):
             return False
     return True
 
@@ -355,7 +374,7 @@ _FACING = 0.2
 _SIZE = 1.35
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _surround(image: NDArray[np.uint8], x: int, y: int, shape: Array) -> float:
     """Return the mean grey level of eight pixels on a ring around an ellipse at (x, y)."""
     height, width = image.shape
@@ -371,7 +390,7 @@ def _surround(image: NDArray[np.uint8], x: int, y: int, shape: Array) -> float:
     return total / 8
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _seek(
     image: NDArray[np.uint8], uv: Array, shape: Array, margin: float, least: float, contrast: float, sign: int,
     theta: Array, room: Room,
@@ -407,13 +426,13 @@ def _seek(
     return code
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def look(
     image: NDArray[np.uint8], side: int, scene: DiscScene, margin: float, noise: float, least: float,
     found: DiscMeasurement, work: FitBuffers, room: Room,
 ) -> None:  # fmt: skip
     """Find the discs of one image around where the pose ``found.T`` predicts them; ``found.codes`` holds the outcomes."""
-    T = scene.T_right_left @ found.T if side == 1 else found.T
+    T = product(scene.T_right_left, found.T) if side == 1 else found.T
     P, n = np.empty(3), np.empty(3)
     theta, expected, J_P, J_n = np.empty(10), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
     for m in range(len(scene.radii)):
@@ -450,7 +469,10 @@ def look(
             found.contrast[m, side] = abs(theta[6])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "const u1[:, ::1], const u1[:, ::1], const f8[:, ::1], f8[::1], f8, DiscScene, f8, f8, f8, f8[::1], "
+    "DiscMeasurement, f8[:, ::1], FitBuffers, (f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])",
+)
 def follow_pair(
     left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, scene: DiscScene,
     margin: float, noise: float, least: float, limits: Array, found: DiscMeasurement, cov_noise: Array,

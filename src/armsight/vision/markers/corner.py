@@ -23,11 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
+from armsight.kernels import kernel
 from armsight.vision.markers.crossing import (
     GREY,
     MOMENTS,
@@ -52,7 +52,7 @@ ARM_GAP_PX = 1.5
 PIXELS_FIRST = 64
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def gather(
     image: NDArray[np.uint8],
     c: Array,
@@ -124,7 +124,7 @@ def gather(
     return n
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _add_row(m: Array, y: int, n: int, x: int, xx: int, i: int, ix: int, ii: int) -> None:
     """Add the sums of a row of pixels to the moments m, in the order of crossing.MOMENTS."""
     m[0] += n
@@ -139,7 +139,7 @@ def _add_row(m: Array, y: int, n: int, x: int, xx: int, i: int, ix: int, ii: int
     m[9] += ii
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def thin(n: int, w: Work, flat: Array) -> int:
     """Keep a share of the pixels; return their number."""
     step = max(1, n // PIXELS_FIRST)
@@ -150,14 +150,14 @@ def thin(n: int, w: Work, flat: Array) -> int:
     return few
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def fill_up(n: int, w: Work) -> None:
     """Repeat the last pixel to the end of a SIMD vector."""
     for i in range(n, n + SIMD_WIDTH):
         w[i], w[Y + i], w[GREY + i] = w[n - 1], w[Y + n - 1], w[GREY + n - 1]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def reach_px(square: Array) -> float:
     """Return how far the window extends along the shorter side of a square, px."""
     shorter = min(np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1]))
@@ -237,7 +237,7 @@ class CornerFits(Record):
         return np.asarray(self.outcome == _KEPT)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _fit_one(
     image: NDArray[np.uint8],
     start: Array,
@@ -292,7 +292,10 @@ def _fit_one(
     return n
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, b1, b1[::1], f8[:, ::1], f8[:, :, ::1], "
+    "f8[::1], i8[::1]",
+)
 def _refine(
     image: NDArray[np.uint8],
     uv0: Array,
@@ -352,7 +355,7 @@ def crossing_signs(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1]", "const u1[:, ::1], f8[:, ::1], f8[:, :, :], f8[::1]")
 def _quick_signs(image: NDArray[np.uint8], uv: Array, squares: Array, out: Array) -> None:
     """Fill what :func:`crossing_signs` returns, out (N,) being zero."""
     means = np.empty((2, 2))

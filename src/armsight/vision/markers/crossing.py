@@ -8,11 +8,12 @@ Last come the noise at the edges, from the residuals, and the covariance of the 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.geometry.matrix import dot
+from armsight.kernels import kernel
 from armsight.vision.markers.normal import SIMD_WIDTH, decay_single, edge_single, factor, products, solve
 
 Work = NDArray[np.float32]
@@ -41,7 +42,7 @@ _ZERO, _HALF, _ONE, _TWO = _f(0.0), _f(0.5), _f(1.0), _f(2.0)
 _TWO_OVER_PI, _THIRD = _f(2.0 / np.pi), _f(1.0 / 3.0)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel("i8, f4[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1]", fastmath=True)
 def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow: Array) -> None:
     """Fill residuals and derivatives of the n pixels in the work space w at parameters q.
 
@@ -98,13 +99,13 @@ def evaluate(n: int, w: Work, x0: float, y0: float, q: Array, sides: Array, bow:
         w[JACOBIAN + 9 * ROOM + i] = level * dy
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def rows(w: Work) -> Work:
     """Return (12, ROOM) derivatives, residuals and an empty row of the work space."""
     return w[JACOBIAN:].reshape(PARAMETERS + 2, ROOM)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _add_plain(flat: Array, x0: float, y0: float, q: Array, H: Array) -> None:
     """Add the plain squares to H: there the image is linear in x and y, so moments are sufficient."""
     cx, cy, kx, ky, B = q[0] - x0, q[1] - y0, q[8], q[9], np.zeros((PARAMETERS, 3))
@@ -131,7 +132,7 @@ def _add_plain(flat: Array, x0: float, y0: float, q: Array, H: Array) -> None:
                     H[i, j] += v0 * B[j, 0] + v1 * B[j, 1] + v2 * B[j, 2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("i8, f4[::1], f8[:, ::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def _assemble(
     n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, H: Array
 ) -> float:
@@ -155,7 +156,7 @@ def _assemble(
     return float(cost)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def first_guess(
     n: int, w: Work, flat: Array, x0: float, y0: float, c: Array, square: Array, blur: float, q: Array
 ) -> None:
@@ -175,7 +176,7 @@ def first_guess(
     q[6], q[7] = total / count, signed / count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _slight(x: Array, q: Array, share: float) -> bool:
     """Whether a step x from q moves and blurs the edges so little that the residuals change linearly."""
     blur2 = min(q[4], q[5]) + 1.0 / 12.0
@@ -183,7 +184,7 @@ def _slight(x: Array, q: Array, share: float) -> bool:
     return bool(moved < share * np.sqrt(blur2) and max(abs(x[4]), abs(x[5])) < share * blur2)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _carry(n: int, w: Work, x: Array) -> None:
     """Update the residuals for a step x, linearly."""
     left = w[RESIDUAL : RESIDUAL + n]
@@ -194,7 +195,7 @@ def _carry(n: int, w: Work, x: Array) -> None:
             left[m] -= share * row[m]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def fit_crossing(
     n: int, w: Work, flat: Array, x0: float, y0: float, q: Array, sides: Array, bow: Array, L: Array, stop: float,
     slight: float,
@@ -226,7 +227,7 @@ def fit_crossing(
         solve(L, g, x)
         trial[:] = q + x
         trial[4], trial[5] = max(trial[4], _BLUR2_MIN), max(trial[5], _BLUR2_MIN)
-        gain = np.dot(x, g)  # how much lower the cost should get, or a little more
+        gain = dot(x, g)  # how much lower the cost should get, or a little more
         x[:] = trial - q
         done = damping <= 1.0 and (gain < stop * cost / pixels or _slight(x, q, slight))
         if done and current:  # derivatives stay what they are
@@ -250,7 +251,7 @@ def fit_crossing(
     return False
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def rough_noise(n: int, w: Work) -> float:
     """Return the variance of the residuals of the n pixels near the edges."""
     r, power = w[RESIDUAL : RESIDUAL + n], np.float32(0.0)
@@ -259,7 +260,7 @@ def rough_noise(n: int, w: Work) -> float:
     return float(power / (n - PARAMETERS))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
     """Return the variance of the noise and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from armsight.data import Array, Ids
+from armsight.kernels import kernel
 
 
 def grid_points(columns: int, rows: int, pitch_m: float) -> Array:
@@ -54,7 +54,7 @@ def local_squares(uv: Array) -> tuple[Array, Array]:
     return squares, bows
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, :, ::1]")
 def _read_squares(uv: Array, squares: Array, bows: Array) -> bool:
     """Fill what :func:`local_squares` returns; return whether a known point has a side without a neighbour, NaN."""
     rows, columns = uv.shape[:2]
@@ -76,7 +76,7 @@ def _read_squares(uv: Array, squares: Array, bows: Array) -> bool:
     return missing
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _read_side(uv: Array, y: int, x: int, down: int, right: int, side: Array, bow: Array) -> None:
     """Fill the side (2,) of the square and the bow (2,) of the line at a point, along a row or a column; NaN if unknown."""
     rows, columns = uv.shape[:2]
@@ -97,7 +97,7 @@ def _read_side(uv: Array, y: int, x: int, down: int, right: int, side: Array, bo
     bow[0], bow[1] = ((bx - along * ux) / lengths2, (by - along * uy) / lengths2) if known == 2 else (np.nan, np.nan)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _mean_about(bow: Array, y: int, x: int, mean: Array) -> None:
     """Average bow (rows, columns, 2) over a point and its known neighbours: lenses bow lines slowly over the image."""
     count, across, down = 0, 0.0, 0.0

@@ -10,20 +10,22 @@ The normal equations of a least-squares fit are assembled, Cholesky-factored, so
 
 from __future__ import annotations
 
-import numba
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from armsight.data import Array
+from armsight.kernels import kernel
 
 _TABLE_STEP, REACH = 1.0 / 256.0, 4.0
 _z = np.arange(0.0, REACH + 2 * _TABLE_STEP, _TABLE_STEP)
 #: erf(z / sqrt 2) and the normal density over z >= 0; linear interpolation is good to 1e-6.
-_ERF, _PHI = erf(_z / np.sqrt(2.0)), np.exp(-0.5 * _z * _z) / np.sqrt(2.0 * np.pi)
+_ERF = np.array([math.erf(z / math.sqrt(2.0)) for z in _z])
+_PHI = np.exp(-0.5 * _z * _z) / np.sqrt(2.0 * np.pi)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _normal(z: float) -> tuple[float, float]:
     """Return erf(z / sqrt 2) and the normal density at z."""
     x = abs(z)
@@ -36,7 +38,7 @@ def _normal(z: float) -> tuple[float, float]:
     return (e if z > 0 else -e), _PHI[i] + f * (_PHI[i + 1] - _PHI[i])
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel("f8, f8, f8", fastmath=True)
 def edge(u: float, s: float, w: float) -> tuple[float, float, float]:
     """Return the profile of a step at distance u, blurred by s and a box of width w, px; and its derivatives by u, s."""
     if abs(u) > REACH * s + 0.5:
@@ -59,7 +61,7 @@ _T, _A1, _A2 = _f(0.3275911 / np.sqrt(2.0)), _f(0.254829592), _f(-0.284496736)
 _A3, _A4, _A5 = _f(1.421413741), _f(-1.453152027), _f(1.061405429)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@kernel(fastmath=True, forceinline=True)
 def decay_single(y: np.float32) -> np.float32:
     """Return exp(-y) for y >= 0 to 1e-6: a power of two put together from its bits, times a polynomial."""
     t = _MINUS_LOG2_E * min(y, _FAR)
@@ -70,7 +72,7 @@ def decay_single(y: np.float32) -> np.float32:
     return p * power
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, forceinline=True)
+@kernel("f4, f4, f4, f4, f4", fastmath=True, forceinline=True)
 def edge_single(
     u: np.float32, per_s: np.float32, two_s: np.float32, half_w: np.float32, per_w: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:
@@ -94,7 +96,7 @@ Floats = NDArray[np.float32]
 SIMD_WIDTH = 32
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def products(n: int, rows: Floats, sums: Array) -> None:
     """Fill the lower half of sums (12, 12) with the products of each two of the rows (12, N), summed over n pixels.
 
@@ -118,7 +120,7 @@ def products(n: int, rows: Floats, sums: Array) -> None:
             sums[i + 1, j], sums[i + 1, j + 1], sums[i + 1, j + 2], sums[i + 1, j + 3] = t0, t1, t2, t3
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
     """Fill A = J J^T and g = J r."""
     for i in range(len(J)):
@@ -134,7 +136,7 @@ def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
         g[i] = s
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def factor(A: Array, damping: float, L: Array) -> bool:
     """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite.
 
@@ -155,7 +157,7 @@ def factor(A: Array, damping: float, L: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def solve(L: Array, g: Array, x: Array) -> None:
     """Solve L L^T x = g with the factor from :func:`factor`."""
     for i in range(len(L)):
@@ -170,7 +172,7 @@ def solve(L: Array, g: Array, x: Array) -> None:
         x[i] = s * L[i, i]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def invert(L: Array, inverse: Array) -> None:
     """Fill the inverse of L L^T, L from :func:`factor`."""
     unit, x = np.zeros(len(L)), np.empty(len(L))
@@ -181,7 +183,7 @@ def invert(L: Array, inverse: Array) -> None:
         inverse[i] = x
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def edge_noise(n: int, J: Array, r: Array, inverse: Array, first: int, second: int) -> float:
     """Estimate the variance of the noise from the residuals r (n,) of the pixels that determine two parameters (position).
 

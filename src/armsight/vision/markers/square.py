@@ -20,11 +20,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
+from armsight.geometry.matrix import dot
+from armsight.kernels import kernel
 from armsight.vision.markers.normal import edge, edge_noise, factor, invert, normal_equations, solve
 
 FIELD = 12  # coefficients of the quadratic field over the marker
@@ -33,7 +34,7 @@ _STEPS, _STOP, _STALL, _LAMBDA = 40, 0.05, 0.05, 1e-2  # as in corner.py
 _BLUR2_MIN = 0.03  # px^2, as in corner.py
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8, f8, f8[:, ::1]")
 def field(x: float, y: float, phi: Array) -> None:
     """Fill the displacement basis phi (12, 2) at the marker's coordinates x, y in -1..1."""
     phi[:, :] = 0.0
@@ -46,7 +47,7 @@ def field(x: float, y: float, phi: Array) -> None:
     phi[11, 0], phi[11, 1] = x * y, -y * y
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _shares(x: float, cells: int, px: float, width: float, blur: float, out: Array) -> int:
     """Fill the shares of the four cells about x along one axis, out (3, 4): shares, derivative by x and by blur.
 
@@ -67,7 +68,7 @@ def _shares(x: float, cells: int, px: float, width: float, blur: float, out: Arr
     return near - 2
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _skewed(
     u: float, v: float, cells: int, px: Array, spread: float, grid: Array, cx: int, cy: int, slopes: Array
 ) -> float:
@@ -102,7 +103,7 @@ def _skewed(
     return gain
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _evaluate(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, r: Array) -> float:
     """Fill residuals r and derivatives J (18, n) of pixels px (8, n) at parameters q (18,); return the cost.
 
@@ -160,7 +161,7 @@ def _evaluate(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, 
     return float(cost)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _assemble(n: int, q: Array, prior: Array, J: Array, r: Array, A: Array, g: Array) -> None:
     """Fill the normal equations with the prior, and hold a blur that is at its lower bound."""
     normal_equations(n, J, r, A, g)
@@ -172,7 +173,7 @@ def _assemble(n: int, q: Array, prior: Array, J: Array, r: Array, A: Array, g: A
         g[FIELD] = 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("i8, f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]")
 def fit_pattern(n: int, px: Array, grid: Array, prior: Array, q: Array, inverse: Array) -> float:
     """Minimise from q by Levenberg-Marquardt; fill ``inverse`` (18, 18); return the noise variance, -1 if unsettled."""
     J, r, A, L = (
@@ -188,7 +189,7 @@ def fit_pattern(n: int, px: Array, grid: Array, prior: Array, q: Array, inverse:
         if not factor(A, damping, L):
             return -1.0
         solve(L, g, step)
-        gain = np.dot(step, g)
+        gain = dot(step, g)
         done = damping <= 1.0 and gain < _STOP * cost / n
         trial[:] = q + step
         trial[FIELD] = max(trial[FIELD], _BLUR2_MIN)

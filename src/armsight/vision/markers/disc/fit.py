@@ -25,11 +25,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.vision.markers.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
@@ -96,6 +96,10 @@ class FitBuffers(NamedTuple):
     start: Array
     products: Array
     sums: Array
+    kernel_types = (
+        "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
+        "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+    )
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -117,7 +121,7 @@ def workspace() -> FitBuffers:
     )  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     """Fill whitened residual, J and share of disc of the first n pixels at ``work.at``.
 
@@ -179,7 +183,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     return float(square)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def normal_equations(n: int, work: FitBuffers) -> None:
     """Fill H = J J^T (10, 10), its lower half, and g = J residual (10,), of the first n pixels."""
     J, H, g, sums = work.J, work.H, work.g, work.sums
@@ -193,7 +197,7 @@ def normal_equations(n: int, work: FitBuffers) -> None:
             H[a, b] = sums[a, b]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def factor(H: Array, L: Array, scale: Array) -> bool:
     """Factor H as D L L^T D; False where it is not positive definite.
 
@@ -219,7 +223,7 @@ def factor(H: Array, L: Array, scale: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def solve(L: Array, scale: Array, g: Array, x: Array) -> None:
     """Solve H x = g with the factors of :func:`factor`."""
     n = len(g)
@@ -242,7 +246,7 @@ def solve(L: Array, scale: Array, g: Array, x: Array) -> None:
 _NEAR, _RING_PX = 3.4, 4.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _chord(v: float, s: Array) -> tuple[float, float]:
     """Return middle and half length of the chord at height v of an ellipse of :func:`_enlarged`; half < 0: none."""
     rest = s[2] - v * v
@@ -251,7 +255,7 @@ def _chord(v: float, s: Array) -> tuple[float, float]:
     return s[3] * v, s[4] * np.sqrt(rest)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enlarged(shape: Array, by: float, out: Array) -> None:
     """Fill the ellipse with half axes longer by ``by``, not below zero: S11, S12, S22, slope and length of its chords."""
     mean, half = (shape[0] + shape[2]) / 2, (shape[0] - shape[2]) / 2
@@ -263,7 +267,7 @@ def _enlarged(shape: Array, by: float, out: Array) -> None:
     out[3], out[4] = out[1] / out[2], np.sqrt(a * b) / out[2]
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _append(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0: int, n: int, work: FitBuffers) -> int:
     """Append the pixels first <= x < end of a row; return the new count."""
     count = max(min(end - first, MOST_PIXELS - n), 0)
@@ -276,7 +280,7 @@ def _append(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0:
     return n + count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def gather(image: NDArray[np.uint8], theta: Array, work: FitBuffers) -> tuple[int, int]:
     """Collect the pixels that depend on a disc: px, py relative to the nearest pixel of the centre, and their grey.
 
@@ -332,7 +336,7 @@ def gather(image: NDArray[np.uint8], theta: Array, work: FitBuffers) -> tuple[in
 SECTORS = 16
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def spread(n: int, work: FitBuffers, flat: Array) -> None:
     """Fill the mean squares of the residuals inside and outside, away from the rim, and their counts (4,)."""
     residual, inside = work.residual, work.inside
@@ -349,7 +353,7 @@ def spread(n: int, work: FitBuffers, flat: Array) -> None:
     flat[2], flat[3] = count_in, count_out
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def clipped(n: int, work: FitBuffers) -> int:
     """Count the pixels that are black or white to the last level."""
     level, count = work.level, np.int32(0)
@@ -358,7 +362,7 @@ def clipped(n: int, work: FitBuffers) -> int:
     return int(count)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _stepped(n: int, work: FitBuffers) -> None:
     """Fill ``work.left``, the residuals after the last step; ``work.residual`` is before it."""
     residual, J, left = work.residual, work.J, work.left
@@ -369,7 +373,7 @@ def _stepped(n: int, work: FitBuffers) -> None:
         left[i] = residual[i] - x0 * J[0, i] - x1 * J[1, i] - shape - light
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: Array) -> None:
     """Fill, for each sixteenth of the rim, its distance outside the ellipse, px, and the weight of that (2, 16)."""
     px, py, J, inside = work.px, work.py, work.J, work.inside
@@ -389,7 +393,7 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: A
         sectors[0, k] /= max(sectors[1, k], 1e-12)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def texture_factor(n: int, blur: float, texture: float, work: FitBuffers) -> float:
     """Return the factor by which the centre's variance grows because neighbouring pixels of a texture are correlated.
 
@@ -413,7 +417,7 @@ def texture_factor(n: int, blur: float, texture: float, work: FitBuffers) -> flo
     return 1.0 + (along * min(along, 1.0 + 2.0 * blur) - 1.0) * by_texture / by_all
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def of_centre(work: FitBuffers, cov: Array) -> None:
     """Fill the centre's (2, 2) block of H^-1."""
     g, L, scale, x = work.g, work.L, work.scale, work.x
@@ -424,7 +428,7 @@ def of_centre(work: FitBuffers, cov: Array) -> None:
         cov[a, 0], cov[a, 1] = x[0], x[1]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, out: Array) -> None:
     """Fill the products of the columns of a gradient inside the disc, u and v times its share.
 
@@ -456,7 +460,7 @@ def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, o
     out[0, 11], out[0, 12], out[1, 11], out[1, 12] = uu, uv, uv, vv
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -> float:
     """Return by how much a gradient inside the disc would lower chi-square, in units of the noise's variance."""
     g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
@@ -482,7 +486,7 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -
     return float((k11 * s0 * s0 - 2 * k01 * s0 * s1 + k00 * s1 * s1) / det)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def slope_outside(theta: Array, work: FitBuffers) -> float:
     """Return by how much chi-square would rise without the surround's gradient, in units of the noise's variance."""
     L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
@@ -535,7 +539,7 @@ _UNEVEN = 0.12
 _LEAST_SNR = 3.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _step(
     n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: FitBuffers
 ) -> tuple[float, float]:
@@ -569,7 +573,7 @@ def _step(
     return (shift if shrink == 1.0 else max(shift, 1.0)), square
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _minimise(
     n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: FitBuffers
 ) -> tuple[float, float]:
@@ -596,7 +600,7 @@ def _minimise(
     return -1.0, 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _average(
     n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: FitBuffers
 ) -> None:
@@ -639,7 +643,7 @@ def _average(
     cov[1, 0] = cov[0, 1]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
     """Fit one disc.
 
@@ -716,7 +720,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     return 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def shape_of(theta: Array, shape: Array) -> None:
     """Fill S11, S12, S22 of a fitted ellipse, px^2.
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, factor, fit, shape_of, solve
 
 #: Longest half chord, px: half of the largest disc, blur and all.
@@ -27,7 +27,7 @@ Grey = NDArray[np.uint8]
 Room: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int) -> int:
     """Return how many pixels from (x, y) along (dx, dy) are on the disc's side of ``half``; -1 where there is no end."""
     height, width = image.shape
@@ -41,7 +41,7 @@ def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int) -
     return -1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room) -> int:
     """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
 
@@ -156,7 +156,7 @@ _EMPTY = np.uint64(0)
 Words64 = NDArray[np.uint64]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("const u1[:, ::1]")
 def noise_of(image: Grey) -> float:
     """Estimate the standard deviation of an image's noise, grey levels: the median difference of neighbours.
 
@@ -188,19 +188,19 @@ def noise_of(image: Grey) -> float:
     return 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _marks(a: np.uint64, b: np.uint64, t: np.uint64) -> np.uint64:
     """Mark, with the high bit of its byte, each pixel of b that is brighter than that of a by t times four levels."""
     return ((((b >> _TWO) & _SIX) | _HIGH) - ((a >> _TWO) & _SIX) - t) & _HIGH
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _apart(row: Words64, i: int, t: np.uint64) -> np.uint64:
     """Mark the pixels of word i of a row that differ from those eight further on."""
     return _marks(row[i], row[i + 1], t) | _marks(row[i + 1], row[i], t)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def differs(row: Words64, t: np.uint64) -> bool:
     """Return whether any two pixels of a row (W / 8,), eight apart, differ by t units of four levels."""
     every = _EMPTY
@@ -209,7 +209,7 @@ def differs(row: Words64, t: np.uint64) -> bool:
     return bool(every != _EMPTY)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
     """Return whether any two pixels of the eight searched rows from y differ as in :func:`differs`.
 
@@ -226,7 +226,7 @@ def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
     return bool(every != _EMPTY)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
     """Whether a pixel was examined already, or lies on a disc that was found."""
     n = cells[y >> 3, x >> 3]
@@ -239,7 +239,7 @@ def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArr
     return bool(np.sqrt(q) < 1.0 + _RIM_PX * np.sqrt(starts[n, 2] + starts[n, 4]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
     """Enter a disc into the cells that it covers, with a margin."""
     height, width = cells.shape
@@ -252,7 +252,7 @@ def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
             cells[y, x] = n
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def search(
     image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
@@ -318,7 +318,7 @@ def search(
     return n
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
     """Whether disc n repeats one of those before it; if not, enter it into its cell of 8 px.
 
@@ -336,7 +336,10 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
     return False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(
+    "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
+)
 def find(
     image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], cov: Array, shape: Array, room: Room, work: FitBuffers,

@@ -1,0 +1,141 @@
+"""The decorator of kernels: functions of numbers and arrays, written in Python, compiled when the package is built.
+
+A kernel that Python calls names the types that it takes, as strings; one that only other kernels call names none:
+
+    @kernel("f8[:, ::1], const f8[::1], i8")
+    def scale(out: Array, factors: Array, count: int) -> float: ...
+
+``b1`` is a boolean, ``i8 i4 i2 i1 u8 u4 u2 u1`` integers by their bytes, ``f8 f4`` floats. ``[:, :]`` is an array of
+two dimensions, ``[:, ::1]`` one whose rows are contiguous, ``const`` one that is only read. A ``NamedTuple`` stands by its
+name; it has an attribute ``kernel_types`` with the types of its fields. Several strings are tried in their order.
+
+Where the environment has ARMSIGHT_KERNELS=python the functions run as they stand: slow, but with a debugger, and the
+oracle of what was compiled.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar, cast, overload
+
+import numpy as np
+
+from armsight.errors import ArmsightError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: The letters of numbers in a compiled signature (call.c), as numpy names them.
+LETTERS = {
+    "b": "?",
+    "q": "i8",
+    "i": "i4",
+    "h": "i2",
+    "c": "i1",
+    "Q": "u8",
+    "I": "u4",
+    "H": "u2",
+    "C": "u1",
+    "d": "f8",
+    "f": "f4",
+}
+#: What build.py sets to turn kernels into functions that it compiles: (function, signatures, options) -> its own.
+builder: Callable[[Callable[..., Any], tuple[str, ...], dict[str, Any]], Any] | None = None
+_AGAIN = "build them: python -m pip install -e . in the checkout, or python -m armsight.kernels.build"
+
+
+def in_python() -> bool:
+    """Return whether kernels run as plain Python."""
+    return os.environ.get("ARMSIGHT_KERNELS") == "python"
+
+
+@functools.cache
+def _library() -> Any:  # noqa: ANN401 - a compiled module has no types
+    try:
+        from armsight.kernels import _compiled  # type: ignore[attr-defined]
+    except ImportError as error:
+        raise ArmsightError(f"the compiled kernels are not there ({error}); {_AGAIN}") from None
+    return _compiled
+
+
+@functools.cache
+def _sources() -> dict[str, str]:
+    """Return the digests of the modules as they were compiled; none where nobody edits them, in an installed wheel."""
+    folder = Path(__file__).resolve().parents[3]
+    if not (folder / "setup.py").exists():
+        return {}
+    return dict(_library().sources())
+
+
+@functools.cache
+def _check_not_stale(module: str, path: str) -> None:
+    compiled = _sources().get(module)
+    if compiled is not None and compiled != source_digest(Path(path)):
+        raise ArmsightError(f"{path} has changed since its kernels were compiled; {_AGAIN}")
+
+
+def source_digest(path: Path) -> str:
+    """Return a digest of a source file's text."""
+    return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()[:16]
+
+
+def _array(data: bytearray, letter: str, shape: tuple[int, ...]) -> Any:  # noqa: ANN401
+    return np.frombuffer(data, LETTERS[letter]).reshape(shape)
+
+
+def _inner(function: Callable[P, R]) -> Callable[P, R]:
+    """Return what stands for a kernel that only kernels call: a refusal, as Python is a thousand times slower."""
+
+    @functools.wraps(function)
+    def refuse(*args: P.args, **kwargs: P.kwargs) -> R:
+        raise TypeError(
+            f"{function.__module__}.{function.__qualname__} has no signature: only kernels call it. Give its @kernel one "
+            "to call it from Python"
+        )
+
+    return refuse
+
+
+@overload
+def kernel(first: Callable[P, R]) -> Callable[P, R]: ...
+@overload
+def kernel(first: str, *signatures: str, **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]: ...  # noqa: ANN401
+@overload
+def kernel(**options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]: ...  # noqa: ANN401
+
+
+def kernel(first: Any = None, *signatures: str, **options: Any) -> Any:
+    """Make a function a kernel; see the module's text for signatures.
+
+    Args:
+        first: the function, where neither signatures nor options are given; else the first signature.
+        signatures: the others.
+        options: ``nogil=True``: other threads of Python run meanwhile (not for kernels of some microseconds: to get the
+            interpreter back takes longer). ``fastmath``, ``inline``, ``forceinline``: as numba defines them.
+
+    Returns:
+        What Python calls; arguments are positional, and their types are checked.
+    """
+    if callable(first):
+        return kernel()(first)
+    given = () if first is None else (first, *signatures)
+
+    def wrap(function: Callable[P, R]) -> Callable[P, R]:
+        if builder is not None:
+            return cast("Callable[P, R]", builder(function, given, options))
+        if in_python():
+            return function
+        if not given:
+            return _inner(function)
+        found = _library().find(function.__module__, function.__name__, _array)
+        if found is None:
+            raise ArmsightError(f"{function.__module__}.{function.__name__} is not compiled; {_AGAIN}")
+        _check_not_stale(function.__module__, str(sys.modules[function.__module__].__file__))
+        return cast("Callable[P, R]", functools.update_wrapper(found, function))
+
+    return wrap
