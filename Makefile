@@ -11,6 +11,7 @@ demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held
 	$(BIN)/armsight demo -o demo
 
 test: $(VENV)/.armsight-test $(VENV)/.opencv4 lint  ## everything that must hold
+	$(BIN)/python -m armsight.kernels.build
 	$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile
 	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
 	$(OPENCV4) -m pytest -n auto --maxprocesses=4 --dist=loadfile -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)

@@ -144,9 +144,13 @@ class _Wanted:
     nogil: bool
 
 
+def _numba_types() -> Any:  # noqa: ANN401 - numba's own annotations of it do not hold
+    return importlib.import_module("numba.core.types")
+
+
 def _types(text: str, function: Any) -> tuple[Any, ...]:  # noqa: ANN401
     """Return numba's types of a signature."""
-    from numba.core import types
+    types = _numba_types()
 
     numbers = {name: getattr(types, f"{_KINDS[name[0]]}{8 * int(name[1])}") for name in _LETTERS if name != "?"}
     numbers["b1"] = types.boolean
@@ -171,7 +175,7 @@ def _types(text: str, function: Any) -> tuple[Any, ...]:  # noqa: ANN401
 
 def _code(kind: Any) -> str:  # noqa: ANN401
     """Return the letters (call.c) of one of numba's types."""
-    from numba.core import types
+    types = _numba_types()
 
     if isinstance(kind, types.Array):
         return f"[{'w' if kind.mutable else 'r'}{_code(kind.dtype)}{kind.ndim}{kind.layout}"
@@ -192,7 +196,8 @@ def _code(kind: Any) -> str:  # noqa: ANN401
 def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  # noqa: ANN401
     """Add a function ``int symbol(const uint64_t *arguments, uint64_t *result)`` that calls a compiled kernel."""
     from llvmlite import ir
-    from numba.core import types
+
+    types = _numba_types()
 
     word, described = ir.IntType(64), result.fndesc
     module = context.create_module(symbol)
@@ -264,6 +269,8 @@ def _prepare_numba() -> Any:  # noqa: ANN401
     context._internal_codegen = Codegen("armsight")
     context.get_executable = lambda *_: [].append  # numba knows each by a built-in function of its own; none is called
     module, library = nrtdynmod.create_nrt_module(context)
+    for function in module.functions:
+        function.attributes.discard("noinline")  # the last passes may; the first, which pair counts, do not inline
     with global_compiler_lock:
         library.add_ir_module(module)
         library.finalize()

@@ -7,7 +7,7 @@ A kernel that Python calls names the types that it takes, as strings; one that o
 
 ``b1`` is a boolean, ``i8 i4 i2 i1 u8 u4 u2 u1`` integers by their bytes, ``f8 f4`` floats. ``[:, :]`` is an array of
 two dimensions, ``[:, ::1]`` one whose rows are contiguous, ``const`` one that is only read. A ``NamedTuple`` stands by its
-name; it has an attribute ``kernel_types`` with the types of its fields. Several strings are tried in their order.
+name; :func:`kernel_types` says the types of its fields. Several strings are tried in their order.
 
 Where the environment has ARMSIGHT_KERNELS=python the functions run as they stand: slow, but with a debugger, and the
 oracle of what was compiled.
@@ -29,6 +29,7 @@ from armsight.errors import ArmsightError
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 #: The letters of numbers in a compiled signature (call.c), as numpy names them.
 LETTERS = {
@@ -99,6 +100,16 @@ def _inner(function: Callable[P, R]) -> Callable[P, R]:
         )
 
     return refuse
+
+
+def kernel_types(fields: str) -> Callable[[type[T]], type[T]]:
+    """Say the types of a NamedTuple's fields, as in a kernel's signature."""
+
+    def keep(record: type[T]) -> type[T]:
+        record.kernel_types = fields  # type: ignore[attr-defined]
+        return record
+
+    return keep
 
 
 @overload

@@ -2,7 +2,7 @@
 
 Points in the camera's frame (+X right, +Y down, +Z forward) go to raw pixels and back. Brown-Conrady in OpenCV's order
 and rational form (Brown 1966; Claus and Fitzgibbon 2005) and Kannala-Brandt's equidistant fisheye (PAMI 28(8), 2006,
-as in OpenCV's ``fisheye``). The kernels are compiled by numba; all derivatives are analytic.
+as in OpenCV's ``fisheye``). All derivatives are analytic.
 """
 
 from __future__ import annotations

@@ -5,21 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.run.experiment import enable, require_start, warm_up
+from armsight.app.run.experiment import enable, require_start
 from armsight.app.run.motion_file import QUICK, read_motions
-from armsight.data import JointCommand, JointStates
+from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
-from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement
-from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault, Reaction
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
-from armsight.robot.trajectories import point_to_point
 from armsight.sim.joints import JointPlant, PotFault
-from fresh_process import compiled, run_fresh
 
 ARM = open_arm("six_r")
 
@@ -140,32 +136,3 @@ def test_a_board_that_reports_no_angles(made):
     setup = SimpleNamespace(board=stands(np.zeros((0, 6))), arm=ARM)
     with pytest.raises(DeviceError, match="reports no joint angles"):
         require_start(setup, read_motions(ARM, QUICK), ARM.home[None])
-
-
-def test_nothing_is_compiled_in_a_loop_that_was_warmed_up():
-    assert run_fresh("test_run_experiment", "close_the_loop") == "six_r puma560\n"
-
-
-def close_the_loop():
-    """Close the loop on vision; after the warm-up nothing may be compiled, whatever the arm."""
-    for name in ("six_r", "puma560"):
-        arm = open_arm(name)
-        warm_up(arm)
-        before = compiled()
-        estimator, servo = (
-            KalmanEstimator(arm, delay=Delay(0.013, 2e-3)),
-            PoseServo(arm, LoopTiming(0.016, 0.033, 0.045)),
-        )
-        way = point_to_point(arm, arm.home, arm.home + 0.2)
-        for tick in range(1, 400):
-            t_s = 1e-3 * tick
-            q = way.at(np.array([t_s])).q
-            estimator.joints(JointStates(np.array([t_s]), q))
-            if tick % 33 == 0:
-                T, cov = arm.forward(way.at(t_s - 0.02).q), np.diag([1e-8] * 6)
-                estimator.vision(PoseMeasurement(t_s - 0.02, T, cov, cov))
-            if tick % 16 == 0:
-                servo.step(servo.aim(way, t_s), estimator)
-        estimator.smoothed(np.linspace(0.1, 0.3, 50))
-        assert compiled() == before, {name for name, count in compiled().items() if before.get(name) != count}
-    print("six_r puma560")

@@ -1,11 +1,9 @@
-"""Windows' totals and winners against their definitions, and vectors against plain numbers."""
+"""Windows' totals and winners against their definitions."""
 
-import numba
 import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense import simd as simd
 from armsight.vision.dense.block import RAW_MAX, Block
 from armsight.vision.dense.method import Search
 
@@ -73,41 +71,3 @@ def test_no_sum_leaves_its_type():
         checks = np.where(np.indices((60, 80)).sum(axis=0) % 4 < 2, black, white)
         found = Block(reach=reach).search(checks, np.roll(checks, 2, axis=1).copy(), Search(0, 2))
         assert found.least.max() <= RAW_MAX * (2 * reach + 1) ** 2 < 65536
-
-
-@numba.njit
-def worked(a, b, out):
-    """Write what each operation makes of 32 bytes, one row after another."""
-    p, q, o, n = simd.start(a), simd.start(b), simd.start(out), np.uintp(simd.SIMD_WIDTH)
-    x, y = simd.load(p, np.uintp(0)), simd.load(q, np.uintp(3))
-    simd.store(o, np.uintp(0), simd.plus(x, y))
-    simd.store(o, n, simd.minus(x, y))
-    simd.store(o, np.uintp(2) * n, simd.least(x, y))
-    simd.store(o, np.uintp(3) * n, simd.above(x, y))
-    simd.store(o, np.uintp(4) * n, simd.differing(x, y))
-    simd.store(o, np.uintp(5) * n, simd.bits_set(x))
-    simd.store(o, np.uintp(6) * n, simd.half(x))
-    simd.store(o, np.uintp(7) * n, simd.where_less(x, y, simd.spread(np.uint8(1)), simd.count_up(np.uint8(250))))
-
-
-@numba.njit
-def widened(a, out):
-    p, o = simd.start(a), simd.start(out)
-    simd.store(o, np.uintp(0), simd.plus(simd.as_in(simd.load(p, np.uintp(0)), o), simd.spread(np.uint16(1000))))
-
-
-def test_vectors_work_as_numbers_do():
-    rng = np.random.default_rng(0)
-    a, b = (rng.integers(0, 256, simd.SIMD_WIDTH + 3).astype(np.uint8) for _ in range(2))
-    x, y = a[: simd.SIMD_WIDTH], b[3:]
-    out = np.zeros(8 * simd.SIMD_WIDTH, np.uint8)
-    worked(a, b, out)
-    counted = (250 + np.arange(simd.SIMD_WIDTH)).astype(np.uint8)
-    expected = [
-        x + y, x - y, np.minimum(x, y), np.where(x > y, x - y, 0), x ^ y, np.bitwise_count(x), x // 2,
-        np.where(x < y, 1, counted),
-    ]  # fmt: skip
-    np.testing.assert_array_equal(out.reshape(8, -1), np.array(expected))
-    wide = np.zeros(simd.SIMD_WIDTH, np.uint16)
-    widened(a, wide)
-    np.testing.assert_array_equal(wide, x.astype(np.uint16) + 1000)

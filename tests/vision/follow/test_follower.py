@@ -10,7 +10,6 @@ from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from disc_views import PLATE, discs_of, hd_rig, someplace
-from fresh_process import compiled, run_fresh
 
 RIG = hd_rig()
 BODY = Composite(PLATE.body.name, (), PLATE)
@@ -146,55 +145,6 @@ def test_what_was_given_stays_as_it_was():
             np.testing.assert_array_equal(before, after)
 
 
-def test_nothing_is_compiled_once_it_is_ready():
-    assert run_fresh("test_follower", "measure_all_kinds_of_shots") == "searched, followed and lost\n"
-
-
-def measure_all_kinds_of_shots():
-    """Follow, lose and search a body in colour, grey and 16 bits; nothing may be compiled meanwhile."""
-    follower = Follower(RIG, BODY)
-    before, ways = compiled(), []
-    for k, (_, shot) in enumerate(shots(PLATE, 9, 8, {6: ((0, 0),)})):
-        left, right = shot.left, shot.right
-        if k in (3, 7):
-            left, right = np.dstack([left] * 3), np.dstack([right] * 3)
-        if k == 4:
-            left = left.astype(np.uint16) * 257
-        follower.measure(Shot(shot.name, left, right, shot.t_s))
-        ways.append(follower.way)
-    start = someplace(np.random.default_rng(8), z=(0.8, 0.8), tilt=0.2)
-    for k, across in enumerate((0.0, 0.12, 0.0)):  # too far for following: search after search
-        there = start @ exp_se3(np.array([across, 0.0, 0.0, 0.0, 0.0, 0.0]))
-        follower.measure(Shot("far", *pair_of(RIG, PLATE, there, np.random.default_rng(k)), 10 + k / 60))
-        ways.append(follower.way)
-    assert ways[-3:] == ["searched"] * 3
-    assert set(ways) >= {"searched", "followed", "lost"}
-    assert compiled() == before
-    print("searched, followed and lost")
-
-
-@pytest.mark.parametrize(
-    "target",
-    [
-        discs_of([[0, 0, 0], [0.1, 0, 0], [0.05, 0.05 * np.sqrt(3), 0]]),
-        discs_of([[0, 0, 0], [0.1, 0, 0], [0.02, 0.09, 0]], normal=None),
-        discs_of(np.eye(3) * 0.05, normal=np.eye(3)),
-        discs_of([[0, 0, 0.05], [0, 0, -0.05], [0.05, 0, 0], [-0.05, 0, 0]],
-                 normal=[[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]),
-        discs_of([[0, 0, 0], [9, 0, 0], [2, 8, 0]], radius=0.4),
-        discs_of([[0, 0, 0], [1e-3, 0, 0], [2e-4, 1e-3, 0]], radius=2e-4),
-    ],
-    ids=["all alike", "no normals", "a corner", "four sides", "9 m", "1 mm"],
-)  # fmt: skip
-def test_getting_ready_for_any_body_leaves_no_trace(target):
-    """The warm-up identifies and locates the body where it is not: the first shots must not know of that."""
-    follower = Follower(RIG, Composite("any", (), target))
-    blank = np.full(RIG.left.image_size_px[::-1], 45, np.uint8)
-    for k in range(2):
-        assert isinstance(follower.measure(Shot(str(k), blank, blank, k / 60)), Missed)
-        assert (follower.way, follower.jump) == ("lost", None)
-
-
 def test_covariance_is_honest():
     """NEES of followed poses against truth, the rig exactly known, over fresh noise."""
     rig = hd_rig(known=True)
@@ -236,7 +186,7 @@ def test_fast_motion_is_followed_once_two_searches_have_reported_its_velocity():
 
 
 def test_where_it_is_expected_it_is_found_without_a_search_of_the_whole_image(monkeypatch):
-    searches, follower = [], Follower(RIG, BODY)  # made before: its warm-up measures, too
+    searches, follower = [], Follower(RIG, BODY)
     monkeypatch.setattr(
         "armsight.vision.follow.follower.measure", lambda *a: (searches.append(a[2].name), measure(*a))[1]
     )

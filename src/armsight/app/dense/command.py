@@ -10,7 +10,7 @@ import click
 
 from armsight.app.dense.evaluate import SceneResult, evaluate_scene, evaluation_json, table_text, write_evaluation
 from armsight.app.dense.files import check_folder, make_folder
-from armsight.app.dense.run import PairResult, compile_apart, problem_line, read_pair, result_line, run_shot, search_of
+from armsight.app.dense.run import PairResult, problem_line, read_pair, result_line, run_shot, search_of
 from armsight.app.progress import bar
 from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
@@ -82,7 +82,6 @@ def match(
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
     check_folder(output)
-    compile_apart(name)
     method = open_method(name)
 
     def run(shot: Shot, where: Path) -> PairResult:

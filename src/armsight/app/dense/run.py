@@ -1,17 +1,10 @@
-"""One pair of ``armsight dense``, from images to files; and a method compiled in another process.
+"""One pair of ``armsight dense``, from images to files.
 
 In: the images of a pair, how to rectify them, a method and its search. Out: the files and a :class:`PairResult`.
-
-The first run of a method compiles it, and the compiler keeps about 100 MB for as long as its process lives.
-:func:`compile_apart` has another process do that and end; this one reads what is compiled from numba's cache::
-
-    python -m armsight.app.dense.run METHOD
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba.core import event
 from numpy.typing import NDArray
 
 from armsight.app.dense.files import DenseSummary, make_folder, write_png, write_result
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
-from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.middlebury import read_pfm, read_tiff
 from armsight.vision.dense.rectified import match_pair, plain_grey
 from armsight.vision.image import read_image
@@ -179,43 +170,3 @@ def result_line(result: PairResult) -> str:
         line += f"; depth {summary.median_depth_mm:.0f} mm ± {summary.median_depth_sigma_mm:.1f} (medians)"
         line += f", {summary.points} points"
     return line + f"; {result.seconds:.2f} s; written to {result.folder}"
-
-
-class _NotYetError(Exception):
-    """Something is about to be compiled here."""
-
-
-class _CompileListener(event.Listener):
-    """Raises where something would be compiled."""
-
-    def on_start(self, event: event.Event) -> None:
-        """Raise before anything is compiled."""
-        raise _NotYetError
-
-    def on_end(self, event: event.Event) -> None:
-        """Nothing was begun."""
-
-
-def compile_method(name: str) -> None:
-    """Match a small pair, so that all of a method is compiled, or read from the cache."""
-    noise = np.random.default_rng(0).integers(0, 256, (64, 140)).astype(np.uint8)
-    left, right = noise[:, :128].copy(), noise[:, 4:132].copy()  # a disparity of 4: matched, smoothed and filled
-    for image in (left, right):
-        image.setflags(write=False)  # as a shot's images are: to the compiler that is another type
-    open_method(name).match(left, right, Search(0, 16))
-
-
-def compile_apart(name: str) -> None:
-    """Have a method compiled elsewhere, unless numba's cache holds it already.
-
-    Where the cache cannot be written, this process will compile when it matches: only its memory is more.
-    """
-    try:
-        with event.install_listener("numba:compile", _CompileListener()):
-            compile_method(name)
-    except _NotYetError:
-        subprocess.run([sys.executable, "-m", __name__, name], check=False, capture_output=True)
-
-
-if __name__ == "__main__":
-    compile_method(sys.argv[1])

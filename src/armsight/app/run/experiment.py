@@ -3,13 +3,12 @@
 In: a :class:`~armsight.app.run.setup.Setup` (the workcell or real devices), a calibrated rig and a motion plan. Out: a
 :class:`RunResult`. After a device failure or an interrupt it has everything measured until then; the arm is stopped first.
 
-Before an arm moves, :func:`require_start` checks its joint angles and limits, :func:`warm_up` compiles all that the loop
-runs, and :func:`enable` switches the drives on.
+Before an arm moves, :func:`require_start` checks its joint angles and limits, and :func:`enable` switches
+the drives on.
 """
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -22,11 +21,10 @@ from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
-from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.loop.estimators import Delay, KalmanEstimator, PoseMeasurement, Prior
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.servo import LoopTiming, PoseServo
-from armsight.robot.arm import Arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.trajectories import Trajectory, point_to_point
@@ -38,8 +36,6 @@ START_RAD = float(np.radians(2.0))
 #: How long to wait for a board that is stopping its arm, s.
 _SLOWS_S = 3.0
 _STEP_S = 0.05
-_MOVE_RAD = 0.05  # motion of the joints in warm_up
-_WARM_UP = 400  # readings
 _CHECKED = 200  # joint angles along a motion that are checked
 
 
@@ -64,27 +60,6 @@ def enable(board: Board) -> None:
         )
     if board.status.state is not BoardState.ENABLED:  # a held arm is taken over without releasing it
         board.enable()
-
-
-def warm_up(arm: Arm) -> None:
-    """Run once all that the loop runs in motion, so that nothing is compiled while an arm waits for a command."""
-    low, high = np.maximum(arm.home - _MOVE_RAD, arm.q_min), np.minimum(arm.home + _MOVE_RAD, arm.q_max)
-    way = point_to_point(arm, low, high)
-    t_s = np.linspace(1e-3, 1e-3 * _WARM_UP, _WARM_UP)
-    q = way.at(t_s).q
-    servo = PoseServo(arm, LoopTiming(PERIOD_S, 0.016, 0.02))
-    estimator = KalmanEstimator(arm, delay=Delay(0.02, 0.02))
-    for first in range(0, _WARM_UP, 4):
-        rows = slice(first, first + 4)
-        estimator.joints(JointStates(t_s[rows], q[rows]))
-        estimator.estimate()
-        if first % 16 == 0:
-            estimator.vision(
-                PoseMeasurement(float(t_s[first]), arm.forward(q[first]), 1e-8 * np.eye(6), 1e-8 * np.eye(6))
-            )
-        with contextlib.suppress(ArmsightError):
-            servo.step(servo.aim(way, float(t_s[first])), estimator)
-    estimator.smoothed(t_s[-100:])
 
 
 def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
@@ -232,7 +207,6 @@ def _run(
         progress("preparing to follow the body")
         follower = Follower(rig, setup.target)
         if setup.clock is not None:
-            warm_up(setup.arm)
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
         loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
         enable(setup.board)

@@ -1,4 +1,4 @@
-"""Kinematics as plain functions of (table, q), compiled by numba: no checks and no allocation; :class:`Arm` checks.
+"""Kinematics as plain functions of (table, q), all kernels: no checks and no allocation; :class:`Arm` checks.
 
 In: the packed table of an arm and joint angles, rad, or a pose T_base_tool, m. Out: poses, Jacobians, joint angles.
 
@@ -6,7 +6,4 @@ In: the packed table of an arm and joint angles, rad, or a pose T_base_tool, m. 
 - ``chain``: forward kinematics, Jacobian and its rate, one configuration or a batch of eight;
 - ``structure``: which closed-form inverse a table has; ``closed``: that inverse;
 - ``inverse``: all joint angles of a pose, checked, polished and sorted; the nearest pose where there are none.
-
-numba's cache on disk looks at the age of a function's own file only: after a change to a file here, remove the cached
-code of the files that call into it (``find src -name "*.nb[ci]" -delete``).
 """

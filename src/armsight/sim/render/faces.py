@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array, Ids, Image
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.sim.render.optics import Radiance, Window, gather_parts, spread_down
 from armsight.sim.render.paint import SUB, Slots, paint, paint_disc
 from armsight.sim.render.scene import CLEAR, Pattern
 
 
+@kernel_types("f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[:, ::1]")
 class Palette(NamedTuple):
     """Patterns as the painter takes them, end to end.
 
@@ -34,7 +35,6 @@ class Palette(NamedTuple):
     values: Array
     discs: Array
     first: Ids
-    kernel_types = "f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[:, ::1]"
 
 
 @lru_cache(maxsize=64)
@@ -54,6 +54,7 @@ def palette(patterns: tuple[Pattern, ...]) -> Palette:
     )
 
 
+@kernel_types("Palette, f8[::1], i8[:, ::1], f8[:, :, :, :, ::1], i8[:, ::1]")
 class Exposure(NamedTuple):
     """What is painted in an exposure of S steps.
 
@@ -72,7 +73,6 @@ class Exposure(NamedTuple):
     order: Ids
     Ms: Array
     boxes: Ids
-    kernel_types = "Palette, f8[::1], i8[:, ::1], f8[:, :, :, :, ::1], i8[:, ::1]"
 
     def shown(self) -> Ids:
         """Return the boxes (N, 4) of the patterns that face the camera."""

@@ -9,8 +9,7 @@ straight within a part but for its mean bend there); where several edges meet, a
 and Hodgman, CACM 17(1), 1974). The parts are kept, so that the lens's blur is applied to the parts and not to whole pixels.
 
 In this order: pixels cast on to a plane and split into parts; cells of a grid and areas clipped by cells; discs; the
-painters :func:`paint_disc` and :func:`paint`. numba's cache on disk looks at the age of the file that calls: after a
-change here, delete the cache of ``faces`` too.
+painters :func:`paint_disc` and :func:`paint`.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ def open_parts(v: int, u: int, coarse: Array, slot: Slots, fine: Array, count: i
         forward_selection = np.empty((2 * count, SUB, SUB))
         forward_selection[:count] = fine
         fine = forward_selection
-    for a in range(SUB):  # numba is slow at filling such a small part of an array
+    for a in range(SUB):  # filling such a small part of an array at once is slow
         for b in range(SUB):
             fine[count, a, b] = coarse[v, u]
     slot[v, u] = count

@@ -4,8 +4,7 @@ In: a camera, its pose T_base_camera and a seed. Out: a :class:`StillView`: ligh
 in the base frame: x runs away from the wall, towards the cameras; z up; the table's top is z = 0.
 
 Surfaces are dull: a lamp's light falls off with the cosine, and some comes from everywhere (Lambert). Capsules are met as
-in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end. All compiled functions that
-call each other stay in this file: numba's cache on disk looks at one file's age only.
+in the closed form for a swept sphere: the cylinder's quadratic, or that of the nearer end.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The contract is :class:`~armsight.vision.dense.method.Method` in ``method.py``; 
 
 - The methods: ``block.py`` (windows), ``scanline.py`` (dynamic programming),
   ``semiglobal.py``, ``opencv.py``. What they share: ``cost.py`` (matching costs), ``winner.py`` (the least total),
-  ``simd.py`` (vectors for numba), ``postprocess.py`` (rejection, smoothing, filling, sigma).
+  ``postprocess.py`` (rejection, smoothing, filling, sigma).
 - Before and after: ``rectified.py`` (checks of a pair), ``depth.py`` (depth with its standard deviation),
   ``registration.py`` (the pose of a body from a point cloud).
 - ``evaluate.py`` and ``middlebury.py``: errors against a true disparity map, and the benchmark's files.

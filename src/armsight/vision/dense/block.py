@@ -22,7 +22,7 @@ import numpy as np
 
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.vision.dense.cost import Bytes
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
@@ -42,6 +42,7 @@ _USUAL = 4
 BYTE_REACH = (255 // RAW_MAX - 1) // 2
 
 
+@kernel_types("u1[::1], u1[::1], u1[::1], u1[::1], u8, u8")
 class PairPlanes(NamedTuple):
     """A pair as the costs need it: rows of bytes, one after another, widened so that every window lies inside.
 
@@ -60,7 +61,6 @@ class PairPlanes(NamedTuple):
     right_census: Bytes
     left_stride: np.uintp
     right_stride: np.uintp
-    kernel_types = "u1[::1], u1[::1], u1[::1], u1[::1], u8, u8"
 
 
 @kernel("u1[:, ::1], u1[:, ::1]", nogil=True)
@@ -220,7 +220,8 @@ def _add_row(
             here, right = np.uint16(k), buffers.right[pad - d :]
             least, where = buffers.least, buffers.where
             for x in range(np.uintp(d), np.uintp(width)):
-                where[x] = here if total[x] < least[x] else where[x]
+                before, t = where[x], total[x]
+                where[x] = here if t < least[x] else before
             for x in range(np.uintp(d), np.uintp(width)):
                 least[x] = min(total[x], least[x])
                 right[x] = min(total[x], right[x])

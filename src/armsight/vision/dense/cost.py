@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Image
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 
 Bytes = NDArray[np.uint8]
 Words32 = NDArray[np.uint32]
@@ -34,6 +34,7 @@ _RAW_MAX = np.uint8(34)
 COST_MAX = 3 * 34
 
 
+@kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")
 class CensusPair(NamedTuple):
     """A pair as the costs need it; the planes of the right image are mirrored and padded by the search.
 
@@ -56,7 +57,6 @@ class CensusPair(NamedTuple):
     right_low: Bytes
     right_high: Bytes
     right_census: Words32
-    kernel_types = "u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]"
 
 
 _ODD, _PAIRS, _NIBBLES, _BYTES = (np.uint32(x) for x in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.vision.dense.cost import BLOCK
 
 
@@ -50,6 +50,7 @@ Counts = NDArray[np.uint16]
 NOWHERE = np.uint16(65535)
 
 
+@kernel_types("f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]")
 class Winners(NamedTuple):
     """The winning disparity of every pixel of the left image.
 
@@ -64,7 +65,6 @@ class Winners(NamedTuple):
     agreed: NDArray[np.bool_]
     curvature: Singles
     least: Singles
-    kernel_types = "f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]"
 
 
 def make_winners(height: int, width: int) -> Winners:

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from armsight.data import Array, Discs, Ids, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import Expected
 from armsight.vision.markers.disc.target import DiscTarget
@@ -318,6 +318,7 @@ def _by_rig(rig: StereoRig, p_left: Array) -> Array:
     return J
 
 
+@kernel_types("const f8[::1], const f8[::1], const f8[:, ::1], const f8[:, ::1], f8[::1], f8[::1], const b1[::1]")
 class _Side(NamedTuple):
     """The N discs of one image as the compiled sweep needs them; the first four as in :class:`_Lines`.
 
@@ -338,7 +339,6 @@ class _Side(NamedTuple):
     radius_px: Array
     tolerance_px: Array
     bright: NDArray[np.bool_]
-    kernel_types = "const f8[::1], const f8[::1], const f8[:, ::1], const f8[:, ::1], f8[::1], f8[::1], const b1[::1]"
 
 
 def _side(view: DiscView, of: _Lines, s: int) -> _Side:

@@ -4,10 +4,6 @@ The pose is extrapolated with the velocity of the last two; each disc is searche
 errors of the last predictions, and everything from pixels to covariance is one compiled call
 (:mod:`~armsight.vision.follow.kernel`). A shot that does not fit, and any first shot, is measured by
 :func:`~armsight.vision.measure.measure`, which searches the whole image and uses no prediction.
-
-:func:`warm_up` runs everything that a shot may need once before a live loop, so that nothing is compiled within it. A
-body that is nowhere in the images would leave most of the code unused, so the discs are set where a body before the
-cameras would show them.
 """
 
 from __future__ import annotations
@@ -23,8 +19,6 @@ from armsight.data import (
     SIDES,
     Array,
     Correspondences,
-    Detections,
-    Discs,
     Dropped,
     Missed,
     Points,
@@ -33,10 +27,7 @@ from armsight.data import (
     Shot,
 )
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.discs.bias import LEAST_FACING, bias_normals, expect
-from armsight.vision.discs.locate import locate_composite, locate_discs
-from armsight.vision.discs.pairing import DEPTHS_M
-from armsight.vision.discs.predict import view
+from armsight.vision.discs.bias import bias_normals
 from armsight.vision.follow.kernel import (
     FACING_AWAY,
     NOT_THERE,
@@ -52,44 +43,11 @@ from armsight.vision.image import grey
 from armsight.vision.locate import misfit_limit
 from armsight.vision.markers.disc import search
 from armsight.vision.markers.disc.fit import REASONS, workspace
-from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from armsight.vision.posefit import moved
 from armsight.vision.rig import StereoRig
-
-#: Distance of the body from the cameras in its own sizes, and sigma of its discs, px, for the warm-up.
-_AWAY, _SIGMA_PX = 5.0, 0.05
-
-
-def warm_up(rig: StereoRig, target: Target, discs: DiscTarget) -> None:
-    """Run every function that a shot may need: search black images, and identify and locate given discs.
-
-    Args:
-        rig: the calibrated pair.
-        target: the body.
-        discs: its discs.
-    """
-    black = [np.zeros(camera.image_size_px[::-1], np.uint8) for camera in rig.cameras]
-    measure(rig, target, Shot("", black[0], black[1]))
-    points = discs.body.points
-    away = np.clip(_AWAY * float(np.linalg.norm(np.ptp(points, axis=0))), *DEPTHS_M)
-    T = view(rig, points, discs.normals, float(away)).T_left_body
-    expected = expect(rig, discs, T)
-    rows = np.flatnonzero(np.isfinite(expected.uv).all(axis=(1, 2)) & ~(expected.facing < LEAST_FACING).any(axis=1))
-    cov = np.tile(_SIGMA_PX**2 * np.eye(2), (len(rows), 2, 1, 1))
-    left, right = (
-        Discs(expected.uv[rows][:, s].copy(), cov[:, s].copy(), expected.shape[rows][:, s].copy(), discs.bright[rows])
-        for s in (0, 1)
-    )
-    coded = Detections.none("")
-    locate_composite(rig, target.body, discs, (coded, coded), (left, right))
-    # A body whose discs are ambiguous at that pose may not be so elsewhere: it is located with the true names too.
-    seen = Correspondences(rows, expected.uv[rows], cov)
-    nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
-    locate_discs(rig, target.body, discs, nothing, seen, T, _SIGMA_PX**2 * np.eye(6))
-
 
 #: A prediction expires after so many shots, or so many times the time between the last two poses; poses less than so
 #: many seconds apart give no velocity.
@@ -198,14 +156,6 @@ class Follower:
         self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
         self._work, self._outline = workspace(), search.workspace()
-        # Everything that a shot runs, on arrays of the same types: nothing is compiled within a live loop.
-        warm_up(rig, target, discs)
-        black = [grey(np.zeros(camera.image_size_px[::-1], np.uint8)) for camera in rig.cameras]
-        track = BodyTrack(np.eye(4), np.zeros(6), 0.0, 0, 1.0, math.inf, False)
-        track.predicted(1.0)
-        velocity(track.T_left_body, track.T_left_body, 1.0, np.zeros(6))
-        self._noise = search.noise_of(black[0])
-        self._pair(black[0], black[1], track.T_left_body, track.twist.copy(), 1.0, track.margin_px)
 
     def measure(self, shot: Shot, expected: Array | None = None) -> PoseEstimate | Missed:
         """Measure one shot; shots must come in the order of their time.

@@ -26,7 +26,7 @@ from armsight.geometry.matrix import (
     transposed_applied,
     transposed_product,
 )
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
 from armsight.vision.markers.disc.fit import FitBuffers, factor, fit, shape_of, solve
@@ -42,6 +42,10 @@ _REACHED = 1e-5
 _OFF_SIGMAS = 6.0
 
 
+@kernel_types(
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1], "
+    "b1[::1], f8[::1], i8[::1]"
+)
 class DiscScene(NamedTuple):
     """The quantities that are constant from pair to pair.
 
@@ -74,12 +78,13 @@ class DiscScene(NamedTuple):
     faces: NDArray[np.bool_]
     radii: Array
     signs: NDArray[np.int64]
-    kernel_types = (
-        "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1], "
-        "b1[::1], f8[::1], i8[::1]"
-    )
 
 
+@kernel_types(
+    "i8[:, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
+    "f8[:, ::1], f8[:, :, ::1], f8[::1]"
+)
 class DiscMeasurement(NamedTuple):
     """The measurement of one pair; M discs, two cameras.
 
@@ -122,11 +127,6 @@ class DiscMeasurement(NamedTuple):
     J_rig: Array
     bias: Array
     squares: Array
-    kernel_types = (
-        "i8[:, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
-        "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-        "f8[:, ::1], f8[:, :, ::1], f8[::1]"
-    )
 
 
 @kernel

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.kernels import kernel
+from armsight.kernels import kernel, kernel_types
 from armsight.vision.markers.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
@@ -52,6 +52,10 @@ _ZERO, _HALF, _ONE, _FIVE = F(0.0), F(0.5), F(1.0), F(5.0)
 Floats = NDArray[np.float32]
 
 
+@kernel_types(
+    "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
+    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+)
 class FitBuffers(NamedTuple):
     """The buffers of a fit; one set for each thread.
 
@@ -96,10 +100,6 @@ class FitBuffers(NamedTuple):
     start: Array
     products: Array
     sums: Array
-    kernel_types = (
-        "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-        "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]"
-    )
 
 
 def _aligned(rows: int, columns: int) -> Floats:
