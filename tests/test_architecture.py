@@ -10,13 +10,14 @@ SRC = Path(__file__).resolve().parent.parent / "src" / "armsight"
 
 #: Layer -> the layers it may import besides itself. Everything may import the ground beneath.
 MAY_IMPORT = {
-    "geometry": set(),
+    "geometry": {"kernels"},
+    "kernels": set(),
     "firmware": set(),
-    "vision": {"geometry"},
-    "robot": {"geometry", "firmware"},
-    "sim": {"geometry", "vision", "robot"},
-    "loop": {"geometry", "vision", "robot"},
-    "app": {"geometry", "firmware", "vision", "robot", "sim", "loop"},
+    "vision": {"geometry", "kernels"},
+    "robot": {"geometry", "kernels", "firmware"},
+    "sim": {"geometry", "kernels", "vision", "robot"},
+    "loop": {"geometry", "kernels", "vision", "robot"},
+    "app": {"geometry", "kernels", "firmware", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
 GROUND = {"data": {"errors"}, "errors": set(), "files": {"errors"}}

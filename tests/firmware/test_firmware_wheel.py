@@ -55,7 +55,7 @@ def test_the_wheel_carries_what_runs_a_board(wheel):
 
 def test_the_wheel_is_for_this_platform_and_any_python_3(wheel):
     python, binary, platform = wheel.stem.split("-")[-3:]
-    assert (python, binary) == ("py3", "none")
+    assert (python, binary) == ("cp311", "abi3")
     assert platform != "any"
 
 

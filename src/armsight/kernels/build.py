@@ -1,8 +1,8 @@
-"""Compile the package's kernels into one extension module: numba turns Python into LLVM's code, here and never at run time.
+"""Compile the package's kernels into one extension module: numba writes LLVM's code for them, here and never at run time.
 
 In: the modules of ``armsight`` that import :mod:`armsight.kernels`, a target. Out: ``armsight/kernels/_compiled`` for
 that target. Three stages: each module's kernels become LLVM's intermediate code (the same for all targets), that is
-optimised and turned into an object file for a processor, and zig links the objects with ``call.c``. The first two are kept
+optimised and compiled to an object file for a processor, and zig links the objects with ``call.c``. The first two are kept
 in ``build/kernels`` under a digest of everything that went into them, as make would keep objects.
 
 ``python -m armsight.kernels.build [TARGET]`` builds for this machine or for one of :data:`TARGETS`.
@@ -36,7 +36,7 @@ CACHE = PACKAGE.parents[1] / "build" / "kernels"
 
 
 @dataclass(frozen=True)
-class Target:
+class Platform:
     """A kind of machine.
 
     Attributes:
@@ -54,14 +54,14 @@ class Target:
 
 #: x86-64-v3 has AVX2 and FMA (2013 and later); older processors get the second.
 TARGETS = {
-    "linux-x86_64": Target(
+    "linux-x86_64": Platform(
         "x86_64-unknown-linux-gnu", "x86_64-linux-gnu.2.17", ("x86-64-v3", "x86-64"), "_compiled.abi3.so"
     ),
-    "linux-aarch64": Target(
+    "linux-aarch64": Platform(
         "aarch64-unknown-linux-gnu", "aarch64-linux-gnu.2.17", ("cortex-a72",), "_compiled.abi3.so"
     ),
-    "macos-arm64": Target("arm64-apple-macosx11.0.0", "aarch64-macos.11.0", ("apple-m1",), "_compiled.abi3.so"),
-    "windows-x86_64": Target("x86_64-pc-windows-gnu", "x86_64-windows-gnu", ("x86-64-v3", "x86-64"), "_compiled.pyd"),
+    "macos-arm64": Platform("arm64-apple-macosx11.0.0", "aarch64-macos.11.0", ("apple-m1",), "_compiled.abi3.so"),
+    "windows-x86_64": Platform("x86_64-pc-windows-gnu", "x86_64-windows-gnu", ("x86-64-v3", "x86-64"), "_compiled.pyd"),
 }
 _LETTERS = {name: letter for letter, name in kernels.LETTERS.items()}
 _KINDS = {"f": "float", "i": "int", "u": "uint"}
@@ -135,7 +135,7 @@ def _key(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Called:
     """A kernel that Python calls."""
 
     dispatcher: Any
@@ -208,7 +208,7 @@ def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  
     builder = ir.IRBuilder(entry.append_basic_block())
     at = [0]
 
-    def place(start: Any, words: int) -> Any:  # noqa: ANN401
+    def address(start: Any, words: int) -> Any:  # noqa: ANN401
         here = builder.gep(start, [ir.Constant(word, at[0])])
         at[0] += words
         return here
@@ -219,7 +219,7 @@ def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  
             return context.make_tuple(builder, kind, [take(each) for each in kind])
         words = 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
         return model.load_from_data_pointer(
-            builder, builder.bitcast(place(entry.args[0], words), model.get_data_type().as_pointer())
+            builder, builder.bitcast(address(entry.args[0], words), model.get_data_type().as_pointer())
         )
 
     def give(kind: Any, value: Any) -> None:  # noqa: ANN401
@@ -230,7 +230,7 @@ def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  
             model = context.data_model_manager[kind]
             words = 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
             data = model.as_data(builder, value)
-            builder.store(data, builder.bitcast(place(entry.args[1], words), data.type.as_pointer()))
+            builder.store(data, builder.bitcast(address(entry.args[1], words), data.type.as_pointer()))
 
     arguments = [take(kind) for kind in described.argtypes]
     status, value = context.call_conv.call_function(builder, kernel, described.restype, described.argtypes, arguments)
@@ -300,22 +300,22 @@ def _linked(library: Any) -> bytes:  # noqa: ANN401
     return bytes(module.as_bitcode())
 
 
-def _gather() -> dict[str, list[_Wanted]]:
+def _gather() -> dict[str, list[_Called]]:
     """Set the decorator to collect kernels; the dictionary fills as modules are imported."""
     import numba
 
-    wanted: dict[str, list[_Wanted]] = {}
+    called: dict[str, list[_Called]] = {}
 
     def collect(function: Any, signatures: tuple[str, ...], options: dict[str, Any]) -> Any:  # noqa: ANN401
         options = {"error_model": "numpy", **options}
         nogil = options.pop("nogil", False)
         dispatcher = numba.njit(**options, no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
         if signatures:
-            wanted.setdefault(function.__module__, []).append(_Wanted(dispatcher, function, signatures, nogil))
+            called.setdefault(function.__module__, []).append(_Called(dispatcher, function, signatures, nogil))
         return dispatcher
 
     kernels.builder = collect
-    return wanted
+    return called
 
 
 #: What modules with kernels import for their other functions.
@@ -347,7 +347,7 @@ def _intermediate(path: Path) -> Path:
         return out
     if not _worker:
         _worker.extend((_gather(), _prepare_numba()))
-    wanted, context = _worker
+    called, context = _worker
     from numba.core.compiler_lock import global_compiler_lock
 
     absent = _Absent()
@@ -358,7 +358,7 @@ def _intermediate(path: Path) -> Path:
         sys.meta_path.remove(absent)
     library, lines = context.codegen().create_library(name), []
     with global_compiler_lock:
-        for each in wanted.get(name, ()):
+        for each in called.get(name, ()):
             for n, text in enumerate(each.signatures):
                 types = _types(text, each.function)
                 if len(types) != each.function.__code__.co_argcount:
@@ -396,7 +396,7 @@ def _suffix(level: str) -> str:
     return level.replace("-", "_")
 
 
-def _object(bitcode: Path, target: Target, level: str) -> Path:
+def _object(bitcode: Path, target: Platform, level: str) -> Path:
     """Optimise one module's code for a processor and write it as an object file; return its path."""
     import llvmlite.binding as ll
 
@@ -437,7 +437,7 @@ def _object(bitcode: Path, target: Target, level: str) -> Path:
     return out
 
 
-def _table(modules: list[Path], bitcodes: list[Path], target: Target) -> str:
+def _table(modules: list[Path], bitcodes: list[Path], target: Platform) -> str:
     """Return the C source with the signatures of all kernels, for each processor's level."""
     rows: list[tuple[str, ...]] = []
     for path, bitcode in zip(modules, bitcodes, strict=True):

@@ -45,7 +45,7 @@ LETTERS = {
     "d": "f8",
     "f": "f4",
 }
-#: What build.py sets to turn kernels into functions that it compiles: (function, signatures, options) -> its own.
+#: What build.py sets, to collect the functions that it compiles: (function, signatures, options) -> its own.
 builder: Callable[[Callable[..., Any], tuple[str, ...], dict[str, Any]], Any] | None = None
 _AGAIN = "build them: python -m pip install -e . in the checkout, or python -m armsight.kernels.build"
 
@@ -90,16 +90,16 @@ def _array(data: bytearray, letter: str, shape: tuple[int, ...]) -> Any:  # noqa
 
 
 def _inner(function: Callable[P, R]) -> Callable[P, R]:
-    """Return what stands for a kernel that only kernels call: a refusal, as Python is a thousand times slower."""
+    """Return what stands for a kernel that only kernels call: an error, as Python is a thousand times slower."""
 
     @functools.wraps(function)
-    def refuse(*args: P.args, **kwargs: P.kwargs) -> R:
+    def fail(*args: P.args, **kwargs: P.kwargs) -> R:
         raise TypeError(
             f"{function.__module__}.{function.__qualname__} has no signature: only kernels call it. Give its @kernel one "
             "to call it from Python"
         )
 
-    return refuse
+    return fail
 
 
 def kernel_types(fields: str) -> Callable[[type[T]], type[T]]:

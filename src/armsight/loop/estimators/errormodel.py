@@ -151,6 +151,12 @@ class ErrorModel:
         return own
 
 
+@kernel
+def _decayed(x: float) -> float:
+    """Return exp(-x), and nothing where it is below 1e-20: numbers near the least that there is are slow (denormals)."""
+    return math.exp(-x) if x < 46.0 else 0.0
+
+
 @kernel(
     "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[:, ::1], "
     "f8[:, ::1]",
@@ -178,16 +184,16 @@ def _forget(
         for i in range(6):
             way, k = max(travel[n, i], 0.0), REST + i
             whole += way
-            kept[n, k] = math.exp(-way / rest_travel)
+            kept[n, k] = _decayed(way / rest_travel)
             # A whole change of side moves it from -1 to 1.
             flipped = flip**2 * max(flips[n, 0, i], 0.0) + flip_float**2 * max(flips[n, 1, i], 0.0)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + crept + 0.5 * learning**2 * flipped
             # Of two means of the same readings the one of more has the share of the other's noise that it has of readings.
             share, k = min(variance[n, i] / was[n, i], 1.0), READING + i
-            kept[n, k] = share * math.exp(-abs(time[n]) / lasts[n, i])
+            kept[n, k] = share * _decayed(abs(time[n]) / lasts[n, i])
             added[n, k] = reading**2 * max(variance[n, i] - kept[n, k] ** 2 * was[n, i], 0.0)
         for k in range(POSE, POSE + 6):
-            kept[n, k] = math.exp(-whole / pose_travel)
+            kept[n, k] = _decayed(whole / pose_travel)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
 
 

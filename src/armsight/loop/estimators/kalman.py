@@ -51,6 +51,9 @@ WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
 #: The diagonal of a covariance, and the rows of what is forgotten: the rest, the readings' noise and the pose.
 #: They stand side by side.
 DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
+#: Covariances below this (of m, rad: 1e-20 of each) are set to zero: forgotten ones would decay to numbers so small that a
+#: processor takes a hundred times as long for each (denormals).
+_NOTHING = 1e-40
 _GATE = float(chdtri(6, CHANCE))
 
 
@@ -224,6 +227,7 @@ class KalmanEstimator:
         P[FORGETS] *= step.kept[0, FORGETS, None]
         P[:, FORGETS] *= step.kept[0, FORGETS]
         P[DIAGONAL] += step.added[0]
+        P[np.abs(P) < _NOTHING] = 0.0
         z, H, R = first = self._innovation(x, joints, pose_measurement)
         PHt = P @ H.T
         outcome = self._gate(z, H @ PHt + R + pose_measurement.cov_common)
