@@ -73,8 +73,9 @@ class Arrow(Record):
         H = self.H_shared + np.diag(damping * np.diag(self.H_shared))
         Hs = self.H_shots + damping * self.H_shots * np.eye(self.H_shots.shape[1])
         gain = np.linalg.solve(Hs, self.H_cross)
-        S = H - np.tensordot(self.H_cross, gain, axes=((0, 1), (0, 1)))
-        g = self.g_shared - np.tensordot(gain, self.g_shots, axes=((0, 1), (0, 1)))
+        flat = gain.reshape(-1, len(H))
+        S = H - self.H_cross.reshape(-1, len(H)).T @ flat
+        g = self.g_shared - self.g_shots.reshape(-1) @ flat
         shared = solve_scaled(S, g)
         shots = np.linalg.solve(Hs, (self.g_shots - self.H_cross @ shared)[..., None])[..., 0]
         return shared, np.asarray(shots, np.float64)
@@ -82,7 +83,8 @@ class Arrow(Record):
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the shots' own marginalised."""
         gain = np.linalg.solve(self.H_shots, self.H_cross)
-        return np.asarray(self.H_shared - np.tensordot(self.H_cross, gain, axes=((0, 1), (0, 1))))
+        count = len(self.H_shared)
+        return np.asarray(self.H_shared - self.H_cross.reshape(-1, count).T @ gain.reshape(-1, count))
 
     def cov_shots(self, cov_shared: Array) -> Array:
         """(S, K, K) covariance of the shots' own parameters, given that of the shared ones (Q, Q)."""
