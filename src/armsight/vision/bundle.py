@@ -24,6 +24,11 @@ from armsight.kernels import kernel
 from armsight.vision.projection import BundleModel, BundleState, Observations, moved, predict
 
 
+def _flat(blocks: Array) -> Array:
+    """Return blocks (S, K, Q) one below the other, (S K, Q)."""
+    return blocks.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
+
+
 @dataclass(frozen=True, eq=False)
 class Arrow(Record):
     """Normal equations of Q shared parameters and K own ones of each of S shots.
@@ -73,8 +78,8 @@ class Arrow(Record):
         H = self.H_shared + np.diag(damping * np.diag(self.H_shared))
         Hs = self.H_shots + damping * self.H_shots * np.eye(self.H_shots.shape[1])
         gain = np.linalg.solve(Hs, self.H_cross)
-        flat = gain.reshape(-1, len(H))
-        S = H - self.H_cross.reshape(-1, len(H)).T @ flat
+        flat = _flat(gain)
+        S = H - _flat(self.H_cross).T @ flat
         g = self.g_shared - self.g_shots.reshape(-1) @ flat
         shared = solve_scaled(S, g)
         shots = np.linalg.solve(Hs, (self.g_shots - self.H_cross @ shared)[..., None])[..., 0]
@@ -83,8 +88,7 @@ class Arrow(Record):
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the shots' own marginalised."""
         gain = np.linalg.solve(self.H_shots, self.H_cross)
-        count = len(self.H_shared)
-        return np.asarray(self.H_shared - self.H_cross.reshape(-1, count).T @ gain.reshape(-1, count))
+        return np.asarray(self.H_shared - _flat(self.H_cross).T @ _flat(gain))
 
     def cov_shots(self, cov_shared: Array) -> Array:
         """(S, K, K) covariance of the shots' own parameters, given that of the shared ones (Q, Q)."""
