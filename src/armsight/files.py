@@ -8,6 +8,7 @@ import io
 import math
 import os
 import secrets
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -89,6 +90,11 @@ def _target(path: str | Path) -> Path:
     return target
 
 
+def _beside(target: Path) -> Path:
+    """Return the name of a temporary file beside another."""
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+
+
 @contextlib.contextmanager
 def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a file for writing that replaces ``path`` only when the block ends well.
@@ -105,7 +111,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """
     target = _target(path)
     # The name is chosen first: whatever happens from here on, there is only one file to take away.
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    temporary = _beside(target)
     raw: _NamedFile | None = None
     try:
         raw = _NamedFile(temporary)
@@ -135,7 +141,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] = ()) -> None:
-    """Find out before long work whether a file can be written at ``path``.
+    """Find out before long work whether a file can be written at ``path``; nothing is left there.
 
     Args:
         path: the file to be.
@@ -144,12 +150,111 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
     Raises:
         InputError: its folder is missing or not writable, ``path`` is no ordinary file, or one of ``apart_from``.
     """
+    _check_name(path)
     for other in apart_from:
-        if other is not None and os.path.realpath(other) == os.path.realpath(path):
+        if other is not None and _same_file(other, path):
             raise InputError(f"{path}: is given twice, or is read as well as written; give the result another name")
-    folder = _target(path).parent
+    target = _target(path)
+    folder = target.parent
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: cannot be written: no permission to write in {folder}")
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            os.lstat(_beside(target))  # a name that is too long
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_suffix(path: str | Path, suffix: str, what: str) -> None:
+    """Check that a file to be is named as what it will hold.
+
+    Args:
+        path: the file to be.
+        suffix: that it must have, in small or capital letters.
+        what: is written, as the message names it: "a figure of the arm".
+
+    Raises:
+        InputError: another suffix, or none.
+    """
+    if Path(path).suffix.lower() != suffix:
+        raise InputError(f"{path}: {what} is written as {suffix}; give it a name that ends so")
+
+
+def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None] = ()) -> None:
+    """Find out before long work whether all files of a command can be written, each apart from the others and the inputs.
+
+    Args:
+        outputs: the files to be; None is no file.
+        inputs: the files that are read; None is no file.
+
+    Raises:
+        InputError: as :func:`check_writable`, for the first that cannot be written.
+    """
+    taken = list(inputs)
+    for path in outputs:
+        if path is not None:
+            check_writable(path, apart_from=taken)
+            taken.append(path)
+
+
+def check_folder(
+    path: str | Path,
+    *,
+    holding: Iterable[str] = (),
+    apart_from: Iterable[str | Path | None] = (),
+    problem: str = "nothing can be written here",
+    advice: str = "",
+) -> Path:
+    """Find out before long work whether files can be written to a folder; one that is missing is not made.
+
+    Args:
+        path: the folder to be.
+        holding: names of files that will be written to it.
+        apart_from: files that must not be written over.
+        problem: what does not work, as the message has it: "no report can be written here".
+        advice: what to do, at the end of the message.
+
+    Returns:
+        The folder, ``~`` expanded.
+
+    Raises:
+        InputError: it cannot be made or written to, or one of its files is one of ``apart_from``.
+    """
+    _check_name(path)
+    folder = Path(path).expanduser()
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            folder.stat()
+        there = next(p for p in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(p))
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
+    others = [other for other in apart_from if other is not None]
+    for name in holding:
+        if any(_same_file(other, folder / name) for other in others):
+            raise InputError(f"{folder / name}: is read, and would be written over; choose another folder")
+    return folder
+
+
+def _check_name(path: str | Path) -> None:
+    """Reject what is no name of a file: - stands for the standard output elsewhere."""
+    if str(path) in ("-", ""):
+        raise InputError(
+            f"-o {str(path) or repr('')}: give the name of a file or folder; --json prints to standard output"
+        )
+
+
+def _same_file(one: str | Path, other: str | Path) -> bool:
+    """Say whether two paths are one file, also by hard links or a file system that ignores case."""
+    if os.path.realpath(one) == os.path.realpath(other):
+        return True
+    try:
+        return os.path.samefile(one, other)
+    except (OSError, ValueError):
+        return False
 
 
 def finite_json(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds

@@ -203,8 +203,8 @@ def test_a_folder_in_use_is_not_touched(tmp_path):
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(InputError, match=f"{folder}: no recording can be made here: Not a directory"):
             record(Played(some(1)), folder)
-    result = record(Played(some(1)), "/proc/none")  # where nothing can be made, found out with the first shot
-    assert result.stopped == "/proc/none: no recording can be made here: No such file or directory"
+    with pytest.raises(InputError, match="/proc/none: no recording can be made here: No such file or directory"):
+        record(Played(some(1)), "/proc/none")  # found out before the first shot
 
 
 def test_without_a_single_shot_there_is_no_recording(tmp_path):

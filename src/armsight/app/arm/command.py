@@ -14,7 +14,7 @@ from armsight.app.arm import description
 from armsight.app.arm.figure import write_arm_figure
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import check_writable
+from armsight.files import check_suffix, check_writable
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.arm import Arm
@@ -58,9 +58,11 @@ def list_(as_json: bool) -> None:
 @_JSON
 def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
+    if output is not None:
+        check_suffix(output, ".png", "a figure of the arm")
+        check_writable(output, apart_from=(arm_name,))
     arm = open_arm(arm_name, tool_link=tool_link)
     if output is not None:
-        check_writable(output, apart_from=(arm_name,))
         write_arm_figure(arm, output)
     click.echo(json.dumps(description.show_json(arm)) if as_json else description.show_text(arm))
 
@@ -113,6 +115,7 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 @click.option("-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="To write.")
 def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     """Write an arm as a URDF file."""
+    check_suffix(output, ".urdf", "an arm")
     check_writable(output, apart_from=(arm_name,))
     write_urdf(open_arm(arm_name, tool_link=tool_link), output)
     click.echo(str(output))

@@ -12,14 +12,14 @@ from typing import Any
 import click
 import cv2
 
-from armsight.app.calibrate.report import write_report
+from armsight.app.calibrate.report import REPORT_FILES, write_report
 from armsight.app.progress import bar, steps
-from armsight.app.report.page import PAGE, writable_folder
+from armsight.app.report.page import PAGE
 from armsight.app.report.plotting import require_matplotlib
 from armsight.app.report.table import TextTable, print_table
 from armsight.data import SIDES, Detections
 from armsight.errors import InputError
-from armsight.files import check_writable
+from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate.boards import FOLDS, MODELS, Pair, calibrate_boards
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration
@@ -82,17 +82,22 @@ def command(
         raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
-    check_writable(output, apart_from=(refine_body, *points))
-    if refine_body is not None:
-        check_writable(refine_body, apart_from=points)
+    source = None if left is None or right is None else PairsSource.open(left, right)
+    inputs = points if source is None else source.files
+    check_outputs((output, refine_body), inputs)
     if report is not None:
         require_matplotlib()
-        writable_folder(report, "no report")
+        check_folder(
+            report,
+            holding=REPORT_FILES,
+            apart_from=(output, refine_body, *inputs),
+            problem="no report can be written here",
+        )
     started = time.perf_counter()
-    if left is not None and right is not None and target is not None:
+    if source is not None and target is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        calibration = _from_images(left, right, open_board(target), models, flat_target, folds)
-        given = {"left": left, "right": right, "target": target}
+        calibration = _from_images(source, open_board(target), models, flat_target, folds)
+        given = {"left": str(left), "right": str(right), "target": target}
     elif detections is not None and cameras is not None and body is not None:
         known, pair = load_body_csv(body), read_cameras(cameras)
         with steps() as progress:
@@ -114,10 +119,9 @@ def command(
 
 
 def _from_images(
-    left: str, right: str, target: CalibrationBoard, models: tuple[str, ...], flat: bool, folds: int
+    source: PairsSource, target: CalibrationBoard, models: tuple[str, ...], flat: bool, folds: int
 ) -> Calibration:
     """Detect the target in every pair of images and calibrate."""
-    source = PairsSource.open(left, right)
     pairs: list[Pair] = []
     sizes: Sizes | None = None
     with bar("detecting the target", len(source.pairs)) as advance:

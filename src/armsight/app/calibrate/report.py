@@ -319,6 +319,10 @@ FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
 }
 
 
+#: Names of all files that a report may have.
+REPORT_FILES = (PAGE, *(f"report-{name}.png" for name in FIGURES))
+
+
 def write_report(calibration: Calibration, directory: str | Path) -> Path:
     """Write the report of a calibration.
 

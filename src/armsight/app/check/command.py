@@ -10,13 +10,13 @@ import numpy as np
 
 from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.plan import CYCLES, PlannedTest, plan_csv, plan_test
-from armsight.app.check.report import text, write_check
+from armsight.app.check.report import REPORT_FILES, text, write_check
 from armsight.app.check.result import check_json
 from armsight.app.check.run_folder import is_run
 from armsight.app.report.page import PAGE, writable_folder
 from armsight.app.report.plotting import require_matplotlib
 from armsight.errors import InputError
-from armsight.files import check_writable, write_text
+from armsight.files import check_folder, check_writable, write_text
 from armsight.robot.arm_file import open_arm
 
 _KINDS = (".toml", ".csv")
@@ -58,6 +58,11 @@ def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> N
     Metrics are without the instrument's own noise; one below that noise is called not resolvable. The motions of a test:
     armsight check plan --help.
     """
+    if output is not None:
+        require_matplotlib()
+        check_folder(
+            output, holding=REPORT_FILES, apart_from=(data, data / "check.csv"), problem="no report can be written here"
+        )
     if output is not None and output.is_dir():
         if is_run(output):
             raise InputError(f"{output}: holds a run, whose report would be written over; choose another folder")
@@ -65,11 +70,9 @@ def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> N
             raise InputError(
                 f"{output}: holds another command's {PAGE}, which would be written over; choose another folder"
             )
-        check_writable(output / "check.csv", apart_from=(data, data / "check.csv"))
     attained = read_check(data, closed=closed)
     result = evaluate(attained)
     if output is not None:
-        require_matplotlib()
         write_check(result, attained.rows, data, writable_folder(output, "no report"))
     for note in result.notes:
         click.echo(f"note: {note}", err=True)
@@ -125,7 +128,7 @@ def plan(
     Poses and paths lie in the cube's diagonal plane, as ISO 9283 has it. Look at them in your workcell before you run them.
     """
     if output is not None:
-        check_writable(output)
+        check_writable(output, apart_from=(arm_name, visible_in))
         if output.suffix not in _KINDS or (output.suffix == ".csv" and name in ("line", "circle")):
             raise InputError(f"{output}: a plan is written as .toml, motions to run, or, of poses, as .csv")
     middle = None if centre is None else np.array(centre) / 1e3

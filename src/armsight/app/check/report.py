@@ -312,6 +312,10 @@ FIGURES: dict[str, tuple[str, Callable[[CheckResult, Sequence[Row]], Figure | No
 }
 
 
+#: Names of all files that a report may have.
+REPORT_FILES = (PAGE, "check.json", "check.csv", *(f"check-{name}.png" for name in FIGURES))
+
+
 def write_check(result: CheckResult, rows: Sequence[Row], source: Path, folder: Path) -> Path:
     """Write the report of a test.
 

@@ -75,10 +75,10 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
     """
     began = time.perf_counter()
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
+    open_folder(demo.folder)
     progress("building the workcell")
     with _workcell(demo, demo.cameras) as workcell:
         plan = read_motions(workcell.model, _MOTIONS[demo.quick])
-        open_folder(demo.folder)
         make_room(demo.folder)
         progress("rendering the calibration target")
         calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress)

@@ -9,11 +9,20 @@ from pathlib import Path
 import click
 
 from armsight.app.dense.evaluate import SceneResult, evaluate_scene, evaluation_json, table_text, write_evaluation
-from armsight.app.dense.files import check_folder, make_folder
-from armsight.app.dense.run import PairResult, problem_line, read_pair, result_line, run_shot, search_of
+from armsight.app.dense.files import RESULT_FILES
+from armsight.app.dense.run import (
+    PairResult,
+    check_near,
+    problem_line,
+    read_pair,
+    result_line,
+    run_shot,
+    search_of,
+)
 from armsight.app.progress import bar
 from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
+from armsight.files import check_folder
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.middlebury import find_scenes, load_scene
 from armsight.vision.rectify import Rectification
@@ -81,7 +90,9 @@ def match(
     frame).
     """
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
-    check_folder(output)
+    check_folder(output, holding=RESULT_FILES, apart_from=paths, advice="; give a folder")
+    if form is not None and near is not None:
+        check_near(form, near)
     method = open_method(name)
 
     def run(shot: Shot, where: Path) -> PairResult:
@@ -146,11 +157,11 @@ def evaluate(folder: Path, names: tuple[str, ...], output: Path | None, as_json:
     the errors that 50, 90, 95 and 99% stay below, over all pixels and over those both cameras see. Gaps are filled.
     With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
+    if output is not None:
+        check_folder(output, advice="; give a folder")
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)
     for path in scenes:
         load_scene(path)  # all can be read, before anything is written
-    if output is not None:
-        make_folder(output)
     lines: list[SceneResult] = []
     with bar("evaluating", len(scenes) * len(chosen)) as advance:
         for path in scenes:

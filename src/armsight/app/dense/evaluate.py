@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.dense.files import paint_disparity, paint_errors, write_png
+from armsight.app.dense.files import make_folder, paint_disparity, paint_errors, write_png
 from armsight.files import finite_json, write_text
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.methods import open_method
@@ -77,6 +77,7 @@ def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Scene
     result = method.match(left, right, scene.search)
     seconds = time.perf_counter() - begun
     if out is not None:
+        make_folder(out)
         write_png(out / f"{scene.name}_{name}_errors.png", paint_errors(result.disparity, truth))
         write_png(out / f"{scene.name}_{name}.png", paint_disparity(result))
     sure = result.measured & truth.seen & truth.known

@@ -120,6 +120,20 @@ def paint_errors(disparity: NDArray[np.float32], truth: TrueDisparity) -> Image:
 
 #: Steps of a pixel in the 16-bit disparity image: 1023 px at most.
 PNG_STEPS = 64
+#: Files of a pair's result; the first two and the depth's only with a rig.
+RESULT_FILES = (
+    "left.png",
+    "right.png",
+    "disparity.pfm",
+    "disparity.png",
+    "valid.png",
+    "state.png",
+    "sigma.pfm",
+    "picture.png",
+    "depth_mm.pfm",
+    "depth_sigma_mm.pfm",
+    "cloud.ply",
+)
 #: Fields of a point of a cloud.
 _FIELDS = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
 #: Rows of the image whose points are written at a time.
@@ -174,17 +188,6 @@ def make_folder(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from None
     return path
-
-
-def check_folder(path: Path) -> None:
-    """Check that a path can become a folder, without making it: a pair without a result must leave nothing behind.
-
-    Raises:
-        InputError: something that is no folder stands there, or in the way.
-    """
-    there = next(p for p in (path, *path.absolute().parents) if p.exists())
-    if not there.is_dir():
-        raise InputError(f"{path}: cannot be made a folder: {there} is a file")
 
 
 def write_png(path: Path, image: Image) -> None:

@@ -25,6 +25,8 @@ from armsight.vision.rectify import Rectification
 
 #: Without a nearest depth or a greatest disparity: the nearest depth, in baselines.
 _NEAREST_BASELINES = 3.0
+#: A nearest depth at which the disparity is below this, px, is no nearest depth: millimetres were taken for metres.
+_LEAST_DISPARITY = 2.0
 
 
 def read_pair(left: Path, right: Path) -> Shot:
@@ -79,6 +81,24 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
             f"--near {near:g}: the disparity there is {count} px, outside an image {width} px wide; give more"
         )
     return Search(0, max(2, min(count, width)))
+
+
+def check_near(form: Rectification, near: float) -> None:
+    """Check that a nearest depth leaves something to search.
+
+    Args:
+        form: how the images are rectified.
+        near: the nearest depth, m.
+
+    Raises:
+        InputError: the disparity at that depth is so small that all of a scene is nearer.
+    """
+    disparity = float(form.disparity_of(near))
+    if disparity < _LEAST_DISPARITY:
+        raise InputError(
+            f"--near {near:g}: metres; {near:g} m away the disparity is {disparity:.2g} px, so that everything nearer is "
+            f"left out: give the depth of the nearest surface in m (300 mm is --near 0.3)"
+        )
 
 
 def _in_view(result: Disparity, form: Rectification) -> Disparity:

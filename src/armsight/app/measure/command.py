@@ -28,6 +28,7 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
+from armsight.vision.sources.pairs import StoredSource
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,8 @@ def command(
                 PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
             )
             stack.enter_context(contextlib.closing(opened))
+            if output is not None and isinstance(opened, StoredSource):
+                check_writable(output, apart_from=opened.files)
             results = _measured(stereo, found, _shots(opened, stereo, rig))
             total = len(getattr(opened, "pairs", ())) or None
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)

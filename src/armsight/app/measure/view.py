@@ -19,7 +19,7 @@ from armsight.app.report.page import writable_folder
 from armsight.app.report.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.files import replacing
+from armsight.files import check_folder, replacing
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
@@ -33,7 +33,7 @@ def view_folder(directory: str | Path) -> Path:
     """Check that pictures can be written, before anything is measured.
 
     Args:
-        directory: the folder of the pictures; made with its parents where it does not exist.
+        directory: the folder of the pictures; made with its parents for the first of them.
 
     Returns:
         The folder.
@@ -47,7 +47,7 @@ def view_folder(directory: str | Path) -> Path:
         raise InputError(
             '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"'
         ) from None
-    return writable_folder(directory, "no pictures", "; give a folder")
+    return check_folder(directory, problem="no pictures can be written here", advice="; give a folder")
 
 
 class PictureFolder:
@@ -130,6 +130,8 @@ class PictureFolder:
 
     def _put(self, name: str, data: bytes) -> None:
         """Write a file, complete or not at all."""
+        if not self._written:
+            writable_folder(self.folder, "no pictures")
         with replacing(self.folder / name, "wb") as file:
             file.write(data)
         self._written.add(name)

@@ -21,7 +21,7 @@ import numpy as np
 from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import replacing
+from armsight.files import check_folder, replacing
 from armsight.vision.sources.folder import COLUMNS, INDEX
 from armsight.vision.sources.source import Source
 
@@ -68,7 +68,7 @@ def record(
     Raises:
         InputError: the folder is not empty, or holds a recording already.
     """
-    folder = _unused(Path(directory).expanduser())
+    folder = unused_folder(directory)
     writer = _Writer(folder)
     stopped, interrupted = None, False
     first: Shot | None = None
@@ -103,8 +103,13 @@ def _age_s(shot: Shot, first: Shot, started_s: float) -> float:
     return 0.0 if shot.t_s is None else shot.t_s - first.t_s
 
 
-def _unused(folder: Path) -> Path:
-    """Return a folder; raise an InputError if it is not new or empty."""
+def unused_folder(directory: str | Path) -> Path:
+    """Return a folder, not made yet, to which a recording can be written.
+
+    Raises:
+        InputError: it is not new or empty, or cannot be made or written to.
+    """
+    folder = Path(directory).expanduser()
     try:
         names = os.listdir(folder)
     except FileNotFoundError:
@@ -115,7 +120,7 @@ def _unused(folder: Path) -> Path:
         raise InputError(f"{folder}: already holds a recording; record into a new folder")
     if names:
         raise InputError(f"{folder}: is not empty; record into a new folder")
-    return folder
+    return check_folder(directory, problem="no recording can be made here")
 
 
 class _Writer:

@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from armsight.errors import InputError
+from armsight.files import check_outputs, check_writable
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
 from armsight.vision.rigfiles.rigfile import ASSUMED_SIGMA_PX
@@ -57,6 +58,7 @@ def import_(
 ) -> None:
     """Convert another program's calibration to a rig file. Its uncertainty is unknown, which the rig file records."""
     size = None if image_size is None else _image_size(image_size)
+    check_writable(output, apart_from=files)
     rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px)
     rig.save(output)
     for key in ("uncertainty", "sigma_px"):
@@ -75,6 +77,7 @@ def import_(
 def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
     """Write a rig for another program, and print what its format cannot hold."""
     paths = (*output, *more)
+    check_outputs(paths, (path,))
     lost = export_rig(StereoRig.load(path), name, paths)
     for what in lost:
         click.echo(f"note: not in the {name} format: {what}", err=True)

@@ -158,7 +158,7 @@ def command(
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
         )
-    motions = read_motions(arm, motion)
+    motions = _motions(arm, arm_spec, motion)
     ends: list[Array] = [motions.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in motions.motions)]
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
@@ -182,6 +182,20 @@ def command(
         click.echo(json.dumps(summary.to_json()))
     else:
         print_summary(summary, output)
+
+
+def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
+    """Plan the motions; where an arm cannot make the built-in ones, say which option gives others."""
+    try:
+        return read_motions(arm, path)
+    except InputError as error:
+        if path != DEFAULT_MOTION:
+            raise
+        reason = str(error).removeprefix(f"{path}: ")
+        raise InputError(
+            f"--arm {arm_spec}: the built-in motion is made for six_r ({reason}); give this arm's own with --motion FILE "
+            "(docs/howto/run.md), or plan one: armsight check plan"
+        ) from None
 
 
 @contextlib.contextmanager

@@ -38,7 +38,7 @@ from armsight.app.run.report import NAMES, RunReport, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
 from armsight.data import Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import write_text
+from armsight.files import check_folder, write_text
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.robot.arm import Arm
 from armsight.vision.image import grey
@@ -258,11 +258,12 @@ def _write_summary(folder: Path, summary: RunSummary) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Remove the files of an earlier run from a folder, so that they are not mixed with those of this run.
+    """Make a run's folder; remove the files of an earlier run from it, so that they are not mixed with those of this run.
 
     Raises:
-        InputError: a file cannot be removed.
+        InputError: the folder cannot be made or written to, or a file cannot be removed.
     """
+    writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*NAMES, "pose", "workcell", *_OLD_FIGURES)]
     names += [f"{name}.{kind}" for name in (*_TRACKS, *_OLD_TRACKS, "joints") for kind in ("csv", "parquet")]
     names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"]
@@ -346,11 +347,11 @@ def overlaid(rig: StereoRig, image: Image, estimate: PoseEstimate, axis_m: float
 
 
 def open_folder(folder: Path) -> None:
-    """Make a run's folder, before the long work begins.
+    """Check that a run can be written to a folder, before the long work begins; it is not made yet.
 
     Raises:
         InputError: it cannot be made or written to, or holds shots that are not of a run and would be overwritten.
     """
+    check_folder(folder, problem="no run can be written here")
     if (folder / _SHOTS).exists() and not (folder / "summary.json").exists():
         raise InputError(f"{folder}: holds shots that are not of an earlier run; choose another folder")
-    writable_folder(folder, "no run")

@@ -50,6 +50,11 @@ class StoredSource:
         self.pairs = tuple(pairs)
         self._rest = iter(self.pairs)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The image files of all pairs."""
+        return tuple(file for pair in self.pairs for file in (pair.left, pair.right) if file is not None)
+
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
         pair = next(self._rest, None)

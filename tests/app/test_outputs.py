@@ -1,0 +1,174 @@
+"""What every command that writes holds to: inputs stay, two outputs are two files, and what cannot be written ends at once.
+
+No input here can be read: a command that reads one before it looks at its output fails with another message.
+"""
+
+import os
+
+import click
+import pytest
+
+from armsight.app.main import COMMANDS, group
+from cli_runs import assert_rejected
+from strategies import ordinary_rig
+
+#: Command -> arguments without its output. ``board build`` compiles first what it is to write; ``run`` needs its rig first.
+FILE_WRITERS = {
+    "rig import": ("f.yml", "--format", "opencv"),
+    "rig export": ("rig.json", "--format", "kalibr"),
+    "calibrate": ("--left", "left*.png", "--right", "right*.png", "--target", "chessboard:9x6:25mm"),
+    "measure": ("rig.json", "--target", "chessboard:9x6:25mm", "--left", "left*.png", "--right", "right*.png"),
+    "body draw": ("body.toml",),
+    "arm show": ("arm.toml",),
+    "arm urdf": ("arm.toml",),
+    "check plan": ("--arm", "arm.toml"),
+    "identify plan": ("--arm", "six_r"),
+}
+FOLDER_WRITERS = {
+    "calibrate --report": (*FILE_WRITERS["calibrate"], "-o", "new.json"),
+    "measure --view": FILE_WRITERS["measure"],
+    "dense match": ("rig.json", "left1.png", "right1.png"),
+    "dense evaluate": (".",),
+    "check": ("poses.csv",),
+    "record": ("usb:97,98",),
+    "demo": ("--arm", "no such arm"),
+}
+SUFFIXES = {
+    "arm show": ".png",
+    "arm urdf": ".urdf",
+    "check plan": ".toml",
+    "identify plan": ".csv",
+    "body draw": ".pdf",
+}
+ELSEWHERE = {"identify", "run", "board build", "board flash"}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in a folder of files that all are nonsense but the rig."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("left1.png", "right1.png", "left2.png", "right2.png", "f.yml", "body.toml", "arm.toml", "poses.csv"):
+        (tmp_path / name).write_text("nonsense\n")
+    ordinary_rig().save(tmp_path / "rig.json")
+    return tmp_path
+
+
+def writers(command, name=""):
+    """Yield the names of all commands that have an option -o."""
+    if any("-o" in parameter.opts for parameter in command.params):
+        yield name
+    if isinstance(command, click.Group):
+        for each in command.list_commands(click.Context(command)):
+            yield from writers(command.get_command(click.Context(command), each), f"{name} {each}".strip())
+
+
+def test_every_command_that_writes_is_tried_here():
+    assert set(COMMANDS) <= set(group.list_commands(click.Context(group)))
+    known = {name.split(" --")[0] for name in (*FILE_WRITERS, *FOLDER_WRITERS)} | ELSEWHERE
+    assert {name.removesuffix(" evaluate") if name == "check evaluate" else name for name in writers(group)} == known
+
+
+def call(armsight, name, arguments, output):
+    words, option, _ = name.partition(" --")
+    return armsight(*words.split(), *arguments, f"--{_}" if option else "-o", output)
+
+
+@pytest.mark.parametrize("name", FILE_WRITERS)
+def test_a_file_that_cannot_be_written_is_reported_at_once(here, armsight, name):
+    before = sorted(os.listdir(here))
+    end = SUFFIXES.get(name, "")
+    for output, words in (
+        (f"none/out{end}", ["cannot be written", "there is no folder"]),
+        (f"/proc/out{end}", [f"/proc/out{end}", "cannot be written"]),
+        (f"{'x' * 250}{end}", ["cannot be written", "File name too long"]),
+        *([] if end else [(".", ["it is a folder"])]),
+        *([] if end else [("-", ["-o -: give the name of a file"])]),
+    ):
+        assert_rejected(call(armsight, name, FILE_WRITERS[name], output), *words)
+    assert sorted(os.listdir(here)) == before
+
+
+@pytest.mark.parametrize("name", FOLDER_WRITERS)
+def test_a_folder_that_cannot_be_written_is_reported_at_once(here, armsight, name):
+    before = sorted(os.listdir(here))
+    for output, words in (
+        ("rig.json", ["rig.json: no", "Not a directory"]),
+        ("rig.json/deeper", ["rig.json/deeper: no", "here"]),
+        ("/proc/out", ["/proc/out: no", " here: No such file"]),
+        ("x" * 256, ["File name too long"]),
+        ("-", ["-o -: give the name of a file or folder"]),
+    ):
+        assert_rejected(call(armsight, name, FOLDER_WRITERS[name], output), *words)
+    assert sorted(os.listdir(here)) == before
+
+
+@pytest.mark.parametrize("name", [name for name in FOLDER_WRITERS if name != "measure --view"])  # draws what was missed
+def test_a_command_that_fails_leaves_no_empty_folder(here, armsight, name):
+    before = sorted(os.listdir(here))
+    assert call(armsight, name, FOLDER_WRITERS[name], "new/folder").code == 2
+    assert sorted(os.listdir(here)) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file"),
+    [
+        (("rig", "export", "rig.json", "--format", "kalibr", "-o", "rig.json"), "rig.json"),
+        (("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "link.json"), "rig.json"),
+        (("rig", "import", "f.yml", "--format", "opencv", "-o", "f.yml"), "f.yml"),
+        (("calibrate", *FILE_WRITERS["calibrate"], "-o", "right2.png"), "right2.png"),
+        (("measure", *FILE_WRITERS["measure"], "-o", "left1.png"), "left1.png"),
+        (("measure", "rig.json", "--target", "chessboard:9x6:25mm", "--source", ".", "-o", "right1.png"), "right1.png"),
+        (("measure", *FILE_WRITERS["measure"], "-o", "rig.json"), "rig.json"),
+        (("dense", "rig.json", "pair/left.png", "right1.png", "-o", "pair"), "pair"),
+        (("body", "draw", "page.svg", "-o", "page.svg"), "page.svg"),
+        (("arm", "urdf", "arm.urdf", "-o", "./arm.urdf"), "arm.urdf"),
+        (("check", "plan", "--arm", "arm.toml", "-o", "arm.toml"), "arm.toml"),
+    ],
+)
+def test_no_input_is_written_over(here, armsight, arguments, file):
+    os.link(here / "rig.json", here / "link.json")
+    (here / "pair").mkdir()
+    for name in ("pair/left.png", "page.svg", "arm.urdf"):
+        (here / name).write_text("nonsense\n")
+    before = {path: path.read_bytes() for path in here.rglob("*.*")}
+    assert_rejected(armsight(*arguments), "read")
+    assert {path: path.read_bytes() for path in here.rglob("*.*")} == before
+    assert (here / file).exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "./a.yaml"),
+        ("measure", *FILE_WRITERS["measure"], "-o", "run.png", "--view", "."),
+        ("calibrate", *FILE_WRITERS["calibrate"], "-o", "r.json", "--report", ".", "-o", "report.html"),
+    ],
+)
+def test_two_outputs_are_two_files(here, armsight, arguments):
+    before = sorted(os.listdir(here))
+    assert_rejected(armsight(*arguments), "choose another folder" if "--report" in arguments else "given twice")
+    assert sorted(os.listdir(here)) == before
+
+
+def test_the_suffix_of_an_arms_files_is_checked(here, armsight):
+    assert_rejected(armsight("arm", "show", "six_r", "-o", "a.xyz"), "a.xyz", ".png")
+    assert_rejected(armsight("arm", "urdf", "six_r", "-o", "a.png"), "a.png", ".urdf")
+    assert_rejected(armsight("arm", "show", "six_r", "-o", "-"), "-: ")
+
+
+def test_millimetres_taken_for_metres_are_reported(here, armsight):
+    said = armsight("dense", "rig.json", "left1.png", "right1.png", "--near", "300", "-o", "out")
+    assert_rejected(said, "--near 300", "--near 0.3", "metres")
+
+
+def test_a_built_in_motion_that_an_arm_cannot_make_is_reported_by_its_option(here, armsight):
+    marker = (
+        '[[markers]]\nname = "{}"\nposition_mm = [{}, {}, 0.0]\nnormal = [0, 0, -1]\ndisc = {{ radius_mm = 8.0 }}\n'
+    )
+    discs = (("a", 0.0, 0.0), ("b", 40.0, 0.0), ("c", 5.0, 25.0))
+    (here / "body.toml").write_text('name = "plate"\n' + "".join(marker.format(*one) for one in discs))
+    devices = ("--source", "sim:", "--board", "emulated:", "--rig", "rig.json", "--target", "body.toml")
+    said = armsight("run", *devices, "--arm", "ur10")
+    assert_rejected(said, "--arm ur10", "--motion FILE")
+    assert "site-packages" not in said.err
+    assert ".toml:" not in said.err
