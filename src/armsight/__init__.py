@@ -9,9 +9,11 @@ imported when they are first used, so that the command line starts at once.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
     from armsight.robot.arm import Arm
@@ -37,6 +39,7 @@ __all__ = [
     "PoseEstimate",
     "Shot",
     "StereoRig",
+    "__version__",
     "calibrate_boards",
     "calibrate_bodies",
     "measure",
@@ -66,6 +69,8 @@ _HOME = {
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type
     """Import a public name on its first use (PEP 562)."""
+    if name == "__version__":
+        return importlib.metadata.version("armsight")
     if name not in _HOME:
         raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
     return getattr(importlib.import_module(_HOME[name]), name)

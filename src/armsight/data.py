@@ -7,6 +7,7 @@ Arrays in a record are read-only. Frames, units and the meaning of a covariance:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,7 +23,18 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A frozen record whose arrays are read-only views of what it was given."""
+    """A frozen record whose arrays are read-only views of what it was given, printed as one line."""
+
+    def __init_subclass__(cls) -> None:
+        """Keep the short form: ``dataclass`` writes one of its own only where a class has none."""
+        if "__repr__" not in cls.__dict__:
+            type.__setattr__(cls, "__repr__", Record.__repr__)
+        super().__init_subclass__()
+
+    def __repr__(self) -> str:
+        """Return the fields in one line: short arrays whole, of poses the position, of others the shape."""
+        shown = (f"{name}={_short(name, value)}" for name, value in self.__dict__.items() if not name.startswith("_"))
+        return f"{type(self).__name__}({', '.join(shown)})"
 
     def __post_init__(self) -> None:
         """Make every array field a read-only view."""
@@ -31,6 +43,29 @@ class Record:
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = view = value.view()
                 view.setflags(write=False)
+
+
+#: Longest array and tuple that the text of a record has whole, and longest text, characters.
+_WHOLE, _LETTERS = 6, 60
+
+
+def _short(name: str, value: object) -> str:
+    """Return the value of a record's field in a few words."""
+    if isinstance(value, np.ndarray):
+        if value.shape == (4, 4) and name.startswith("T_"):
+            return f"<pose at {', '.join(f'{x:.6g}' for x in value[:3, 3])} m>"
+        if value.ndim == 1 and value.size <= _WHOLE:
+            return f"[{', '.join(f'{x:.6g}' if value.dtype.kind == 'f' else str(x) for x in value)}]"
+        return f"<{' x '.join(map(str, value.shape))} {value.dtype}>"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Record):
+        inner = repr(value)
+        return inner if len(inner) <= 2 * _LETTERS else f"{type(value).__name__}(...)"
+    if isinstance(value, (tuple, list, Mapping)) and len(value) > _WHOLE:
+        return f"<{len(value)} entries>"
+    text = repr(value)
+    return text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}..."
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import sys
 
 import click
 
+from armsight.app.messages import colour, print_error
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands; each has a folder of its name, whose ``command.py`` holds a click command called
@@ -65,22 +66,21 @@ def group() -> None:
 def main() -> None:
     """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 interrupted."""
     try:
-        code = group.main(standalone_mode=False)
+        code = group.main(prog_name="armsight", standalone_mode=False, color=colour())
         if sys.stdout is not None:
             sys.stdout.flush()
         sys.exit(code if isinstance(code, int) else 0)
     except click.exceptions.Abort:
         click.echo("armsight: interrupted", err=True)
         sys.exit(130)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help
         error.show()
-        if "extra argument" in error.format_message() and {"--left", "--right"} & set(sys.argv):
-            click.echo(
-                "A glob must be quoted: --left 'DIR/left*.png', or the shell puts every file name there.", err=True
-            )
+        sys.exit(2)
+    except click.ClickException as error:
+        print_error(_usage_text(error))
         sys.exit(2)
     except ArmsightError as error:
-        click.echo(f"armsight: error: {error}", err=True)
+        print_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         click.echo("armsight: interrupted", err=True)
@@ -90,8 +90,18 @@ def main() -> None:
         sys.exit(0)
     except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
         _silence_stdout()
-        click.echo(f"armsight: error: the output cannot be written: {error.strerror}", err=True)
+        print_error(f"the output cannot be written: {error.strerror}")
         sys.exit(2)
+
+
+def _usage_text(error: click.ClickException) -> str:
+    """Return what click found wrong with the command line, as one line that ends with what to do."""
+    text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
+    text = text[:1].lower() + text[1:]
+    if "extra argument" in text and {"--left", "--right"} & set(sys.argv):
+        return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"
 
 
 def _silence_stdout() -> None:

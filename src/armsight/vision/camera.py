@@ -179,6 +179,11 @@ class Camera(Record):
         if not (self.intrinsics[:2] > 0).all():
             raise InputError(f"focal lengths must be positive, got fx {self.intrinsics[0]}, fy {self.intrinsics[1]}")
 
+    def __repr__(self) -> str:
+        """Return the camera in one line."""
+        (width, height), numbers = self.image_size_px, ", ".join(f"{x:.6g}" for x in self.intrinsics)
+        return f"Camera({width}x{height} px, {self.model}, fx fy cx cy {numbers} px)"
+
     @property
     def matrix(self) -> Array:
         """(3, 3) camera matrix K."""

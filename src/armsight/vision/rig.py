@@ -72,6 +72,11 @@ class StereoRig(Record):
         if not 0 <= self.sigma_px < np.inf:
             raise InputError(f"sigma_px must be a finite number not below zero, got {self.sigma_px}")
 
+    def __repr__(self) -> str:
+        """Return the rig in one line."""
+        between = f"baseline {1e3 * self.baseline_m:.6g} mm, convergence {self.convergence_deg:.4g} deg"
+        return f"StereoRig(left={self.left!r}, right={self.right!r}, {between}, sigma_px={self.sigma_px:.6g})"
+
     @property
     def cameras(self) -> tuple[Camera, Camera]:
         """Left and right."""

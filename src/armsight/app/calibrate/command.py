@@ -13,6 +13,7 @@ import click
 import cv2
 
 from armsight.app.calibrate.report import REPORT_FILES, write_report
+from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
 from armsight.app.report.page import PAGE
 from armsight.app.report.plotting import require_matplotlib
@@ -129,7 +130,9 @@ def _from_images(
             shot = stored.load()
             if shot.left is None or shot.right is None:
                 nothing = Detections.none(shot.problem or "no image")
-                pairs.append(Pair(shot.name, nothing, Detections(nothing.ids, nothing.uv, nothing.cov_uv)))
+                unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
+                left, right = unread[::-1] if (shot.problem or "").startswith(f"{stored.right}:") else unread
+                pairs.append(Pair(shot.name, left, right))
             else:
                 now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
                 sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
@@ -205,9 +208,9 @@ def _print(calibration: Calibration, output: Path, report: Path | None) -> None:
         f"{c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
-        *(f"rejected {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
+        *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
         *(f"note: {note}" for note in c.notes),
-        *(f"weak: {weakness}" for weakness in c.weaknesses),
+        *(weak(weakness) for weakness in c.weaknesses),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
     ]
     click.echo("\n".join(lines))

@@ -16,11 +16,14 @@ tick's conversions are averaged: noise of a step or so compensates the rounding.
 
 from __future__ import annotations
 
-import mujoco
+import importlib
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.kernels import kernel
@@ -34,6 +37,16 @@ from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, Motors, Solids,
 SUBSTEPS = 4
 #: A dry friction yields this little: what is held creeps less than a microradian a second.
 _HARD = 'solreffriction="0.0005 1" solimpfriction="0.9999 0.9999 0.001"'
+
+
+def _mujoco() -> Any:  # noqa: ANN401 - a module without types
+    """Import MuJoCo, which only the simulated workcell needs."""
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError:
+        raise InputError(
+            "the simulated workcell needs mujoco, which is not installed: pip install 'armsight[sim]'"
+        ) from None
 
 
 def mjcf(arm: Arm, parts: Solids, motors: Motors, backlash_rad: Array, stiffness: Array, damping: Array) -> str:
@@ -231,13 +244,15 @@ class ArmPlant:
         self.stiffness = load / true.imperfections.compliance_rad
         damping = 2 * _DAMPING * np.sqrt(self.stiffness * inertia(model, self.parts, model.home))
         text = mjcf(true.arm, self.parts, self.motors, true.backlash_rad, self.stiffness, damping)
+        mujoco = _mujoco()
+        self._mj_step = mujoco.mj_step
         self._model = mujoco.MjModel.from_xml_string(text)
         self._data = mujoco.MjData(self._model)
         self._drives_on = False
         self._qpos, self._ctrl, self._force = self._data.qpos, self._data.ctrl, self._data.actuator_force
         self._newton_metre_per_a = self.motors.gear_ratio * self.motors.torque_constant
         self._qpos[:] = np.tile(model.home, 2)
-        mujoco.mj_step(self._model, self._data, nstep=round(_SETTLE_S / TICK_S) * SUBSTEPS)
+        self._mj_step(self._model, self._data, nstep=round(_SETTLE_S / TICK_S) * SUBSTEPS)
         self._ticks = 1  # what a board's first tick, number 1, senses
         self._path = np.empty((4096, 12))
         self._path[:2] = self._qpos
@@ -267,7 +282,7 @@ class ArmPlant:
         if drives_on != self._drives_on:
             self._switch(drives_on)
         self._ctrl[:] = duty if drives_on else 0.0
-        mujoco.mj_step(self._model, self._data, nstep=SUBSTEPS)
+        self._mj_step(self._model, self._data, nstep=SUBSTEPS)
         self._ticks += 1
         if self._ticks == len(self._path):
             self._path = np.concatenate([self._path, np.empty_like(self._path)])

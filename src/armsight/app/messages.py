@@ -1,0 +1,22 @@
+"""How messages look on a terminal: errors are red, weaknesses yellow; elsewhere, and with NO_COLOR, plain text."""
+
+from __future__ import annotations
+
+import os
+
+import click
+
+
+def colour() -> bool | None:
+    """Return whether text is in colour: False with NO_COLOR (no-color.org), None where the terminal decides."""
+    return False if os.environ.get("NO_COLOR") else None
+
+
+def print_error(text: str) -> None:
+    """Print an error as one line on stderr."""
+    click.echo(click.style(f"armsight: error: {text}", fg="red"), err=True, color=colour())
+
+
+def weak(text: str) -> str:
+    """Return a line that says what is weak about a result."""
+    return click.style(f"weak: {text}", fg="yellow")

@@ -1,0 +1,93 @@
+"""The command line as a whole: its own errors, its version, what it needs, its colours."""
+
+import importlib.metadata
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+import armsight as package
+from armsight.app.main import COMMANDS
+from cli_runs import assert_rejected
+from strategies import ordinary_rig
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("nothing",), ["no such command 'nothing'", "armsight -h"]),
+        (("--nothing",), ["no such option", "--nothing"]),
+        (("measure", "--nothing"), ["no such option", "armsight measure -h"]),
+        (("measure",), ["RIG.json", "armsight measure -h"]),
+        (("rig", "export", "r.json", "-o", "a"), ["--format", "opencv, ros, kalibr", "armsight rig export -h"]),
+        (("check", "plan"), ["--arm", "armsight check plan -h"]),
+        (("check",), ["RUN|POSES.csv", "armsight check -h"]),
+        (("dense", "a", "b", "c", "--method", "x", "-o", "d"), ["'x' is not one of", "armsight dense match -h"]),
+        (("calibrate", "--left", "a1", "a2", "-o", "r"), ["unexpected extra argument", "quote a glob, --left 'DIR/"]),
+        (("demo", "--board", "real"), ["--board real", "emulated:unicorn", "armsight demo -h"]),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_one_line(armsight, arguments, words):
+    assert_rejected(armsight(*arguments), *words)
+
+
+def test_the_package_runs_and_has_a_version():
+    version = importlib.metadata.version("armsight")
+    assert package.__version__ == version
+    ran = subprocess.run([sys.executable, "-m", "armsight", "--version"], capture_output=True, text=True, check=True)
+    assert ran.stdout == f"armsight, version {version}\n"
+    ran = subprocess.run([sys.executable, "-m", "armsight", "nothing"], capture_output=True, text=True, check=False)
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("armsight: error: no such command")
+
+
+def stderr_of(arguments, **environment):
+    """Return what a run prints on stderr where that is a terminal."""
+    ours, theirs = pty.openpty()
+    kept = {name: value for name, value in os.environ.items() if name != "NO_COLOR"}
+    run = [sys.executable, "-m", "armsight", *arguments]
+    subprocess.run(run, stderr=theirs, stdout=subprocess.DEVNULL, env={**kept, **environment}, check=False)
+    os.close(theirs)
+    said = os.read(ours, 10_000).decode()
+    os.close(ours)
+    return said
+
+
+def test_errors_are_red_on_a_terminal_without_no_color():
+    assert stderr_of(["nothing"]).startswith("\x1b[31marmsight: error: no such command")
+    assert stderr_of(["nothing"], NO_COLOR="1").startswith("armsight: error: no such command")
+    assert stderr_of(["rig", "show", "none.json"]).startswith("\x1b[31marmsight: error: none.json: no such file")
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "extra"),
+    [
+        ("mujoco", ("demo", "--quick"), "sim"),
+        ("matplotlib.figure", ("demo",), "report"),
+        ("matplotlib.figure", ("check", "a.csv", "-o", "a"), "report"),
+        ("matplotlib.figure", ("arm", "show", "six_r", "-o", "a.png"), "report"),
+        ("pyarrow", ("demo",), "run"),
+        ("serial", ("board", "monitor", "--board", "serial:/dev/none"), "board"),
+        ("unicorn", ("board", "monitor", "--board", "emulated:unicorn"), "board"),
+        ("yaml", ("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "b.yaml"), "formats"),
+        ("yaml", ("rig", "import", "rig.json", "--format", "kalibr", "-o", "a.json"), "formats"),
+    ],
+)
+def test_an_optional_package_that_is_missing_is_named(armsight, monkeypatch, tmp_path, module, arguments, extra):
+    monkeypatch.chdir(tmp_path)
+    ordinary_rig("brown4").save("rig.json")
+    monkeypatch.setitem(sys.modules, module, None)
+    said = armsight(*arguments)
+    assert_rejected(said, "pip install", f"armsight[{extra}]")
+    assert os.listdir(tmp_path) == ["rig.json"]
+
+
+def test_help_needs_no_optional_package():
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('mujoco', 'matplotlib', 'pyarrow', 'serial', 'unicorn', 'yaml')))\n"
+        "from armsight.app.main import main; main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True)
+    assert all(f"  {name} " in ran.stdout for name in COMMANDS)
