@@ -7,8 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from armsight.app.check.limits import check_limits
+from armsight.app.check.report import MetricLine
 from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
+from armsight.loop.iso9283.statistic import Metric
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import Said, assert_rejected, run
@@ -324,3 +327,56 @@ def test_rotations_that_are_not_given_have_no_metrics(tmp_path, capsys):
         rows = [["" if n in left else v for n, v in enumerate(row)] for row in rows_of() if row[0] == "pose"]
         pose_1 = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)["poses"]["P1"]
         assert (pose_1["AP_rotation_rad"] is not None, pose_1["RP_rotation_rad"] is not None) == known
+
+
+def test_limits_pass_and_fail(tmp_path, capsys):
+    data = file_of(tmp_path / "poses.csv", rows_of())
+    (plain,) = said(capsys, data, "--json").lines
+    assert not {"limits", "passed"} & plain.keys()
+    answer = said(capsys, data, "--limit", "AP=1.5mm", "--limit", "AT=400um", "-o", tmp_path / "out", "--json")
+    assert answer.code == 1
+    (found,) = answer.lines
+    assert found == json.loads((tmp_path / "out" / "check.json").read_text())
+    by_name = {name: [one for one in found["limits"] if one["metric"] == name] for name in ("AP", "AT")}
+    # AP of the five poses is about 1 mm by construction, the path lies 0.5 mm aside.
+    assert [one["passed"] for one in by_name["AP"]] == [True] * 5
+    assert [one["value_m"] for one in by_name["AP"]] == [p["AP_m"]["clean"] for p in found["poses"].values()]
+    assert [(one["passed"], one["certain"], one["limit_m"]) for one in by_name["AT"]] == [(False, True, 4e-4)]
+    assert found["passed"] is False
+    assert "FAIL (limit 0.4 mm)" in (tmp_path / "out" / "report.html").read_text()
+    answer = said(capsys, data, "--limit", "AP=1.5mm", "--limit", "AT=0.6mm")
+    assert answer.code == 0
+    assert answer.out.count("PASS (limit 1.5 mm)") == 5
+    assert "PASS: 0 of 6 metrics with a limit are above it" in answer.out
+    near = [one["clean"] for one in (p["AP_m"] for p in plain["poses"].values())]
+    answer = said(capsys, data, "--limit", f"AP={1e3 * np.median(near) + 1e-4:.6f}mm")
+    assert answer.code == 1
+    assert "PASS" in answer.out
+    assert "FAIL (limit " in answer.out
+    assert ", within the interval)" in answer.out
+
+
+def test_a_metric_below_the_noise_passes_by_its_upper_bound():
+    line = MetricLine("RP", "P1", Metric(1e-4, None, 0.0, 3e-4, 2e-4))
+    for limit, passed, certain in ((4e-4, True, True), (2e-4, False, False)):
+        (outcome,) = check_limits([line], {"RP": limit})
+        assert (outcome.value_m, outcome.passed, outcome.certain) == (3e-4, passed, certain)
+    unknown = MetricLine("backlash", "along x", Metric(-1e-4, None, None, None, None))
+    (outcome,) = check_limits([unknown], {"backlash": 1e-4})
+    assert (outcome.value_m, outcome.passed, outcome.certain) == (1e-4, True, None)
+
+
+def test_limits_are_checked(tmp_path, capsys):
+    data = file_of(tmp_path / "poses.csv", [row for row in rows_of() if row[0] == "pose"])
+    for given, words in (
+        ("APP=1mm", ["unknown metric 'APP'", "AP, RP"]),
+        ("AP", ["NAME=LENGTH", "AP=0.5mm"]),
+        ("AP=0.5", ["with a unit"]),
+        ("AP=-1mm", ["with a unit"]),
+        ("AT=1mm", ["this test has no such metric; it has AP, RP"]),
+    ):
+        assert_rejected(
+            said(capsys, data, "--limit", given, "-o", tmp_path / "out"), f"--limit {given.split('=')[0]}", *words
+        )
+    assert_rejected(said(capsys, data, "--limit", "AP=1mm", "--limit", "AP=2mm"), "already")
+    assert not (tmp_path / "out").exists()

@@ -9,8 +9,9 @@ import click
 import numpy as np
 
 from armsight.app.check.evaluate import evaluate, read_check
+from armsight.app.check.limits import check_limits, limits_json, read_limits
 from armsight.app.check.plan import CYCLES, PlannedTest, plan_csv, plan_test
-from armsight.app.check.report import REPORT_FILES, text, write_check
+from armsight.app.check.report import REPORT_FILES, metric_lines, text, write_check
 from armsight.app.check.result import check_json
 from armsight.app.check.run_folder import is_run
 from armsight.app.report.page import PAGE, writable_folder
@@ -50,8 +51,15 @@ def command() -> None:
     type=click.Path(path_type=Path),
     help="Folder for report.html, check.json, figures.",
 )
+@click.option(
+    "--limit",
+    "limit_texts",
+    multiple=True,
+    metavar="NAME=LENGTH",
+    help="Say PASS or FAIL of a metric, such as AP=0.5mm; may be repeated. Exit code 1 where one fails.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
-def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> None:
+def evaluated(data: Path, closed: bool, output: Path | None, limit_texts: tuple[str, ...], as_json: bool) -> int:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
     RUN is a folder of armsight run or armsight demo, POSES.csv a table of attained poses (docs/howto/iso9283.md).
@@ -70,18 +78,27 @@ def evaluated(data: Path, closed: bool, output: Path | None, as_json: bool) -> N
             raise InputError(
                 f"{output}: holds another command's {PAGE}, which would be written over; choose another folder"
             )
+    limits = read_limits(limit_texts)
     attained = read_check(data, closed=closed)
     result = evaluate(attained)
+    outcomes = check_limits(list(metric_lines(result)), limits)
+    remarks = ["" if each is None else each.text() for each in outcomes] if limits else []
     if output is not None:
-        write_check(result, attained.rows, data, writable_folder(output, "no report"))
+        folder = writable_folder(output, "no report")
+        write_check(result, attained.rows, data, folder, remarks, limits_json(outcomes))
+    failed = [each for each in outcomes if each is not None and not each.passed]
     for note in result.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
-        click.echo(json.dumps(check_json(result)))
-        return
-    click.echo(text(result))
+        click.echo(json.dumps(check_json(result) | limits_json(outcomes)))
+        return 1 if failed else 0
+    click.echo(text(result, remarks))
+    if limits:
+        compared = sum(each is not None for each in outcomes)
+        click.echo(f"\n{'FAIL' if failed else 'PASS'}: {len(failed)} of {compared} metrics with a limit are above it")
     if output is not None:
         click.echo(f"\nwritten: {output}/report.html with its figures as PNG, check.json, check.csv")
+    return 1 if failed else 0
 
 
 @command.command("plan")

@@ -7,9 +7,10 @@ its figures as PNG, check.json and check.csv.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -116,11 +117,12 @@ def metric_text(metric: Metric) -> str:
     return f"{clean:.3f} mm, {low:.3f} to {high:.3f} ({raw:.3f} as measured)"
 
 
-def text(result: CheckResult) -> str:
-    """Return all metrics as text."""
+def text(result: CheckResult, remarks: Sequence[str] = ()) -> str:
+    """Return all metrics as text; ``remarks`` stand behind their lines, one each."""
     rows = list(metric_lines(result))
     wide = max(len(row.what) for row in rows)
     lines = [f"{row.name:14s} {row.what:{wide}s}  {metric_text(row.metric)}" for row in rows]
+    lines = [f"{line}  {remark}".rstrip() for line, remark in zip(lines, remarks or [""] * len(lines), strict=True)]
     return "\n".join(
         ["metric without the instrument's noise, the interval that holds it to 95 %, as measured:", *lines]
     )
@@ -316,7 +318,14 @@ FIGURES: dict[str, tuple[str, Callable[[CheckResult, Sequence[Row]], Figure | No
 REPORT_FILES = (PAGE, "check.json", "check.csv", *(f"check-{name}.png" for name in FIGURES))
 
 
-def write_check(result: CheckResult, rows: Sequence[Row], source: Path, folder: Path) -> Path:
+def write_check(
+    result: CheckResult,
+    rows: Sequence[Row],
+    source: Path,
+    folder: Path,
+    remarks: Sequence[str] = (),
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> Path:
     """Write the report of a test.
 
     Args:
@@ -324,6 +333,8 @@ def write_check(result: CheckResult, rows: Sequence[Row], source: Path, folder: 
         rows: what they are made of.
         source: where those came from.
         folder: an existing folder; files of an earlier report in it are replaced.
+        remarks: what stands behind the metrics' lines, one each: PASS or FAIL.
+        more: further entries of check.json.
 
     Returns:
         The page; check.json, check.csv and the figures are beside it.
@@ -338,17 +349,17 @@ def write_check(result: CheckResult, rows: Sequence[Row], source: Path, folder: 
             if plotted is not None:
                 images[name] = png(plotted)
     files = {f"check-{name}.png": data for name, data in images.items()}
-    files["check.json"] = (json.dumps(check_json(result), indent=1) + "\n").encode()
+    files["check.json"] = (json.dumps(check_json(result) | dict(more), indent=1) + "\n").encode()
     files["check.csv"] = rows_csv(list(rows)).encode()
-    put_files(folder, {**files, PAGE: _page(result, images, source).encode()})
+    put_files(folder, {**files, PAGE: _page(result, images, source, remarks).encode()})
     for name in FIGURES.keys() - images.keys():
         (folder / f"check-{name}.png").unlink(missing_ok=True)
     return folder / PAGE
 
 
-def _page(result: CheckResult, images: dict[str, bytes], source: Path) -> str:
+def _page(result: CheckResult, images: dict[str, bytes], source: Path, remarks: Sequence[str]) -> str:
     """Return the page."""
-    sections = {"result": ("Result", _result_section(result))}
+    sections = {"result": ("Result", _result_section(result, remarks))}
     for name, data in images.items():
         title, _, caption = FIGURES[name]
         image = picture(data, title)
@@ -361,16 +372,27 @@ def _mm(value: float | None) -> str:
     return "" if value is None else f"{1e3 * value:.3f}"
 
 
-def _result_section(result: CheckResult) -> str:
+def _result_section(result: CheckResult, remarks: Sequence[str]) -> str:
     """Return the table of all metrics, HTML."""
     listed = list(metric_lines(result))
     rows = []
-    for name, what, m in listed:
+    for (name, what, m), remark in zip(listed, remarks or [""] * len(listed), strict=True):
         raw, sigma, low, high, least = (_mm(value) for value in (m.raw, m.sigma, m.low, m.high, m.resolvable))
         value = "not resolvable" if m.clean is None else _mm(m.clean)
         ends = f"{low} to {high}" if low else ""
-        rows.append((escaped(name), escaped(what), f"<b>{value}</b>", sigma, ends, raw, least))
-    head = ("", "of", "mm", "sigma", "95 %, from to", "as measured", "resolvable from")
+        rows.append(
+            (
+                escaped(name),
+                escaped(what),
+                f"<b>{value}</b>",
+                sigma,
+                ends,
+                raw,
+                least,
+                *([escaped(remark)] if remarks else []),
+            )
+        )
+    head = ("", "of", "mm", "sigma", "95 %, from to", "as measured", "resolvable from", *(["limit"] if remarks else []))
     used = {row.name for row in listed}
     meant = [f"{name}: {meaning}." for name, meaning in MEANINGS.items() if name in used]
     introduction = (
