@@ -348,3 +348,21 @@ def test_a_wrong_line_in_a_table(rendered, seen, armsight, file, old, new, said)
 def test_empty_tables(rendered, seen, armsight, text):
     (seen / "d.csv").write_text(text)
     assert_rejected(armsight(*by_detections(rendered, seen)), seen / "d.csv")
+
+
+def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsight, tmp_path):
+    """OpenCV's own recording: a print 0.13 mm off its drawing, which every shot of 13 shows as a misfit."""
+    folder = data_dir / "opencv-480p"
+    given = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg")
+    rig, board, spec = tmp_path / "rig.json", tmp_path / "rig.board.toml", "chessboard:9x6:25mm"
+    said = armsight("calibrate", *given, "--target", spec, "-o", rig)
+    assert f"armsight measure --target {board}" in said.out
+    drawn = armsight("measure", rig, *given, "--target", spec, "--json")
+    found = armsight("measure", rig, *given, "--target", board, "--json")
+    misfits = [[shot["misfit"] for shot in run.lines if shot["ok"]] for run in (drawn, found)]
+    assert f"measure with --target {board}" in drawn.err
+    assert "measure with --target" not in found.err
+    assert len(misfits[0]) == len(misfits[1]) == 13
+    # Where the shape is known, what is left is the noise: a misfit by chance, and the recording's one bad pair.
+    assert sum(misfit > 1 for misfit in misfits[0]) == 13
+    assert sum(misfit > 1 for misfit in misfits[1]) <= 3

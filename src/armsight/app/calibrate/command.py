@@ -28,6 +28,7 @@ from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey
 from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board_file import save_board_file
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.sources import PairsSource
 
@@ -85,20 +86,21 @@ def command(
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
     source = None if left is None or right is None else PairsSource.open(left, right)
     inputs = points if source is None else source.files
-    check_outputs((output, refine_body), inputs)
+    board_file = None if source is None else output.parent / f"{output.stem}.board.toml"
+    check_outputs((output, refine_body, board_file), inputs)
     if report is not None:
         require_matplotlib()
         check_folder(
             report,
             holding=REPORT_FILES,
-            apart_from=(output, refine_body, *inputs),
+            apart_from=(output, refine_body, board_file, *inputs),
             problem="no report can be written here",
         )
     started = time.perf_counter()
-    if source is not None and target is not None:
+    if source is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
         calibration = _from_images(source, open_board(target), models, flat_target, folds)
-        given = {"left": str(left), "right": str(right), "target": target}
+        given = {"left": str(left), "right": str(right), "target": target, "board": board_file.name}
     elif detections is not None and cameras is not None and body is not None:
         known, pair = load_body_csv(body), read_cameras(cameras)
         with steps() as progress:
@@ -111,12 +113,14 @@ def command(
     if refine_body is not None:
         save_body_csv(calibration.body, refine_body)
     calibration.rig.save(output)
+    if board_file is not None and target is not None:
+        save_board_file(board_file, target, calibration.body.points)
     if report is not None:
         write_report(calibration, report)
     if as_json:
-        click.echo(json.dumps(_summary(calibration, output, report, time.perf_counter() - started)))
+        click.echo(json.dumps(_summary(calibration, output, board_file, report, time.perf_counter() - started)))
     else:
-        _print(calibration, output, report)
+        _print(calibration, output, board_file, report)
 
 
 def _from_images(
@@ -168,7 +172,9 @@ def _provenance(given: dict[str, str], calibration: Calibration) -> dict[str, An
     }
 
 
-def _summary(calibration: Calibration, output: Path, report: Path | None, seconds: float) -> dict[str, Any]:
+def _summary(
+    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
+) -> dict[str, Any]:
     """Return the object that ``--json`` prints."""
     c = calibration
     return {
@@ -186,12 +192,13 @@ def _summary(calibration: Calibration, output: Path, report: Path | None, second
         "sigma_px": c.rig.sigma_px,
         "body_deviation_rms_m": c.deviation_m,
         "rig": str(output),
+        "board": None if board_file is None else str(board_file),
         "report": str(report / PAGE) if report is not None else None,
         "seconds": seconds,
     }
 
 
-def _print(calibration: Calibration, output: Path, report: Path | None) -> None:
+def _print(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> None:
     """Print the held-out metrics first, then those of the fit, then what is weak."""
     c, h = calibration, calibration.heldout
     rows = (
@@ -212,5 +219,10 @@ def _print(calibration: Calibration, output: Path, report: Path | None) -> None:
         *(f"note: {note}" for note in c.notes),
         *(weak(weakness) for weakness in c.weaknesses),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
+        *(
+            [f"board as found written to {board_file}; to measure this board: armsight measure --target {board_file}"]
+            if board_file is not None
+            else []
+        ),
     ]
     click.echo("\n".join(lines))

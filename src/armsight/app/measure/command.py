@@ -47,7 +47,10 @@ Result = tuple[Shot, PoseEstimate | Missed, _Followed | None]
 @click.command("measure")
 @click.argument("rig", metavar="RIG.json", type=click.Path(path_type=Path))
 @click.option(
-    "--target", required=True, metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file."
+    "--target",
+    required=True,
+    metavar="SPEC|BODY",
+    help="A board such as chessboard:9x6:25mm, a body file, or calibrate's .board.toml.",
 )
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images.")
@@ -116,7 +119,7 @@ def command(
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
-    _close(records, time.perf_counter() - started, output, view)
+    _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
 
 
 def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
@@ -192,7 +195,18 @@ def _line(record: ShotPose) -> str:
     )
 
 
-def _close(records: list[ShotPose], seconds: float, output: Path | None, view: PictureFolder | None) -> None:
+def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
+    """Return the file of the board as the rig's calibration found it, where that board is measured by its drawing."""
+    name = rig.provenance.get("board")
+    if rig.provenance.get("target") != target or not isinstance(name, str):
+        return None
+    beside = path.parent / name
+    return beside if beside.exists() else None
+
+
+def _close(
+    records: list[ShotPose], seconds: float, output: Path | None, view: PictureFolder | None, board_file: Path | None
+) -> None:
     """Print on stderr what was measured and missed; raise an error if nothing was measured."""
     good = [r for r in records if r.ok]
     missed = [r for r in records if not r.ok]
@@ -210,5 +224,7 @@ def _close(records: list[ShotPose], seconds: float, output: Path | None, view: P
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
     if odd := sum(r.misfit > 1 for r in good):
         summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma includes it)"
+        if board_file is not None:
+            summary += f"; the rig's calibration found the shape of this board: measure with --target {board_file}"
     summary += f"; {view.summary()}" if view is not None else ""
     click.echo(summary + (f"; written to {output}" if output is not None else ""), err=True)

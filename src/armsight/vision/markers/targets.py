@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
+from armsight.files import read_text
 from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.board_file import load_board_file
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
 from armsight.vision.markers.disc.target import DiscTarget
@@ -90,7 +93,7 @@ def open_target(spec: str) -> Target:
     """Make a target that can be found in images.
 
     Args:
-        spec: a board such as ``chessboard:9x6:25mm``, or a TOML body file.
+        spec: a board such as ``chessboard:9x6:25mm``, a TOML body file, or a TOML board file of ``calibrate``.
 
     Raises:
         InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
@@ -101,7 +104,17 @@ def open_target(spec: str) -> Target:
             f"{spec}: a CSV body has points but no description of its markers, so it cannot be found in images; give "
             "--detections with it, or describe its markers in a TOML body file (docs/howto/targets.md)"
         )
-    return load_body_toml(spec) if kind == ".toml" else open_board(spec)
+    if kind == "board":
+        return open_board(spec)
+    return load_board_file(spec) if _is_board_file(spec) else load_body_toml(spec)
+
+
+def _is_board_file(path: str) -> bool:
+    """Say whether a TOML file describes a board as calibrated; one that is no TOML is left to the body files' reader."""
+    try:
+        return "board" in tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError:
+        return False
 
 
 def open_body(spec: str) -> Body:

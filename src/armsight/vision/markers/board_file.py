@@ -1,0 +1,106 @@
+"""Board files: a printed board as a calibration found it, its points measured instead of drawn.
+
+A board's spec and the positions of its points go to a TOML file, and a target that is found as the board of that spec and
+measured against those positions comes back. A sheet of paper differs from its drawing by tenths of a millimetre; measured
+against the drawing, that is a residual in every shot. The format::
+
+    version = 2
+    board = "chessboard:9x6:25mm"
+    points_mm = [[0.0, 0.0, 0.0], [25.02, 0.01, -0.1], ...]   # board frame, in the order of the drawing's points
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.errors import InputError
+from armsight.files import read_text, write_text
+from armsight.geometry.check import checked
+from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.body_file import VERSION
+from armsight.vision.markers.marker import Target
+
+#: A point further from its drawing than this share of the board's size is a mistake in the file, not a bent sheet.
+_MOST_OFF = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedBoard(Record, Target):
+    """A board whose points are where a calibration found them.
+
+    Attributes:
+        drawing: the board as its spec describes it.
+        points: (M, 3) positions of its points, m, board frame.
+    """
+
+    drawing: CalibrationBoard
+    points: Array
+
+    @cached_property
+    def body(self) -> Body:
+        """The board with its estimated points."""
+        drawn = self.drawing.body
+        return Body(f"{drawn.name}, as calibrated", drawn.point_names, self.points)
+
+    @property
+    def symmetries(self) -> tuple[Ids, ...]:
+        """Those of the drawing: in one image the board looks the same all the same."""
+        return self.drawing.symmetries
+
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
+        return self.drawing.detect(image)
+
+
+def save_board_file(path: str | Path, spec: str, points: Array) -> None:
+    """Write a board file, to the nanometre, in one step.
+
+    Args:
+        path: the file.
+        spec: of the board.
+        points: (M, 3) positions of its points, m, board frame.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = ",\n".join(f"  [{', '.join(f'{1e3 * x + 0.0:.6f}' for x in row)}]" for row in points.tolist())
+    head = f"# The board as armsight calibrate found it: armsight measure --target {Path(path).name}\nversion = {VERSION}\n"
+    write_text(path, f"{head}board = {json.dumps(spec)}\npoints_mm = [\n{rows},\n]\n")
+
+
+def load_board_file(path: str | Path) -> EstimatedBoard:
+    """Read a board file.
+
+    Raises:
+        InputError: missing, malformed, or points that are not those of the board; the message names the file.
+    """
+    document = tomllib.loads(read_text(path))
+    if unknown := document.keys() - {"version", "board", "points_mm"}:
+        raise InputError(f"{path}: unknown key {min(unknown)!r}; a board file has version, board and points_mm")
+    version, spec = document.get("version", 1), document["board"]
+    if type(version) is not int or not 1 <= version <= VERSION:
+        raise InputError(f"{path}: version {version!r}; this program reads board files of version 1 to {VERSION}")
+    if not isinstance(spec, str):
+        raise InputError(f'{path}: board must be a spec in quotes, such as board = "chessboard:9x6:25mm"')
+    try:
+        drawing = open_board(spec)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    drawn = drawing.body.points
+    points = 1e-3 * checked(document.get("points_mm", []), drawn.shape, f"{path}: points_mm of {spec}")
+    off = np.linalg.norm(points - drawn, axis=1)
+    if off.max() > _MOST_OFF * np.ptp(drawn, axis=0).max():
+        worst = int(np.argmax(off))
+        raise InputError(
+            f"{path}: point {worst} is {1e3 * off[worst]:.3g} mm from its position on {spec}: are points_mm in mm, and "
+            "in the order of the board's points?"
+        )
+    return EstimatedBoard(drawing, points)
