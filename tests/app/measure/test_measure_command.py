@@ -352,7 +352,7 @@ def test_empty_tables(rendered, seen, armsight, text):
 
 def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsight, tmp_path):
     """OpenCV's own recording: a print 0.13 mm off its drawing, which every shot of 13 shows as a misfit."""
-    folder = data_dir / "opencv-480p"
+    folder = data_dir / "stereo" / "opencv-480p"
     given = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg")
     rig, board, spec = tmp_path / "rig.json", tmp_path / "rig.board.toml", "chessboard:9x6:25mm"
     said = armsight("calibrate", *given, "--target", spec, "-o", rig)
