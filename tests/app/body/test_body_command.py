@@ -1,5 +1,6 @@
 """``armsight body``: the assessment of good and bad bodies, drawings to scale, and what is typed wrongly."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -18,6 +19,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.vision.discs.bias import project_discs
 from armsight.vision.discs.identify import identify
 from armsight.vision.discs.predict import plain_rig, view
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from cli_runs import assert_rejected
@@ -428,3 +430,77 @@ def test_the_command_ends_with_its_code():
     run = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert run.returncode == 1
     assert json.loads(run.stdout)["assessment"] == "unusable"
+
+
+SHEET_SPECS = [
+    "chessboard:7x4:20mm",
+    "charuco:8x5:20mm:15mm:DICT_5X5_100",
+    "acircles:4x5:20mm",
+    "aprilgrid:3x2:40mm:0.3",
+]
+
+
+@pytest.mark.parametrize("spec", [*SHEET_SPECS, "circles:6x5:20mm"])
+def test_a_board_is_drawn_from_its_spec_and_found_at_its_scale(armsight, tmp_path, spec):
+    (image,) = pages_of(armsight, spec, tmp_path)
+    board, less = open_board(spec), 4 if "circles" in spec else 1  # OpenCV's finder of discs knows no large ones
+    image = cv2.resize(image, None, fx=1 / less, fy=1 / less, interpolation=cv2.INTER_AREA)
+    found = board.detect(cv2.GaussianBlur(image, (0, 0), 0.8))
+    found = dataclasses.replace(found, uv=(found.uv + 0.5) * less - 0.5)
+    assert len(found.ids) == len(board.body.points), found.problem
+    order = min((np.arange(len(found.ids)), *board.symmetries), key=lambda ids: off(board, found.uv[ids])[1])
+    scale, worst = off(board, found.uv[order])
+    assert scale == pytest.approx(1.0, abs=PAPER_MM / np.ptp(1e3 * board.body.points, axis=0).max())
+    assert worst < PAPER_MM
+
+
+def off(board, uv):
+    """Scale of what was found on paper and its largest distance from the board, mm; Kalibr's boards have y up."""
+    p, q = 1e3 * board.body.points[:, :2] @ [1, 1j], uv / PX_PER_MM @ [1, 1j]
+    p = p.conj() if board.body.name.startswith("aprilgrid") else p
+    (scale, shift), *_ = np.linalg.lstsq(np.stack([p, np.ones_like(p)], axis=1), q)
+    return abs(scale), np.abs(scale * p + shift - q).max()
+
+
+def cut_at(image, axis):
+    """Where the marks in the margins of a sheet are, along an axis, px; the same on both sides."""
+    margin = round(9.5 * PX_PER_MM), round(2 * PX_PER_MM)
+    strips = (image[margin[1] : margin[0]], image[-margin[0] : -margin[1]])
+    if axis == 0:
+        strips = (image[:, margin[1] : margin[0]].T, image[:, -margin[0] : -margin[1]].T)
+    # A mark is 4.5 mm long; the letters of a sheet's label are half of that.
+    found = [np.flatnonzero((strip < 200).sum(axis=0) > 4 * PX_PER_MM) for strip in strips]
+    np.testing.assert_array_equal(*found)
+    groups = np.split(found[0], np.flatnonzero(np.diff(found[0]) > 3) + 1) if len(found[0]) else []
+    return [float(group.mean()) for group in groups]
+
+
+def test_sheets_cut_at_their_marks_make_the_whole_board(armsight, tmp_path):
+    spec = "chessboard:5x4:45mm"  # 270 x 225 mm: two sheets of A4, or a page of A3
+    sheets = pages_of(armsight, spec, tmp_path, "--split")
+    assert len(sheets) == 2
+    assert {sheet.shape for sheet in sheets} == {sheets[0].shape}
+    axis = 1 if cut_at(sheets[0], 1) else 0
+    first, last = (sheet if axis == 1 else sheet.T for sheet in sheets)
+    (end,), (start,) = cut_at(sheets[0], axis), cut_at(sheets[1], axis)
+    joined = np.hstack([first[:, : round(end)], last[:, round(start) :]])
+    image = joined if axis == 1 else joined.T
+    found = open_board(spec).detect(cv2.GaussianBlur(image, (0, 0), 0.8))
+    assert len(found.ids) == 20, found.problem
+    scale, worst = off(open_board(spec), found.uv)
+    # Where the sheets are joined a pixel is rounded away or not, on top of what the paper allows.
+    assert worst < PAPER_MM + 1 / PX_PER_MM
+    assert scale == pytest.approx(1.0, abs=(PAPER_MM + 1 / PX_PER_MM) / 225)
+
+
+def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fits(armsight, tmp_path):
+    said = armsight("body", "draw", "chessboard:9x6:50mm", "-o", tmp_path / "a.pdf")
+    assert_rejected(said, "chessboard:9x6:50mm: the board needs", "--split", "--paper a2")
+    said = armsight("body", "draw", "chessboard:9x6:50mm", "-o", tmp_path / "a.pdf", "--split")
+    assert said.code == 0
+    assert "page 1 is split over 6 sheets that overlap by 10 mm" in said.err
+    assert (tmp_path / "a.pdf").read_bytes().count(b"/MediaBox") == 6
+    assert armsight("body", "draw", PLATE, "-o", tmp_path / "b.pdf").code == 0
+    assert armsight("body", "draw", PLATE, "-o", tmp_path / "c.pdf", "--split").code == 0
+    assert (tmp_path / "b.pdf").read_bytes() == (tmp_path / "c.pdf").read_bytes()
+    assert_rejected(armsight("body", "draw", "dartboard:3:4", "-o", tmp_path / "d.pdf"), "unknown board", "chessboard:")

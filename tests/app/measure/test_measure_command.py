@@ -359,7 +359,7 @@ def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsigh
     assert f"armsight measure --target {board}" in said.out
     drawn = armsight("measure", rig, *given, "--target", spec, "--json")
     found = armsight("measure", rig, *given, "--target", board, "--json")
-    misfits = [[shot["misfit"] for shot in run.lines if shot["ok"]] for run in (drawn, found)]
+    misfits = [[shot["misfit"] for shot in run.lines if shot["status"] == "ok"] for run in (drawn, found)]
     assert f"measure with --target {board}" in drawn.err
     assert "measure with --target" not in found.err
     assert len(misfits[0]) == len(misfits[1]) == 13

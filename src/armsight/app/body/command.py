@@ -63,26 +63,30 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
 
 
 @command.command()
-@click.argument("path", metavar="BODY.toml")
+@click.argument("path", metavar="BODY.toml|BOARD")
 @click.option("-o", "--output", required=True, metavar="OUT", help="The drawing: .pdf, .svg or .png.")
 @click.option("--paper", default="a4", show_default=True, type=click.Choice(list(PAPERS), case_sensitive=False))
+@click.option("--split", is_flag=True, help="Draw what is larger than the paper on several sheets that overlap.")
 @click.option("--dpi", default=600, show_default=True, type=click.IntRange(72, 2400), help="Pixels an inch of a .png.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def draw(path: str, output: str, paper: str, dpi: int, as_json: bool) -> None:
-    """Draw a body's markers to scale: print at 100%, measure the bar, glue.
+def draw(path: str, output: str, paper: str, split: bool, dpi: int, as_json: bool) -> None:
+    """Draw a body's markers, or a calibration board, to scale: print at 100%, measure the bar, glue.
 
-    One page for each plane of the body; .svg and .png have a file for each.
+    BOARD is a spec such as chessboard:9x6:25mm. One page for each plane of a body; .svg and .png have a file for each page
+    and sheet.
     """
     check_writable(output, apart_from=(path,))
-    drawing = draw_body(path, output, paper=paper.lower(), dpi=dpi)
+    drawing = draw_body(path, output, paper=paper.lower(), dpi=dpi, split=split)
     for note in drawing.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
-        pages = [{"normal": page.normal.tolist(), "markers": page.names} for page in drawing.pages]
+        pages = [
+            {"normal": page.normal.tolist(), "markers": [name or path for name in page.names]} for page in drawing.pages
+        ]
         click.echo(json.dumps({"body": path, "files": drawing.files, "paper": paper.lower(), "pages": pages}))
         return
     for number, page in enumerate(drawing.pages, start=1):
-        click.echo(f"page {number}: {', '.join(page.names)}")
+        click.echo(f"page {number}: {', '.join(name or path for name in page.names)}")
     click.echo(f"written to {', '.join(drawing.files)}; print at 100%, not fitted to the page, and measure the bar")
 
 

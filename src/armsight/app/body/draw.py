@@ -1,6 +1,7 @@
-"""A body's markers on paper, to scale: ``armsight body draw``.
+"""A body's markers, or a calibration board, on paper, to scale: ``armsight body draw``.
 
-In: a body's layout. Out: a page for each plane of the body, seen from outside, as PDF, SVG or PNG.
+In: a body's layout, or a board's spec. Out: a page for each plane of the body, seen from outside, as PDF, SVG or PNG; one
+that is larger than the paper is split over several sheets where that is requested.
 
 First the markers are sorted by plane. The coordinates of a ``Page`` are millimetres, x to the right and y down, the body's
 origin projected to (0, 0). Then each page is put on paper: a figure of the paper's size whose only axes cover it and count
@@ -29,6 +30,7 @@ from armsight.sim.render.scene import CLEAR, Pattern, aprilgrid, charuco, chessb
 from armsight.vision.discs.predict import face_axes, look_direction
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.aruco import cells
+from armsight.vision.markers.board import BOARDS, open_board
 from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
@@ -268,6 +270,8 @@ PAPERS = {
 #: White edge that printers need, height of what stands below the drawing, and the least width of that, mm.
 _EDGE, _FOOT, _FOOT_WIDTH = 10.0, 30.0, 130.0
 _BAR = 100.0
+#: How far sheets of a split drawing overlap, and from where to where in the margin their marks reach, mm.
+_OVERLAP, _MARK = 10.0, (4.5, 9.0)
 _ARROW = 8.0
 _TEXT, _SMALL = 3.2, 2.4  # height of letters, mm
 _POINT = 25.4 / 72
@@ -290,43 +294,119 @@ class Drawing(Record):
     notes: tuple[str, ...]
 
 
-def draw_body(path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600) -> Drawing:
-    """Draw a body's markers to scale.
+@dataclass(frozen=True)
+class _Sheet:
+    """One of the sheets that a drawing is split over; mm.
+
+    Attributes:
+        paper: its width and height.
+        low: x and y of the drawing at the upper left corner of its printed part.
+        cuts: (x of the upright, y of the level) lines of the drawing along which sheets are joined.
+        label: which one it is.
+    """
+
+    paper: tuple[float, float]
+    low: tuple[float, float]
+    cuts: tuple[tuple[float, ...], tuple[float, ...]]
+    label: str
+
+
+def is_board_spec(path: str | Path) -> bool:
+    """Say whether what is to be drawn is a board's spec and no file."""
+    return str(path).strip().split(":")[0] in BOARDS or (":" in str(path) and not Path(path).exists())
+
+
+def draw_body(
+    path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600, split: bool = False
+) -> Drawing:
+    """Draw a body's markers, or a board, to scale.
 
     Args:
-        path: the TOML body file.
+        path: the TOML body file, or a board's spec such as ``chessboard:9x6:25mm``.
         output: .pdf (a page for each plane), .svg or .png (a file for each, numbered from the second on).
         paper: a key of PAPERS; rotated where that fits better.
         dpi: pixels an inch of a .png.
+        split: draw a plane that does not fit the paper on several sheets that overlap.
 
     Raises:
-        InputError: no body file, an unknown suffix, a plane that does not fit the paper, matplotlib is missing, or the
-            file cannot be written.
+        InputError: no body file and no board, an unknown suffix, a plane that does not fit the paper, no matplotlib,
+            or the file cannot be written.
     """
     suffix = Path(output).suffix.lower()
     if suffix not in _SAVERS:
         raise InputError(f"{output}: a drawing is a {', '.join(_SAVERS)} file, by its suffix")
     if importlib.util.find_spec("matplotlib") is None:
         raise InputError('drawing a body needs matplotlib, which is not installed: pip install "armsight[report]"')
-    layout = read_layout(path)
-    sheets, notes = pages(path, layout)
-    sizes = [_paper(path, page, paper) for page in sheets]
+    planes: tuple[Page, ...]
+    if is_board_spec(path):
+        name, planes, notes = str(path), (_board_page(str(path)),), list[str]()
+        foot = "drawn by armsight body draw"
+    else:
+        layout = read_layout(path)
+        name, (planes, notes) = layout.name, pages(path, layout)
+        foot = f"{plain(Path(path).name)}   sha256 {hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]}"
+    sizes = [_paper(path, page, paper, split) for page in planes]
+    parts = [_sheets(size, PAPERS[paper]) if split and paper != "fit" else [] for size in sizes]
     if suffix == ".png":
-        _check_pixels(output, sizes, dpi)
-    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
-    foot = f"{plain(Path(path).name)}   sha256 {digest}"
+        _check_pixels(output, [each[0].paper if each else size for each, size in zip(parts, sizes, strict=True)], dpi)
     with drawing():
         figures = []
-        for number, (page, size) in enumerate(zip(sheets, sizes, strict=True), start=1):
-            head = plain(layout.name) + (f", plane {number} of {len(sheets)}" if len(sheets) > 1 else "")
-            figures.append(_figure(page, size, head, foot))
+        for number, (page, size, sheets) in enumerate(zip(planes, sizes, parts, strict=True), start=1):
+            head = plain(name) + (f", plane {number} of {len(planes)}" if len(planes) > 1 else "")
+            figures += [_figure(page, size, head, foot, sheet) for sheet in (*sheets,) or (None,)]
+            if sheets:
+                notes.append(
+                    f"page {number} is split over {len(sheets)} sheets that overlap by {_OVERLAP:g} mm: cut each along the "
+                    "marks in its margins and join them edge to edge"
+                )
         files = _SAVERS[suffix](figures, Path(output), dpi)
-    return Drawing(tuple(str(file) for file in files), sheets, tuple(notes))
+    return Drawing(tuple(str(file) for file in files), planes, tuple(notes))
+
+
+def _board_page(spec: str) -> Page:
+    """Return the page of a board by itself, its white margin left to the paper."""
+    board = open_board(spec)
+    pattern = BOARD_PATTERNS[type(board)](board)
+    axes = np.eye(3)
+    mark = _pattern("", pattern, pattern.T_body_pattern)(axes)
+    if isinstance(board, AprilGrid):  # its y axis runs up
+        axes = np.diag([1.0, -1.0, -1.0])
+        mark = _pattern("", pattern, pattern.T_body_pattern)(axes)
+    corners = [mark.polygons.reshape(-1, 2)]
+    corners += [mark.circles[:, :2] + sign * mark.circles[:, 2:] for sign in (-1.0, 1.0)]
+    dark = np.concatenate(corners)
+    whole = Mark("", mark.circles, True, 0.0, False, mark.polygons, np.array([dark.min(axis=0), dark.max(axis=0)]))
+    return Page(-axes[:, 2], axes, (whole,))
+
+
+def _sheets(size: tuple[float, float], paper: tuple[float, float]) -> list[_Sheet]:
+    """Return the sheets that a drawing is split over, row by row, on upright or rotated paper, whichever are fewer."""
+    if _rotated(paper, np.array(size)) is not None:
+        return []
+    counts = {}
+    for form in (paper, paper[::-1]):
+        inner = np.array(form) - 2 * _EDGE
+        counts[form] = np.ceil((np.array(size) - _OVERLAP) / (inner - _OVERLAP)).astype(int)
+    form = min(counts, key=lambda each: int(counts[each].prod()))
+    (columns, rows), step = counts[form], np.array(form) - 2 * _EDGE - _OVERLAP
+    cuts = tuple(tuple(float(k * step[i] + _OVERLAP / 2) for k in range(1, counts[form][i])) for i in (0, 1))
+    return [
+        _Sheet(
+            form,
+            (float(column * step[0]), float(row * step[1])),
+            (cuts[0], cuts[1]),
+            f"sheet {row * columns + column + 1} of {rows * columns}: row {row + 1}, column {column + 1}",
+        )
+        for row in range(rows)
+        for column in range(columns)
+    ]
 
 
 def _content(page: Page) -> Array:
     """Return (2, 2) low and high corner of what is on a page, names included, mm."""
     boxes = np.array([mark.box for mark in page.marks])
+    if not any(page.names):
+        return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
     names = [0.6 * _TEXT * len(plain(mark.name, 24)) / 2 for mark in page.marks]
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     middle = boxes[:, :, 0].mean(axis=1)
@@ -334,8 +414,8 @@ def _content(page: Page) -> Array:
     return np.array([low - 2 * _TEXT, high + 2 * _TEXT])
 
 
-def _paper(path: str | Path, page: Page, paper: str) -> tuple[float, float]:
-    """Return the width and height of the paper, upright or rotated, mm."""
+def _paper(path: str | Path, page: Page, paper: str, split: bool) -> tuple[float, float]:
+    """Return the width and height of the paper, upright or rotated, mm; of the drawing where it is to be split."""
     low, high = _content(page)
     needed = high - low + [2 * _EDGE, 2 * _EDGE + _FOOT]
     needed[0] = max(needed[0], _FOOT_WIDTH + 2 * _EDGE)
@@ -343,12 +423,15 @@ def _paper(path: str | Path, page: Page, paper: str) -> tuple[float, float]:
         return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
     larger = [name for name, size in PAPERS.items() if name != "fit" and _rotated(size, needed) is not None]
     size = _rotated(PAPERS[paper], needed)
+    if size is None and split:
+        return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
     if size is None:
         hint = f"--paper {larger[0]}, or " if larger else ""
+        what = f"the plane of {', '.join(page.names[:3])}" if any(page.names) else "the board"
         raise InputError(
-            f"{path}: the plane of {', '.join(page.names[:3])} needs {needed[0]:.0f} x {needed[1]:.0f} mm of paper, and "
-            f"{paper} is {PAPERS[paper][0]:g} x {PAPERS[paper][1]:g} mm: take {hint}--paper fit for a plotter or for a "
-            "program that prints posters on several sheets"
+            f"{path}: {what} needs {needed[0]:.0f} x {needed[1]:.0f} mm of paper, and "
+            f"{paper} is {PAPERS[paper][0]:g} x {PAPERS[paper][1]:g} mm: take {hint}--paper fit for a plotter, or "
+            "--split for several sheets to join"
         )
     return size
 
@@ -368,18 +451,20 @@ def _check_pixels(output: str | Path, sizes: list[tuple[float, float]], dpi: int
         )
 
 
-def _figure(page: Page, size: tuple[float, float], head: str, foot: str) -> Figure:
-    """Draw one page."""
+def _figure(page: Page, size: tuple[float, float], head: str, foot: str, sheet: _Sheet | None = None) -> Figure:
+    """Draw one page, or one sheet of it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     width, height = size
-    figure = Figure(figsize=(width / 25.4, height / 25.4))
+    paper = size if sheet is None else sheet.paper
+    figure = Figure(figsize=(paper[0] / 25.4, paper[1] / 25.4))
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set_axis_off()
-    axes.set_xlim(0.0, width)
-    axes.set_ylim(height, 0.0)
+    if sheet is None:
+        axes = _window(figure, size, (0.0, 0.0), 0.0)
+    else:
+        _joints(_window(figure, paper, (0.0, 0.0), 0.0), sheet)
+        axes = _window(figure, paper, sheet.low, _EDGE)
     low, high = _content(page)
     room = np.array([width, height - _FOOT])
     shift = (room - (high - low)) / 2 - low
@@ -398,6 +483,30 @@ def _figure(page: Page, size: tuple[float, float], head: str, foot: str) -> Figu
     seen = f"seen from ({', '.join(f'{c + 0.0:.3g}' for c in page.normal.round(6))})"
     _footer(axes, height, [f"{head}, {seen}", foot])
     return figure
+
+
+def _window(figure: Figure, paper: tuple[float, float], low: tuple[float, float], edge: float) -> Axes:
+    """Return axes in mm on a paper less its edges, whose upper left corner is ``low``."""
+    (width, height), (x, y) = paper, low
+    axes = figure.add_axes((edge / width, edge / height, 1.0 - 2 * edge / width, 1.0 - 2 * edge / height))
+    axes.set_axis_off()
+    axes.set_xlim(x, x + width - 2 * edge)
+    axes.set_ylim(y + height - 2 * edge, y)
+    return axes
+
+
+def _joints(axes: Axes, sheet: _Sheet) -> None:
+    """Draw in a sheet's margins where it is cut, and which one it is."""
+    style: Any = {"color": "black", "lw": 0.4, "solid_capstyle": "butt"}
+    width, height = sheet.paper
+    for i, size, across in ((0, width, height), (1, height, width)):
+        for cut in sheet.cuts[i]:
+            at = _EDGE + cut - sheet.low[i]
+            if not _EDGE < at < size - _EDGE:
+                continue
+            for ends in (_MARK, (across - _MARK[1], across - _MARK[0])):
+                axes.plot(*(((at, at), ends) if i == 0 else (ends, (at, at))), **style)
+    _write(axes, np.array([_EDGE + 30.0, height - 6.5]), sheet.label, _SMALL, va="center")
 
 
 def _surround(axes: Axes, mark: Mark, shift: Array) -> None:
@@ -433,6 +542,8 @@ def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:
     """Write a marker's name beside it, where nothing else is."""
     low, high = mark.box + shift
     name = plain(mark.name, 24)
+    if not name:
+        return
     half = np.array([0.3 * _TEXT * len(name), 0.6 * _TEXT])
     middle, beyond = (low + high) / 2, (high - low) / 2 + half + 1.0
     positions = [middle + beyond * step for step in np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])]
@@ -448,7 +559,7 @@ def _free(box: Array, taken: list[Array]) -> bool:
 
 def _write(axes: Axes, at: Array, text: str, height_mm: float, **more: str) -> None:
     """Write text of a height; a dollar sign is a dollar sign."""
-    style: Any = {"fontsize": height_mm / _POINT / 0.72, "color": "black", "parse_math": False, **more}
+    style: Any = {"fontsize": height_mm / _POINT / 0.72, "color": "black", "parse_math": False, "clip_on": True, **more}
     axes.text(float(at[0]), float(at[1]), text, **style)
 
 
