@@ -7,9 +7,10 @@ import csv
 import io
 import math
 import os
+import re
 import secrets
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -35,20 +36,88 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def read_table(path: str | Path) -> list[list[str]]:
+#: A number as half of the world writes it: 0,25 or -1,5e-3.
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> list[list[str]]:
     """Read a CSV file into rows of cells; a byte-order mark before the first is left out.
 
+    Cells may also be separated by semicolons or tabs, as spreadsheets write them where the comma is the decimal mark;
+    numbers with a decimal comma are then returned with a point.
+
+    Args:
+        path: the file.
+        columns: name that the caller looks for -> name in the file's first line, as :func:`read_columns` returns them.
+
     Raises:
-        InputError: missing, unreadable, not text or not a table, or one whose cells are separated by semicolons or tabs.
+        InputError: missing, unreadable, not text or not a table, decimal commas and points in one table, or a name of
+            ``columns`` that the first line does not have.
     """
+    text = read_text(path).removeprefix("\ufeff")
+    first = text.partition("\n")[0]
+    mark = next((mark for mark in (";", "\t") if mark in first and "," not in first), ",")
     try:
-        rows = list(csv.reader(io.StringIO(read_text(path).removeprefix("\ufeff"))))
+        rows = list(csv.reader(io.StringIO(text), delimiter=mark))
     except csv.Error as error:
         raise InputError(f"{path}: not a table: {error}") from None
-    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
-        if rows and len(rows[0]) == 1 and mark in rows[0][0]:
-            raise InputError(f"{path}: line 1: columns are separated by {name}; save it with commas between them")
+    if mark != ",":
+        rows = _with_points(path, rows)
+    if columns and rows:
+        rows[0] = _renamed(path, [name.strip() for name in rows[0]], columns)
     return rows
+
+
+def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
+    """Return rows with decimal points for decimal commas; a table has one or the other."""
+    found = [(line, cell) for line, row in enumerate(rows, 1) for cell in row if _DECIMAL_COMMA.fullmatch(cell.strip())]
+    if not found:
+        return rows
+    for line, row in enumerate(rows[1:], 2):
+        for cell in row:
+            if re.fullmatch(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?", cell.strip()):
+                raise InputError(
+                    f"{path}: line {line} has {cell.strip()} and line {found[0][0]} {found[0][1].strip()}: is the comma "
+                    "the decimal mark, or the point? save it with one of them"
+                )
+    return [
+        [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in row] for row in rows
+    ]
+
+
+def _renamed(path: str | Path, header: list[str], columns: Mapping[str, str]) -> list[str]:
+    """Return the names of a first line as the caller knows them; a column that is renamed replaces one of that name."""
+    for name, theirs in columns.items():
+        if theirs not in header:
+            raise InputError(f"{path}: line 1: no column {theirs!r} for {name}; there are {', '.join(header)}")
+    given = {theirs: name for name, theirs in columns.items()}
+    return [given.get(name, f"({name})" if name in columns else name) for name in header]
+
+
+def read_columns(text: str | None, known: Collection[str]) -> dict[str, str]:
+    """Read the option ``--columns NAME=THEIRS,...``.
+
+    Args:
+        text: its value; None where it is not given.
+        known: the names that the command looks for.
+
+    Returns:
+        Name that the command looks for -> name in the file.
+
+    Raises:
+        InputError: no such form, an unknown name, or one given twice.
+    """
+    columns: dict[str, str] = {}
+    for part in [] if text is None else text.split(","):
+        name, equals, theirs = (piece.strip() for piece in part.partition("="))
+        if not (name and equals and theirs):
+            raise InputError(f"--columns {text}: expected NAME=COLUMN,..., such as x_m=X,y_m=Y; got {part.strip()!r}")
+        if name not in known:
+            raise InputError(f"--columns {text}: unknown name {name!r}; known are {', '.join(known)}")
+        if name in columns or theirs in columns.values():
+            raise InputError(f"--columns {text}: {part.strip()} repeats a name")
+        columns[name] = theirs
+    return columns
 
 
 class _NamedFile(io.FileIO):

@@ -380,3 +380,21 @@ def test_limits_are_checked(tmp_path, capsys):
         )
     assert_rejected(said(capsys, data, "--limit", "AP=1mm", "--limit", "AP=2mm"), "already")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_a_spreadsheet_has_the_same_metrics(tmp_path, capsys):
+    rows = [row for row in rows_of() if row[0] == "pose"]
+    (plain,) = said(capsys, file_of(tmp_path / "poses.csv", rows), "--json").lines
+    names = ["test", "Pose no.", *COLUMNS[2:5], "X", *COLUMNS[6:], *COMMAND, *SIGMA]
+    lines = [";".join(names)]
+    lines += [
+        ";".join(str(cell).replace(".", ",") if isinstance(cell, float) else str(cell) for cell in row) for row in rows
+    ]
+    (tmp_path / "semicolons.csv").write_text("\n".join(lines) + "\n")
+    columns = ("--columns", "pose=Pose no.,x_m=X")
+    (found,) = said(capsys, tmp_path / "semicolons.csv", "--json", *columns).lines
+    assert found == plain
+    assert_rejected(said(capsys, tmp_path / "semicolons.csv"), "semicolons.csv: line 1: column pose is missing")
+    assert_rejected(said(capsys, tmp_path / "semicolons.csv", "--columns", "z=Z"), "--columns z=Z", "unknown name")
+    (tmp_path / "run").mkdir()
+    assert_rejected(said(capsys, tmp_path / "run", *columns), "--columns goes with a table")

@@ -52,6 +52,9 @@ def command() -> None:
     help="Folder for report.html, check.json, figures.",
 )
 @click.option(
+    "--columns", metavar="NAME=COLUMN,...", help="Of a CSV: its own names of columns, such as x_m=X,command_x_m=X0."
+)
+@click.option(
     "--limit",
     "limit_texts",
     multiple=True,
@@ -59,7 +62,14 @@ def command() -> None:
     help="Say PASS or FAIL of a metric, such as AP=0.5mm; may be repeated. Exit code 1 where one fails.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
-def evaluated(data: Path, closed: bool, output: Path | None, limit_texts: tuple[str, ...], as_json: bool) -> int:
+def evaluated(
+    data: Path,
+    closed: bool,
+    output: Path | None,
+    columns: str | None,
+    limit_texts: tuple[str, ...],
+    as_json: bool,
+) -> int:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
     RUN is a folder of armsight run or armsight demo, POSES.csv a table of attained poses (docs/howto/iso9283.md).
@@ -79,7 +89,7 @@ def evaluated(data: Path, closed: bool, output: Path | None, limit_texts: tuple[
                 f"{output}: holds another command's {PAGE}, which would be written over; choose another folder"
             )
     limits = read_limits(limit_texts)
-    attained = read_check(data, closed=closed)
+    attained = read_check(data, closed=closed, columns=columns)
     result = evaluate(attained)
     outcomes = check_limits(list(metric_lines(result)), limits)
     remarks = ["" if each is None else each.text() for each in outcomes] if limits else []

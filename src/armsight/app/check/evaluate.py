@@ -41,21 +41,24 @@ _OUTLIER_RATIO = 12.0
 _OUTLIER_LEAST_M = 1e-5
 
 
-def read_check(path: Path, *, closed: bool = False) -> Attained:
+def read_check(path: Path, *, closed: bool = False, columns: str | None = None) -> Attained:
     """Read what was attained, from a run's folder (or the check.csv in it) or from a CSV.
 
     Args:
         path: folder or file.
         closed: of a run, take the motions with the loop closed on vision.
+        columns: of a CSV, what its columns are called, as the option --columns has it.
 
     Raises:
         InputError: it cannot be read, or holds nothing that can be evaluated.
     """
     if path.is_dir() and not (path / "check.csv").exists():
+        if columns is not None:
+            raise InputError(f"{path}: --columns goes with a table of attained poses; this is a run's folder")
         return attained_in(path, closed=closed)
     if closed:
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
-    rows = read_rows(path / "check.csv" if path.is_dir() else path)
+    rows = read_rows(path / "check.csv" if path.is_dir() else path, columns)
     unknown = not any(row.cov.any() for row in rows)
     return Attained(
         rows, ["no sigma_x_m .. are given: the instrument's noise is taken for none"] if unknown else [], []

@@ -13,7 +13,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_table
+from armsight.files import read_columns, read_table
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
 
@@ -99,13 +99,17 @@ class Attained(NamedTuple):
     reversals: list[Reversal]
 
 
-def read_rows(file: Path) -> list[Row]:
+def read_rows(file: Path, columns: str | None = None) -> list[Row]:
     """Read a CSV.
+
+    Args:
+        file: the table.
+        columns: what its columns are called there, as the option --columns has it; None where they have our names.
 
     Raises:
         InputError: unreadable, a column missing, or a value that is no number; the message names the line.
     """
-    table = read_table(file)
+    table = read_table(file, read_columns(columns, _COLUMNS))
     if not table:
         raise InputError(f"{file}: empty; a first line of column names is needed")
     header = [name.strip() for name in table[0]]
