@@ -614,3 +614,37 @@ def test_command_mistakes(tmp_path, size, said):
         run("import", tmp_path / "none.yml", "--format", "opencv", "-o", tmp_path / "r.json", "--image-size", size)
     assert list(tmp_path.iterdir()) == []
     assert run("import", "x", "--format", "matlab", "-o", "r").exit_code == 2
+
+
+def test_one_alpha_in_all_rectifications_and_it_is_said(tmp_path):
+    """All pixels of a rectified image come from inside the raw one: OpenCV's maps are the oracle."""
+    rig, P = ordinary_rig("brown5"), {}
+    rig.save(tmp_path / "rig.json")
+    for name in ("opencv", "ros"):
+        files = paths(tmp_path, name)
+        out = run("export", tmp_path / "rig.json", "--format", name, "-o", files[0], files[1], "--json")
+        assert json.loads(out.stdout)["rectification_alpha"] == 0.0
+        assert "alpha 0" in out.stderr
+    stored = cv2.FileStorage(str(tmp_path / "extrinsics.yml"), cv2.FILE_STORAGE_READ)
+    P["opencv"] = [stored.getNode(key).mat() for key in ("R1", "R2", "P1", "P2")]
+    stored.release()
+    documents = [yaml.safe_load((tmp_path / f"{side}.yaml").read_text()) for side in ("left", "right")]
+    P["ros"] = [
+        np.reshape(one[key]["data"], (3, -1))
+        for key in ("rectification_matrix", "projection_matrix")
+        for one in documents
+    ]
+    for ours, theirs in zip(P["opencv"], P["ros"], strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    for camera, R, projection in zip(rig.cameras, P["ros"][:2], P["ros"][2:], strict=True):
+        u, v = cv2.initUndistortRectifyMap(
+            camera.matrix, np.array(camera.distortion), R, projection, camera.image_size_px, cv2.CV_32FC1
+        )
+        width, height = camera.image_size_px
+        # OpenCV finds the valid part on a grid of 9 x 9 points of the edge: between them an edge bends by a pixel or so.
+        assert u.min() > -2
+        assert u.max() < width + 1
+        assert v.min() > -2
+        assert v.max() < height + 1
+    out = run("export", tmp_path / "rig.json", "--format", "ros", "--help")
+    assert "alpha 0" in " ".join(out.output.split())

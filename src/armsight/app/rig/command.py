@@ -14,7 +14,7 @@ from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
-from armsight.vision.rigfiles.rigfile import ASSUMED_SIGMA_PX
+from armsight.vision.rigfiles.rigfile import ALPHA, ASSUMED_SIGMA_PX
 
 _FORMAT = click.option("--format", "name", required=True, type=click.Choice(list(FORMATS)), help="The other program.")
 
@@ -75,13 +75,24 @@ def import_(
 @_FORMAT
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
-    """Write a rig for another program, and print what its format cannot hold."""
+    """Write a rig for another program, and print what its format cannot hold.
+
+    OUT are the format's files in the order of armsight rig -h, such as -o left.yaml -o right.yaml; after the first -o the
+    others may also follow by themselves: -o left.yaml right.yaml. The rectification in files of opencv and ros (R1 R2 P1 P2
+    Q) has alpha 0: all pixels of the rectified images are valid.
+    """
     paths = (*output, *more)
     check_outputs(paths, (path,))
     lost = export_rig(StereoRig.load(path), name, paths)
+    alpha = ALPHA if FORMATS[name].RECTIFIES else None
+    if alpha is not None:
+        click.echo(
+            f"note: the rectification in it has alpha {alpha:g}: all pixels of the rectified images are valid", err=True
+        )
     for what in lost:
         click.echo(f"note: not in the {name} format: {what}", err=True)
-    click.echo(json.dumps({"rig": path, "format": name, "files": paths, "lost": lost}) if as_json else " ".join(paths))
+    answer = {"rig": path, "format": name, "files": paths, "lost": lost, "rectification_alpha": alpha}
+    click.echo(json.dumps(answer) if as_json else " ".join(paths))
 
 
 def _image_size(text: str) -> tuple[int, int]:

@@ -32,6 +32,8 @@ from armsight.vision.rigfiles.rigfile import (
 )
 
 FILES = "one file, camchain.yaml"
+#: Its file holds no rectification.
+RECTIFIES = False
 #: Kalibr model -> ours.
 MODELS = {"radtan": "brown4", "equidistant": "fisheye", "none": "none"}
 #: Keys that armsight cannot represent.

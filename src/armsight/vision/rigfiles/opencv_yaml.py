@@ -38,6 +38,8 @@ from armsight.vision.rigfiles.rigfile import (
 )
 
 FILES = "intrinsics.yml and extrinsics.yml, or one file with both"
+#: Its files hold a rectification.
+RECTIFIES = True
 NEEDED = ("M1", "D1", "M2", "D2", "R", "T")
 OPTIONAL = ("unit_m", "image_width", "image_height", "distortion_model")
 
@@ -83,7 +85,7 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
         "D2": right.distortion.reshape(1, -1),
     }
     extrinsics = {"unit_m": 1.0, "R": T_right_left[:3, :3], "T": T_right_left[:3, 3].reshape(3, 1)}
-    extrinsics |= dict(zip(("R1", "R2", "P1", "P2", "Q"), rectification(rig, alpha=1.0), strict=True))
+    extrinsics |= dict(zip(("R1", "R2", "P1", "P2", "Q"), rectification(rig), strict=True))
     parts = [intrinsics, extrinsics] if len(paths) == 2 else [intrinsics | extrinsics]
     write_together(paths, [_dump(part) for part in parts])
     return not_held(rig)

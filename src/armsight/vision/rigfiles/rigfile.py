@@ -29,6 +29,9 @@ Foreign: TypeAlias = Any
 #: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A
 #: larger value widens every predicted uncertainty in proportion.
 ASSUMED_SIGMA_PX = 0.2
+#: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
+#: rectified images so that all of their pixels are valid; 1 would keep all pixels of the raw images, and black edges.
+ALPHA = 0.0
 #: A printed rotation may be this far from orthonormal: three digits leave 1e-3, six leave 1e-6.
 LOOSEST_ROTATION = 2e-3
 
@@ -49,7 +52,13 @@ class ImportOptions:
 
 
 class RigFormat(Protocol):
-    """One foreign format; a module with these two functions fulfils it."""
+    """One foreign format; a module with this constant and these two functions fulfils it.
+
+    Attributes:
+        RECTIFIES: whether its files hold a rectification, which is computed with ALPHA.
+    """
+
+    RECTIFIES: bool
 
     def read(self, paths: Sequence[Path], options: ImportOptions) -> StereoRig:
         """Read a rig; its provenance says what was assumed and what was left behind.
@@ -193,13 +202,8 @@ def imported(
     return StereoRig(left, right, T_left_right, np.zeros((count, count)), options.sigma_px, provenance)
 
 
-def rectification(rig: StereoRig, alpha: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Return OpenCV's R1 R2 P1 P2 Q for a rig.
-
-    Args:
-        rig: two Brown cameras or two fisheyes.
-        alpha: 0 keeps only valid pixels, 1 keeps all.
-    """
+def rectification(rig: StereoRig) -> tuple[Array, Array, Array, Array, Array]:
+    """Return OpenCV's R1 R2 P1 P2 Q, with ALPHA, for a rig of two Brown cameras or two fisheyes."""
     T_right_left = inverse(rig.T_left_right)
     fisheye = [camera.model == "fisheye" for camera in rig.cameras]
     if any(fisheye) and not all(fisheye):
@@ -208,9 +212,9 @@ def rectification(rig: StereoRig, alpha: float) -> tuple[Array, Array, Array, Ar
     args = (left.matrix, np.array(left.distortion), right.matrix, np.array(right.distortion), left.image_size_px)
     R, t = np.ascontiguousarray(T_right_left[:3, :3]), np.ascontiguousarray(T_right_left[:3, 3:])
     if all(fisheye):
-        R1, R2, P1, P2, Q = cv2.fisheye.stereoRectify(*args, R, t, flags=cv2.CALIB_ZERO_DISPARITY, balance=alpha)
+        R1, R2, P1, P2, Q = cv2.fisheye.stereoRectify(*args, R, t, flags=cv2.CALIB_ZERO_DISPARITY, balance=ALPHA)
     else:
-        R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(*args, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha)
+        R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(*args, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=ALPHA)
     R1, R2, P1, P2, Q = (np.asarray(m, dtype=np.float64) for m in (R1, R2, P1, P2, Q))
     return R1, R2, P1, P2, Q
 

@@ -38,6 +38,8 @@ from armsight.vision.rigfiles.rigfile import (
 )
 
 FILES = "two files, left.yaml and right.yaml"
+#: Its files hold a rectification.
+RECTIFIES = True
 #: ROS model -> the numbers of coefficients it may come with.
 MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
@@ -68,7 +70,7 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     """Write the left and the right camera_info file."""
     count_paths(paths, (2,), FILES)
     lost = list(not_held(rig))
-    R1, R2, P1, P2, _ = rectification(rig, alpha=0.0)
+    R1, R2, P1, P2, _ = rectification(rig)
     documents = []
     for name, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2)):
         model, d = (
