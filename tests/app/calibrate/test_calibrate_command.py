@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -281,3 +282,22 @@ def test_the_rig_is_json_that_others_can_read(rendered):
     document = json.loads(rendered.rig.read_text())
     assert document["format"] == "armsight-rig"
     assert np.shape(document["covariance"]) == (len(document["parameters"]),) * 2
+
+
+def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight, tmp_path):
+    """Two webcams that are not synchronised: the board moved between their exposures, and stayed away from the edges."""
+    folder = data_dir / "stereo" / "webcams-360p"
+    images = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg", "--target", "chessboard:9x6:24.23mm")
+    said = armsight("calibrate", *images, "--lens-model", "brown4", "-o", tmp_path / "rig.json", "--report", tmp_path)
+    (fit,) = [line for line in said.out.splitlines() if line.startswith("fit: ")]
+    epipolar, reprojection = (float(number) for number in re.findall(r"(\d\.\d+) px", fit)[:2])
+    assert epipolar > 2 * reprojection
+    assert "the reprojection follows the board, which moved between the two exposures" in fit
+    assert "of 108 corners of both images dropped" in said.out
+    (share,) = re.findall(r"weak: (\d+%) of the left image never saw the board \(counted in 8 x 8 cells\)", said.out)
+    rig = StereoRig.load(tmp_path / "rig.json")
+    assert rig.provenance["board"] == "rig.board.toml"
+    page = (tmp_path / "report.html").read_text()
+    assert f"{share} of the left image never saw the board" in page
+    assert "The percentages are counted in 8 x 8 cells, larger than those of the map." in page
+    assert "The reprojection follows the board, which moved" in page

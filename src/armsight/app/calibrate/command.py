@@ -12,7 +12,7 @@ from typing import Any
 import click
 import cv2
 
-from armsight.app.calibrate.report import REPORT_FILES, write_report
+from armsight.app.calibrate.report import MOTION_FITTED, REPORT_FILES, write_report
 from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
 from armsight.app.report.page import PAGE
@@ -210,9 +210,10 @@ def _print(calibration: Calibration, output: Path, board_file: Path | None, repo
     print_table(
         TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
     )
+    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
     lines = [
-        f"fit: epipolar {c.epipolar_rms_px:.3f} px, reprojection {c.reprojection_rms_px:.3f} px RMS; {len(c.pairs)} of "
-        f"{c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
+        f"fit: epipolar {c.epipolar_rms_px:.3f} px, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
+        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
         *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),

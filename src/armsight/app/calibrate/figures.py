@@ -15,6 +15,7 @@ from armsight.app.calibrate.assessment import HELD_M, SHARES, Slice, target_draw
 from armsight.app.report.plotting import BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain
 from armsight.data import SIDES, Array
 from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.weak import COVERAGE_GRID, coverage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -196,8 +197,9 @@ def coverage_figure(calibration: Calibration) -> Figure:
     grids = [grid_counts(calibration, side) for side in (0, 1)]
     most = max(counts.max() for counts, _, _ in grids)
     for side, (axes, (counts, u, v)) in enumerate(zip(panels, grids, strict=True)):
-        empty = 100 * float((counts == 0).mean())
-        _image_axes(axes, calibration, side, f"{SIDES[side]} image: {empty:.0f}% of the cells are empty")
+        empty = 100 * float((coverage(calibration, side, COVERAGE_GRID) == 0).mean())
+        title = f"{SIDES[side]} image: {empty:.0f}% of {COVERAGE_GRID} x {COVERAGE_GRID} cells saw no point"
+        _image_axes(axes, calibration, side, title)
         axes.set_facecolor(EMPTY)
         axes.patch.set(hatch="////", edgecolor="#e9a57f")
         shown = np.ma.masked_equal(counts, 0)

@@ -43,6 +43,7 @@ from armsight.data import Array
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors
+from armsight.vision.calibrate.weak import COVERAGE_GRID
 from armsight.vision.rig import StereoRig
 
 if TYPE_CHECKING:
@@ -66,9 +67,17 @@ def headline_table(calibration: Calibration) -> str:
     ]
     fit = f"{calibration.reprojection_rms_px:.3g} px"
     meaning = "Error of the fitted model at the points it was fitted to. It does not predict errors in millimetres."
+    if calibration.motion is not None:
+        meaning += f" {MOTION_FITTED}"
     rows.append(("reprojection RMS", "–", fit, "", meaning))
     head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "meaning")
     return table(head, rows, "headline")
+
+
+#: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
+MOTION_FITTED = (
+    "The reprojection follows the board, which moved between the two exposures of a pair; the epipolar RMS does not."
+)
 
 
 def models_table(calibration: Calibration) -> str:
@@ -193,7 +202,10 @@ def result(calibration: Calibration, figures: Figures) -> str:
 def coverage(calibration: Calibration, figures: Figures) -> str:
     """Return the coverage maps."""
     what = target(calibration)
-    see = f"points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number."
+    see = (
+        f"points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number. The "
+        f"percentages are counted in {COVERAGE_GRID} x {COVERAGE_GRID} cells, larger than those of the map."
+    )
     bad = (
         "hatched cells where you want to measure: no point was seen there, so the lens model is extrapolated. Take more "
         f"pairs with the {what} there. (The dark rim around the image of a fisheye lens stays empty.)"

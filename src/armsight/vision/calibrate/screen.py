@@ -122,7 +122,7 @@ def screen(
     for j in kept:
         mine = observations.shot == j
         if lost := int((mine & ~good).sum()):
-            notes.append(f"{names[j]}: {lost} of {mine.sum()} corners dropped as gross errors")
+            notes.append(f"{names[j]}: {lost} of {mine.sum()} corners of both images dropped as gross errors")
     unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
     solution = minimise(_of_shots(model, kept), state, final, sigma)
     return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))

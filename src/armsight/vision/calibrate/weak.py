@@ -10,7 +10,7 @@ from armsight.vision.calibrate.result import Calibration
 
 _LEAST_TILT_DEG = 15.0
 _GOOD_PAIRS = 12
-_COVERAGE_GRID = 8
+COVERAGE_GRID = 8
 _LEAST_COVERED = 0.6
 _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
@@ -54,12 +54,12 @@ def _tilts(calibration: Calibration) -> str | None:
 
 def _coverage(calibration: Calibration) -> str | None:
     for side, name in enumerate(("left", "right")):
-        share = coverage(calibration, side, _COVERAGE_GRID)
+        share = coverage(calibration, side, COVERAGE_GRID)
         if (share > 0).mean() < _LEAST_COVERED:
             empty = 100 * (share == 0).mean()
             return (
-                f"{empty:.0f}% of the {name} image never saw the board, so its distortion is unknown there: "
-                "move the board into the corners of both images"
+                f"{empty:.0f}% of the {name} image never saw the board (counted in {COVERAGE_GRID} x {COVERAGE_GRID} "
+                "cells), so its distortion is unknown there: move the board into the corners of both images"
             )
     return None
 
