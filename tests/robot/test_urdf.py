@@ -217,7 +217,7 @@ PRISMATIC = (
             changed('velocity="1.5707963267948966"', 'velocity="0"'),
             "joint 'joint1': <limit> velocity=0 must be more than 0",
         ),
-        (changed('<link name="link2" />', '<link name="link1" />'), "two links are called 'link1'"),
+        (changed('<link name="link2">', '<link name="link1">'), "two links are called 'link1'"),
         (changed('name="joint2"', 'name="joint1"'), "two joints are called 'joint1'"),
         (
             changed('upper="2.9670597283903604"', 'upper="170"'),
@@ -375,3 +375,38 @@ def test_an_arm_as_ros_describes_it_is_the_one_of_the_makers_table(tmp_path):
     off = np.linalg.inv(base) @ arm.forward(probes()) - MODELS["ur5"].forward(probes())
     assert np.abs(off).max() < 7 * 5e-12
     assert len(arm.inverse(arm.forward(np.array([0.3, -1.2, 1.4, -0.5, 1.0, 0.2])))) == 8
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_written_arm_loads_in_mujoco_and_can_hold_itself(name):
+    mujoco = pytest.importorskip("mujoco")
+    arm = MODELS[name]
+    text = urdf_text(arm)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    assert model.njnt == 6
+    assert (model.body_mass[1:] > 0).all()
+    assert (model.body_inertia[1:] > 0).all()
+    np.testing.assert_allclose(model.jnt_range, np.column_stack([arm.q_min, arm.q_max]), atol=1e-12)
+    efforts = model.jnt_actfrcrange[:, 1]
+    assert (efforts > 0).all()
+    rng = np.random.default_rng(1)
+    data.qpos[:] = arm.home
+    mujoco.mj_forward(model, data)
+    T_6_tool = np.linalg.inv(pose(data.xmat[-1].reshape(3, 3), data.xpos[-1])) @ arm.forward(arm.home)
+    for q in rng.uniform(arm.q_min, arm.q_max, (50, 6)):
+        data.qpos[:], data.qvel[:] = q, 0.0
+        mujoco.mj_forward(model, data)
+        at = pose(data.xmat[-1].reshape(3, 3), data.xpos[-1])  # of link 6: flange and tool are fused with it
+        np.testing.assert_allclose(at @ T_6_tool, arm.forward(q), atol=1e-12)
+        assert (np.abs(data.qfrc_bias) < efforts).all()  # what gravity asks for
+
+
+def test_every_link_that_moves_has_a_shape_and_the_file_says_that_they_are_stand_ins():
+    text = urdf_text(SIX_R)
+    assert "masses, inertias, efforts and shapes are stand-ins" in text
+    links = ET.fromstring(text).findall("link")
+    shaped = {link.get("name") for link in links if link.find("visual/geometry/cylinder") is not None}
+    assert shaped >= {f"link{i}" for i in range(1, 7)}
+    sizes = [float(c.get(key)) for c in ET.fromstring(text).iter("cylinder") for key in ("radius", "length")]
+    assert min(sizes) > 0

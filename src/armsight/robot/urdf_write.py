@@ -2,7 +2,12 @@
 
 A link's frame sits at its joint and rotates with it, so that joint i + 1 stands at Rz(offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i)
 of link i, which is what a URDF origin holds without loss. Accelerations and jerks stand in ``limit`` as URDF 1.2 has them;
-the home pose and the source stand in an element ``armsight`` that other programs ignore. Efforts are not known: 0.
+the home pose and the source stand in an element ``armsight`` that other programs ignore.
+
+An arm's table says nothing of shapes, masses and motors, and programs such as MuJoCo and Gazebo need them. So each link is
+a solid bar from its joint to the next, with a drum at the joint: both as visuals, and as mass and inertia. The greatest
+effort is a multiple of what holds those masses stretched out. These are stand-ins, and the file says so; replace them
+before you simulate forces. What armsight reads back does not depend on them.
 """
 
 from __future__ import annotations
@@ -18,14 +23,29 @@ from armsight.geometry.pose import pose
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.table import exact_cos_sin
 
+#: Radius of the bars, as a share of the arm's length along its links, its bounds, m, and how it shrinks from link to link.
+_RADIUS, _THINNEST_M, _THICKEST_M, _TAPER = 0.04, 0.01, 0.08, 0.9
+#: Density of the bars, kg/m^3: a hollow aluminium casting with its motors.
+_DENSITY = 1500.0
+#: Length of a joint's drum, in radii; greatest effort, in torques that hold the stretched arm; its least, N m.
+_DRUM, _EFFORT, _LEAST_EFFORT_NM = 2.4, 3.0, 1.0
+_GRAVITY_M_S2 = 9.81
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
 
 def urdf_text(arm: Arm) -> str:
     """Return an arm as URDF text."""
     robot = ET.Element("robot", name=arm.name)
     ET.SubElement(robot, "armsight", home_rad=_numbers(arm.home), source=arm.source)
     names = ["base", *(f"link{i}" for i in range(1, 7)), "flange", "tool"]
-    for name in names:
-        ET.SubElement(robot, "link", name=name)
+    robot.append(ET.Comment(" masses, inertias, efforts and shapes are stand-ins: the arm's table does not have them "))
+    origins = [_origin(arm, i)[0] for i in range(8)]
+    radii = _radii(origins)
+    for i, name in enumerate(names):
+        link = ET.SubElement(robot, "link", name=name)
+        if i < 7:
+            _solid(link, origins[i], radii[i], moves=i > 0)
+    efforts = _efforts(origins, radii)
     for i in range(8):
         fixed = i >= 6
         name = f"{names[i]}-{names[i + 1]}" if fixed else arm.joint_names[i]
@@ -41,7 +61,7 @@ def urdf_text(arm: Arm) -> str:
             "lower": arm.q_min[i],
             "upper": arm.q_max[i],
             "velocity": arm.qd_max[i],
-            "effort": 0.0,  # not known, and the format asks for it
+            "effort": efforts[i],
             "acceleration": arm.qdd_max[i],
             "deceleration": arm.qdd_max[i],
             "jerk": arm.qddd_max[i],
@@ -49,6 +69,60 @@ def urdf_text(arm: Arm) -> str:
         ET.SubElement(joint, "limit", {key: repr(float(value)) for key, value in limits.items()})
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def _radii(origins: list[Array]) -> list[float]:
+    """Return the radius of the bar of each link from the base to link 6, m."""
+    length = float(sum(np.linalg.norm(origin) for origin in origins))
+    first = float(np.clip(_RADIUS * length, _THINNEST_M, _THICKEST_M))
+    return [first * _TAPER**i for i in range(7)]
+
+
+def _mass(origin: Array, radius: float) -> float:
+    """Return the mass of a link, kg: a bar to the next joint, no shorter than a drum."""
+    return float(_DENSITY * np.pi * radius**2 * max(float(np.linalg.norm(origin)), _DRUM * radius))
+
+
+def _efforts(origins: list[Array], radii: list[float]) -> list[float]:
+    """Return the greatest effort of each joint, N m."""
+    efforts = []
+    for joint in range(6):
+        reach = torque = 0.0
+        for i in range(joint + 1, 7):
+            length = float(np.linalg.norm(origins[i]))
+            torque += _mass(origins[i], radii[i]) * _GRAVITY_M_S2 * (reach + length / 2)
+            reach += length
+        efforts.append(round(max(_EFFORT * torque, _LEAST_EFFORT_NM), 1))
+    return efforts
+
+
+def _solid(link: ET.Element, origin: Array, radius: float, *, moves: bool) -> None:
+    """Give a link its shapes, and one that moves its mass and inertia (of a solid cylinder about its middle)."""
+    length = float(np.linalg.norm(origin))
+    along = _along(origin) if length > radius else np.zeros(3)
+    middle = origin / 2 if length > radius else np.zeros(3)
+    if moves:
+        mass, tall = _mass(origin, radius), max(length, _DRUM * radius)
+        across = mass * (3 * radius**2 + tall**2) / 12
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "origin", xyz=_numbers(middle), rpy=_numbers(along))
+        ET.SubElement(inertial, "mass", value=repr(mass))
+        moments = {"ixx": across, "iyy": across, "izz": mass * radius**2 / 2}
+        ET.SubElement(inertial, "inertia", {key: repr(moments.get(key, 0.0)) for key in _INERTIA})
+    cylinders = [(np.zeros(3), np.zeros(3), _DRUM * radius, radius)] if moves else []
+    if length > radius:
+        cylinders.append((middle, along, length, 0.8 * radius))
+    for xyz, rpy, tall, thick in cylinders:
+        visual = ET.SubElement(link, "visual")
+        ET.SubElement(visual, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
+        geometry = ET.SubElement(visual, "geometry")
+        ET.SubElement(geometry, "cylinder", radius=repr(thick), length=repr(tall))
+
+
+def _along(vector: Array) -> Array:
+    """Return roll, pitch, yaw, rad, of a frame whose z axis is along a vector (3,)."""
+    x, y, z = vector
+    return np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
 
 
 def write_urdf(arm: Arm, path: str | Path) -> None:
