@@ -91,3 +91,12 @@ def test_help_needs_no_optional_package():
     )
     ran = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True)
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
+
+
+def test_help_says_what_identify_needs_and_lists_measure_first(armsight):
+    text = " ".join(armsight("identify", "-h").out.split())
+    assert "--arm ARM Required: the nominal arm" in text
+    assert "--data POSES.csv Required: joint angles" in text
+    text = armsight("-h").out
+    assert text.index("\n  measure ") < text.index("\n  body ") < text.index("\n  dense ")
+    assert "OUT are the format's files in the order" in " ".join(armsight("rig", "export", "-h").out.split())

@@ -107,6 +107,23 @@ def test_what_a_page_names_exists(page):
     assert unknown == {}
 
 
+def texts_of_code() -> dict[str, str]:
+    """Return every file of code that people read, by its path: the package's, without what is built, and the firmware's."""
+    kinds = {".py", ".toml", ".c", ".h", ".ld", ".S", ".xml"}
+    found = [
+        path for folder in ("src", "firmware") for path in sorted((ROOT / folder).rglob("*")) if path.suffix in kinds
+    ]
+    names = {
+        path.relative_to(ROOT).as_posix(): path for path in found if not {"built", "__pycache__"} & set(path.parts)
+    }
+    return {name: path.read_text(encoding="utf-8") for name, path in names.items()}
+
+
+def test_the_files_that_code_names_exist():
+    missing = {name: found for name, text in texts_of_code().items() if (found := missing_files(text))}
+    assert missing == {}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page):
     for target in LINK.findall(page.read_text(encoding="utf-8")):
@@ -116,6 +133,8 @@ def test_links_lead_somewhere(page):
 
 def test_the_checks_find_what_is_planted():
     assert missing_files("see `src/armsight/nothing.py` and docs/index.md") == ["src/armsight/nothing.py"]
+    assert "src/armsight/files.py" in texts_of_code()
+    assert any(name.startswith("firmware/") for name in texts_of_code())
     assert missing_names("armsight.vision.nothing and armsight.vision.rig.StereoRig") == ["armsight.vision.nothing"]
     assert missing_names("from armsight.data import Shot, Nothing") == ["armsight.data.Nothing"]
     planted = calls("    armsight measure rig.json --nothing 3\n`armsight calibrate --left a`\n$ armsight nowhere x\n")

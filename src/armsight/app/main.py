@@ -19,7 +19,7 @@ from armsight.errors import ArmsightError
 #: ``command``.
 SECTIONS: dict[str, tuple[str, ...]] = {
     "Calibrate cameras": ("calibrate", "cameras", "record", "rig"),
-    "Measure": ("body", "measure", "dense"),
+    "Measure": ("measure", "body", "dense"),
     "Operate an arm": ("arm", "board", "run"),
     "Check and identify an arm": ("check", "identify"),
     "Simulate": ("demo",),

@@ -398,3 +398,9 @@ def test_a_table_of_a_spreadsheet_has_the_same_metrics(tmp_path, capsys):
     assert_rejected(said(capsys, tmp_path / "semicolons.csv", "--columns", "z=Z"), "--columns z=Z", "unknown name")
     (tmp_path / "run").mkdir()
     assert_rejected(said(capsys, tmp_path / "run", *columns), "--columns goes with a table")
+
+
+def test_help_shows_both_usages(capsys):
+    lines = said(capsys, "--help").out.splitlines()
+    assert lines[:2] == ["Usage: armsight check [OPTIONS] RUN|POSES.csv", "       armsight check plan [OPTIONS]"]
+    assert said(capsys, "plan", "--help").out.startswith("Usage: armsight check plan [OPTIONS]\n")

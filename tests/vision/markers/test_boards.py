@@ -100,6 +100,13 @@ def test_every_kind_has_a_spec_here_and_a_sound_body(kind):
     assert not points.flags.writeable
 
 
+def test_boards_say_which_way_up_they_are_and_which_tags_they_have():
+    boards = {kind: open_board(spec) for kind, spec in SPECS.items()}
+    assert {kind for kind, board in boards.items() if board.y_up} == {"aprilgrid"}
+    found = {kind: board.codes for kind, board in boards.items() if board.codes[1]}
+    assert found == {"charuco": ("DICT_5X5_100", 24), "aprilgrid": ("tag36h11", 12)}
+
+
 @pytest.mark.parametrize("kind", BOARDS)
 @pytest.mark.parametrize("columns_rows", ["4x3", "5x5", "4x4", "6x5"])
 def test_a_flip_lays_the_points_on_themselves(kind, columns_rows):

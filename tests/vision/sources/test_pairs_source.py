@@ -26,7 +26,10 @@ def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, 
     for k in (1, 2, 10):
         store(tmp_path / f"left{k}.png", "left", k)
         store(tmp_path / f"right{k}.png", "right", k)
-    found = shots(PairsSource.open(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png"))
+    source = PairsSource.open(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png")
+    assert source.count == 3
+    assert set(source.files) == set(tmp_path.iterdir())
+    found = shots(source)
     assert [shot.name for shot in found] == ["left1", "left2", "left10"]
     assert [(read_back(shot.left), read_back(shot.right)) for shot in found] == [
         (("left", k), ("right", k)) for k in (1, 2, 10)

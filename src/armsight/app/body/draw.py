@@ -367,11 +367,8 @@ def _board_page(spec: str) -> Page:
     """Return the page of a board by itself, its white margin left to the paper."""
     board = open_board(spec)
     pattern = BOARD_PATTERNS[type(board)](board)
-    axes = np.eye(3)
+    axes = np.diag([1.0, -1.0, -1.0]) if board.y_up else np.eye(3)
     mark = _pattern("", pattern, pattern.T_body_pattern)(axes)
-    if isinstance(board, AprilGrid):  # its y axis runs up
-        axes = np.diag([1.0, -1.0, -1.0])
-        mark = _pattern("", pattern, pattern.T_body_pattern)(axes)
     corners = [mark.polygons.reshape(-1, 2)]
     corners += [mark.circles[:, :2] + sign * mark.circles[:, 2:] for sign in (-1.0, 1.0)]
     dark = np.concatenate(corners)

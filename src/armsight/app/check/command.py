@@ -23,6 +23,26 @@ from armsight.robot.arm_file import open_arm
 _KINDS = (".toml", ".csv")
 
 
+class _Context(click.Context):
+    """The context of a command that is called without its name."""
+
+    @property
+    def command_path(self) -> str:
+        """The words by which it is called."""
+        return super().command_path.rstrip()
+
+
+class _Evaluate(click.Command):
+    """``armsight check RUN``, whose usage also names the group's other command."""
+
+    context_class = _Context
+
+    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write both usages."""
+        super().format_usage(ctx, formatter)
+        formatter.write_usage(f"{ctx.command_path} plan", "[OPTIONS]", prefix="       ")
+
+
 class _Check(click.Group):
     """``armsight check RUN`` and ``armsight check plan``: what is no subcommand is data to evaluate."""
 
@@ -41,7 +61,7 @@ def command() -> None:
     """Evaluate an arm by ISO 9283: accuracy and repeatability."""
 
 
-@command.command("evaluate")
+@command.command("evaluate", cls=_Evaluate)
 @click.argument("data", metavar="RUN|POSES.csv", type=click.Path(path_type=Path))
 @click.option("--closed", is_flag=True, help="Of a run: evaluate the motions with the loop closed on vision.")
 @click.option(

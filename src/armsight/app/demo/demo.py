@@ -19,7 +19,7 @@ from armsight.app.run.experiment import Progress, RunResult, run_experiment
 from armsight.app.run.folder import Finished, finish, make_room, open_folder
 from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, MotionPlan, read_motions
-from armsight.app.run.setup import Setup
+from armsight.app.run.setup import setup_of
 from armsight.app.run.summary import RunSummary
 from armsight.data import Array
 from armsight.errors import ArmsightError
@@ -126,21 +126,6 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
         rig=demo.layout,
         assumed=nominal,
         like=like,
-    )
-
-
-def setup_of(workcell: Workcell) -> Setup:
-    """Return the setup of a workcell: the interface that real devices have as well."""
-    timing = workcell.timing
-    sync_s = float(np.hypot(timing.sync_s / np.sqrt(3), timing.skew_s))
-    return Setup(
-        workcell.model,
-        workcell.board,
-        workcell.poll,
-        workcell.target,
-        workcell.gravity_duty,
-        timing.rate_hz,
-        sync_s,
     )
 
 

@@ -23,10 +23,16 @@ from armsight.vision.rig import StereoRig
 
 @click.group("identify", invoke_without_command=True)
 @click.option(
-    "--arm", "arm_name", metavar="ARM", help="The nominal arm: a name (armsight arm list), a .toml or a .urdf file."
+    "--arm",
+    "arm_name",
+    metavar="ARM",
+    help="Required: the nominal arm, a name (armsight arm list), a .toml or a .urdf file.",
 )
 @click.option(
-    "--data", metavar="POSES.csv", type=click.Path(path_type=Path), help="Joint angles, and measured poses of the tool."
+    "--data",
+    metavar="POSES.csv",
+    type=click.Path(path_type=Path),
+    help="Required: joint angles, and measured poses of the tool.",
 )
 @click.option(
     "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to validate with."

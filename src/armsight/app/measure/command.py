@@ -106,7 +106,7 @@ def command(
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             results = _measured(stereo, found, _shots(opened, stereo, rig))
-            total = len(getattr(opened, "pairs", ())) or None
+            total = opened.count
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:

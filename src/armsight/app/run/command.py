@@ -12,7 +12,6 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armsight.app.demo.demo import setup_of
 from armsight.app.progress import steps
 from armsight.app.report.plotting import require_matplotlib
 from armsight.app.run.calibrate import handeye_poses
@@ -20,7 +19,7 @@ from armsight.app.run.experiment import Progress, require_start, run_experiment
 from armsight.app.run.folder import Finished, finish, make_room, open_folder
 from armsight.app.run.motion_file import DEFAULT_MOTION, MotionPlan, read_motions
 from armsight.app.run.record import require_pyarrow
-from armsight.app.run.setup import HostClock, LiveShots, Setup
+from armsight.app.run.setup import HostClock, LiveShots, Setup, setup_of
 from armsight.app.run.summary import RunSummary, print_summary
 from armsight.data import Array
 from armsight.errors import InputError

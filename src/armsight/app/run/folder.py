@@ -98,6 +98,8 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
     left = iter(shots)
 
     class Kept:
+        count = len(shots)
+
         def read(self) -> Shot | None:
             return next(left, None)
 

@@ -2,7 +2,7 @@
 
 :class:`Setup` is the record that the loop is given. Two helpers are for real devices, whose time passes by itself:
 :class:`HostClock` converts image times from the computer's clock to the board's, and :class:`LiveShots` reads the cameras
-in a thread.
+in a thread. :func:`setup_of` makes the setup of a workcell.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError
@@ -18,6 +21,9 @@ from armsight.robot.arm import Arm
 from armsight.robot.boards.board import Board
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources.source import Source
+
+if TYPE_CHECKING:
+    from armsight.sim.workcell.workcell import Workcell
 
 _JOIN_S = 2.0
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
@@ -154,3 +160,18 @@ class LiveShots:
         if self._thread is not None:
             self._thread.join(_JOIN_S)
         self._source.close()
+
+
+def setup_of(workcell: Workcell) -> Setup:
+    """Return the setup of a workcell: the interface that real devices have as well."""
+    timing = workcell.timing
+    sync_s = float(np.hypot(timing.sync_s / np.sqrt(3), timing.skew_s))
+    return Setup(
+        workcell.model,
+        workcell.board,
+        workcell.poll,
+        workcell.target,
+        workcell.gravity_duty,
+        timing.rate_hz,
+        sync_s,
+    )

@@ -240,8 +240,13 @@ def _against_truth(before: RunData, covered_s: tuple[float, float] | None) -> di
     found: dict[str, TrackMetrics] = {}
     if before.truth is None:
         return found
-    for name in ("vision", "potentiometers", "fused", "live"):
-        track: ToolTrack = getattr(before, name)
+    tracks = {
+        "vision": before.vision,
+        "potentiometers": before.potentiometers,
+        "fused": before.fused,
+        "live": before.live,
+    }
+    for name, track in tracks.items():
         seen = ~_hidden(track, covered_s)
         moving, resting = (track.phase == "open_loop") & seen, (track.phase == "rest") & seen
         if moving.any() and resting.any():

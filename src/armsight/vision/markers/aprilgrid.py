@@ -52,6 +52,16 @@ class AprilGrid(Record, Target):
             raise fields.error(f"has {columns * rows} tags, and {FAMILY} has {family_size(FAMILY)}")
         return AprilGrid(columns, rows, fields.length_m(1), fields.ratio(2))
 
+    @property
+    def y_up(self) -> bool:
+        """Whether its y axis runs up."""
+        return True
+
+    @property
+    def codes(self) -> tuple[str, int]:
+        """Family and number of its tags."""
+        return FAMILY, self.columns * self.rows
+
     @cached_property
     def body(self) -> Body:
         """The corners of all tags, m, z = 0, named by their number."""

@@ -23,6 +23,16 @@ class CalibrationBoard(Target, Protocol):
     ``symmetries`` is empty for a board that shows which way up it is.
     """
 
+    @property
+    def y_up(self) -> bool:
+        """Whether y runs up and z points out of its face, as on Kalibr's boards; else they run down and into it."""
+        ...
+
+    @property
+    def codes(self) -> tuple[str, int]:
+        """The family of its tags, which have the ids from 0 on, and how many there are; "" and 0 where it has none."""
+        ...
+
 
 #: Kind -> (form, maker).
 BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {

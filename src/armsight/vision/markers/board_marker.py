@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
-from armsight.vision.markers.aprilgrid import FAMILY, AprilGrid
 from armsight.vision.markers.aruco import APRILTAGS, family_name
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import Marker
-from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.marker import Target
 
 #: T_marker_board of a board whose y axis runs up and whose z axis points out of the face.
@@ -80,9 +78,7 @@ class BoardTarget(Record, Target):
                         "need to be of different kinds, and their tags of different families"
                     )
             T = marker.pose()
-            boards.append(
-                MountedBoard(marker.name, board, T @ _ABOUT_X if isinstance(board, AprilGrid) else T, -T[:3, 2])
-            )
+            boards.append(MountedBoard(marker.name, board, T @ _ABOUT_X if board.y_up else T, -T[:3, 2]))
         return BoardTarget(name, tuple(boards))
 
     @cached_property
@@ -136,11 +132,8 @@ def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
 
 def _codes(board: CalibrationBoard) -> tuple[str, int]:
     """Return the dictionary of a board's tags and their number; an empty name and 0 where it has no tags."""
-    if isinstance(board, AprilGrid):
-        return _dictionary(FAMILY), board.columns * board.rows
-    if isinstance(board, Charuco):
-        return _dictionary(board.family), board.columns * board.rows // 2
-    return "", 0
+    family, count = board.codes
+    return _dictionary(family), count
 
 
 def _dictionary(family: str) -> str:

@@ -59,6 +59,16 @@ class Charuco(Record, Target):
             raise fields.error(f"needs {columns * rows // 2} markers, and {family} has {family_size(family)}")
         return Charuco(columns, rows, square_m, marker_m, family)
 
+    @property
+    def y_up(self) -> bool:
+        """Whether its y axis runs up."""
+        return False
+
+    @property
+    def codes(self) -> tuple[str, int]:
+        """Family and number of its tags."""
+        return self.family, self.columns * self.rows // 2
+
     @cached_property
     def body(self) -> Body:
         """The inner corners, m, z = 0, named by their number."""

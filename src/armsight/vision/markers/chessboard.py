@@ -60,6 +60,16 @@ class Chessboard(Record, Target):
         columns, rows = fields.counts(0, least=3)
         return Chessboard(columns, rows, fields.length_m(1))
 
+    @property
+    def y_up(self) -> bool:
+        """Whether its y axis runs up."""
+        return False
+
+    @property
+    def codes(self) -> tuple[str, int]:
+        """Family and number of its tags."""
+        return "", 0
+
     @cached_property
     def body(self) -> Body:
         """The inner corners, m, z = 0, named by their number."""

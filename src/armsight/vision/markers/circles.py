@@ -59,6 +59,16 @@ class CircleGrid(Record, Target):
         columns, rows = fields.counts(0, least=2)
         return CircleGrid(columns, rows, fields.length_m(1), True)
 
+    @property
+    def y_up(self) -> bool:
+        """Whether its y axis runs up."""
+        return False
+
+    @property
+    def codes(self) -> tuple[str, int]:
+        """Family and number of its tags."""
+        return "", 0
+
     @cached_property
     def body(self) -> Body:
         """The discs' middles, m, z = 0, named by their number."""

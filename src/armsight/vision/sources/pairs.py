@@ -51,6 +51,11 @@ class StoredSource:
         self._rest = iter(self.pairs)
 
     @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.pairs)
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """The image files of all pairs."""
         return tuple(file for pair in self.pairs for file in (pair.left, pair.right) if file is not None)

@@ -14,6 +14,11 @@ from armsight.data import Shot
 class Source(Protocol):
     """Two cameras, or a recording of them."""
 
+    @property
+    def count(self) -> int | None:
+        """How many shots there are in all; None where that is not known, as of live cameras."""
+        ...
+
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end.
 

@@ -215,6 +215,8 @@ class _Reader(threading.Thread):
 class UrlSource:
     """Two live streams."""
 
+    count: int | None = None
+
     def __init__(self, left: Stream, right: Stream, timeout_s: float = TIMEOUT_S + 2) -> None:
         self._changed = threading.Condition()
         self._readers = [_Reader(stream, self._changed) for stream in (left, right)]

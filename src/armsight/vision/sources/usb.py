@@ -131,6 +131,8 @@ class UsbCamera:
 class UsbSource:
     """Two USB cameras."""
 
+    count: int | None = None
+
     def __init__(self, left: UsbCamera, right: UsbCamera, stall_s: float = STALL_S) -> None:
         self._left, self._right, self._stall_s = left, right, stall_s
         self._shots = 0

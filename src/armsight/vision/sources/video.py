@@ -21,6 +21,8 @@ from armsight.vision.sources.capture import QuietCapture, open_capture
 class VideoSource:
     """Two video files, or one side-by-side file."""
 
+    count: int | None = None  # what a container promises is an estimate
+
     def __init__(self, files: Sequence[_File]) -> None:
         self._files = list(files)
         self._shots = 0
