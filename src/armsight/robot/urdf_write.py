@@ -6,7 +6,7 @@ the home pose and the source stand in an element ``armsight`` that other program
 
 An arm's table says nothing of shapes, masses and motors, and programs such as MuJoCo and Gazebo need them. So each link is
 a solid bar from its joint to the next, with a drum at the joint: both as visuals, and as mass and inertia. The greatest
-effort is a multiple of what holds those masses stretched out. These are stand-ins, and the file says so; replace them
+effort is a multiple of what holds those masses held straight out. These are stand-ins, and the file says so; replace them
 before you simulate forces. What armsight reads back does not depend on them.
 """
 
@@ -27,7 +27,7 @@ from armsight.robot.kinematics.table import exact_cos_sin
 _RADIUS, _THINNEST_M, _THICKEST_M, _TAPER = 0.04, 0.01, 0.08, 0.9
 #: Density of the bars, kg/m^3: a hollow aluminium casting with its motors.
 _DENSITY = 1500.0
-#: Length of a joint's drum, in radii; greatest effort, in torques that hold the stretched arm; its least, N m.
+#: Length of a joint's drum, in radii; greatest effort, in torques that hold the straight arm; its least, N m.
 _DRUM, _EFFORT, _LEAST_EFFORT_NM = 2.4, 3.0, 1.0
 _GRAVITY_M_S2 = 9.81
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

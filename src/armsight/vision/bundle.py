@@ -77,7 +77,7 @@ class Arrow(Record):
         """Solve for the shared step (Q,) and the shots' steps (S, K) with Marquardt's damping."""
         H = self.H_shared + np.diag(damping * np.diag(self.H_shared))
         Hs = self.H_shots + damping * self.H_shots * np.eye(self.H_shots.shape[1])
-        gain = np.linalg.solve(Hs, self.H_cross)
+        gain: Array = np.linalg.solve(Hs, self.H_cross).astype(np.float64)
         flat = _flat(gain)
         S = H - _flat(self.H_cross).T @ flat
         g = self.g_shared - self.g_shots.reshape(-1) @ flat
@@ -87,12 +87,12 @@ class Arrow(Record):
 
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the shots' own marginalised."""
-        gain = np.linalg.solve(self.H_shots, self.H_cross)
+        gain: Array = np.linalg.solve(self.H_shots, self.H_cross).astype(np.float64)
         return np.asarray(self.H_shared - _flat(self.H_cross).T @ _flat(gain))
 
     def cov_shots(self, cov_shared: Array) -> Array:
         """(S, K, K) covariance of the shots' own parameters, given that of the shared ones (Q, Q)."""
-        gain = np.linalg.solve(self.H_shots, self.H_cross)
+        gain: Array = np.linalg.solve(self.H_shots, self.H_cross).astype(np.float64)
         return np.asarray(np.linalg.inv(self.H_shots) + gain @ cov_shared @ gain.transpose(0, 2, 1))
 
 

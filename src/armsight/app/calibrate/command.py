@@ -28,8 +28,8 @@ from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey
 from armsight.vision.markers.board import CalibrationBoard, open_board
-from armsight.vision.markers.board_file import save_board_file
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
+from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.sources import PairsSource
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]

@@ -15,9 +15,9 @@ from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.vision.markers.board import BOARDS, open_board
-from armsight.vision.markers.board_file import load_board_file
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
+from armsight.vision.markers.calibrated_board import load_board_file
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget

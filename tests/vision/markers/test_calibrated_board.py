@@ -5,7 +5,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.vision.markers.board import open_board
-from armsight.vision.markers.board_file import load_board_file, save_board_file
+from armsight.vision.markers.calibrated_board import load_board_file, save_board_file
 from armsight.vision.markers.targets import open_body, open_target
 
 SPEC = "chessboard:9x6:25mm"
