@@ -9,7 +9,6 @@ imported when they are first used, so that the command line starts at once.
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ _HOME = {
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type
     """Import a public name on its first use (PEP 562)."""
     if name == "__version__":
-        return importlib.metadata.version("armsight")
+        return importlib.import_module("importlib.metadata").version("armsight")
     if name not in _HOME:
         raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
     return getattr(importlib.import_module(_HOME[name]), name)

@@ -6,10 +6,11 @@ import pty
 import subprocess
 import sys
 
+import click
 import pytest
 
 import armsight as package
-from armsight.app.main import COMMANDS
+from armsight.app.main import COMMANDS, SECTIONS, group
 from cli_runs import assert_rejected
 from strategies import ordinary_rig
 
@@ -100,3 +101,10 @@ def test_help_says_what_identify_needs_and_lists_measure_first(armsight):
     text = armsight("-h").out
     assert text.index("\n  measure ") < text.index("\n  body ") < text.index("\n  dense ")
     assert "OUT are the format's files in the order" in " ".join(armsight("rig", "export", "-h").out.split())
+
+
+def test_the_list_of_commands_has_the_first_sentences_of_their_help():
+    context = click.Context(group)
+    for names in SECTIONS.values():
+        for name, text in names.items():
+            assert group.get_command(context, name).get_short_help_str(1000) == text

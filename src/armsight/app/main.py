@@ -15,14 +15,33 @@ import click
 from armsight.app.messages import colour, print_error
 from armsight.errors import ArmsightError
 
-#: What a person is about -> the commands; each has a folder of its name, whose ``command.py`` holds a click command called
-#: ``command``.
-SECTIONS: dict[str, tuple[str, ...]] = {
-    "Calibrate cameras": ("calibrate", "cameras", "record", "rig"),
-    "Measure": ("measure", "body", "dense"),
-    "Operate an arm": ("arm", "board", "run"),
-    "Check and identify an arm": ("check", "identify"),
-    "Simulate": ("demo",),
+#: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
+#: ``command.py`` holds a click command called ``command``. Their list imports none of them.
+SECTIONS: dict[str, dict[str, str]] = {
+    "Calibrate cameras": {
+        "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
+        "cameras": "List the attached cameras and their modes.",
+        "record": "Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.",
+        "rig": "Show a rig file, import a rig of another program, or export one.",
+    },
+    "Measure": {
+        "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
+        "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
+        "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
+    },
+    "Operate an arm": {
+        "arm": "Print an arm's table and kinematics: mm and degrees here, m and rad in --json.",
+        "board": "Build and flash the arm's firmware, watch a board, tune its gains, test it.",
+        "run": "Run the experiment on a real arm: calibrate hand and eye, make the motions, close the loop on vision.",
+    },
+    "Check and identify an arm": {
+        "check": "Evaluate an arm by ISO 9283: accuracy and repeatability.",
+        "identify": "Identify an arm: its kinematic table, joint zeros, sensor errors, backlash and compliance, "
+        "each with sigma.",
+    },
+    "Simulate": {
+        "demo": "Calibrate, measure the moving arm, compare the tracks, and close the loop, in a simulated workcell.",
+    },
 }
 COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
 
@@ -34,13 +53,11 @@ class _Sections(click.Group):
         return list(COMMANDS)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands, section by section, each with the first sentence of its help."""
-        longest, whole = max(map(len, COMMANDS)), 1000  # no sentence is cut
-        for title, names in SECTIONS.items():
-            commands = [(name, self.get_command(ctx, name)) for name in names]
-            rows = [(name, command.get_short_help_str(whole)) for name, command in commands if command is not None]
+        """Write the commands, section by section."""
+        longest = max(map(len, COMMANDS))
+        for title, commands in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl([(name.ljust(longest), text) for name, text in rows])
+                formatter.write_dl([(name.ljust(longest), text) for name, text in commands.items()])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
