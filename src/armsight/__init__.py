@@ -38,7 +38,6 @@ __all__ = [
     "PoseEstimate",
     "Shot",
     "StereoRig",
-    "__version__",
     "calibrate_boards",
     "calibrate_bodies",
     "measure",
