@@ -58,7 +58,8 @@ def joint_noise(model: Model, solution: Solution, weighted: Measured, measured: 
     phi = model.feature_values(measured.q, measured.approach)
     e, J = model.linearised(solution.x, measured, phi)
     free = J[:, :, solution.free]
-    taken = float(np.einsum("nif,fg,njg,nji->", free, _part(solution), free, _inverse_noise(weighted, solution)))
+    spread = (free @ _part(solution)) @ free.swapaxes(1, 2)  # of the predictions
+    taken = float(np.einsum("nij,nji->", spread, _inverse_noise(weighted, solution)))
     share = float(np.clip(1 - taken / e.size, 0.2, 1.0))  # what the fit has left of the residuals' variance
     B = np.concatenate(
         [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2

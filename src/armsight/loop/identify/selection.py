@@ -6,15 +6,20 @@ priors, and hundreds of measurements determine which. The evidence of a linear m
 "Bayesian interpolation", Neural Computation 4, 1992); on one linearisation it costs one factorisation of P x P.
 
 :func:`forward_selection` starts with base and tool alone, adds one error source at a time as long as that lowers the error
-on poses left out, and removes again what does not lower it. Everything is scored on one linearisation: with each fold's
-H = J^T J and g = J^T e, a fit to the other folds and its squared error on this one are a few small matrix products, so that
-hundreds of models cost no more than one. Folds are made of clusters of joint angles rather than of rows: what is kept must
-also hold where the arm was not measured.
+on poses left out by more than chance, and removes again what does not lower it. Where numbers are few, a sensor's curve is
+added as a whole, as its harmonics hide each other at few poses; then every harmonic is removed that is not worth its price,
+and so is every load of a compliance. The price (PRICE) is on top of held-out errors: of two models that predict alike, the
+smaller one stands. Then what the whole curves hid may be added.
+
+Everything is scored on one linearisation: with each fold's H = J^T J and g = J^T e, a fit to the other folds and its
+squared error on this one are a few small matrix products. One factorisation scores all candidates of a step, by Schur
+complements to add and by rows of the inverse to remove, so that hundreds of models cost little more than one. Folds are
+made of clusters of joint angles rather than of rows: what is kept must also hold where the arm was not measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -107,6 +112,9 @@ FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 MIN_GAIN = 1.0
 #: Parameters further from nominal than this many sigmas are kept without trying their removal.
 SURE = 8.0
+#: Where numbers are few: what a harmonic's or load's coefficient costs, in the logarithms of the held-out squares summed
+#: over the numbers measured, which is minus twice a log likelihood. Without a price chance keeps half as many again.
+PRICE = 1.0
 #: A fall by less than this part is rounding's.
 ROUNDING = 1e-6
 #: Mean squared errors, in squared sigmas of the noise, below which an error is no longer noise but rounding: (1e-4)^2.
@@ -115,8 +123,8 @@ NOISELESS = 1e-8
 _NONE = 1e-200
 #: The kinds that say where the arm is: base in the rig, tool on the flange.
 PLACEMENT = ("base", "tool")
-#: A sensor's harmonics make one curve, and the links' loads one compliance: they are added or left out together, and priors
-#: keep them small. One of these numbers alone means nothing.
+#: A sensor's harmonics make one curve, and the links' loads one compliance: they may be added together, and priors keep
+#: them small. One of these numbers alone may hardly show at the poses measured.
 CURVE = ("wave", "ripple")
 TOGETHER = (*CURVE, "compliance")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
@@ -163,19 +171,118 @@ class _Folds(NamedTuple):
 
     def losses(self, free: Mask) -> Array:
         """Return the mean squared error of every fold (F,) under a fit of ``free`` to the others."""
-        fixed = np.where(free, 0.0, self.home)  # from the linearisation back to nominal
-        H, g = self.H.sum(axis=0), self.g.sum(axis=0)
-        rows = np.flatnonzero(free)
-        A = (H - self.H)[:, rows[:, None], rows] + np.diag(self.pull[rows])
-        b = (g - self.g)[:, rows] + ((H - self.H)[:, rows] @ fixed) - (self.pull * self.home)[rows]
-        scale = 1 / np.sqrt(np.einsum("fii->fi", A))
-        step = -np.linalg.solve(A * scale[:, :, None] * scale[:, None], (b * scale)[..., None])[..., 0] * scale
-        delta = np.broadcast_to(fixed, self.g.shape).copy()
-        delta[:, rows] = step
-        by_slope, by_bend = 2 * np.einsum("fi,fi->f", self.g, delta), np.einsum("fi,fij,fj->f", delta, self.H, delta)
+        return np.asarray(self.losses_at(self.fits(free)[0][..., None])[0])
+
+    def losses_at(self, delta: Array) -> Array:
+        """Return the mean squared error of every fold (C, F) at each fold's vectors (F, P, C), from the linearisation."""
+        by_slope = 2 * (self.g[:, None] @ delta)[:, 0]
+        by_bend = np.einsum("fpc,fpc->fc", delta, self.H @ delta)
         # Poses without noise: below this a difference of large numbers is rounding.
-        least = _ROUNDED * (self.c + np.abs(by_slope) + np.abs(by_bend))
-        return np.asarray(np.maximum(self.c + by_slope + by_bend, least) / self.numbers)
+        least = _ROUNDED * (self.c[:, None] + np.abs(by_slope) + np.abs(by_bend))
+        return np.asarray((np.maximum(self.c[:, None] + by_slope + by_bend, least) / self.numbers[:, None]).T)
+
+    def fits(self, free: Mask, beyond: Mask | None = None) -> tuple[Array, Array, Array]:
+        """Fit ``free`` to all but each fold.
+
+        Args:
+            free: (P,) the S parameters to fit; the others are nominal.
+            beyond: (P,) R others; None: none.
+
+        Returns:
+            The vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and (F,
+            S, R) by how much the fit of each free parameter falls with one unit of each of the others.
+        """
+        rows = np.flatnonzero(free)
+        others = np.flatnonzero(beyond) if beyond is not None else rows[:0]
+        fixed = np.where(free, 0.0, self.home)  # from the linearisation back to nominal
+        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
+        A = H[:, rows[:, None], rows] + np.diag(self.pull[rows])
+        scale = 1 / np.sqrt(np.einsum("fii->fi", A))
+        C = np.linalg.inv(A * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None]
+        b = g[:, rows] + H[:, rows] @ fixed - (self.pull * self.home)[rows]
+        delta = np.broadcast_to(fixed, self.g.shape).copy()
+        delta[:, rows] = -(C @ b[..., None])[..., 0]
+        return delta, C, C @ H[:, rows[:, None], others]
+
+    def losses_with(self, kept: Mask, groups: Mapping[str, Mask]) -> dict[str, Array]:
+        """Return the losses (F,) under a fit of ``kept`` and each group: one factorisation for all of the groups.
+
+        With A the information, S the parameters kept and G a group, the information about G beyond S is Schur's complement
+        A_GG - A_GS A_SS^-1 A_SG.
+        """
+        beyond = np.any(list(groups.values()), axis=0) & ~kept
+        delta, _, X = self.fits(kept, beyond)
+        rows, others = np.flatnonzero(kept), np.flatnonzero(beyond)
+        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
+        schur = H[:, others[:, None], others] + np.diag(self.pull[others]) - H[:, others[:, None], rows] @ X
+        slope = g[:, others] + (H[:, others] @ delta[..., None])[..., 0]
+        tried = np.repeat(delta[..., None], len(groups), axis=2)
+        for c, mask in enumerate(groups.values()):
+            at = np.flatnonzero(mask[others])
+            A = schur[:, at[:, None], at]
+            scale = 1 / np.sqrt(np.einsum("fii->fi", A))
+            z = (
+                np.linalg.solve(A * scale[:, :, None] * scale[:, None], (-slope[:, at] * scale)[..., None])
+                * scale[..., None]
+            )
+            tried[:, others[at], c] += z[..., 0]
+            tried[:, rows, c] -= (X[:, :, at] @ z)[..., 0]
+        return dict(zip(groups, self.losses_at(tried), strict=True))
+
+
+class _Removal:
+    """Fits of what is kept to all but each fold, from which groups are removed one after the other.
+
+    The fit without a group G follows from that with it: with C = A^-1, the free numbers move by C_:G C_GG^-1 times what
+    brings those of G back to nominal, and C falls by C_:G C_GG^-1 C_G:.
+    """
+
+    def __init__(self, folds: _Folds, kept: Mask) -> None:
+        self.folds, self.kept = folds, kept.copy()
+        self.rows = np.flatnonzero(kept)
+        self.delta, self.C, _ = folds.fits(kept)
+
+    def losses(self) -> Array:
+        """Return the losses (F,) of what is kept."""
+        return np.asarray(self.folds.losses_at(self.delta[..., None])[0])
+
+    def losses_without(self, groups: Sequence[Mask]) -> Array:
+        """Return the losses (G, F) without each group."""
+        tried = np.repeat(self.delta[..., None], len(groups), axis=2)
+        for c, mask in enumerate(groups):
+            tried[:, self.rows, c] += self._moved(np.flatnonzero(mask[self.rows]))
+        return self.folds.losses_at(tried)
+
+    def _moved(self, at: NDArray[np.int64]) -> Array:
+        """Return by how much the free numbers (F, S) move when those ``at`` come back to nominal."""
+        back = (self.folds.home - self.delta)[:, self.rows[at]]
+        return np.asarray((self.C[:, :, at] @ np.linalg.solve(self.C[:, at[:, None], at], back[..., None]))[..., 0])
+
+    def doubtful(self, groups: Sequence[Mask]) -> list[Mask]:
+        """Return the groups so near their nominal values that leaving them there may cost nothing."""
+        folds, rows = self.folds, self.rows
+        A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
+        scale = 1 / np.sqrt(np.diag(A))
+        cov = np.linalg.inv(scale[:, None] * A * scale) * np.outer(scale, scale)
+        fixed = np.where(self.kept, 0.0, folds.home)
+        b = folds.g.sum(axis=0)[rows] + folds.H.sum(axis=0)[rows] @ fixed - (folds.pull * folds.home)[rows]
+        off = -cov @ b - folds.home[rows]
+        found = []
+        for mask in groups:
+            at = np.flatnonzero(mask[rows])
+            if off[at] @ np.linalg.solve(cov[np.ix_(at, at)], off[at]) < SURE**2 * len(at):
+                found.append(mask)
+        return found
+
+    def remove(self, mask: Mask) -> None:
+        """Remove a group."""
+        at = np.flatnonzero(mask[self.rows])
+        self.delta[:, self.rows] += self._moved(at)
+        self.delta[:, self.rows[at]] = self.folds.home[self.rows[at]]
+        stay = np.flatnonzero(~mask[self.rows])
+        fall = np.linalg.solve(self.C[:, at[:, None], at], self.C[:, at[:, None], stay])
+        self.C = self.C[:, stay[:, None], stay] - self.C[:, stay[:, None], at] @ fall
+        self.rows, self.kept = self.rows[stay], self.kept & ~mask
 
 
 def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
@@ -206,7 +313,7 @@ def forward_selection(
         measured: the poses.
         free: (P,) the candidates.
         prior: (P,) prior sigmas.
-        together: (P,) harmonics and loads that are selected only as parts of a whole.
+        together: (P,) harmonics and loads that may also be added as a whole.
         progress: called with a line of text after each step.
     """
     part = measured.rows(start.used)
@@ -215,8 +322,30 @@ def forward_selection(
     kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])
     losses = folds.losses(kept)
     steps = [SelectionStep("base and tool", _named(model, kept), _rms(losses, folds))]
+    kept = _added(model, folds, groups, kept, steps, progress)
+    if together.any():
+        kept = _together(model, folds, groups, kept, steps)
+    kept, removed = _pruned(model, folds, kept, together, steps)
+    if together.any():  # what the whole curves hid may show now
+        again = _added(model, folds, groups, kept, steps, progress)
+        if (again != kept).any():
+            kept, removed_again = _pruned(model, folds, again, together, steps)
+            removed |= removed_again
+    return Selection(kept, tuple(steps), _reasons(model, folds, kept, groups, removed))
+
+
+def _added(
+    model: Model,
+    folds: _Folds,
+    groups: dict[str, Mask],
+    kept: Mask,
+    steps: list[SelectionStep],
+    progress: Callable[[str], None],
+) -> Mask:
+    """Add the group that lowers the held-out error most, as long as one lowers it; it leaves ``groups``."""
+    losses = folds.losses(kept)
     while groups:
-        tried = {name: folds.losses(kept | mask) for name, mask in groups.items()}
+        tried = folds.losses_with(kept, groups)
         improving = [name for name in tried if _improves(losses, tried[name], folds)]
         if not improving:
             break
@@ -225,29 +354,19 @@ def forward_selection(
         kept, losses = kept | added, tried[name]
         steps.append(SelectionStep(name, _named(model, added), _rms(losses, folds)))
         progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
-    if together.any():
-        kept = _together(model, folds, groups, kept, steps)
-    kept, removed = _pruned(model, folds, kept, together, steps)
-    return Selection(kept, tuple(steps), _reasons(model, folds, kept, groups, removed))
+    return kept
 
 
 def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[SelectionStep]) -> Mask:
-    """Add what lowers the error only together, as two sources that hide each other do, less what that does not need."""
-    losses, whole = folds.losses(kept), kept.copy()
-    for mask in groups.values():
-        whole |= mask
-    if not groups or not _improves(losses, folds.losses(whole), folds):
+    """Add all that is left where it lowers the error only together, as two sources that hide each other do."""
+    if not groups:
         return kept
-    added = dict(groups)
-    while added:
-        left = {name: _rms(folds.losses(whole & ~mask), folds) for name, mask in added.items()}
-        name = min(left, key=lambda n: left[n])
-        if left[name] > _rms(folds.losses(whole), folds):
-            break
-        whole &= ~added.pop(name)
-    for name in added:
-        del groups[name]
-    steps.append(SelectionStep(", ".join(added), _named(model, whole & ~kept), _rms(folds.losses(whole), folds)))
+    whole: Mask = kept | np.any(list(groups.values()), axis=0)
+    losses = folds.losses(whole)
+    if not _improves(folds.losses(kept), losses, folds):
+        return kept
+    steps.append(SelectionStep(", ".join(groups), _named(model, whole & ~kept), _rms(losses, folds)))
+    groups.clear()
     return whole
 
 
@@ -257,9 +376,9 @@ def _reasons(
     """Return name -> why a parameter was not kept."""
     rms = _rms(folds.losses(kept), folds)
     reasons: dict[str, str] = {}
-    for mask in groups.values():
-        why = _not_improving(folds.losses(kept | mask), folds, rms)
-        reasons |= {model.names[k]: why for k in np.flatnonzero(mask)}
+    for name, losses in (folds.losses_with(kept, groups) if groups else {}).items():
+        why = _not_improving(losses, folds, rms)
+        reasons |= {model.names[k]: why for k in np.flatnonzero(groups[name])}
     return reasons | {name: _not_improving(losses, folds, rms) for name, losses in removed.items()}
 
 
@@ -293,10 +412,9 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
             continue
         name = _GROUPS.get(p.kind, f"{p.kind} of joint {p.joint + 1}")
         if p.kind in CURVE:
-            curve = [k for k, other in enumerate(model.parameters) if other.kind in CURVE and other.joint == p.joint]
             name = f"sensor curve of joint {p.joint + 1}"
             harmonic = p.name.removeprefix(f"{p.kind}{p.joint + 1}_")[3:]  # of "sin12" or "cos2"
-            name += "" if together[curve].any() else f", {harmonic} a revolution"
+            name += "" if together[k] else f", {harmonic} a revolution"
         groups.setdefault(name, np.zeros(len(free), bool))[k] = True
     return groups
 
@@ -304,6 +422,11 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
 def _rms(losses: Array, folds: _Folds) -> float:
     """Return the RMS of all folds: the geometric mean of theirs, which one pose that nothing explains cannot rule."""
     return float(np.exp(0.5 * np.sum(np.log(losses + _NONE) * folds.numbers) / folds.numbers.sum()))
+
+
+def _score(losses: Array, folds: _Folds) -> float:
+    """Return the held-out squares' logarithms, summed over the measured numbers: minus twice a log likelihood."""
+    return float(np.sum(np.log(losses + _NONE) * folds.numbers))
 
 
 def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
@@ -315,37 +438,42 @@ def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
 def _pruned(
     model: Model, folds: _Folds, kept: Mask, together: Mask, steps: list[SelectionStep]
 ) -> tuple[Mask, dict[str, Array]]:
-    """Remove, one at a time, parameters without which the held-out error is no worse."""
+    """Remove, one at a time, parameters and harmonics without which the held-out error is no worse than their price."""
     removed: dict[str, Array] = {}
-    stays = together | np.array([p.kind in PLACEMENT for p in model.parameters])
+    units = _units(model, kept, together)
+    now = _Removal(folds, kept)
     while True:
-        doubtful = [int(k) for k in np.flatnonzero(kept & ~stays) if _doubt(folds, kept, int(k))]
-        losses = folds.losses(kept)
-        best = min(((_rms(folds.losses(_without(kept, k)), folds), k) for k in doubtful), default=None)
-        if best is None or best[0] > _rms(losses, folds):
-            return kept, removed
-        k = best[1]
-        kept = _without(kept, k)
-        removed[model.names[k]] = losses
-        steps.append(SelectionStep(f"-{model.names[k]}", (model.names[k],), best[0]))
+        units = [mask for mask in units if (mask & now.kept).any()]
+        doubtful = now.doubtful(units)
+        if not doubtful:
+            return now.kept, removed
+        losses, tried = now.losses(), now.losses_without(doubtful)
+        rise = [
+            _score(t, folds) - _score(losses, folds) - PRICE * (mask & together).sum()
+            for t, mask in zip(tried, doubtful, strict=True)
+        ]
+        best = int(np.argmin(rise))
+        if rise[best] > 0:
+            return now.kept, removed
+        now.remove(doubtful[best])
+        names = _named(model, doubtful[best])
+        removed |= dict.fromkeys(names, losses)
+        steps.append(SelectionStep(f"-{_common(names)}", names, _rms(tried[best], folds)))
 
 
-def _doubt(folds: _Folds, kept: Mask, k: int) -> bool:
-    """Return whether a parameter is so near its nominal value that leaving it there may cost nothing."""
-    rows = np.flatnonzero(kept)
-    A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
-    fixed = np.where(kept, 0.0, folds.home)
-    b = folds.g.sum(axis=0)[rows] + folds.H.sum(axis=0)[rows] @ fixed - (folds.pull * folds.home)[rows]
-    cov = np.linalg.inv(A)
-    i = int(np.flatnonzero(rows == k)[0])
-    off = float((-cov @ b)[i] - folds.home[k])
-    return abs(off) < SURE * float(np.sqrt(cov[i, i]))
+def _units(model: Model, kept: Mask, together: Mask) -> list[Mask]:
+    """Return what is removed at once: sine and cosine of a harmonic where curves are whole, else single parameters."""
+    units: dict[str, Mask] = {}
+    for k, p in enumerate(model.parameters):
+        if kept[k] and p.kind not in PLACEMENT:
+            name = p.name.replace("cos", "sin") if together[k] and p.kind in CURVE else p.name
+            units.setdefault(name, np.zeros(len(kept), bool))[k] = True
+    return list(units.values())
 
 
-def _without(kept: Mask, k: int) -> Mask:
-    out = kept.copy()
-    out[k] = False
-    return out
+def _common(names: Sequence[str]) -> str:
+    """Return the name of one parameter, or of a harmonic's two."""
+    return names[0] if len(names) == 1 else f"{names[0].split('_')[0]}_{names[0].split('_')[1][3:]}"
 
 
 def _not_improving(losses_with: Array, folds: _Folds, rms: float) -> str:
