@@ -1,6 +1,6 @@
 """What identification and hand-eye calibration reach: real robots, real hand-eye sets, a worn arm that is made up, time.
 
-    python benchmarks/identify.py [--quick]
+    python benchmarks/identify.py [--quick | --speed]
 
 Real recordings are looked for at ARMSIGHT_DATA. Each line says what was asked for; a miss is printed as a miss.
 """
@@ -17,13 +17,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "loop"))
 
+from worn_arm import poses, worn
+
+from armsight.app.identify.run import MANY, run_identify
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.read import read_poses
 from armsight.loop.identify.validate import validate
 from armsight.robot.arm_file import open_arm
 from identify_handeye import eth_pairs, kuka2
-from identify_worn import worn_arms
+from identify_worn import UNSEEN, worn_arms
 
 DATA = Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 SEEDS = 4
@@ -103,8 +106,36 @@ def many_poses() -> None:
     report("12,000 poses, memory of this process so far", memory, 1.0, "GB")
 
 
+#: Poses -> seconds asked for, and seconds of the command on the computer of the record (two cores, one thread) before all
+#: candidates of a selection step were scored from one factorisation. Without --validate: six identifications of 200 poses.
+SPEED = {200: (20.0, 17.0), 1000: (30.0, 5.1)}
+
+
+def speed() -> None:
+    """Time the command on a worn arm: positions of one point; lengths, zeros, curves, backlash and compliance off."""
+    w = worn(0)
+    arm = w.nominal
+    for count, (most, recorded) in SPEED.items():
+        rng = np.random.default_rng(100)
+        q, approach = poses(arm, count + UNSEEN, rng)
+        seen = w.seen(q, approach, rng)
+        every = Measured(q, seen.p_rig, None, None, approach)
+        rows, other = np.arange(count), np.arange(count, count + UNSEEN)
+        given = every.rows(other) if count > MANY else None
+        start, cpu = time.perf_counter(), time.process_time()
+        run = run_identify(arm, every.rows(rows), rows.astype(float), given)
+        wall, cpu = time.perf_counter() - start, time.process_time() - cpu
+        fitted = int(run.found.solution.free.sum())
+        off = 1e3 * validate(run.found, every.rows(other)).identified.summary()["mean_m"]
+        more = f", {wall / recorded:.2f} of the record; {cpu:.1f} s of CPU, {fitted} parameters of {3 * count} numbers"
+        report(f"identify, {count} poses, wall clock", wall, most, "s", f"{more}, {off:.3f} mm on {UNSEEN} unseen")
+
+
 def main() -> None:
     """Print every metric."""
+    speed()
+    if "--speed" in sys.argv[1:]:
+        return
     quick = "--quick" in sys.argv[1:]
     if (DATA / "robots").is_dir():
         many_poses()

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     __version__: str
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
+    from armsight.loop.identify.corrected import Corrected, open_corrected
     from armsight.robot.arm import Arm
     from armsight.robot.arm_file import open_arm
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -32,6 +33,7 @@ __all__ = [
     "ArmsightError",
     "Body",
     "Camera",
+    "Corrected",
     "Follower",
     "Missed",
     "Pair",
@@ -44,6 +46,7 @@ __all__ = [
     "open_arm",
     "open_board",
     "open_body",
+    "open_corrected",
     "open_source",
     "open_target",
 ]
@@ -56,6 +59,7 @@ _HOME = {
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
     "Follower": "armsight.vision.follow.follower",
+    **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
     "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),

@@ -16,7 +16,7 @@ A .toml file is one of two. It holds a table as data sheets print it, six rows w
 
 Or it is a corrected.toml, as ``armsight identify`` writes it: the identified table with Hayati's angles beta, base and
 body. An :class:`Arm` has no room for the error sources beyond the table (gains, waves, backlash, compliance), so the
-reader passes over them: the board and :class:`~armsight.loop.identify.corrected.Corrected` apply those.
+reader passes over them: the board and :func:`~armsight.loop.identify.corrected.open_corrected` apply those.
 """
 
 from __future__ import annotations
@@ -82,16 +82,25 @@ def open_arm(name_or_path: str | Path, *, tool_link: str | None = None) -> Arm:
     return MODELS[text]
 
 
+def parsed_toml(path: str | Path) -> dict[str, Any]:
+    """Return what a TOML file holds.
+
+    Raises:
+        InputError: unreadable, or not TOML.
+    """
+    try:
+        return tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from None
+
+
 def read_arm_toml(path: str | Path) -> Arm:
     """Read an arm from a TOML file.
 
     Raises:
         InputError: unreadable, or a key or number that is not allowed; the message names it.
     """
-    try:
-        given = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+    given = parsed_toml(path)
     if "identified" in given:
         return _identified(path, given)
     rows = given.pop("joint", None)
@@ -160,11 +169,23 @@ def _identified(path: str | Path, given: dict[str, Any]) -> Arm:
     Raises:
         InputError: something is missing, or no number; the message names it.
     """
+    arm, beta = identified_table(path, given)
+    if not beta.any():
+        return arm
+    return replace(parse_urdf(tilted_urdf(arm, beta), path), source=arm.source)
+
+
+def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Array]:
+    """Return the arm of a parsed corrected.toml without Hayati's angles, and these angles (6,), rad.
+
+    Raises:
+        InputError: something is missing, or no number; the message names it.
+    """
     rows = given.get("joint")
     if not isinstance(rows, list) or len(rows) != 6 or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{path}: six [[joint]] tables are needed")
-    at = {column: _column(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
-    limits = {key: _column(path, rows, f"{key}_{unit}") for key, unit in LIMITS.items()}
+    at = {column: joint_numbers(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
+    limits = {key: joint_numbers(path, rows, f"{key}_{unit}") for key, unit in LIMITS.items()}
     convention = given.get("convention")
     if convention not in ("standard", "modified"):
         raise InputError(f'{path}: convention = "standard" or "modified" is needed, got {convention!r}')
@@ -174,20 +195,23 @@ def _identified(path: str | Path, given: dict[str, Any]) -> Arm:
         d=at["d"],
         alpha=at["alpha"],
         offset=at["offset"],
-        direction=_column(path, rows, "direction"),
+        direction=joint_numbers(path, rows, "direction"),
         convention="modified" if convention == "modified" else "standard",
-        T_base_0=_transform(path, given, "T_base_0"),
-        T_flange_tool=_transform(path, given, "T_flange_body"),
+        T_base_0=file_transform(path, given, "T_base_0"),
+        T_flange_tool=file_transform(path, given, "T_flange_body"),
         joint_names=tuple(str(row.get("name", f"joint{i + 1}")) for i, row in enumerate(rows)),
         source=f"identified: {path}",
         **limits,
     )
-    if not at["beta"].any():
-        return arm
-    return replace(parse_urdf(tilted_urdf(arm, at["beta"]), path), source=arm.source)
+    return arm, at["beta"]
 
 
-def _column(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:
+def joint_numbers(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:
+    """Return a number (6,) that every [[joint]] of a corrected.toml has.
+
+    Raises:
+        InputError: it is missing, or no number.
+    """
     out = np.empty(6)
     for i, row in enumerate(rows):
         value = row.get(key)
@@ -197,8 +221,12 @@ def _column(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:
     return out
 
 
-def _transform(path: str | Path, given: dict[str, Any], name: str) -> Array:
-    """Read a position and a quaternion wxyz."""
+def file_transform(path: str | Path, given: dict[str, Any], name: str) -> Array:
+    """Return a pose (4, 4) that a corrected.toml has as a position and a quaternion wxyz.
+
+    Raises:
+        InputError: it is missing, or no pose.
+    """
     try:
         p, q = (np.array(given[name][key], float) for key in ("position_m", "quaternion_wxyz"))
     except (KeyError, TypeError, ValueError):

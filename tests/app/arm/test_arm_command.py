@@ -1,6 +1,7 @@
 """``armsight arm``: its answers against the library's own, its text, and every kind of bad input one by one."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -239,3 +240,25 @@ def test_a_malformed_urdf_is_named_with_its_element(armsight, tmp_path):
     assert_rejected(armsight("arm", "ik", path, 400, 0, 500, 0, 0, 0), path, "joint 'joint1'", '<axis xyz="0 0">')
     assert_rejected(armsight("arm", "urdf", path, "-o", path), "given twice, or is read as well as written")
     assert '<axis xyz="0 0" />' in path.read_text()
+
+
+def test_readings_of_an_identified_arm_are_corrected(armsight, tmp_path):
+    """A curve of 0.01 rad in joint 1, within the readings seen: the arm is where it is at the true angle."""
+    from armsight.loop.identify.corrected import Corrected
+    from armsight.loop.identify.measured import Measured
+    from armsight.loop.identify.model import Model
+
+    home = SIX_R.home[None]
+    model = Model.of(SIX_R, Measured(home, np.zeros((1, 1, 3))), backlash=False)
+    model = model.with_seen(home + np.array([[-2.0], [2.0]]))
+    x = model.nominal()
+    x[model.names.index("wave1_cos1")] = 0.01
+    path, q = tmp_path / "corrected.toml", np.radians(Q_DEG)
+    Corrected(model, x, np.zeros(len(x))).save(path)
+    said = armsight("arm", "fk", path, *Q_DEG, "--json")
+    true = q + 0.01 * np.cos(q[0]) * np.eye(6)[0]
+    np.testing.assert_allclose(
+        said.lines[0]["T_base_tool"], replace(SIX_R, T_flange_tool=np.eye(4)).forward(true), atol=1e-12
+    )
+    assert "curves" in said.err
+    assert armsight("arm", "show", path).code == 0

@@ -77,7 +77,7 @@ def test_a_written_urdf_is_the_identified_arm():
         x[shaped.table_at + 29] = 0.0  # beta of row 6 is the tool's
         q = rng.uniform(-1, 1, 6)
         at = shaped.tool_in_base(x, q[None], None)[0]
-        np.testing.assert_allclose(walk(ET.fromstring(Corrected(shaped, x).urdf()), q), at, atol=1e-9)
+        np.testing.assert_allclose(walk(ET.fromstring(Corrected(shaped, x, np.zeros(len(x))).urdf()), q), at, atol=1e-9)
 
 
 def walk(robot, q):
@@ -179,6 +179,65 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
     other.write_text("\n".join(",".join(row) for row in rows))
     parts = ("to validate with", "the sign is wrong of joint 2")
     assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said_of_it"),
+    [
+        (lambda lines: [], "no rows"),
+        (lambda lines: lines[:1], "no rows"),
+        (lambda lines: [lines[0].replace("q6_rad", "elbow"), *lines[1:]], "column q6_rad is missing"),
+        (lambda lines: [lines[0] + ",q7_rad", *(line + ",0" for line in lines[1:])], "six joints"),
+        (lambda lines: [line.replace("p1_", "p2_") for line in lines], "no point 1"),
+        (
+            lambda lines: [
+                lines[0],
+                *(",".join(line.split(",")[1:6] + line.split(",")[:1] + line.split(",")[6:]) for line in lines[1:]),
+            ],
+            "order",
+        ),
+        (lambda lines: [lines[0], *(",".join(["1.5", *line.split(",")[1:]]) for line in lines[1:6])], "other joints"),
+    ],
+)
+def test_a_wrong_file_to_validate_with_is_rejected_before_the_fit(tmp_path, capsys, monkeypatch, spoil, said_of_it):
+    data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
+    other.write_text("\n".join(spoil(other.read_text().splitlines())))
+
+    def never(*arguments, **options):
+        raise AssertionError("fitted before the file was looked at")
+
+    monkeypatch.setattr("armsight.app.identify.run.identify", never)
+    answer = said(capsys, "--arm", "six_r", "--data", data, "--validate", other)
+    assert_rejected(answer, str(other), said_of_it)
+    missing = said(capsys, "--arm", "six_r", "--data", data, "--validate", tmp_path / "none.csv")
+    assert_rejected(missing, "none.csv")
+
+
+def test_poses_to_validate_with_have_the_points_of_those_fitted(tmp_path, capsys):
+    data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
+    lines = other.read_text().splitlines()
+    lines = [
+        f"{line},{','.join(('p2_x_mm', 'p2_y_mm', 'p2_z_mm') if k == 0 else ('1', '2', '3'))}"
+        for k, line in enumerate(lines)
+    ]
+    other.write_text("\n".join(lines))
+    answer = said(capsys, "--arm", "six_r", "--data", data, "--validate", other)
+    assert_rejected(answer, str(other), "2 tracked points a pose", "1 tracked point a pose")
+
+
+def test_the_ranges_seen_are_in_every_output(tmp_path, capsys):
+    data, out = poses_csv(tmp_path / "poses.csv"), tmp_path / "corrected"
+    q = read_poses(data).measured.q
+    (found,) = said(capsys, "--arm", "six_r", "--data", data, "--json", "-o", out).lines
+    low, high = ([joint[f"{end}_rad"] for joint in found["joint_ranges_seen"]] for end in ("min", "max"))
+    np.testing.assert_allclose(low, q.min(axis=0))
+    np.testing.assert_allclose(high, q.max(axis=0))
+    assert found["curve_fade_rad"] == pytest.approx(np.deg2rad(20))
+    shown = f"{np.degrees(low[0]):.1f}"
+    assert f"joint 1  {shown} to {np.degrees(high[0]):.1f} deg" in said(capsys, "--arm", "six_r", "--data", data).out
+    assert shown in (out / "report.html").read_text()
+    for name in ("corrected.toml", "zeros.toml"):
+        assert tomllib.loads((out / name).read_text())["joint"][0]["seen_min_rad"] == low[0]
 
 
 def test_no_folder_made_for_results_stays_after_a_mistake(tmp_path, capsys):

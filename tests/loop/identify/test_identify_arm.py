@@ -187,7 +187,7 @@ def test_what_is_written_is_read_as_the_same_arm(scene, tmp_path):
     x, q = found.solution.x.copy(), rng.uniform(-1, 1, (20, 6))
     x[found.model.names.index("beta2")] = 1e-3  # axes a little off parallel
     found = replace(found, solution=replace(found.solution, x=x.copy()))
-    (tmp_path / "corrected.toml").write_text(table_text(found))
+    (tmp_path / "corrected.toml").write_text(table_text(Corrected.of(found)))
     (tmp_path / "corrected.urdf").write_text(Corrected.of(found).urdf())
     x[found.model.sources_at :] = 0.0
     for name in ("corrected.toml", "corrected.urdf"):
@@ -201,9 +201,9 @@ def test_a_file_of_the_first_version_is_read_and_any_name_is_written(scene, tmp_
     found = scene[2]
     name = '\U0001f9be "worn\\ \x7f'
     model = replace(found.model, arm=replace(found.model.arm, name=name))
-    text = table_text(replace(found, model=model))
-    assert "version = 2\n" in text
-    old = text.replace("version = 2\n", "").replace("[[error_source]]", "[[cause]]")
+    text = table_text(Corrected.of(replace(found, model=model)))
+    assert "version = 3\n" in text
+    old = text.replace("version = 3\n", "").replace("[[error_source]]", "[[cause]]")
     for file, content in (("new.toml", text), ("old.toml", old)):
         (tmp_path / file).write_text(content, encoding="utf-8")
     new, first = (open_arm(tmp_path / file) for file in ("new.toml", "old.toml"))

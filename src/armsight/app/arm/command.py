@@ -17,6 +17,7 @@ from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx
+from armsight.loop.identify.corrected import is_corrected, open_corrected
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.chain import MOST_RADIANS
@@ -72,10 +73,22 @@ def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: boo
 @click.argument("angles", nargs=-1, metavar="Q1 .. Q6")
 @_JSON
 def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
-    """Print the pose of the tool at six joint angles, in degrees."""
+    """Print the pose of the tool at six joint angles, in degrees.
+
+    Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
+    """
     arm = open_arm(arm_name, tool_link=tool_link)
     q = _joints(arm, angles)
-    click.echo(json.dumps(description.forward_json(arm, q)) if as_json else description.forward_text(arm, q))
+    T = arm.forward(q)
+    if is_corrected(arm_name):
+        corrected = open_corrected(arm_name)
+        T = corrected.forward(q[None])[0]
+        for note in corrected.notes:
+            click.echo(f"note: {note}", err=True)
+        click.echo(
+            "note: with the sensors' curves and compliance; from which sides the joints came is not known", err=True
+        )
+    click.echo(json.dumps(description.forward_json(arm, q, T)) if as_json else description.forward_text(T))
 
 
 @command.command(context_settings=_NUMBERS)

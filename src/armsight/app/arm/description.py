@@ -95,19 +95,18 @@ def show_text(arm: Arm) -> str:
     return "\n".join([*lines, f"source: {arm.source}"])
 
 
-def forward_json(arm: Arm, q: Array) -> dict[str, Any]:
-    """Return the pose of the tool at joint angles (6,), rad."""
+def forward_json(arm: Arm, q: Array, T: Array) -> dict[str, Any]:
+    """Return the pose T (4, 4) of the tool in the base at joint angles (6,), rad."""
     return {
         "arm": arm.name,
         **_angles_json(q),
         "within_limits": bool(arm.within_limits(q)),
-        **_pose_json(arm.forward(q)),
+        **_pose_json(T),
     }
 
 
-def forward_text(arm: Arm, q: Array) -> str:
-    """Return the pose of the tool at joint angles (6,), rad, as lines."""
-    T = arm.forward(q)
+def forward_text(T: Array) -> str:
+    """Return the pose T (4, 4) of the tool in the base as lines."""
     return "\n".join([f"tool at {_pose_text(T)}", "T_base_tool, m:", *_matrix(T)])
 
 

@@ -11,7 +11,14 @@ import click
 
 from armsight.app.identify.plan import plan_csv, plan_from, plan_json, plan_text
 from armsight.app.identify.report import write_identify_report
-from armsight.app.identify.run import headline, identify_json, results_in, run_identify, text, write_results
+from armsight.app.identify.run import (
+    headline,
+    identify_json,
+    results_in,
+    run_identify,
+    text,
+    write_results,
+)
 from armsight.app.progress import steps
 from armsight.app.report.plotting import require_matplotlib
 from armsight.errors import InputError
@@ -86,6 +93,7 @@ def command(
             read.measured,
             read.lines,
             None if held is None else held.measured,
+            other_name=str(other),
             priors=_priors(priors),
             notes=notes,
             progress=progress,

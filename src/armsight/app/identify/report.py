@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.identify.run import Identification, headline, value_text
+from armsight.app.identify.run import Identification, headline, ranges_seen, value_text
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table
 from armsight.app.report.page import text as escaped
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, drawing, new_figure, png
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Points plotted at most: more only hide each other.
 MOST_POINTS = 4000
-#: Names fit beside a matrix up to this many.
+#: Names of full size fit beside a matrix up to this many; more are smaller.
 MOST_NAMES = 60
 #: Intervals of a joint's angle over which errors are averaged.
 _BINS = 12
@@ -125,12 +125,11 @@ def correlation_figure(run: Identification) -> Figure:
         ax.set_axis_off()
         ax.text(0, 0.5, "nothing but base and tool was fitted", color=INK)
         return figure
-    sigma = np.sqrt(np.diag(found.cov))[rows]
-    plotted = ax.imshow(found.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma), cmap="RdBu", vmin=-1, vmax=1)
-    if len(rows) <= MOST_NAMES:
-        names = [model.names[k] for k in rows]
-        ax.set_xticks(range(len(rows)), names, rotation=90, fontsize=7)
-        ax.set_yticks(range(len(rows)), names, fontsize=7)
+    plotted = ax.imshow(found.correlation(rows), cmap="RdBu", vmin=-1, vmax=1)
+    names = [model.names[k] for k in rows]
+    size = min(7.0, 7.0 * MOST_NAMES / len(rows))
+    ax.set_xticks(range(len(rows)), names, rotation=90, fontsize=size)
+    ax.set_yticks(range(len(rows)), names, fontsize=size)
     figure.colorbar(plotted, ax=ax, label="correlation", shrink=0.7)
     return figure
 
@@ -206,6 +205,7 @@ def page(run: Identification, images: dict[str, bytes]) -> str:
     for name, (_, title, caption) in FIGURES.items():
         image = picture(images[name], title)
         sections[name] = (title, f"<figure>{image}<figcaption><p>{escaped(caption)}</p></figcaption></figure>\n")
+    sections["ranges"] = ("Ranges of the joints", _ranges(run))
     sections["parameters"] = ("Parameters", _parameters(run))
     fitted = int(run.found.solution.free.sum())
     sub = f"{run.arm.name} · {len(run.measured)} poses · {fitted} parameters fitted"
@@ -219,6 +219,19 @@ def _result_section(run: Identification) -> str:
         f"<p>Held-out residual over its predicted sigma: {run.held_out.residual_over_predicted:.2f} (1: the sigmas are "
         "right).</p>\n"
     ) + (bullets(run.notes) if run.notes else "")
+
+
+def _ranges(run: Identification) -> str:
+    """Return the readings that the poses have shown of each joint, HTML."""
+    rows = [
+        [escaped(name), f"{np.degrees(low):.1f}", f"{np.degrees(high):.1f}"]
+        for name, (low, high) in zip(run.arm.joint_names, ranges_seen(run.found), strict=True)
+    ]
+    fade = np.degrees(run.found.model.fade_rad)
+    return (
+        f"<p>The curve of a joint's sensor holds over the readings seen. Beyond them it fades within {fade:.0f} degrees to "
+        "its mean over them: a pose measured there would say what it is.</p>\n"
+    ) + table(("joint", "least reading, deg", "greatest reading, deg"), rows, "numbers")
 
 
 def _parameters(run: Identification) -> str:

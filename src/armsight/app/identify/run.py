@@ -21,18 +21,21 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
-from armsight.loop.identify.corrected import Corrected, table_text, zeros_text
-from armsight.loop.identify.diagnose import BAD_M, BAD_RAD, check_plausible, without_tool
+from armsight.loop.identify.corrected import Corrected, zeros_text
+from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import Parameter
-from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, validate
+from armsight.loop.identify.model import Model, Parameter
+from armsight.loop.identify.placement import with_placement
+from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
 from armsight.robot.arm import Arm
 
 #: Parts of the poses that are left out, one after the other, where nothing is given to validate with.
 FOLDS = 5
 #: With more poses than this, one part is enough.
 MANY = 500
+#: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
+FAR_M = 0.1
 #: What is written beside the report.
 FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json")
 
@@ -68,6 +71,7 @@ def run_identify(
     lines: Array,
     other: Measured | None,
     *,
+    other_name: str = "the poses to validate with",
     priors: Mapping[str, float] | None = None,
     notes: tuple[str, ...] = (),
     progress: Callable[[str], None] = lambda line: None,
@@ -79,6 +83,7 @@ def run_identify(
         measured: joint angles, and measured poses of the tool.
         lines: (N,) lines of the file that they come from.
         other: poses to validate with; None: parts of ``measured`` are left out, one after the other.
+        other_name: what an error calls these: their file.
         priors: as in :func:`identify`.
         notes: of the reading.
         progress: called with each step as text.
@@ -87,9 +92,14 @@ def run_identify(
         InputError: either file's poses cannot be of this arm, or are too few.
         CalibrationError: the poses are too alike.
     """
+    if other is not None:
+        try:
+            check_other(arm, measured, other)
+        except InputError as error:
+            raise InputError(f"{other_name}: {error}") from None
     found = identify(arm, measured, priors=priors, progress=progress)
     if other is not None:
-        held_out = _validated(found, arm, other)
+        held_out = validate(found, other)
         how = f"{len(other)} poses of another file" + (
             ", base and tool fitted anew" if held_out.placement_refitted else ""
         )
@@ -100,17 +110,32 @@ def run_identify(
     return Identification(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
 
 
-def _validated(found: Identified, arm: Arm, other: Measured) -> Validation:
-    """Validate the arm on another file's poses; where they fit far too badly, raise what would make them fit."""
-    held_out = validate(found, other)
-    off = held_out.identified
-    rotated = bool(off.angle_rad.size) and float(np.median(off.angle_rad)) > BAD_RAD
-    if len(other) >= MIN_POSES and (rotated or float(np.median(off.position_m)) > BAD_M):
+def check_other(arm: Arm, measured: Measured, other: Measured) -> None:
+    """Reject poses to validate with that cannot be of the arm, before anything is fitted.
+
+    Args:
+        arm: the nominal arm.
+        measured: what it will be identified from.
+        other: the poses to validate with. Fewer than MIN_POSES are evaluated in the set-up of ``measured``.
+
+    Raises:
+        InputError: other points, or joint angles that do not fit; the message says what would make them fit.
+    """
+    require_alike(other, measured.points, measured.R_rig_body is not None)
+    if len(other) >= MIN_POSES:
         try:
             check_plausible(without_tool(arm), other)
         except InputError as error:
             raise InputError(f"the poses to validate with: {error}") from None
-    return held_out
+        return
+    check_plausible(without_tool(arm), measured)  # or its placement means nothing
+    model, x = with_placement(Model.of(without_tool(arm), measured, backlash=False).with_features(()), measured)
+    off = float(np.median(errors(model, x, other).position_m))
+    if off > FAR_M:
+        raise InputError(
+            f"the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their angles: "
+            f"other joints, or another set-up, for which {MIN_POSES} poses are needed"
+        )
 
 
 def _left_out(
@@ -209,6 +234,10 @@ def identify_json(run: Identification) -> dict[str, Any]:
         "noise_m": found.solution.noise[0],
         "noise_rad": found.solution.noise[1] if found.model.full else None,
         "parameters": [row._asdict() for row in parameter_rows(run)],
+        "joint_ranges_seen": [
+            {"joint": i + 1, "min_rad": low, "max_rad": high} for i, (low, high) in enumerate(ranges_seen(found))
+        ],
+        "curve_fade_rad": float(found.model.fade_rad),
         "correlated": [{"a": a, "b": b, "correlation": c} for a, b, c in found.correlated()],
         "forward_selection": [
             {"source": s.source, "parameters": list(s.names), "held_out_rms": s.rms} for s in found.steps
@@ -251,7 +280,7 @@ def _make(out: Path, made: list[Path]) -> None:
 def write_results(run: Identification, out: Path) -> None:
     """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
     corrected = Corrected.of(run.found)
-    write_text(out / "corrected.toml", table_text(run.found))
+    corrected.save(out / "corrected.toml")
     write_text(out / "corrected.urdf", corrected.urdf())
     write_text(out / "zeros.toml", zeros_text(run.found))
     write_text(out / "parameters.csv", _parameters(run))
@@ -318,11 +347,27 @@ def text(run: Identification, *, everything: bool = False) -> str:
         for p, free in zip(found.model.parameters, found.solution.free, strict=True)
     )
     lines += _not_fitted(run) if everything else ["", f"{left} more parameters were not fitted; -v says why"]
+    lines += ["", _ranges_title(found)]
+    lines += [
+        f"  joint {i + 1}  {np.degrees(a):.1f} to {np.degrees(b):.1f} deg"
+        for i, (a, b) in enumerate(ranges_seen(found))
+    ]
     pairs = found.correlated()
     if pairs:
         lines += ["", "correlations over 0.9 (more varied poses distinguish them):"]
         lines += [f"  {a} and {b}: {c:+.3f}" for a, b, c in pairs]
     return "\n".join(lines)
+
+
+def ranges_seen(found: Identified) -> list[tuple[float, float]]:
+    """Return the least and greatest reading of each joint in the poses fitted, rad."""
+    assert found.model.q_seen is not None  # for the type checker: an identified arm has them
+    return [(float(low), float(high)) for low, high in found.model.q_seen]
+
+
+def _ranges_title(found: Identified) -> str:
+    fade = f"within {np.degrees(found.model.fade_rad):.0f} deg"
+    return f"readings seen (beyond them a sensor's curve fades {fade} to its mean; zeros and lengths hold everywhere):"
 
 
 def _ripples(run: Identification) -> list[str]:

@@ -1,31 +1,46 @@
 """An identified arm in use: the pose of its tool at given joint readings, and the readings that reach a given pose.
 
 Also the arm for other programs: an :class:`Arm` with the corrected table, a URDF with Hayati's angles in its origins,
-corrected.toml (:func:`table_text`, which :mod:`armsight.robot.arm_file` reads), and what the board adds to its readings
-(:func:`zeros_text`).
+corrected.toml, and what the board adds to its readings (:func:`zeros_text`). :func:`open_corrected` reads corrected.toml
+with everything that corrects; :mod:`armsight.robot.arm_file` reads its table alone, as an :class:`Arm`.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import write_text
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.model import Model
+from armsight.loop.identify.model import FAST, RIPPLES, Feature, Model, all_features
 from armsight.robot.arm import Arm
-from armsight.robot.arm_file import LIMITS, tilted_urdf
+from armsight.robot.arm_file import (
+    LIMITS,
+    file_transform,
+    identified_table,
+    joint_numbers,
+    parsed_toml,
+    tilted_urdf,
+)
 
 #: Newton steps to a reading, and what counts as there, m and rad.
 STEPS, THERE = 30, 1e-9
 #: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
-#: gravity.
-VERSION = 2
+#: gravity; version 2 had no ranges of the readings and no nominal table.
+VERSION = 3
+#: Names of version 1 -> names now.
+_OLD_NAMES = {"slack": "gravity_backlash", "sag": "compliance"}
+#: Columns of the nominal table, which gives the levers of gravity -> their units.
+_NOMINAL = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +50,27 @@ class Corrected(Record):
     Attributes:
         model: the nominal arm with every parameter.
         x: (P,) the vector.
+        sigma: (P,) of every parameter, zero where it was not fitted.
+        notes: what was missing in the file that it was read from, as text.
     """
 
     model: Model
     x: Array
+    sigma: Array
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def of(found: Identified) -> Corrected:
         """Return what was identified, ready for use."""
-        return Corrected(found.model, found.solution.x)
+        return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)))
+
+    def joint_corrections(self, q: Array, approach: Array | None = None) -> Array:
+        """Return what the error sources add to readings q (N, 6), (N, 6), rad: curves, backlash and compliance.
+
+        Beyond the readings that were seen (``model.q_seen``) a sensor's curve fades to its mean over them.
+        """
+        theta = self.model.theta(self.x, q, self.model.feature_values(q, approach))
+        return np.asarray(self.model.arm.direction * theta - q)
 
     def forward(self, q: Array, approach: Array | None = None) -> Array:
         """Return T_base_body (N, 4, 4) at readings q (N, 6), rad; ``approach`` (N, 6) as in :class:`Measured`."""
@@ -74,6 +101,14 @@ class Corrected(Record):
         sides = None if side is None else np.repeat(side, 6, axis=0)
         return np.asarray(log_se3(inverse(T) @ self.forward(many, sides)).T / h)
 
+    def save(self, path: str | Path) -> None:
+        """Write corrected.toml, which :func:`open_corrected` reads as the same arm.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        write_text(Path(path), table_text(self))
+
     def arm(self) -> Arm:
         """Return the corrected table without Hayati's angles and error sources, for which :class:`Arm` has no room."""
         table, T_6_body = self.model.table(self.x), self.model.T_6_body(self.x)
@@ -93,10 +128,10 @@ class Corrected(Record):
         return tilted_urdf(self.arm(), self.model.table(self.x)[:, chain.BETA])
 
 
-def table_text(found: Identified) -> str:
-    """Return the corrected arm as TOML, m and rad; every value with its sigma."""
-    model, x = found.model, found.solution.x
-    table, sigma = model.table(x), np.sqrt(np.diag(found.cov))[model.table_at : model.sources_at].reshape(6, 5)
+def table_text(arm: Corrected) -> str:
+    """Return the corrected arm as TOML, m and rad; every value with its sigma. :func:`open_corrected` reads it."""
+    model, x = arm.model, arm.x
+    table, sigma = model.table(x), model.table(arm.sigma)
     lines = [
         f"name = {_quoted(model.arm.name)}",
         f"convention = {_quoted(model.arm.convention)}",
@@ -106,22 +141,116 @@ def table_text(found: Identified) -> str:
         *_transform("T_rig_base", model.T_rig_base(x)),
         *_transform("T_base_0", model.arm.T_base_0),
         *_transform("T_flange_body", model.T_6_body(x)),
+        f"up_base = [{', '.join(repr(float(v)) for v in model.up_base)}]",
     ]
+    if model.q_seen is not None:
+        lines += [
+            "# A sensor's curve (gain, wave, ripple) holds from seen_min_rad to seen_max_rad of its joint.",
+            "# Beyond, it fades to its mean over that range: with t = distance / curve_fade_rad, 1 - t^2 (3 - 2 t)",
+            "# of its deviation from the mean is left, and none from t = 1 on.",
+            f"curve_fade_rad = {float(model.fade_rad)!r}",
+        ]
     for i, name in enumerate(model.arm.joint_names):
         lines += ["", "[[joint]]", f"name = {_quoted(name)}", f"direction = {model.arm.direction[i]:.0f}"]
         for c, column in enumerate(chain.COLUMNS):
             unit = "m" if c in (chain.D, chain.A) else "rad"
             lines.append(f"{column}_{unit} = {float(table[i, c])!r}")
             lines.append(f"sigma_{column}_{unit} = {float(sigma[i, c])!r}")
+        lines += [f"nominal_{key}_{unit} = {float(getattr(model.arm, key)[i])!r}" for key, unit in _NOMINAL.items()]
+        if model.q_seen is not None:
+            lines += [f"seen_{end}_rad = {float(v)!r}" for end, v in zip(("min", "max"), model.q_seen[i], strict=True)]
         for key, unit in LIMITS.items():
             lines.append(f"{key}_{unit} = {float(getattr(model.arm, key)[i])!r}")
     for k, feature in enumerate(model.features):
         at = model.sources_at + k
-        if found.solution.free[at]:
+        if x[at] != 0.0:
             lines += ["", "[[error_source]]", f"name = {_quoted(feature.name)}", f"kind = {_quoted(feature.kind)}"]
             lines += [f"joint = {feature.joint + 1}", f"unit = {_quoted(feature.unit)}"]
-            lines += [f"value = {float(x[at])!r}", f"sigma = {float(np.sqrt(found.cov[at, at]))!r}"]
+            lines += [f"value = {float(x[at])!r}", f"sigma = {float(arm.sigma[at])!r}"]
     return "\n".join(lines) + "\n"
+
+
+def is_corrected(path: str | Path) -> bool:
+    """Return whether an arm's file is a corrected.toml; a name or another file is none.
+
+    Raises:
+        InputError: a .toml file that is unreadable, or not TOML.
+    """
+    return str(path).lower().endswith(".toml") and "identified" in parsed_toml(path)
+
+
+def open_corrected(path: str | Path) -> Corrected:
+    """Read a corrected.toml with everything that corrects: table, sensors' curves, backlash, compliance, base and body.
+
+    A file of version 1 or 2 has no ranges of the readings, so that its curves do not fade; ``notes`` of the arm says so.
+
+    Raises:
+        InputError: unreadable, no corrected.toml, or something in it is missing or wrong; the message names it.
+    """
+    given = parsed_toml(path)
+    if "identified" not in given:
+        raise InputError(f"{path}: no identified arm; `armsight identify -o DIR` writes DIR/corrected.toml")
+    arm, beta = identified_table(path, given)
+    rows, notes = given["joint"], []
+    table = np.stack([arm.offset, arm.d, arm.a, arm.alpha, beta], axis=1)
+    if "nominal_d_m" in rows[0]:
+        offset, d, a, alpha = (joint_numbers(path, rows, f"nominal_{k}_{unit}") for k, unit in _NOMINAL.items())
+        arm = replace(arm, offset=offset, d=d, a=a, alpha=alpha)
+    else:
+        notes.append(
+            f"{path}: an old file without the nominal table: levers of gravity are those of the identified one"
+        )
+    q_seen, fade_rad = None, chain.FADE_RAD
+    if "seen_min_rad" in rows[0]:
+        q_seen = np.stack([joint_numbers(path, rows, f"seen_{end}_rad") for end in ("min", "max")], axis=1)
+        fade_rad = _positive(path, given, "curve_fade_rad")
+    else:
+        notes.append(
+            f"{path}: an old file without the ranges of the readings seen: sensors' curves do not fade beyond them"
+        )
+    features, coefficients = _error_sources(path, given)
+    T_rig_base, T_6_body = file_transform(path, given, "T_rig_base"), file_transform(path, given, "T_flange_body")
+    up = np.array(given.get("up_base", [0.0, 0.0, 1.0]), float)
+    model = Model(arm, 1, True, features, T_rig_base[:3, :3], T_6_body[:3, :3], up, q_seen, fade_rad)
+    x = np.zeros(len(model.parameters))
+    x[:3], x[model.tool_at : model.tool_at + 3] = T_rig_base[:3, 3], T_6_body[:3, 3]
+    x[model.table_at : model.sources_at] = table.ravel()
+    sigma = np.zeros(len(x))
+    columns = [(key, "m" if key in ("a", "d") else "rad") for key in chain.COLUMNS]
+    numbers = [joint_numbers(path, rows, f"sigma_{key}_{unit}") for key, unit in columns]
+    sigma[model.table_at : model.sources_at] = np.stack(numbers, axis=1).ravel()
+    x[model.sources_at :], sigma[model.sources_at :] = coefficients
+    return Corrected(model, x, sigma, tuple(notes))
+
+
+def _error_sources(path: str | Path, given: dict[str, Any]) -> tuple[tuple[Feature, ...], Array]:
+    """Return the F error sources of a parsed corrected.toml, and their coefficients and sigmas (2, F)."""
+    known = {f.name: f for f in all_features(True, (*RIPPLES, *FAST))}
+    features, values = [], []
+    for row in given.get("error_source", given.get("cause", [])):
+        name = str(row.get("name"))
+        for old, new in _OLD_NAMES.items():
+            name = new + name.removeprefix(old) if name.startswith(old) else name
+        if name not in known:
+            raise InputError(
+                f"{path}: error source {name!r} is unknown; known are such as gain1, wave1_sin1, backlash1"
+            )
+        features.append(known[name])
+        values.append([_finite(path, f"{key} of {name}", row.get(key)) for key in ("value", "sigma")])
+    return tuple(features), np.array(values).reshape(-1, 2).T
+
+
+def _positive(path: str | Path, given: dict[str, Any], key: str) -> float:
+    value = _finite(path, key, given.get(key))
+    if value <= 0:
+        raise InputError(f"{path}: {key} is {value}, must be more than 0")
+    return value
+
+
+def _finite(path: str | Path, key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InputError(f"{path}: {key} is {value!r}, must be a number")
+    return float(value)
 
 
 def zeros_text(found: Identified) -> str:
@@ -130,6 +259,7 @@ def zeros_text(found: Identified) -> str:
     lines = [
         "# angle = (1 + gain) reading + zero + sin1 sin(reading) + cos1 cos(reading) + sin2 sin(2 reading) + ..;",
         "# zero: to be added to every node of the joint's potentiometer table. Backlash and compliance stay uncorrected.",
+        "# It holds for readings from seen_min_rad to seen_max_rad, and says nothing of others.",
     ]
     nominal = model.table(model.nominal())
     for i, name in enumerate(model.arm.joint_names):
@@ -143,6 +273,8 @@ def zeros_text(found: Identified) -> str:
             f"zero_deg = {np.degrees(zero):.5f}",
         ]
         lines.append(f"sigma_zero_rad = {sigma!r}")
+        if model.q_seen is not None:
+            lines += [f"seen_{end}_rad = {float(v)!r}" for end, v in zip(("min", "max"), model.q_seen[i], strict=True)]
         for f in model.features:
             if f.joint == i and f.kind in ("gain", "wave", "ripple") and found.value(f.name)[0] != 0.0:
                 key = "gain" if f.kind == "gain" else f"{f.name.split('_')[1]}_rad"

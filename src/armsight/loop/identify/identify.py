@@ -77,11 +77,19 @@ class Identified(Record):
         k = self.model.names.index(name)
         return float(self.solution.x[k]), float(np.sqrt(self.cov[k, k]))
 
+    def correlation(self, rows: NDArray[np.int64]) -> Array:
+        """Return the correlations (R, R) of fitted parameters: how badly these poses distinguish them.
+
+        They are those of the fit. ``cov`` also has what the choice of the model moves, each number by itself, which would
+        hide the correlations of the terms of a sensor's curve.
+        """
+        sigma = self.solution.sigma()[rows]
+        return np.asarray(self.solution.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma))
+
     def correlated(self) -> list[tuple[str, str, float]]:
         """Return the pairs of fitted parameters whose correlation is over CORRELATED, strongest first."""
         rows = np.flatnonzero(self.solution.free)
-        sigma = np.sqrt(np.diag(self.cov))[rows]
-        C = self.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma)
+        C = self.correlation(rows)
         i, j = np.nonzero(np.triu(np.abs(C) > CORRELATED, 1))
         names = self.model.names
         pairs = [(names[rows[a]], names[rows[b]], float(C[a, b])) for a, b in zip(i, j, strict=True)]
@@ -170,6 +178,7 @@ def _identified(
     nominal = fit(model, start.x, measured, placement, prior, used=solution.used)
     kept_together = {model.names[k] for k in np.flatnonzero(selection.free & ~observable.free)}
     reasons = {**{n: why for n, why in observable.reasons.items() if n not in kept_together}, **selection.reasons}
+    model = model.with_seen(measured.q[solution.used])
     cov = _whole(model, solution, measured, observable.possible, prior)
     between = np.where(selection.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
     cov = np.where(selection.free[:, None] & selection.free, cov + np.diag(between**2), 0.0)

@@ -15,7 +15,9 @@ an elementary rotation about axis u through o is u x (p - o), by a translation a
 The error sources say by how much a joint's true angle differs from its sensor's reading, linear in the coefficients:
 
 - gain: scale of the sensor.
-- wave, ripple: linearity error of the sensor, sine and cosine of its angle and of multiples of it.
+- wave, ripple: linearity error of the sensor, sine and cosine of its angle and of multiples of it. With gain they are the
+  sensor's curve, which holds over the range of readings that was measured. Beyond it the curve fades within FADE_RAD to its
+  mean over that range, which is a part of the joint's zero: what is fitted in one range says nothing of another.
 - backlash: half of it to either side, by the direction of approach: friction holds the joint on the side it came from.
 - gravity_backlash: backlash that the gravity load of the links beyond the joint closes, whichever way the joint came,
   except where the lever is so small that friction is stronger.
@@ -128,6 +130,12 @@ PLENTY = 10
 #: A bearing's friction holds a link inside its backlash against gravity with up to about this lever, m: some per cent of
 #: the lever of such arms' links, as a bearing's friction is some per cent of its load. Over half of it the backlash closes.
 FRICTION_M = 2e-3
+#: Kinds that make up the curve of a joint's sensor: functions of its reading.
+SENSOR = ("gain", "wave", "ripple")
+#: Beyond the range of readings that the poses have shown, a sensor's curve fades over so much, rad. Over more, a fast
+#: harmonic would swing where nothing was measured; over less, what holds a few degrees on would be lost (half of 0.2 mm at
+#: 6 degrees, of the synthetic worn arms).
+FADE_RAD = np.deg2rad(20.0)
 
 
 class Feature(NamedTuple):
@@ -169,7 +177,15 @@ def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...
     return tuple(found)
 
 
-def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | None, up_base: Array) -> Array:
+def values(
+    arm: Arm,
+    features: tuple[Feature, ...],
+    q: Array,
+    approach: Array | None,
+    up_base: Array,
+    q_seen: Array | None = None,
+    fade_rad: float = FADE_RAD,
+) -> Array:
     """Return what one unit of every coefficient adds to its joint's angle.
 
     Args:
@@ -178,6 +194,9 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
         q: (N, 6) joint angles, rad.
         approach: (N, 6) directions of approach, or None.
         up_base: (3,) unit vector against gravity, base.
+        q_seen: (6, 2) least and greatest reading of each joint that the sensors' curves were fitted to, rad, beyond which
+            they fade to their means over that range; None: they never do.
+        fade_rad: how far beyond it they have faded, rad.
 
     Returns:
         (N, F).
@@ -186,12 +205,8 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
     by_gravity = any(f.kind in ("compliance", "gravity_backlash") for f in features)
     levers = _levers(arm, q, up_base) if by_gravity else np.zeros((len(q), 6, 6))
     for k, f in enumerate(features):
-        angle = q[:, f.joint]
-        if f.kind == "gain":
-            out[:, k] = angle
-        elif f.kind in ("wave", "ripple"):
-            n, phase = f.detail
-            out[:, k] = np.cos(n * angle) if phase else np.sin(n * angle)
+        if f.kind in SENSOR:
+            out[:, k] = _curve(f, q[:, f.joint], None if q_seen is None else q_seen[f.joint], fade_rad)
         elif f.kind == "backlash" and approach is not None:
             out[:, k] = -0.5 * approach[:, f.joint]
         elif f.kind == "gravity_backlash":
@@ -199,6 +214,27 @@ def values(arm: Arm, features: tuple[Feature, ...], q: Array, approach: Array | 
         elif f.kind == "compliance":
             out[:, k] = levers[:, f.joint, f.detail[0]]
     return out
+
+
+def _curve(f: Feature, angle: Array, seen: Array | None, fade_rad: float) -> Array:
+    """Return what one unit of a part of a sensor's curve adds at readings (N,), rad; see :func:`values` for ``seen``."""
+    n, phase = f.detail
+    out = angle if f.kind == "gain" else np.cos(n * angle) if phase else np.sin(n * angle)
+    if seen is None:
+        return np.asarray(out)
+    low, high = float(seen[0]), float(seen[1])
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    if f.kind == "gain":
+        mean = middle
+    else:  # the mean of a wave over a range is its value in the middle, times sin(n half) / (n half)
+        mean = float(np.sinc(n * half / np.pi) * (np.cos(n * middle) if phase else np.sin(n * middle)))
+    return np.asarray(mean + fade(angle, low, high, fade_rad) * (out - mean))
+
+
+def fade(angle: Array, low: float, high: float, width: float = FADE_RAD) -> Array:
+    """Return 1 for readings from ``low`` to ``high``, falling to 0 over ``width`` on either side, its slope continuous."""
+    beyond = np.clip(np.maximum(low - angle, angle - high) / width, 0.0, 1.0)
+    return np.asarray(1 - beyond**2 * (3 - 2 * beyond))
 
 
 def _gravity_lever(arm: Arm, levers: Array, joint: int) -> Array:
@@ -270,6 +306,9 @@ class Model(Record):
         R_start: (3, 3) rotation of the base in the rig that the base's rotation parameters start from.
         R_tool: (3, 3) rotation of the body in frame 6 that the tool's rotation parameters start from, with full poses.
         up_base: (3,) unit vector against gravity, base.
+        q_seen: (6, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves
+            fade; None before the fit is done, and of an arm whose file does not say it.
+        fade_rad: how far beyond them the curves have faded, rad.
     """
 
     arm: Arm
@@ -279,6 +318,8 @@ class Model(Record):
     R_start: Array = field(default_factory=lambda: np.eye(3))
     R_tool: Array = field(default_factory=lambda: np.eye(3))
     up_base: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    q_seen: Array | None = None
+    fade_rad: float = FADE_RAD
 
     @staticmethod
     def of(arm: Arm, measured: Measured, *, backlash: bool) -> Model:
@@ -352,13 +393,17 @@ class Model(Record):
             T[:3, :3] = self.R_tool @ exp_so3(x[self.table_at - 3 : self.table_at].copy())
         return T
 
+    def with_seen(self, q: Array) -> Model:
+        """Return the model whose sensors' curves fade beyond the readings (N, 6), rad, of the poses fitted."""
+        return replace(self, q_seen=np.stack([q.min(axis=0), q.max(axis=0)], axis=1))
+
     def with_features(self, features: tuple[Feature, ...]) -> Model:
         """Return the model with other error sources."""
         return replace(self, features=features)
 
     def feature_values(self, q: Array, approach: Array | None) -> Array:
         """Return what one unit of every error source adds to its joint's angle, (N, F), rad per unit."""
-        return values(self.arm, self.features, q, approach, self.up_base)
+        return values(self.arm, self.features, q, approach, self.up_base, self.q_seen, self.fade_rad)
 
     def theta(self, x: Array, q: Array, phi: Array) -> Array:
         """Return the joints' rotations without their offsets (N, 6), rad; ``phi`` is :meth:`feature_values`."""

@@ -90,6 +90,9 @@ def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) 
     requested = _alternative(
         path, columns, [[f"q{i}_{unit}" for i in range(1, 7)] for unit in ("rad", "deg")], "joint angles"
     )
+    seventh = next((name for name in ("q7_rad", "q7_deg") if name in columns), None)
+    if seventh is not None:
+        raise InputError(f"{path}: line 1: column {seventh}: arms of six joints are identified, this one has more")
     poses = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
     if "qw" in columns:
         requested += _alternative(path, columns, [poses], "full poses")

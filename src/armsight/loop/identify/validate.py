@@ -84,10 +84,7 @@ def validate(found: Identified, measured: Measured) -> Validation:
         InputError: another number of points, or points instead of poses.
     """
     model = found.model
-    if measured.points != model.points or (measured.R_rig_body is not None) != model.full:
-        raise InputError(
-            "the poses to validate with must have the same points, or full poses, as those identified with"
-        )
+    require_alike(measured, model.points, model.full)
     kept = [errors(model, x, measured) for x in (found.nominal, found.solution.x)]
     kept_m = float(np.median(kept[1].position_m))
     if len(measured) < MIN_POSES or kept_m < OTHER_M:
@@ -97,6 +94,20 @@ def validate(found: Identified, measured: Measured) -> Validation:
     if kept_m < OTHER * float(np.median(new[1].position_m)):
         return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
     return Validation(new[0], new[1], True, _over(new_model, found, x, measured))
+
+
+def require_alike(measured: Measured, points: int, full: bool) -> None:
+    """Reject poses that do not have the points, or full poses, of those identified with.
+
+    Raises:
+        InputError: another number of points, or points instead of poses.
+    """
+    have, need = (
+        "full poses" if f else f"{p} tracked point{'s' if p > 1 else ''} a pose"
+        for p, f in ((measured.points, measured.R_rig_body is not None), (points, full))
+    )
+    if have != need:
+        raise InputError(f"the poses to validate with have {have}; those identified with have {need}")
 
 
 def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
