@@ -1,6 +1,9 @@
 """``armsight identify`` from files to files."""
 
 import json
+import os
+import subprocess
+import sys
 import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -223,6 +226,15 @@ def test_poses_to_validate_with_have_the_points_of_those_fitted(tmp_path, capsys
     other.write_text("\n".join(lines))
     answer = said(capsys, "--arm", "six_r", "--data", data, "--validate", other)
     assert_rejected(answer, str(other), "2 tracked points a pose", "1 tracked point a pose")
+
+
+@pytest.mark.parametrize(("own", "threads"), [(None, "1"), ("2", "2")])
+def test_small_matrices_are_not_shared_between_threads(own, threads):
+    code = "import os, armsight.app.main as m; m.group.get_command(None, 'identify'); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    setting = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    setting |= {} if own is None else {"OPENBLAS_NUM_THREADS": own}
+    done = subprocess.run([sys.executable, "-c", code], env=setting, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == threads
 
 
 def test_the_ranges_seen_are_in_every_output(tmp_path, capsys):

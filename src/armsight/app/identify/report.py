@@ -6,6 +6,7 @@ Figures: errors over the workspace and over joint angles, error sources, forward
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 MOST_POINTS = 4000
 #: Names of full size fit beside a matrix up to this many; more are smaller.
 MOST_NAMES = 60
+#: More steps of removal after one another than this are one row of the selection's figure.
+MOST_REMOVED = 8
 #: Intervals of a joint's angle over which errors are averaged.
 _BINS = 12
 
@@ -91,16 +94,27 @@ def _binned(ax: Axes, x: Array, y: Array, colour: str, name: str) -> None:
     ax.plot(middle[filled], [y[at == k].mean() for k in filled], color=colour, linewidth=2, label=name)
 
 
+def selection_rows(run: Identification) -> list[tuple[str, float, bool]]:
+    """Return text, held-out RMS and whether it was removed, of each step; many removals after one another are one row."""
+    rows: list[tuple[str, float, bool]] = []
+    for gone, group in groupby(run.found.steps, key=lambda step: step.source.startswith("-")):
+        steps = list(group)
+        if gone and len(steps) > MOST_REMOVED:
+            first, last = (step.source[1:] for step in (steps[0], steps[-1]))
+            rows.append((f"without {first} .. {last}, {len(steps)} steps", steps[-1].rms, True))
+        else:
+            rows += [(f"without {s.source[1:]}" if gone else s.source, s.rms, gone) for s in steps]
+    return rows
+
+
 def selection_figure(run: Identification) -> Figure:
     """Plot the forward selection by the error on poses left out, and the convergence of the final fit."""
-    figure = new_figure(0.24 * len(run.found.steps) + 2.2)
+    figure = new_figure(0.24 * len(selection_rows(run)) + 2.2)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    rms = [step.rms for step in run.found.steps]
-    rows = np.arange(len(rms))
-    left.barh(rows, rms, color=[BLUE if not s.source.startswith("-") else MUTED for s in run.found.steps], height=0.7)
-    left.set_yticks(
-        rows, [s.source if not s.source.startswith("-") else f"without {s.source[1:]}" for s in run.found.steps]
-    )
+    shown = selection_rows(run)
+    rows = np.arange(len(shown))
+    left.barh(rows, [rms for _, rms, _ in shown], color=[MUTED if gone else BLUE for _, _, gone in shown], height=0.7)
+    left.set_yticks(rows, [text for text, _, _ in shown])
     left.invert_yaxis()
     left.set_xlabel("held-out RMS, in sigmas of the noise")
     left.set_title("added, and removed again (grey)")
