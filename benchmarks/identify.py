@@ -106,9 +106,9 @@ def many_poses() -> None:
     report("12,000 poses, memory of this process so far", memory, 1.0, "GB")
 
 
-#: Poses -> seconds asked for, and seconds of the command on the computer of the record (two cores, one thread) before all
-#: candidates of a selection step were scored from one factorisation. Without --validate: six identifications of 200 poses.
-SPEED = {200: (20.0, 17.0), 1000: (30.0, 5.1)}
+#: Poses -> seconds asked for, and seconds of CPU on the computer of the record (one thread) before all candidates of a
+#: selection step were scored from one factorisation. Without --validate: six identifications of 200 poses.
+SPEED = {200: (20.0, 16.4), 1000: (30.0, 3.2)}
 
 
 def speed() -> None:
@@ -127,7 +127,7 @@ def speed() -> None:
         wall, cpu = time.perf_counter() - start, time.process_time() - cpu
         fitted = int(run.found.solution.free.sum())
         off = 1e3 * validate(run.found, every.rows(other)).identified.summary()["mean_m"]
-        more = f", {wall / recorded:.2f} of the record; {cpu:.1f} s of CPU, {fitted} parameters of {3 * count} numbers"
+        more = f", {cpu:.1f} s of CPU, {cpu / recorded:.2f} of the record; {fitted} parameters of {3 * count} numbers"
         report(f"identify, {count} poses, wall clock", wall, most, "s", f"{more}, {off:.3f} mm on {UNSEEN} unseen")
 
 

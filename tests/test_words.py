@@ -62,6 +62,11 @@ LEGITIMATE = (
         r"\bturn_deg\b",
         "what version 1 wrote is read",
     ),
+    (
+        r"src/armsight/loop/identify/corrected\.py|tests/loop/identify/test_identify_corrected\.py",
+        r"\bslack\d?\b|\bsag\d?(_\d)?\b",
+        "what version 1 wrote is read",
+    ),
     (r"", r"\bin[- ]place\b|\bin turn\b", "plain English"),
     (r"src/armsight/robot/kinematics/", r"\bstandard form\b", "of Denavit-Hartenberg parameters"),
     (

@@ -230,7 +230,8 @@ def test_poses_to_validate_with_have_the_points_of_those_fitted(tmp_path, capsys
 
 @pytest.mark.parametrize(("own", "threads"), [(None, "1"), ("2", "2")])
 def test_small_matrices_are_not_shared_between_threads(own, threads):
-    code = "import os, armsight.app.main as m; m.group.get_command(None, 'identify'); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    code = "import os, armsight.app.main as main; main.group.get_command(None, 'identify');"
+    code += "print(os.environ['OPENBLAS_NUM_THREADS'])"
     setting = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     setting |= {} if own is None else {"OPENBLAS_NUM_THREADS": own}
     done = subprocess.run([sys.executable, "-c", code], env=setting, capture_output=True, text=True, check=True)

@@ -100,6 +100,19 @@ def test_a_file_of_version_2_is_read_unfaded_with_a_note(arm, tmp_path):
     )
 
 
+def test_a_file_of_version_1_is_read(arm, tmp_path):
+    """It had other names of the kinds of gravity, and [[cause]] tables."""
+    x = arm.x.copy()
+    x[[arm.model.names.index(name) for name in ("gravity_backlash3", "compliance2_3")]] = 2e-3, 1e-3
+    arm = replace(arm, x=x)
+    text = table_text(arm).replace("version = 3\n", "").replace("[[error_source]]", "[[cause]]")
+    old = tmp_path / "old.toml"
+    old.write_text(text.replace('"gravity_backlash3"', '"slack3"').replace('"compliance2_3"', '"sag2_3"'))
+    q = np.random.default_rng(2).uniform(-1, 1, (20, 6))
+    back = armsight.open_corrected(old)
+    np.testing.assert_allclose(back.joint_corrections(q), arm.joint_corrections(q), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
