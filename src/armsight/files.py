@@ -304,7 +304,9 @@ def check_folder(
     others = [other for other in apart_from if other is not None]
     for name in holding:
         if any(_same_file(other, folder / name) for other in others):
-            raise InputError(f"{folder / name}: is read, and would be written over; choose another folder")
+            raise InputError(
+                f"{folder / name}: is given twice, or is read as well as written; choose another folder for the results"
+            )
     return folder
 
 
