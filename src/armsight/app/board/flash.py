@@ -13,7 +13,7 @@ from pathlib import Path
 from shutil import which
 
 from armsight.errors import DeviceError, InputError
-from armsight.files import replacing
+from armsight.files import check_folder, replacing
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 
@@ -53,6 +53,7 @@ def build_firmware(board: str, folder: Path, compiler: str | None = None) -> Bui
     chosen = build.open_compiler(compiler)
     if board not in build.boards():
         raise InputError(f"no board {board!r}; there are {', '.join(build.boards())}")
+    check_folder(folder, problem="cannot be made a folder of firmware")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
