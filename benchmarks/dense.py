@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 
 for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ[name] = "1"  # before numpy and numba are imported
+    os.environ[name] = "1"  # before numpy is imported
 
 import argparse  # noqa: E402
 import json  # noqa: E402

@@ -28,7 +28,6 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "robot"))
 
 import arms  # noqa: E402
-import numba  # noqa: E402
 import numpy as np  # noqa: E402
 import peers  # noqa: E402
 
@@ -55,21 +54,19 @@ def least(work, times, runs=7):
     return best / times * 1e6
 
 
-@numba.njit
+# One call of a kernel after another: the way from Python into compiled code is part of the time.
 def forwards(table, q, T, rounds):
     for _ in range(rounds):
         for row in q:
             chain.forward(table, row, T)
 
 
-@numba.njit
 def jacobians(table, q, J, rounds):
     for _ in range(rounds):
         for row in q:
             chain.jacobian(table, row, False, J)
 
 
-@numba.njit
 def inverses(table, closed, limits, Ts, near, rows, scratch, n, rounds):
     for _ in range(rounds):
         for T in Ts:

@@ -247,7 +247,6 @@ with mock.patch("{module}.{name}", waiting):
 @pytest.mark.parametrize(
     ("module", "name", "wait"),
     [
-        # Asleep, too: an interrupt that falls into numba's loading of compiled code ends the process (docs/limits.md).
         ("armsight.app.calibrate.command", "calibrate_boards", "time.sleep(60)"),
         ("armsight.vision.sources.pairs", "read_image", "time.sleep(60)"),
         ("armsight.files", "os.replace", "time.sleep(60)"),
