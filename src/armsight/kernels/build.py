@@ -19,6 +19,7 @@ import importlib.machinery
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -244,7 +245,7 @@ def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  
 
 def _prepare_numba() -> Any:  # noqa: ANN401
     """Make numba gather code in place of optimising and loading it; return its context."""
-    from numba.core import codegen
+    from numba.core import callconv, codegen
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.registry import cpu_target
     from numba.core.runtime import nrtdynmod, rtsys
@@ -264,6 +265,9 @@ def _prepare_numba() -> Any:  # noqa: ANN401
         def set_env(self, *_: Any) -> None:  # noqa: ANN401
             pass
 
+    # A kernel that fails says so; what it raised nobody reads, and making it needs more of Python than call.c has.
+    for name in ("set_static_user_exc", "set_dynamic_user_exc"):
+        setattr(callconv.CPUCallConv, name, lambda *_, **__: None)
     context = cpu_target.target_context
     context.refresh()
     context._internal_codegen = Codegen("armsight")
@@ -481,30 +485,41 @@ def build(folder: Path, name: str | None = None) -> Path:
     table = CACHE / target.zig / "table.c"
     table.parent.mkdir(parents=True, exist_ok=True)
     table.write_text(_table(modules, bitcodes, target), encoding="utf-8")
-    folder.mkdir(parents=True, exist_ok=True)
-    out, here = folder / target.library, Path(__file__).parent
-    command = [
-        sys.executable,
-        "-m",
-        "ziglang",
-        "cc",
-        "-target",
-        target.zig,
-        "-shared",
-        "-O2",
-        "-fPIC",
-        "-std=c11",
-        "-s",
-    ]
-    command += ["-Wall", "-Wextra", f"-I{here}", "-o", str(out), str(table), str(here / "call.c"), *map(str, objects)]
+    here, made = Path(__file__).parent, CACHE / target.zig / target.library
+    flags = ["-shared", "-O2", "-fPIC", "-std=c11", "-s", "-Wall", "-Wextra", f"-I{here}"]
+    files = [table, here / "call.c", *objects]
     if "macos" in target.zig:
-        command += ["-undefined", "dynamic_lookup"]
+        flags += ["-undefined", "dynamic_lookup"]
     if "linux" in target.zig:
-        command += ["-lm"]
+        flags += ["-lm"]
+    if "windows" in target.zig:
+        files.append(_import_library(target))
+    _zig("cc", "-target", target.zig, *flags, "-o", made, *files)
+    folder.mkdir(parents=True, exist_ok=True)
+    out = folder / target.library
+    out.unlink(missing_ok=True)  # a process that has it loaded keeps it
+    return Path(shutil.copy(made, out))
+
+
+def _import_library(target: Platform) -> Path:
+    """Write what Windows' linker needs to know of Python: the functions and data that call.c declares, in python3.dll."""
+    source = (Path(__file__).parent / "call.c").read_text(encoding="utf-8")
+    names: list[str] = []
+    for declared in re.findall(r"^FROM_PYTHON (.+);$", source, re.MULTILINE):
+        function = re.search(r"(\w+)\(", declared)
+        names += [function[1]] if function else [f"{name} DATA" for name in re.findall(r"\w+(?=,|$)", declared)]
+    listed = CACHE / target.zig / "python3.def"
+    listed.write_text("\n  ".join(["LIBRARY python3.dll\nEXPORTS", *names, ""]), encoding="utf-8")
+    out = listed.with_suffix(".lib")
+    _zig("dlltool", "-m", "i386:x86-64", "-D", "python3.dll", "-d", listed, "-l", out)
+    return out
+
+
+def _zig(*arguments: str | Path) -> None:
+    command = [sys.executable, "-m", "ziglang", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise InputError(f"{out}: linking failed:\n{done.stderr}")
-    return out
+        raise InputError(f"{' '.join(command)} failed:\n{done.stderr}")
 
 
 if __name__ == "__main__":
