@@ -16,17 +16,18 @@ from setuptools.command.build_py import build_py
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT / "src"))
 
-from armsight.firmware import build as firmware  # noqa: E402 - it is found once src is in the path
+from armsight.firmware import HOST_LIBRARIES  # noqa: E402 - it is found once src is in the path
+from armsight.firmware import build as firmware  # noqa: E402
 from armsight.kernels import build as kernels  # noqa: E402
 
 #: The kind of machine that is built for; kernels/build.py names them.
 TARGET = os.environ.get("ARMSIGHT_TARGET") or None
-#: What pip calls them; Linux needs the C library of 2014 or later.
+#: What pip and Python (sys.platform) call them; Linux needs the C library of 2014 or later.
 PLATFORMS = {
-    "linux-x86_64": "manylinux_2_17_x86_64",
-    "linux-aarch64": "manylinux_2_17_aarch64",
-    "macos-arm64": "macosx_11_0_arm64",
-    "windows-x86_64": "win_amd64",
+    "linux-x86_64": ("manylinux_2_17_x86_64", "linux"),
+    "linux-aarch64": ("manylinux_2_17_aarch64", "linux"),
+    "macos-arm64": ("macosx_11_0_arm64", "darwin"),
+    "windows-x86_64": ("win_amd64", "win32"),
 }
 
 
@@ -35,14 +36,16 @@ class BuildNative(build_py):
 
     def run(self) -> None:
         """Copy the modules, then build."""
+        if not self.editable_mode:  # what was built before may be for another target
+            shutil.rmtree(self.build_lib, ignore_errors=True)
         super().run()
         package = ROOT / "src" / "armsight" if self.editable_mode else Path(self.build_lib) / "armsight"
         kernels.build(package / "kernels", TARGET)
-        compiler = firmware.open_compiler()
+        compiler, library = firmware.open_compiler(), HOST_LIBRARIES[PLATFORMS[TARGET or kernels.this_machine()][1]]
         if TARGET:
             host = (*compiler.host, "-target", kernels.TARGETS[TARGET].zig)
             compiler = dataclasses.replace(compiler, host=host)
-        firmware.build_package(package / "firmware" / "built", compiler)
+        firmware.build_package(package / "firmware" / "built", compiler, library)
         if not self.editable_mode:
             shutil.rmtree(package / "firmware" / "source", ignore_errors=True)
             shutil.copytree(ROOT / "firmware", package / "firmware" / "source")
@@ -52,8 +55,12 @@ class PlatformWheel(bdist_wheel):
     """A wheel for one kind of machine and, by Python's stable binary interface, for every Python from 3.11 on."""
 
     def get_tag(self) -> tuple[str, str, str]:
-        """Return the tags of Python, its binary interface and the platform."""
-        return "cp311", "abi3", PLATFORMS[TARGET or kernels.this_machine()]
+        """Return the tags of Python, its binary interface and the platform: without a target one that no index takes.
+
+        What is built for this very machine may not run on an older one of its kind.
+        """
+        platform, _ = PLATFORMS[TARGET or kernels.this_machine()]
+        return "cp311", "abi3", platform if TARGET else platform.replace("manylinux_2_17", "linux")
 
 
 class NativeDistribution(Distribution):

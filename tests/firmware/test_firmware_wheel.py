@@ -27,6 +27,9 @@ def wheel(tmp_path_factory):
     left_out = shutil.ignore_patterns("built", "__pycache__", "*.egg-info")
     shutil.copytree(ROOT / "src", copy / "src", ignore=left_out)
     shutil.copytree(FIRMWARE, copy / "firmware")
+    kept = ROOT / "build" / "kernels"  # compiled kernels: minutes otherwise
+    if kept.is_dir():
+        shutil.copytree(kept, copy / "build" / "kernels")
     command = [
         sys.executable,
         "-m",

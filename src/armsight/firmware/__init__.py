@@ -19,7 +19,8 @@ from armsight.errors import DeviceError
 BUILT = Path(__file__).parent / "built"
 #: The files of ``built/``, by what they are.
 IMAGE = "pil.elf"
-HOST_LIBRARY = {"win32": "host.dll", "darwin": "host.dylib"}.get(sys.platform, "host.so")
+HOST_LIBRARIES = {"linux": "host.so", "win32": "host.dll", "darwin": "host.dylib"}
+HOST_LIBRARY = HOST_LIBRARIES.get(sys.platform, "host.so")
 DIALECT = "dialect.py"
 
 

@@ -168,8 +168,10 @@ def build_board(board: str, target: Path, compiler: Compiler) -> Path:
 def build_host(target: Path, compiler: Compiler) -> Path:
     """Build the host library and return it."""
     with headers() as mavlink:
-        compile_c(compiler.host, target, host_sources(), *_HOST, *includes(mavlink, "boards/pil"))
-    return target
+        made = mavlink / target.name  # beside a DLL lie an import library and debug data: they go with the headers
+        compile_c(compiler.host, made, host_sources(), *_HOST, *includes(mavlink, "boards/pil"))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return Path(shutil.copy(made, target))
 
 
 def fingerprint() -> str:
@@ -182,13 +184,19 @@ def fingerprint() -> str:
     return digest.hexdigest()
 
 
-def build_package(folder: Path, compiler: Compiler) -> None:
-    """Build what the package carries into ``folder``; it is replaced whole, or left as it was."""
+def build_package(folder: Path, compiler: Compiler, host_library: str = HOST_LIBRARY) -> None:
+    """Build what the package carries into ``folder``; it is replaced whole, or left as it was.
+
+    Args:
+        folder: its ``built``.
+        compiler: makes code for the computers that the package is for.
+        host_library: the host library's file name on them.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as made_in:
         made = Path(made_in) / "built"
         build_board("pil", made / IMAGE, compiler)
-        build_host(made / HOST_LIBRARY, compiler)
+        build_host(made / host_library, compiler)
         generate("Python3", made / DIALECT)
         (made / "__init__.py").write_text('"""Made by armsight.firmware.build."""\n', encoding="utf-8")
         about = {"compiler": compiler.name, "sources_sha256": fingerprint()}

@@ -417,6 +417,7 @@ def _object(bitcode: Path, target: Platform, level: str) -> Path:
         if not function.is_declaration:
             function.linkage = "external" if function.name in entries else "internal"
             if function.name in entries:
+                function.visibility = "hidden"
                 function.name = f"{function.name}_{_suffix(level)}"
     for value in module.global_variables:
         if not value.is_declaration:
@@ -486,10 +487,10 @@ def build(folder: Path, name: str | None = None) -> Path:
     table.parent.mkdir(parents=True, exist_ok=True)
     table.write_text(_table(modules, bitcodes, target), encoding="utf-8")
     here, made = Path(__file__).parent, CACHE / target.zig / target.library
-    flags = ["-shared", "-O2", "-fPIC", "-std=c11", "-s", "-Wall", "-Wextra", f"-I{here}"]
+    flags = ["-shared", "-O2", "-fPIC", "-std=c11", "-fvisibility=hidden", "-s", "-Wall", "-Wextra", f"-I{here}"]
     files = [table, here / "call.c", *objects]
     if "macos" in target.zig:
-        flags += ["-undefined", "dynamic_lookup"]
+        flags += ["-undefined", "dynamic_lookup", f"-Wl,-install_name,@rpath/{target.library}"]
     if "linux" in target.zig:
         flags += ["-lm"]
     if "windows" in target.zig:

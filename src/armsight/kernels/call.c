@@ -580,17 +580,21 @@ static int has_v3(void) {
 }
 #endif
 
-/* Return the kernels for this processor. ARMSIGHT_KERNELS=baseline asks for those that run on every one of its kind. */
+/* Return the kernels for this processor; NULL, with an exception, where they were built on another machine for its newer one.
+ * ARMSIGHT_KERNELS=baseline asks for those that run on every one of its kind. */
 static const Level *level(void) {
+    const Level *last = armsight_levels + armsight_level_count - 1;
     const char *asked = getenv("ARMSIGHT_KERNELS");
-    if (asked != NULL && strcmp(asked, "baseline") == 0) {
-        return armsight_levels + armsight_level_count - 1;
-    }
+    int newest = asked == NULL || strcmp(asked, "baseline") != 0;
 #if defined(__x86_64__)
-    return armsight_levels + (has_v3() ? 0 : armsight_level_count - 1);
-#else
-    return armsight_levels;
+    newest = newest && has_v3();
+    if (!has_v3() && strcmp(last->processor, "x86-64-v3") == 0) {
+        PyErr_Format(PyExc_RuntimeError, "armsight's kernels were built for processors with AVX2 only, which this one has not:"
+                     " install a wheel, or build armsight here");
+        return NULL;
+    }
 #endif
+    return newest ? armsight_levels : last;
 }
 
 static PyObject *find(PyObject *self, PyObject *arguments) {
@@ -600,9 +604,12 @@ static PyObject *find(PyObject *self, PyObject *arguments) {
     if (!PyArg_ParseTuple(arguments, "ssO", &module, &name, &array)) {
         return NULL;
     }
-    const Signature *signatures = level()->signatures;
+    const Level *chosen = level();
+    if (chosen == NULL) {
+        return NULL;
+    }
     for (int n = 0; n < armsight_signature_count; n++) {
-        const Signature *first = signatures + n;
+        const Signature *first = chosen->signatures + n;
         if (strcmp(first->module, module) == 0 && strcmp(first->name, name) == 0) {
             Kernel *found = (Kernel *)PyType_GenericAlloc(kernel_type, 0);
             if (found == NULL) {
