@@ -48,6 +48,9 @@ from armsight.vision.rig import StereoRig
     "--rotation", type=click.Choice(ROTATIONS), help="What rx_deg, ry_deg, rz_deg mean; without it they are not used."
 )
 @click.option(
+    "--columns", metavar="NAME=COLUMN,...", help="The tables' own names of columns, such as q1_deg=J1,p1_x_mm=X."
+)
+@click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
 )
 @click.option(
@@ -66,6 +69,7 @@ def command(
     data: Path | None,
     other: Path | None,
     rotation: str | None,
+    columns: str | None,
     priors: tuple[str, ...],
     output: Path | None,
     verbose: bool,
@@ -85,8 +89,8 @@ def command(
     started = time.perf_counter()
     with nullcontext() if output is None else results_in(output, (data, other, Path(arm_name))), steps() as progress:
         progress("reading")
-        read = read_poses(data, rotation=rotation)
-        held = None if other is None else read_poses(other, rotation=rotation)
+        read = read_poses(data, rotation=rotation, columns=columns)
+        held = None if other is None else read_poses(other, rotation=rotation, columns=columns)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         run = run_identify(
             arm,

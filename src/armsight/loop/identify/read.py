@@ -17,13 +17,21 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_table
+from armsight.files import read_columns, read_table
 from armsight.loop.identify.measured import Measured
 
 #: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
 #: case) or about the axes of the rotated frame (capitals).
 ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+#: The names that ``columns`` may say the file's own for.
+COLUMNS = (
+    *(f"q{i}_{unit}" for i in range(1, 7) for unit in ("rad", "deg")),
+    *("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "rx_deg", "ry_deg", "rz_deg"),
+    *(f"p{k}_{axis}_{unit}" for k in range(1, 10) for axis in "xyz" for unit in ("mm", "m")),
+    *(f"cov_{i}{j}" for i, j in _UPPER),
+    *(f"approach{i}" for i in range(1, 7)),
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,29 +61,30 @@ class Read(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_poses(path: str | Path, *, rotation: str | None = None) -> Read:
+def read_poses(path: str | Path, *, rotation: str | None = None, columns: str | None = None) -> Read:
     """Read a file.
 
     Args:
         path: a CSV file.
         rotation: the convention of rx_deg, ry_deg, rz_deg, one of ROTATIONS; None: they are not used.
+        columns: what the file calls its columns, NAME=THEIRS,... with names of COLUMNS.
 
     Raises:
         InputError: unreadable, columns missing, fields that are no numbers, or hardly a row without gaps.
     """
     if rotation is not None and rotation not in ROTATIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(ROTATIONS)}")
-    rows = read_table(path)
+    rows = read_table(path, read_columns(columns, COLUMNS))
     if len(rows) < 2:
         raise InputError(f"{path}: no rows; a first line of column names and one line a pose are needed")
     header = [name.strip() for name in rows[0]]
     if len(set(header)) != len(header):
         raise InputError(f"{path}: line 1 names a column twice: {_twice(header)}")
-    columns = {name: i for i, name in enumerate(header)}
-    requested = _requested(path, columns, rotation)
-    table, lines, notes = _numbers(path, rows, columns, requested)
+    there = {name: i for i, name in enumerate(header)}
+    requested = _requested(path, there, rotation)
+    table, lines, notes = _numbers(path, rows, there, requested)
     at = {name: table[:, i] for i, name in enumerate(requested)}
-    unused = rotation is None and "rx_deg" in columns and "qw" not in columns
+    unused = rotation is None and "rx_deg" in there and "qw" not in there
     if unused:
         notes = (*notes, "rx_deg, ry_deg, rz_deg are not used: give their convention with --rotation")
     return Read(_measured(path, at, rotation), lines, notes)
