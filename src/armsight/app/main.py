@@ -32,7 +32,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     "Operate an arm": {
         "arm": "Print an arm's table and kinematics: mm and degrees here, m and rad in --json.",
         "board": "Build and flash the arm's firmware, watch a board, tune its gains, test it.",
-        "run": "Run the experiment on a real arm: calibrate hand and eye, make the motions, close the loop on vision.",
+        "run": "Run the experiment on a real arm: hand-eye calibration, the motions, the loop closed on vision.",
     },
     "Check and identify an arm": {
         "check": "Evaluate an arm by ISO 9283: accuracy and repeatability.",

@@ -125,7 +125,9 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 
 @command.command()
 @_arm_argument
-@click.option("-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="To write.")
+@click.option(
+    "-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="The file to write."
+)
 def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     """Write an arm as a URDF file."""
     check_suffix(output, ".urdf", "an arm")

@@ -39,7 +39,7 @@ def _board(action: Callable[..., Any]) -> Callable[..., Any]:
     )
 
 
-_compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; the first one installed without it.")
+_compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")
 _folder = click.option(
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), default=Path("firmware-build"), show_default=True
 )
@@ -55,7 +55,9 @@ def command() -> None:
 
 
 @command.command("build")
-@click.option("--board", "name", metavar="NAME", help="Build this board's image; without it what armsight itself runs.")
+@click.option(
+    "--board", "name", metavar="NAME", help="Build this board's image; by default the firmware that armsight emulates."
+)
 @_folder
 @_compiler
 @_JSON
@@ -73,7 +75,7 @@ def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) 
 
 @command.command("flash")
 @click.option("--board", "name", default=FLASHED[0], show_default=True, metavar="NAME", help="Which board.")
-@click.option("--programmer", type=click.Choice(list(PROGRAMMERS)), help="The first one installed without it.")
+@click.option("--programmer", type=click.Choice(list(PROGRAMMERS)), help="Default: the first one that is installed.")
 @_folder
 @_compiler
 @_JSON
@@ -94,7 +96,7 @@ def flash_(name: str, programmer: str | None, output: Path, compiler: str | None
 @click.option("--every", type=click.FloatRange(min=0.01), default=0.5, show_default=True, help="Seconds between lines.")
 @_JSON
 def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: bool) -> None:
-    """Print a board's state and angles, a line at a time, until Ctrl-C; with --json an object a line.
+    """Print a board's state and angles, line by line, until Ctrl-C; with --json one object per line.
 
     Nothing is commanded: the drives stay as they are.
     """
@@ -117,7 +119,7 @@ def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: 
 @click.option("--store", is_flag=True, help="Keep them over a restart too; only with the drives off.")
 @_JSON
 def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
-    """Print the gains of all joints, changed first where --set says so.
+    """Print the gains of all joints; with --set change them first.
 
     Changes are taken all at once, also in motion, without a jump of the duty; one that is out of range changes nothing.
     """

@@ -32,7 +32,12 @@ def command() -> None:
 
 @command.command()
 @click.argument("path", metavar="BODY.toml")
-@click.option("--rig", "rig_path", metavar="RIG.json", help="The cameras; without it, two HD cameras as stated.")
+@click.option(
+    "--rig",
+    "rig_path",
+    metavar="RIG.json",
+    help="The cameras; by default two perfect HD cameras, f 900 px, 0.2 m apart.",
+)
 @click.option(
     "--distance",
     "distances",
@@ -66,8 +71,14 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
 @click.argument("path", metavar="BODY.toml|BOARD")
 @click.option("-o", "--output", required=True, metavar="OUT", help="The drawing: .pdf, .svg or .png.")
 @click.option("--paper", default="a4", show_default=True, type=click.Choice(list(PAPERS), case_sensitive=False))
-@click.option("--split", is_flag=True, help="Draw what is larger than the paper on several sheets that overlap.")
-@click.option("--dpi", default=600, show_default=True, type=click.IntRange(72, 2400), help="Pixels an inch of a .png.")
+@click.option("--split", is_flag=True, help="Split a drawing larger than the paper into several overlapping sheets.")
+@click.option(
+    "--dpi",
+    default=600,
+    show_default=True,
+    type=click.IntRange(72, 2400),
+    help="Resolution of a .png, pixels per inch.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def draw(path: str, output: str, paper: str, split: bool, dpi: int, as_json: bool) -> None:
     """Draw a body's markers, or a calibration board, to scale: print at 100%, measure the bar, glue.

@@ -49,7 +49,10 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 @click.option("--cameras", metavar="CAMERAS.json", type=click.Path(path_type=Path), help="Intrinsics of both cameras.")
 @click.option("--body", metavar="BODY.csv", type=click.Path(path_type=Path), help="The body's points.")
 @click.option(
-    "--refine-body", metavar="OUT.csv", type=click.Path(path_type=Path), help="Improve the body; write it here."
+    "--refine-body",
+    metavar="OUT.csv",
+    type=click.Path(path_type=Path),
+    help="Estimate the body's points too, and write them here.",
 )
 @click.option(
     "--folds", type=click.IntRange(min=2), default=FOLDS, show_default=True, help="Parts for the held-out errors."

@@ -72,14 +72,14 @@ def command() -> None:
     help="Folder for report.html, check.json, figures.",
 )
 @click.option(
-    "--columns", metavar="NAME=COLUMN,...", help="Of a CSV: its own names of columns, such as x_m=X,command_x_m=X0."
+    "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your CSV, such as x_m=X,command_x_m=X0."
 )
 @click.option(
     "--limit",
     "limit_texts",
     multiple=True,
     metavar="NAME=LENGTH",
-    help="Say PASS or FAIL of a metric, such as AP=0.5mm; may be repeated. Exit code 1 where one fails.",
+    help="Limit of a metric, such as AP=0.5mm: prints PASS or FAIL, exit code 1 if one fails. May be repeated.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def evaluated(
@@ -143,14 +143,18 @@ def evaluated(
     show_default=True,
     help="Five poses in a cube; a hundred all over it; a line across it; a circle both ways.",
 )
-@click.option("--cycles", type=click.IntRange(1, 1000), help="How many times: 30 for poses, 1 wide, 10 line, 3 circle.")
+@click.option(
+    "--cycles", type=click.IntRange(1, 1000), help="Cycles; by default 30 for poses, 1 wide, 10 line, 3 circle."
+)
 @click.option("--centre", nargs=3, type=float, metavar="X Y Z", help="The cube's centre in the base, mm.")
-@click.option("--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="On paths, mm/s.")
+@click.option(
+    "--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="Speed on paths, mm/s."
+)
 @click.option(
     "--visible-in",
     metavar="RUN",
     type=click.Path(path_type=Path),
-    help="An earlier run: its cameras must see all of it.",
+    help="An earlier run; both of its cameras must see the whole test.",
 )
 @click.option(
     "-o",
@@ -172,7 +176,7 @@ def plan(
 ) -> None:
     """Plan a test in the largest cube the arm reaches, clear of its limits and of singularities.
 
-    Poses and paths lie in the cube's diagonal plane, as ISO 9283 has it. Look at them in your workcell before you run them.
+    Poses and paths lie in the cube's diagonal plane, as ISO 9283 requires. Check them in your workcell before you run them.
     """
     if output is not None:
         check_writable(output, apart_from=(arm_name, visible_in))

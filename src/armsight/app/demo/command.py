@@ -25,7 +25,7 @@ from armsight.robot.arm_file import open_arm
     type=click.Path(path_type=Path),
     help="Folder of the run.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything that is random.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random numbers.")
 @click.option(
     "--arm",
     default="worn",
@@ -49,7 +49,7 @@ from armsight.robot.arm_file import open_arm
 @click.option(
     "--nominal-arm",
     metavar="FILE",
-    help="The arm model to compute with, such as corrected.toml of armsight identify; else the table it was built to.",
+    help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
 )
 @click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")

@@ -48,7 +48,7 @@ from armsight.vision.rig import StereoRig
     "--rotation", type=click.Choice(ROTATIONS), help="What rx_deg, ry_deg, rz_deg mean; without it they are not used."
 )
 @click.option(
-    "--columns", metavar="NAME=COLUMN,...", help="The tables' own names of columns, such as q1_deg=J1,p1_x_mm=X."
+    "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your tables, such as q1_deg=J1,p1_x_mm=X."
 )
 @click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
@@ -60,7 +60,7 @@ from armsight.vision.rig import StereoRig
     type=click.Path(path_type=Path),
     help="Folder for the corrected arm and the report.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Print also why the other parameters were not fitted.")
+@click.option("-v", "--verbose", is_flag=True, help="Also print why the other parameters were not fitted.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
 def command(
@@ -124,12 +124,12 @@ def command(
 @click.option(
     "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
 )
-@click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="What was measured already.")
+@click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="Poses that were measured already.")
+@click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that must see the poses.")
 @click.option(
-    "--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that shall see the poses."
+    "-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="Number of poses."
 )
-@click.option("-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="How many poses.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the candidates.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random candidates.")
 @click.option("-o", "--output", metavar="PLAN.csv", type=click.Path(path_type=Path), help="Write the poses here.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def plan(

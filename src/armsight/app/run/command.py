@@ -145,7 +145,7 @@ def command(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Run the experiment on a real arm: calibrate hand and eye, make the motions, close the loop on vision.
+    """Run the experiment on a real arm: hand-eye calibration, the motions, the loop closed on vision.
 
     The arm moves on its own: hand-eye poses around those of the motion, a sweep, the motions twice. Keep the emergency stop
     at hand. Ctrl-C stops the arm first and then saves what was measured.
