@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 
-for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"  # before numpy is imported
 
 import argparse  # noqa: E402

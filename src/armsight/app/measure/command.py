@@ -139,7 +139,6 @@ def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator
     if not follows(target):
         yield from ((shot, measure(rig, target, shot), None) for shot in shots)
         return
-    click.echo("preparing to follow (compiles for a minute or two the first time on a computer)", err=True)
     follower = Follower(rig, target)
     for shot in shots:
         begun = time.perf_counter()

@@ -118,7 +118,7 @@ class Follower:
     jump: str | None
 
     def __init__(self, rig: StereoRig, target: Target) -> None:
-        """Prepare to follow; compiles where that was not done on this computer yet (a minute or two, once).
+        """Prepare to follow.
 
         Args:
             rig: the calibrated pair.
