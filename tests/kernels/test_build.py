@@ -15,10 +15,11 @@ from armsight.errors import ArmsightError
 from armsight.kernels import decorator
 from armsight.robot.kinematics import chain
 from armsight.vision import camera, match
-from armsight.vision.dense import cost, scanline
+from armsight.vision.dense import cost, scanline, semiglobal
 from armsight.vision.markers import normal
 
 compiled = pytest.mark.skipif(decorator.in_python(), reason="kernels run as plain Python")
+GREY = np.zeros((16, 64), np.uint8)
 TABLE, Q, T = open_arm("ur5").table, np.zeros(6), np.zeros((4, 4))
 
 
@@ -44,6 +45,11 @@ REJECTED = {  # (kernel, arguments, number of the first that does not fit)
     "None": (chain.forward, (TABLE, None, T), 2),
     "a float for an integer": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 8.0), 5),
     "an integer beyond 64 bits": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 2**63), 5),
+    "an integer beyond its byte": (
+        semiglobal._strip,
+        (cost.prepare(GREY, GREY, 32), 0, 1, 0, 16, 5, 64, 300, np.zeros(256, np.uint8), None),
+        8,
+    ),
     "text for a float": (chain.angle_of, (1.0, "1"), 2),
     "too few arguments": (chain.forward, (TABLE, Q), 3),
     "too many arguments": (chain.forward, (TABLE, Q, T, T), 4),

@@ -339,6 +339,20 @@ static const char *read_array(const char *code, PyObject *given, Block *block) {
     return code + 5;
 }
 
+/* Whether a whole number fits the bytes of its letter. */
+static int fits(char letter, uint64_t word) {
+    int64_t value = (int64_t)word;
+    switch (letter) {
+        case 'i': return value == (int32_t)value;
+        case 'h': return value == (int16_t)value;
+        case 'c': return value == (int8_t)value;
+        case 'I': return word == (uint32_t)word;
+        case 'H': return word == (uint16_t)word;
+        case 'C': return word == (uint8_t)word;
+        default: return 1;
+    }
+}
+
 static const char *read_scalar(const char *code, PyObject *given, Block *block) {
     if (block->used == MOST_WORDS) {
         return NULL;
@@ -375,7 +389,7 @@ static const char *read_scalar(const char *code, PyObject *given, Block *block) 
         PyErr_Clear();
         return NULL;
     }
-    return code + 1;
+    return fits(code[0], *word) ? code + 1 : NULL;
 }
 
 /* Read the members of a tuple up to the end of the code or its closing bracket. */
