@@ -47,7 +47,7 @@ COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
 
 #: Commands whose matrices are small and many: OpenBLAS's threads wait for each other at every one of them, which on a busy
 #: computer costs ten times the time. It reads its setting when numpy is imported; a setting of the user's own stands.
-ONE_THREAD = ("identify",)
+ONE_THREAD = ("demo", "identify", "run")
 
 
 class _Sections(click.Group):
