@@ -12,8 +12,9 @@ import pytest
 
 from armsight import open_arm
 from armsight.errors import ArmsightError
+from armsight.geometry import matrix
 from armsight.kernels import decorator
-from armsight.robot.kinematics import chain
+from armsight.robot.kinematics import chain, structure
 from armsight.vision import camera, match
 from armsight.vision.dense import cost, scanline, semiglobal
 from armsight.vision.markers import normal
@@ -107,13 +108,13 @@ def test_kernels_keep_name_and_text_of_their_function():
 
 
 @compiled
-def test_a_module_that_was_edited_since_is_rejected_with_the_command_to_run(monkeypatch):
-    again = decorator.kernel("f8")
-    assert again(chain.sincos.__wrapped__)(0.0) == (0.0, 1.0)
-    monkeypatch.setattr(decorator, "_sources", lambda: {chain.__name__: "0" * 16})
-    decorator._check_not_stale.cache_clear()
-    with pytest.raises(ArmsightError, match=r"chain\.py has changed .* python -m armsight\.kernels\.build"):
-        again(chain.sincos.__wrapped__)
+def test_a_module_that_was_edited_since_is_rejected_with_the_command_to_run():
+    """All that the compiled code holds: a module whose kernels only kernels call, and one that constants come from."""
+    sources = dict(decorator._library().sources())
+    decorator._check_not_stale(sources.items())
+    for module in (chain, matrix, structure):
+        with pytest.raises(ArmsightError, match=rf"{module.__name__.split('.')[-1]}\.py has changed .*kernels\.build"):
+            decorator._check_not_stale((sources | {module.__name__: "0" * 16}).items())
 
 
 @compiled

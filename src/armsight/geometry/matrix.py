@@ -1,6 +1,6 @@
 """Products and solutions of small matrices inside kernels; outside of kernels numpy's own are used.
 
-All make a new array: A @ B, A @ x, A.T @ B, A.T @ x, and A^-1 B by elimination with partial pivoting (Golub and Van Loan,
+All make a new array: A @ B, A @ x (A may be a transposed view), and A^-1 B by elimination with partial pivoting (Golub and Van Loan,
 "Matrix Computations", 3.4).
 """
 
@@ -30,27 +30,6 @@ def applied(A: Array, x: Array) -> Array:
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
             out[i] += A[i, j] * x[j]
-    return out
-
-
-@kernel
-def transposed_product(A: Array, B: Array) -> Array:
-    """Return A^T, A (m, n), times B (m, k)."""
-    out = np.zeros((A.shape[1], B.shape[1]))
-    for j in range(A.shape[0]):
-        for i in range(A.shape[1]):
-            for k in range(B.shape[1]):
-                out[i, k] += A[j, i] * B[j, k]
-    return out
-
-
-@kernel
-def transposed_applied(A: Array, x: Array) -> Array:
-    """Return A^T, A (m, n), times x (m,)."""
-    out = np.zeros(A.shape[1])
-    for j in range(A.shape[0]):
-        for i in range(A.shape[1]):
-            out[i] += A[j, i] * x[j]
     return out
 
 

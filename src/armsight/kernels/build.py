@@ -110,6 +110,19 @@ def kernel_modules() -> list[Path]:
     return sorted(p for p in found if "from armsight.kernels import kernel" in p.read_text(encoding="utf-8"))
 
 
+def _constants_from(path: Path) -> list[Path]:
+    """Return the files that a module takes constants from: their values stand in the compiled code."""
+    imports = (node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ImportFrom))
+    names = [node.module for node in imports if node.module and any(each.name.isupper() for each in node.names)]
+    return [PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names if name[:9] == "armsight."]
+
+
+def compiled_sources() -> list[Path]:
+    """Return the files whose text the compiled code holds: an edit of one makes it stale."""
+    modules = kernel_modules()
+    return sorted({*modules, *(each for path in modules for each in _constants_from(path) if each.exists())})
+
+
 def module_name(path: Path) -> str:
     """Return the name that a file of the package is imported by."""
     return ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
@@ -219,9 +232,13 @@ def _emit_entry(context: Any, library: Any, result: Any, symbol: str) -> None:  
         if isinstance(kind, types.BaseTuple):
             return context.make_tuple(builder, kind, [take(each) for each in kind])
         words = 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
-        return model.load_from_data_pointer(
-            builder, builder.bitcast(address(entry.args[0], words), model.get_data_type().as_pointer())
-        )
+        here = builder.bitcast(address(entry.args[0], words), model.get_data_type().as_pointer())
+        value = model.load_from_data_pointer(builder, here)
+        if isinstance(kind, types.Array):
+            # Its memory is Python's: said here, so that the compiler drops the counting of references to it.
+            nothing = ir.Constant(ir.IntType(8).as_pointer(), None)
+            value = builder.insert_value(builder.insert_value(value, nothing, 0), nothing, 1)
+        return value
 
     def give(kind: Any, value: Any) -> None:  # noqa: ANN401
         if isinstance(kind, types.BaseTuple):
@@ -462,8 +479,9 @@ def _table(modules: list[Path], bitcodes: list[Path], target: Platform) -> str:
     ]
     text.append(f"const int armsight_signature_count = {len(rows)};")
     text.append("const Source armsight_sources[] = {")
-    text += [f'    {{"{module_name(path)}", "{kernels.source_digest(path)}"}},' for path in modules]
-    text += ["};", f"const int armsight_source_count = {len(modules)};"]
+    sources = compiled_sources()
+    text += [f'    {{"{module_name(path)}", "{kernels.source_digest(path)}"}},' for path in sources]
+    text += ["};", f"const int armsight_source_count = {len(sources)};"]
     return "\n".join(text) + "\n"
 
 

@@ -18,8 +18,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast, overload
 
@@ -47,6 +46,7 @@ LETTERS = {
 }
 #: What build.py sets, to collect the functions that it compiles: (function, signatures, options) -> its own.
 builder: Callable[[Callable[..., Any], tuple[str, ...], dict[str, Any]], Any] | None = None
+_PACKAGE = Path(__file__).resolve().parents[1]
 _AGAIN = "build them: python -m pip install -e . in the checkout, or python -m armsight.kernels.build"
 
 
@@ -61,23 +61,24 @@ def _library() -> Any:  # noqa: ANN401 - a compiled module has no types
         from armsight.kernels import _compiled  # type: ignore[attr-defined]
     except ImportError as error:
         raise ArmsightError(f"the compiled kernels are not there ({error}); {_AGAIN}") from None
+    if (_PACKAGE.parents[1] / "setup.py").exists():  # a checkout; in an installed wheel nobody edits
+        _check_not_stale(_compiled.sources())
     return _compiled
 
 
-@functools.cache
-def _sources() -> dict[str, str]:
-    """Return the digests of the modules as they were compiled; none where nobody edits them, in an installed wheel."""
-    folder = Path(__file__).resolve().parents[3]
-    if not (folder / "setup.py").exists():
-        return {}
-    return dict(_library().sources())
+def _check_not_stale(sources: Iterable[tuple[str, str]]) -> None:
+    """Check that files have the text that was compiled: all, as kernels contain those of other files that they call.
 
+    Args:
+        sources: names of modules, and digests of their text.
 
-@functools.cache
-def _check_not_stale(module: str, path: str) -> None:
-    compiled = _sources().get(module)
-    if compiled is not None and compiled != source_digest(Path(path)):
-        raise ArmsightError(f"{path} has changed since its kernels were compiled; {_AGAIN}")
+    Raises:
+        ArmsightError: one has another text, or is gone.
+    """
+    for module, digest in sources:
+        path = _PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
+        if not path.exists() or source_digest(path) != digest:
+            raise ArmsightError(f"{path} has changed since kernels were compiled; {_AGAIN}")
 
 
 def source_digest(path: Path) -> str:
@@ -146,7 +147,6 @@ def kernel(first: Any = None, *signatures: str, **options: Any) -> Any:
         found = _library().find(function.__module__, function.__name__, _array)
         if found is None:
             raise ArmsightError(f"{function.__module__}.{function.__name__} is not compiled; {_AGAIN}")
-        _check_not_stale(function.__module__, str(sys.modules[function.__module__].__file__))
         return cast("Callable[P, R]", functools.update_wrapper(found, function))
 
     return wrap

@@ -23,8 +23,6 @@ from armsight.geometry.matrix import (
     product,
     solved,
     solved_vector,
-    transposed_applied,
-    transposed_product,
 )
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
@@ -209,8 +207,8 @@ def settle(scene: DiscScene, found: DiscMeasurement) -> float:
     for _ in range(_STEPS):
         if not np.isfinite(cost):
             return np.inf
-        H[:, :] = transposed_product(found.J, found.J)
-        g[:] = transposed_applied(found.J, found.whitened)
+        H[:, :] = product(found.J.T, found.J)
+        g[:] = applied(found.J.T, found.whitened)
         if not factor(H, L, scale):
             return np.inf
         solve(L, scale, g, xi)
@@ -237,15 +235,15 @@ def uncertainty(scene: DiscScene, found: DiscMeasurement, cov_noise: Array, chi_
     for row in range(len(found.whitened)):
         if found.codes[row // 4, (row // 2) % 2] != SEEN:
             J_rig[row] = 0.0
-    found.H[:, :] = transposed_product(J, J)
+    found.H[:, :] = product(J.T, J)
     cov_noise[:, :] = solved(found.H, np.eye(6))
-    gain = product(cov_noise, transposed_product(J, J_rig))
+    gain = product(cov_noise, product(J.T, J_rig))
     found.cov[:, :] = product(product(gain, scene.cov_rig), gain.T)
     if chi_square <= limit:
         return chi_square
     B = J_rig - product(J, gain)
-    v = transposed_applied(B, found.whitened)
-    M = np.eye(len(scene.cov_rig)) + product(scene.cov_rig, transposed_product(B, B))
+    v = applied(B.T, found.whitened)
+    M = np.eye(len(scene.cov_rig)) + product(scene.cov_rig, product(B.T, B))
     return chi_square - dot(v, solved_vector(M, applied(scene.cov_rig, v)))
 
 
