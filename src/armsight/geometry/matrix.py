@@ -1,7 +1,7 @@
 """Products and solutions of small matrices inside kernels; outside of kernels numpy's own are used.
 
-All make a new array: A @ B, A @ x (A may be a transposed view), and A^-1 B by elimination with partial pivoting (Golub and Van Loan,
-"Matrix Computations", 3.4).
+All make a new array: A @ B, A @ x (A may be a transposed view), and A^-1 B by elimination with partial pivoting (Golub
+and Van Loan, "Matrix Computations", 3.4).
 """
 
 from __future__ import annotations
