@@ -45,9 +45,6 @@ SECTIONS: dict[str, dict[str, str]] = {
 }
 COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
 
-#: Commands whose matrices are small and many: OpenBLAS's threads wait for each other at every one of them, which on a busy
-#: computer costs ten times the time. It reads its setting when numpy is imported; a setting of the user's own stands.
-ONE_THREAD = ("demo", "identify", "run")
 
 
 class _Sections(click.Group):
@@ -66,8 +63,9 @@ class _Sections(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        if cmd_name in ONE_THREAD and "numpy" not in sys.modules:
-            os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # Matrices are small and many here: OpenBLAS's threads wait for each other at every one of them, which on a busy
+        # computer costs ten times the time. It reads its setting when numpy is imported; a user's own setting stands.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         module = importlib.import_module(f"armsight.app.{cmd_name}.command")
         command: click.Command = module.command
         return command
