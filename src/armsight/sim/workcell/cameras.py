@@ -196,7 +196,7 @@ _BODY_M = 0.12
 #: A card that is held before the body: its sides, m; how far before it, m; its grey.
 _CARD_M, _CARD_BEFORE_M, _CARD_GREY = (0.34, 0.30), 0.08, 0.55
 #: So many ticks after an exposure the path is there on both sides of all its times.
-_SPARE_TICKS = 3
+_SPARE_TICKS = 2
 #: Where the path is looked at within an exposure: its mean is the body's position in the image.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -232,6 +232,8 @@ class WorkcellSource:
         self._strip = noise_strip(seed, timing.image_size_px)
         self._next = 0
         self._begun: dict[int, list[Future[Image]]] = {}
+        self._over_s = self._over(0)
+        plant.stepped = self._render_ahead
         self._covers: list[tuple[float, float]] = []
         self._gone_s, self._gone = np.inf, ""
         self._pool = ThreadPoolExecutor(2)
@@ -269,7 +271,7 @@ class WorkcellSource:
         if newest >= self._next:
             self._next = newest + 1
             shot = self._shot(newest)
-        self._render_ahead(now)
+            self._over_s = self._over(self._next)
         return shot
 
     def close(self) -> None:
@@ -319,12 +321,18 @@ class WorkcellSource:
         self.taken[name] = times
         return Shot(name, left.result(), right.result(), times.stamp_s)
 
-    def _render_ahead(self, now: float) -> None:
-        """Begin with the next shot's images where both exposures are over, while they are still on their way."""
-        times = self._times(self._next)
-        over = max(times.left_s, times.right_s) + self._seen_s() / 2 + _SPARE_TICKS * TICK_S
-        if self._next not in self._begun and over <= now < times.stamp_s:
+    def _render_ahead(self) -> None:
+        """Begin with the next shot's images as soon as both exposures are over, while they are still on their way."""
+        if self._plant.t_s < self._over_s:
+            return
+        times, self._over_s = self._times(self._next), np.inf
+        if self._now() < times.stamp_s:
             self._begun = {self._next: self._rendering(times, self._timing.shutter, self._next, None)}
+
+    def _over(self, shot: int) -> float:
+        """Return when both exposures of a shot are over and the path about them is known, s."""
+        times = self._times(shot)
+        return max(times.left_s, times.right_s) + self._seen_s() / 2 + (_SPARE_TICKS - 1e-6) * TICK_S
 
     def _seen_s(self) -> float:
         """Return how long an image looks from its first row's beginning to its last row's end, s."""

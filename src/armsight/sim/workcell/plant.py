@@ -17,6 +17,7 @@ tick's conversions are averaged: noise of a step or so compensates the rounding.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -225,6 +226,7 @@ class ArmPlant:
         motors: what drives it.
         stop_pressed: whether the emergency stop button is pressed; may be set.
         supply_mv: motor supply, mV; may be set.
+        stepped: called after every step; may be set.
     """
 
     def __init__(self, model: Arm, true: TrueArm, seed: int = 0) -> None:
@@ -238,6 +240,7 @@ class ArmPlant:
         self.arm, self.parts = true.arm, solids(true.arm)
         self.motors: Motors = chosen(model, solids(model), true.imperfections.friction)
         self.stop_pressed, self.supply_mv = False, round(1e3 * SUPPLY_V)
+        self.stepped: Callable[[], None] = lambda: None
         self.pots = Potentiometers(true, pot_travel(model), seed)
         # The twist under the greatest gravity load; joints that carry none are as stiff for the torque they need.
         load = np.maximum(self.motors.gravity_nm, 0.5 * self.motors.needed_nm)
@@ -287,6 +290,7 @@ class ArmPlant:
         if self._ticks == len(self._path):
             self._path = np.concatenate([self._path, np.empty_like(self._path)])
         self._path[self._ticks] = self._qpos
+        self.stepped()
 
     def _switch(self, drives_on: bool) -> None:
         """Open the brakes and close the motors' circuits, or the other way round."""
