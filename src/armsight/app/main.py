@@ -46,7 +46,6 @@ SECTIONS: dict[str, dict[str, str]] = {
 COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
 
 
-
 class _Sections(click.Group):
     """A group that lists its commands by section, and imports a command's module only when that command is requested."""
 

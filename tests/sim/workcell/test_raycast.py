@@ -3,9 +3,10 @@
 import numpy as np
 
 from armsight.robot.arm_file import open_arm
+from armsight.sim.render.render import corner_rays
 from armsight.sim.workcell import raycast
 from armsight.sim.workcell.motors import solids
-from armsight.sim.workcell.raycast import LAMP_BASE, corner_rays, furniture, pixel_rays, view
+from armsight.sim.workcell.raycast import LAMP_BASE, furniture, pixel_rays, view
 from armsight.vision.camera import Camera
 
 EYE = np.array([1.3, -0.2, 0.6])

@@ -30,7 +30,7 @@ from armsight.loop.servo import PoseServo
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.background import plain
 from armsight.sim.render.optics import Sensor
-from armsight.sim.render.render import render_pair
+from armsight.sim.render.render import kept_rays, render_pair
 from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.sim.workcell.body import body_patterns, body_target
 from armsight.sim.workcell.workcell import Workcell
@@ -84,13 +84,15 @@ def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = l
         rig = _rig(given.width, given.baseline_m)
         return _measured(rig, *_rendered(rig, seed, shots, given.distance_m, given.noise))
 
-    return [
+    studies = [
         changed("distance", "m", (0.5, 0.7, 0.9, 1.2, 1.6), lambda v: seen(_Conditions(distance_m=v))),
         changed("baseline", "m", (0.05, 0.1, 0.2, 0.4), lambda v: seen(_Conditions(baseline_m=v))),
         changed("image width", "px", (640, 960, 1280, 1920), lambda v: seen(_Conditions(width=int(v)))),
         changed("pixel noise", "grey levels", (1.0, 2.0, 5.0, 10.0), lambda v: seen(_Conditions(noise=v))),
         _calibration_study(seed, shots, progress),
     ]
+    kept_rays.cache_clear()
+    return studies
 
 
 def _study(name: str, unit: str, values: Sequence[float], found: Sequence[_Errors]) -> Study:

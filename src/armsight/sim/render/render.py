@@ -39,15 +39,25 @@ class Shutter:
     row_s: float = 0.0
 
 
-@lru_cache(maxsize=4)
-def _corner_rays(camera: Camera) -> Array:
-    """Return the rays (H + 1, W + 1, 3) through the corners of a camera's pixels, kept for the next image."""
+#: The rays of so many rows are computed at once: those of all would need ten times the memory of the result.
+_ROWS_AT_ONCE = 64
+
+
+def corner_rays(camera: Camera) -> Array:
+    """Return the rays (H + 1, W + 1, 3) through the corners of a camera's pixels: of depth one, of a fisheye unit ones."""
     width, height = camera.image_size_px
-    v, u = np.mgrid[: height + 1, : width + 1] - 0.5
-    rays = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1))
+    rays = np.empty((height + 1, width + 1, 3))
+    for first in range(0, height + 1, _ROWS_AT_ONCE):
+        some = rays[first : first + _ROWS_AT_ONCE]
+        v, u = np.mgrid[first : first + len(some), : width + 1] - 0.5
+        some[:] = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(some.shape)
     if camera.model != "fisheye":
-        rays /= rays[:, 2:]  # then they are linear in the pixels but for the distortion
-    return rays.reshape(height + 1, width + 1, 3)
+        rays /= rays[..., 2:].copy()  # then they are linear in the pixels but for the distortion
+    return rays
+
+
+#: Kept for the next image: tens of MB for a camera.
+kept_rays = lru_cache(maxsize=4)(corner_rays)
 
 
 def _covered(camera: Camera, T_camera_pattern: Array, points: Array) -> Box | None:
@@ -84,7 +94,7 @@ class _Canvas:
     def __init__(self, camera: Camera, background: Image | float) -> None:
         width, height = camera.image_size_px
         self.camera = camera
-        self.rays = _corner_rays(camera)
+        self.rays = kept_rays(camera)
         if np.shape(background) not in ((), (height, width)):
             raise InputError(f"the background is {np.shape(background)}, must be a number or ({height}, {width})")
         self.coarse = np.empty((height, width))

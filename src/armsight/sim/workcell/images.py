@@ -24,7 +24,7 @@ from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.kernels import kernel
 from armsight.sim.render.faces import Exposure, paint_faces, palette
 from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
-from armsight.sim.render.render import OUTLINE, Shutter, outline
+from armsight.sim.render.render import OUTLINE, Shutter, corner_rays, outline
 from armsight.sim.render.scene import Pattern, PosedBody
 from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import ArmPlant
@@ -38,7 +38,6 @@ from armsight.sim.workcell.raycast import (
     arm_capsules,
     block,
     capsule_boxes,
-    corner_rays,
     furniture,
     pixel_rays,
     view,

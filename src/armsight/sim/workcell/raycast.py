@@ -373,14 +373,6 @@ def furniture(seed: int) -> tuple[Array, tuple[Array, Array, Array]]:
     return table, (ends, radii, rng.uniform(0.3, 0.75, len(radii)))
 
 
-def corner_rays(camera: Camera) -> Array:
-    """Return the rays (H + 1, W + 1, 3) of depth one through the corners of a camera's pixels."""
-    width, height = camera.image_size_px
-    v, u = np.mgrid[: height + 1, : width + 1] - 0.5
-    rays = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height + 1, width + 1, 3)
-    return np.asarray(rays / rays[..., 2:])
-
-
 def pixel_rays(corners: Array) -> Array:
     """Return the unit rays (H, W, 3) of pixels from those of their corners, good to a thousandth of a pixel."""
     rays = corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1]
