@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
-from armsight.app.arm import description
-from armsight.app.arm.figure import write_arm_figure
-from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable
-from armsight.geometry.pose import pose
-from armsight.geometry.rotation import from_euler_zyx
-from armsight.loop.identify.corrected import is_corrected, open_corrected
-from armsight.robot.arm import Arm
-from armsight.robot.arm_file import open_arm
-from armsight.robot.kinematics.chain import MOST_RADIANS
-from armsight.robot.models import MODELS
-from armsight.robot.urdf_write import write_urdf
+
+if TYPE_CHECKING:
+    from armsight.data import Array
+    from armsight.robot.arm import Arm
 
 #: A minus before a number is no option.
 _NUMBERS = {"ignore_unknown_options": True}
@@ -50,6 +43,9 @@ def command() -> None:
 @_JSON
 def list_(as_json: bool) -> None:
     """Print the arms that come with armsight."""
+    from armsight.app.arm import description
+    from armsight.robot.models import MODELS
+
     click.echo(json.dumps(description.list_json(MODELS)) if as_json else description.list_text(MODELS))
 
 
@@ -59,6 +55,10 @@ def list_(as_json: bool) -> None:
 @_JSON
 def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
+    from armsight.app.arm import description
+    from armsight.app.arm.figure import write_arm_figure
+    from armsight.robot.arm_file import open_arm
+
     if output is not None:
         check_suffix(output, ".png", "a figure of the arm")
         check_writable(output, apart_from=(arm_name,))
@@ -77,6 +77,10 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
 
     Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
     """
+    from armsight.app.arm import description
+    from armsight.loop.identify.corrected import is_corrected, open_corrected
+    from armsight.robot.arm_file import open_arm
+
     arm = open_arm(arm_name, tool_link=tool_link)
     q = _joints(arm, angles)
     T = arm.forward(q)
@@ -97,6 +101,9 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
 @_JSON
 def jacobian(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the Jacobian of the tool's point in base axes at six joint angles, in degrees."""
+    from armsight.app.arm import description
+    from armsight.robot.arm_file import open_arm
+
     arm = open_arm(arm_name, tool_link=tool_link)
     q = _joints(arm, angles)
     click.echo(json.dumps(description.jacobian_json(arm, q)) if as_json else description.jacobian_text(arm, q))
@@ -112,6 +119,13 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
     The rotation is Rz(euler_z) Ry(euler_y) Rx(euler_x); ROS calls euler_x roll. Exit code 1 where no joint angles within
     the limits reach the pose: then the reason and the nearest pose that can be reached are the answer.
     """
+    import numpy as np
+
+    from armsight.app.arm import description
+    from armsight.geometry.pose import pose
+    from armsight.geometry.rotation import from_euler_zyx
+    from armsight.robot.arm_file import open_arm
+
     arm = open_arm(arm_name, tool_link=tool_link)
     if len(_no_options(numbers)) != len(_POSE):
         raise InputError(f"a pose is six numbers, {' '.join(_POSE)} (mm, degrees); {len(numbers)} were given")
@@ -130,6 +144,9 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 )
 def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     """Write an arm as a URDF file."""
+    from armsight.robot.arm_file import open_arm
+    from armsight.robot.urdf_write import write_urdf
+
     check_suffix(output, ".urdf", "an arm")
     check_writable(output, apart_from=(arm_name,))
     write_urdf(open_arm(arm_name, tool_link=tool_link), output)
@@ -150,13 +167,18 @@ def _number(text: str, name: str) -> float:
         value = float(text)
     except ValueError:
         raise InputError(f"{name} is {text!r}; it must be a number") from None
-    if not np.isfinite(value):
+    if not math.isfinite(value):
         raise InputError(f"{name} is {text}; it must be a finite number")
     return value
 
 
 def _joints(arm: Arm, texts: tuple[str, ...]) -> Array:
     """Read six joint angles in degrees, and say on stderr which are beyond the limits."""
+    import numpy as np
+
+    from armsight.app.arm import description
+    from armsight.robot.kinematics.chain import MOST_RADIANS
+
     if len(_no_options(texts)) != 6:
         raise InputError(f"{arm.name} has six joints; {len(texts)} angles were given, in degrees: q1 q2 q3 q4 q5 q6")
     degrees = np.array([_number(text, f"q{i + 1}") for i, text in enumerate(texts)])

@@ -5,22 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight import firmware
-from armsight.app.board import text
-from armsight.app.board.flash import FLASHED, PROGRAMMERS, build_firmware, flash
-from armsight.app.board.selftest import selftest
-from armsight.app.progress import steps
-from armsight.firmware import build
-from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import ConfigSource
-from armsight.robot.boards.configuration import gains_array
-from armsight.robot.boards.opening import SERIAL, open_board
+from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.robot.boards.serial import BAUD
-from armsight.sim.joints import JointPlant
+
+if TYPE_CHECKING:
+    from armsight.robot.boards.board import Board
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _DEFAULT = "emulated:unicorn"
@@ -63,6 +56,12 @@ def command() -> None:
 @_JSON
 def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
     """Build the firmware: for the emulated boards where armsight finds it, or a real board's image into a folder."""
+    from armsight import firmware
+    from armsight.app.board import text
+    from armsight.app.board.flash import build_firmware
+    from armsight.app.progress import steps
+    from armsight.firmware import build
+
     with steps() as progress:
         progress("compiling")
         if name is None:
@@ -81,6 +80,10 @@ def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) 
 @_JSON
 def flash_(name: str, programmer: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
     """Build a board's firmware and write it to the board; what the board stored stays."""
+    from armsight.app.board import text
+    from armsight.app.board.flash import build_firmware, flash
+    from armsight.app.progress import steps
+
     with steps() as progress:
         progress("compiling")
         built = build_firmware(name, output, compiler)
@@ -100,6 +103,9 @@ def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: 
 
     Nothing is commanded: the drives stay as they are.
     """
+    from armsight.app.board import text
+    from armsight.robot.boards.opening import SERIAL
+
     if seconds is None and not name.startswith(SERIAL):
         seconds = _WATCH_S
     with _open(name, baud) as board:
@@ -123,6 +129,10 @@ def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: 
 
     Changes are taken all at once, also in motion, without a jump of the duty; one that is out of range changes nothing.
     """
+    from armsight.app.board import text
+    from armsight.robot.boards.codes import ConfigSource
+    from armsight.robot.boards.configuration import gains_array
+
     with _open(name, baud) as board:
         config = board.configuration()
         values = gains_array(config)
@@ -151,6 +161,11 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
     A real board's drives are never switched on without --drives: then it runs only what is safe at rest. Exit code 1 where
     a scenario failed.
     """
+    from armsight.app.board import text
+    from armsight.app.board.selftest import selftest
+    from armsight.app.progress import steps
+    from armsight.robot.boards.opening import SERIAL
+
     if name.startswith(SERIAL):
         moves = (
             "the arm will move by up to 3 degrees, keep clear of it"
@@ -169,4 +184,7 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
 
 def _open(name: str, baud: int) -> Board:
     """Open a board; an emulated one has six free joints at its motors."""
+    from armsight.robot.boards.opening import SERIAL, open_board
+    from armsight.sim.joints import JointPlant
+
     return open_board(name, None if name.startswith(SERIAL) else JointPlant(), baud=baud)

@@ -6,5 +6,21 @@ predicted covariance of the pose; drawings as PDF, SVG or PNG.
 - ``command``: the command line, ``armsight body check`` and ``armsight body draw``.
 - ``check``: overlaps, sizes, visibility, the predicted pose, and ambiguities of discs.
 - ``finding``: the records of an assessment, and the text for ambiguities and axes.
+- ``text``: an assessment as text and as JSON.
 - ``draw``: one page for each plane of the body.
 """
+
+import math
+
+#: Paper -> width and height, mm. "fit" is as large as the drawing needs.
+PAPERS = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+    "fit": (math.inf, math.inf),
+}

@@ -21,6 +21,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.body import PAPERS
 from armsight.app.report.plotting import drawing, plain
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -255,18 +256,6 @@ def _surrounded(mark: Mark, marks: list[Mark], notes: list[str]) -> Mark:
     return Mark(mark.name, mark.circles, mark.dark, reach, False, mark.polygons, box)
 
 
-#: Paper -> width and height, mm. "fit" is as large as the drawing needs.
-PAPERS = {
-    "a4": (210.0, 297.0),
-    "a3": (297.0, 420.0),
-    "a2": (420.0, 594.0),
-    "a1": (594.0, 841.0),
-    "a0": (841.0, 1189.0),
-    "letter": (215.9, 279.4),
-    "legal": (215.9, 355.6),
-    "tabloid": (279.4, 431.8),
-    "fit": (np.inf, np.inf),
-}
 #: White edge that printers need, height of what stands below the drawing, and the least width of that, mm.
 _EDGE, _FOOT, _FOOT_WIDTH = 10.0, 30.0, 130.0
 _BAR = 100.0

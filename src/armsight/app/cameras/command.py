@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import click
 
-from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
+if TYPE_CHECKING:
+    from armsight.vision.sources.v4l2 import VideoDevice
 
 
 @click.command("cameras")
@@ -18,6 +20,8 @@ def command(as_json: bool) -> None:
 
     Two cameras of one model may share a by-id name; by-path, the USB port, distinguishes them.
     """
+    from armsight.vision.sources.v4l2 import find_cameras
+
     cameras = find_cameras()
     if as_json:
         click.echo(json.dumps({"cameras": [dataclasses.asdict(camera) for camera in cameras]}))

@@ -10,3 +10,6 @@ a report.
 - ``report``: metrics as text, figures and an HTML page.
 - ``plan``: poses, line and circle of a test as a motion file.
 """
+
+#: Test -> how many cycles it has unless asked otherwise.
+CYCLES = {"poses": 30, "wide": 1, "line": 10, "circle": 3}

@@ -6,19 +6,10 @@ import json
 from pathlib import Path
 
 import click
-import numpy as np
 
-from armsight.app.check.evaluate import evaluate, read_check
-from armsight.app.check.limits import check_limits, limits_json, read_limits
-from armsight.app.check.plan import CYCLES, PlannedTest, plan_csv, plan_test
-from armsight.app.check.report import REPORT_FILES, metric_lines, text, write_check
-from armsight.app.check.result import check_json
-from armsight.app.check.run_folder import is_run
-from armsight.app.report.page import PAGE, writable_folder
-from armsight.app.report.plotting import require_matplotlib
+from armsight.app.check import CYCLES
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
-from armsight.robot.arm_file import open_arm
 
 _KINDS = (".toml", ".csv")
 
@@ -96,6 +87,14 @@ def evaluated(
     Metrics are without the instrument's own noise; one below that noise is called not resolvable. The motions of a test:
     armsight check plan --help.
     """
+    from armsight.app.check.evaluate import evaluate, read_check
+    from armsight.app.check.limits import check_limits, limits_json, read_limits
+    from armsight.app.check.report import REPORT_FILES, metric_lines, text, write_check
+    from armsight.app.check.result import check_json
+    from armsight.app.check.run_folder import is_run
+    from armsight.app.report.page import PAGE, writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+
     if output is not None:
         require_matplotlib()
         check_folder(output, problem="no report can be written here")
@@ -178,6 +177,11 @@ def plan(
 
     Poses and paths lie in the cube's diagonal plane, as ISO 9283 requires. Check them in your workcell before you run them.
     """
+    import numpy as np
+
+    from armsight.app.check.plan import plan_csv, plan_json, plan_test
+    from armsight.robot.arm_file import open_arm
+
     if output is not None:
         check_writable(output, apart_from=(arm_name, visible_in))
         if output.suffix not in _KINDS or (output.suffix == ".csv" and name in ("line", "circle")):
@@ -187,23 +191,10 @@ def plan(
     if output is not None:
         write_text(output, test.motions if output.suffix == ".toml" else plan_csv(test.plan))
     if as_json:
-        click.echo(json.dumps(_plan_json(test)))
+        click.echo(json.dumps(plan_json(test)))
         return
     at = " ".join(f"{1e3 * v:.0f}" for v in test.plan.centre)
     what = {"line": "a line", "circle": "a circle"}.get(name, f"{len(test.plan.names)} poses")
     click.echo(f"{what} in a cube of {1e3 * test.plan.side_m:.0f} mm about {at} mm, cycles: {test.cycles}")
     if output is not None and output.suffix == ".toml":
         click.echo(f"written: {output}; run it: armsight run --motion {output} ... -o RUN; then: armsight check RUN")
-
-
-def _plan_json(test: PlannedTest) -> dict[str, object]:
-    """Return a plan as JSON has it, SI units."""
-    return {
-        "test": test.name,
-        "cycles": test.cycles,
-        "side_m": test.plan.side_m,
-        "centre_m": test.plan.centre.tolist(),
-        "poses": list(test.plan.names),
-        "q_rad": test.plan.q.tolist(),
-        "T_base_tool": test.plan.Ts_base_tool.tolist(),
-    }

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.check import CYCLES
 from armsight.app.run.motion_file import read_motions
 from armsight.data import Array
 from armsight.errors import InputError
@@ -28,8 +29,6 @@ from armsight.robot.trajectories import Trajectory, circle, line
 from armsight.vision.markers.targets import open_target
 from armsight.vision.rig import StereoRig
 
-#: Test -> how many cycles it has unless asked otherwise.
-CYCLES = {"poses": 30, "wide": 1, "line": 10, "circle": 3}
 #: The circle's radius, in sides of the cube (8.2: its diameter is 80 % of it).
 RADIUS = 0.4
 #: Where on the circle the motion starts, and by how much more than a whole revolution it is run, deg: neither the start nor
@@ -218,3 +217,16 @@ def plan_csv(plan: CheckPlan) -> str:
     for name, q, T in zip(plan.names, plan.q, plan.Ts_base_tool, strict=True):
         writer.writerow([name, *(f"{v:.9f}" for v in (*q, *T[:3, 3], *quaternion_wxyz(T[:3, :3])))])
     return out.getvalue()
+
+
+def plan_json(test: PlannedTest) -> dict[str, object]:
+    """Return a plan as JSON has it, SI units."""
+    return {
+        "test": test.name,
+        "cycles": test.cycles,
+        "side_m": test.plan.side_m,
+        "centre_m": test.plan.centre.tolist(),
+        "poses": list(test.plan.names),
+        "q_rad": test.plan.q.tolist(),
+        "T_base_tool": test.plan.Ts_base_tool.tolist(),
+    }

@@ -7,13 +7,6 @@ from pathlib import Path
 
 import click
 
-from armsight.app.demo.demo import Demo, run_demo
-from armsight.app.progress import steps
-from armsight.app.report.plotting import require_matplotlib
-from armsight.app.run.record import require_pyarrow
-from armsight.app.run.summary import print_summary
-from armsight.robot.arm_file import open_arm
-
 
 @click.command("demo")
 @click.option(
@@ -69,6 +62,13 @@ def command(
     Simulated dynamics, rendered cameras, and the real ARM firmware under emulation; needs no hardware. DIR receives the
     run: report.html, summary.json, every track as CSV and Parquet (docs/howto/run.md).
     """
+    from armsight.app.demo.demo import Demo, run_demo
+    from armsight.app.progress import steps
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.run.record import require_pyarrow
+    from armsight.app.run.summary import print_summary
+    from armsight.robot.arm_file import open_arm
+
     require_matplotlib()
     require_pyarrow()
     emulator = board.removeprefix("emulated:")

@@ -5,29 +5,19 @@ from __future__ import annotations
 import contextlib
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.dense.evaluate import SceneResult, evaluate_scene, evaluation_json, table_text, write_evaluation
-from armsight.app.dense.files import RESULT_FILES
-from armsight.app.dense.run import (
-    PairResult,
-    check_near,
-    problem_line,
-    read_pair,
-    result_line,
-    run_shot,
-    search_of,
-)
-from armsight.app.progress import bar
-from armsight.data import Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
 from armsight.vision.dense.methods import METHODS, open_method
-from armsight.vision.dense.middlebury import find_scenes, load_scene
-from armsight.vision.rectify import Rectification
-from armsight.vision.rig import StereoRig
-from armsight.vision.sources import open_source
+
+if TYPE_CHECKING:
+    from armsight.app.dense.evaluate import SceneResult
+    from armsight.app.dense.run import PairResult
+    from armsight.data import Shot
+    from armsight.vision.rectify import Rectification
 
 
 class _Dense(click.Group):
@@ -89,6 +79,11 @@ def match(
     rig left.png and right.png, rectified, depth_mm.pfm, depth_sigma_mm.pfm and cloud.ply (m, left camera's
     frame).
     """
+    from armsight.app.dense.files import RESULT_FILES
+    from armsight.app.dense.run import check_near, problem_line, read_pair, result_line, run_shot, search_of
+    from armsight.app.progress import bar
+    from armsight.vision.sources import open_source
+
     form, pair = _arguments(paths, source, rectified, max_disparity, near)
     check_folder(output, holding=RESULT_FILES, apart_from=paths, advice="; give a folder")
     if form is not None and near is not None:
@@ -122,6 +117,8 @@ def _arguments(
     paths: tuple[Path, ...], source: str | None, rectified: bool, max_disparity: int | None, near: float | None
 ) -> tuple[Rectification | None, tuple[Path, Path] | None]:
     """Return how to rectify (None: rectified already), and the pair (None: a source was given)."""
+    from armsight.vision.rig import StereoRig
+
     if rectified and max_disparity is None:
         raise InputError("--rectified needs --max-disparity N: nothing else says how near the scene is")
     if rectified and near is not None:
@@ -157,6 +154,10 @@ def evaluate(folder: Path, names: tuple[str, ...], output: Path | None, as_json:
     the errors that 50, 90, 95 and 99% stay below, over all pixels and over those both cameras see. Gaps are filled.
     With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
+    from armsight.app.dense.evaluate import evaluate_scene, evaluation_json, table_text, write_evaluation
+    from armsight.app.progress import bar
+    from armsight.vision.dense.middlebury import find_scenes, load_scene
+
     if output is not None:
         check_folder(output, advice="; give a folder")
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.progress import bar
-from armsight.app.record.recording import record, unused_folder
 from armsight.errors import ArmsightError
-from armsight.vision.sources import open_source
 
 
 @click.command("record")
@@ -37,6 +34,10 @@ def command(
 
     Ctrl-C stops the recording; what was stored until then is complete and readable.
     """  # noqa: D301 - click reads the backspace character
+    from armsight.app.progress import bar
+    from armsight.app.record.recording import record, unused_folder
+    from armsight.vision.sources import open_source
+
     unused_folder(output)
     with contextlib.closing(open_source(source)) as opened, bar("recording shots", shots) as advance:
         result = record(opened, output, shots=shots, seconds=seconds, on_shot=lambda _: advance())

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
-from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles import FORMATS, export_rig, import_rig
-from armsight.vision.rigfiles.rigfile import ALPHA, ASSUMED_SIGMA_PX
+from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, FORMATS, export_rig, import_rig, open_format
+
+if TYPE_CHECKING:
+    from armsight.vision.rig import StereoRig
 
 _FORMAT = click.option("--format", "name", required=True, type=click.Choice(list(FORMATS)), help="The other program.")
 
@@ -33,6 +34,8 @@ def command() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def show(path: str, as_json: bool) -> None:
     """Print the contents of a rig file, with standard deviations where they are known."""
+    from armsight.vision.rig import StereoRig
+
     rig = StereoRig.load(path)
     click.echo(json.dumps(_json(path, rig)) if as_json else "\n".join(_lines(rig)))
 
@@ -81,10 +84,13 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
     others may also follow by themselves: -o left.yaml right.yaml. The rectification in files of opencv and ros (R1 R2 P1 P2
     Q) has alpha 0: all pixels of the rectified images are valid.
     """
+    from armsight.vision.rig import StereoRig
+    from armsight.vision.rigfiles.rigfile import ALPHA
+
     paths = (*output, *more)
     check_outputs(paths, (path,))
     lost = export_rig(StereoRig.load(path), name, paths)
-    alpha = ALPHA if FORMATS[name].RECTIFIES else None
+    alpha = ALPHA if open_format(name).RECTIFIES else None
     if alpha is not None:
         click.echo(
             f"note: the rectification in it has alpha {alpha:g}: all pixels of the rectified images are valid", err=True
@@ -107,12 +113,17 @@ def _baseline_sigma_m(rig: StereoRig) -> float | None:
     """Return the standard deviation of the baseline, m; None where the rig's uncertainty is unknown."""
     along = rig.T_left_right[:3, :3].T @ (rig.T_left_right[:3, 3] / rig.baseline_m)  # d|t| by the tangent's translation
     variance = float(along @ rig.cov[-6:-3, -6:-3] @ along)
-    return float(np.sqrt(variance)) if variance > 0 else None
+    return math.sqrt(variance) if variance > 0 else None
+
+
+def _sigmas(rig: StereoRig) -> dict[str, float]:
+    """Return the standard deviation of each parameter by its name; 0 where it is unknown."""
+    variances = rig.cov.diagonal().tolist()
+    return {name: math.sqrt(max(value, 0.0)) for name, value in zip(rig.parameter_names, variances, strict=True)}
 
 
 def _json(path: str, rig: StereoRig) -> dict[str, Any]:
     """Return the rig as one JSON object."""
-    sigmas = np.sqrt(np.clip(np.diag(rig.cov), 0, None)).tolist()
     return {
         "rig": str(Path(path)),
         **{
@@ -129,15 +140,14 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
         "baseline_sigma_m": _baseline_sigma_m(rig),
         "convergence_deg": rig.convergence_deg,
         "sigma_px": rig.sigma_px,
-        "sigmas": {name: sigma or None for name, sigma in zip(rig.parameter_names, sigmas, strict=True)},
+        "sigmas": {name: sigma or None for name, sigma in _sigmas(rig).items()},
         "provenance": dict(rig.provenance),
     }
 
 
 def _lines(rig: StereoRig) -> list[str]:
     """Return the rig as lines for people: mm, degrees, px."""
-    sigmas = dict(zip(rig.parameter_names, np.sqrt(np.clip(np.diag(rig.cov), 0, None)), strict=True))
-    sigma_baseline = _baseline_sigma_m(rig)
+    sigmas, sigma_baseline = _sigmas(rig), _baseline_sigma_m(rig)
     lines = []
     for side, camera in zip(("left", "right"), rig.cameras, strict=True):
         names = [name for name in rig.parameter_names if name.startswith(f"{side}.")]

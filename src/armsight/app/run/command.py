@@ -2,62 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
-from armsight.app.progress import steps
-from armsight.app.report.plotting import require_matplotlib
-from armsight.app.run.calibrate import handeye_poses
-from armsight.app.run.experiment import Progress, require_start, run_experiment
-from armsight.app.run.folder import Finished, finish, make_room, open_folder
-from armsight.app.run.motion_file import DEFAULT_MOTION, MotionPlan, read_motions
-from armsight.app.run.record import require_pyarrow
-from armsight.app.run.setup import HostClock, LiveShots, Setup, setup_of
-from armsight.app.run.summary import RunSummary, print_summary
-from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
-from armsight.robot.arm import Arm
-from armsight.robot.arm_file import open_arm
-from armsight.robot.boards.opening import EMULATED, emulator_name, open_board
-from armsight.sim.workcell.workcell import Workcell
-from armsight.vision.follow.follower import follows
-from armsight.vision.markers.targets import Composite, open_target
-from armsight.vision.rig import StereoRig
-from armsight.vision.sources import open_source
+
+if TYPE_CHECKING:
+    from armsight.app.run.experiment import Progress
+    from armsight.app.run.motion_file import MotionPlan
+    from armsight.app.run.setup import Setup
+    from armsight.app.run.summary import RunSummary
+    from armsight.data import Array
+    from armsight.robot.arm import Arm
+    from armsight.vision.rig import StereoRig
 
 _HANDEYE_POSES = 30
-_SIM = "sim:"
-#: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
-_SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
-
-
-@dataclass(frozen=True)
-class Devices:
-    """The devices as the command line names them.
-
-    Attributes:
-        source: the cameras, such as usb:0,1; or sim:.
-        board: the controller board, such as serial:/dev/ttyACM0; or emulated:.
-        arm: the nominal arm.
-        target: the body on the tool.
-        rate_hz: rate of the cameras, Hz.
-        sync_s: standard deviation of the time between the two exposures of a shot, s.
-    """
-
-    source: str
-    board: str
-    arm: Arm
-    target: Composite
-    rate_hz: float
-    sync_s: float
 
 
 @dataclass(frozen=True)
@@ -104,7 +69,6 @@ class RunPlan:
 @click.option(
     "--motion",
     type=click.Path(path_type=Path),
-    default=DEFAULT_MOTION,
     help="The motions (TOML, docs/howto/run.md); by default five poses, a line and a circle.",
 )
 @click.option(
@@ -138,7 +102,7 @@ def command(
     rig_path: Path,
     target_spec: str,
     arm_spec: str,
-    motion: Path,
+    motion: Path | None,
     rate: float,
     sync_ms: float,
     open_loop: bool,
@@ -150,6 +114,22 @@ def command(
     The arm moves on its own: hand-eye poses around those of the motion, a sweep, the motions twice. Keep the emergency stop
     at hand. Ctrl-C stops the arm first and then saves what was measured.
     """
+    import numpy as np
+
+    from armsight.app.progress import steps
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.run.calibrate import handeye_poses
+    from armsight.app.run.experiment import require_start
+    from armsight.app.run.folder import make_room, open_folder
+    from armsight.app.run.motion_file import DEFAULT_MOTION
+    from armsight.app.run.record import require_pyarrow
+    from armsight.app.run.setup import Devices, open_devices
+    from armsight.app.run.summary import print_summary
+    from armsight.robot.arm_file import open_arm
+    from armsight.vision.follow.follower import follows
+    from armsight.vision.markers.targets import open_target
+    from armsight.vision.rig import StereoRig
+
     require_matplotlib()
     require_pyarrow()
     arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
@@ -157,6 +137,7 @@ def command(
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
         )
+    motion = DEFAULT_MOTION if motion is None else motion
     motions = _motions(arm, arm_spec, motion)
     ends: list[Array] = [motions.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in motions.motions)]
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
@@ -166,7 +147,7 @@ def command(
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
     with steps() as progress:
         progress("opening the devices")
-        with _opened(devices) as setup:
+        with open_devices(devices) as setup:
             require_start(setup, motions, targets)
             make_room(output)
             for name, text in files.items():
@@ -185,6 +166,8 @@ def command(
 
 def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
     """Plan the motions; where an arm cannot make the built-in ones, say which option gives others."""
+    from armsight.app.run.motion_file import DEFAULT_MOTION, read_motions
+
     try:
         return read_motions(arm, path)
     except InputError as error:
@@ -197,42 +180,11 @@ def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
         ) from None
 
 
-@contextlib.contextmanager
-def _opened(devices: Devices) -> Iterator[Setup]:
-    """Open the devices, or the workcell instead of them, and close them at the end of the block."""
-    source, board = devices.source, devices.board
-    if source.startswith(_SIM) != board.startswith(EMULATED):
-        raise InputError(
-            f"--source {source} --board {board}: {_SIM} and {EMULATED} are one workcell and go together; real ones are "
-            "usb:0,1 and serial:/dev/ttyACM0"
-        )
-    with contextlib.ExitStack() as stack:
-        if source.startswith(_SIM):
-            emulator = "unicorn" if board == EMULATED else emulator_name(board)
-            cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
-            workcell = stack.enter_context(
-                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm)
-            )
-            yield replace(setup_of(workcell), target=devices.target)
-            return
-        opened = stack.enter_context(open_board(board))
-        shots = LiveShots(open_source(source))
-        stack.callback(shots.close)
-        shots.start()
-        yield Setup(
-            devices.arm,
-            opened,
-            shots.poll,
-            devices.target,
-            lambda q: np.zeros(6),
-            devices.rate_hz,
-            devices.sync_s,
-            HostClock(),
-        )
-
-
 def _run(setup: Setup, plan: RunPlan, output: Path, progress: Progress) -> RunSummary:
     """Run and write; raises what ended the run early after everything is written."""
+    from armsight.app.run.experiment import run_experiment
+    from armsight.app.run.folder import Finished, finish
+
     outcome = run_experiment(setup, plan.rig, plan.motions, plan.targets, progress=progress, close_loop=plan.close_loop)
     progress("writing and plotting")
     properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}

@@ -2,30 +2,35 @@
 
 :class:`Setup` is the record that the loop is given. Two helpers are for real devices, whose time passes by itself:
 :class:`HostClock` converts image times from the computer's clock to the board's, and :class:`LiveShots` reads the cameras
-in a thread. :func:`setup_of` makes the setup of a workcell.
+in a thread. :func:`setup_of` makes the setup of a workcell; :func:`open_devices` opens what the command line names.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from armsight.data import Array, Shot
-from armsight.errors import ArmsightError, DeviceError
+from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.robot.arm import Arm
 from armsight.robot.boards.board import Board
+from armsight.robot.boards.opening import EMULATED, emulator_name, open_board
 from armsight.vision.markers.targets import Composite
-from armsight.vision.sources.source import Source
+from armsight.vision.sources import Source, open_source
 
 if TYPE_CHECKING:
     from armsight.sim.workcell.workcell import Workcell
 
 _JOIN_S = 2.0
+_SIM = "sim:"
+#: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
+_SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
 #: A live image's time stamp differs from the present time by at most this, s.
@@ -175,3 +180,60 @@ def setup_of(workcell: Workcell) -> Setup:
         timing.rate_hz,
         sync_s,
     )
+
+
+@dataclass(frozen=True)
+class Devices:
+    """The devices as the command line names them.
+
+    Attributes:
+        source: the cameras, such as usb:0,1; or sim:.
+        board: the controller board, such as serial:/dev/ttyACM0; or emulated:.
+        arm: the nominal arm.
+        target: the body on the tool.
+        rate_hz: rate of the cameras, Hz.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
+    """
+
+    source: str
+    board: str
+    arm: Arm
+    target: Composite
+    rate_hz: float
+    sync_s: float
+
+
+@contextlib.contextmanager
+def open_devices(devices: Devices) -> Iterator[Setup]:
+    """Open the devices, or the workcell instead of them, and close them at the end of the block."""
+    source, board = devices.source, devices.board
+    if source.startswith(_SIM) != board.startswith(EMULATED):
+        raise InputError(
+            f"--source {source} --board {board}: {_SIM} and {EMULATED} are one workcell and go together; real ones are "
+            "usb:0,1 and serial:/dev/ttyACM0"
+        )
+    with contextlib.ExitStack() as stack:
+        if source.startswith(_SIM):
+            from armsight.sim.workcell.workcell import Workcell
+
+            emulator = "unicorn" if board == EMULATED else emulator_name(board)
+            cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
+            workcell = stack.enter_context(
+                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm)
+            )
+            yield replace(setup_of(workcell), target=devices.target)
+            return
+        opened = stack.enter_context(open_board(board))
+        shots = LiveShots(open_source(source))
+        stack.callback(shots.close)
+        shots.start()
+        yield Setup(
+            devices.arm,
+            opened,
+            shots.poll,
+            devices.target,
+            lambda q: np.zeros(6),
+            devices.rate_hz,
+            devices.sync_s,
+            HostClock(),
+        )

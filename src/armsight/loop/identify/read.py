@@ -18,11 +18,9 @@ from scipy.spatial.transform import Rotation
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_columns, read_table
+from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.measured import Measured
 
-#: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
-#: case) or about the axes of the rotated frame (capitals).
-ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 #: The names that ``columns`` may say the file's own for.
 COLUMNS = (

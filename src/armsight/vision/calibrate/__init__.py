@@ -7,3 +7,8 @@ return a :class:`~armsight.vision.calibrate.result.Calibration`.
 - ``motion.py``: motion of the board between the two exposures of a pair.
 - ``heldout.py``: errors on pairs that were left out of the fit. ``weak.py``: weaknesses of a calibration, with advice.
 """
+
+#: Distortion models tried, simplest first.
+MODELS = ("brown4", "brown5", "brown8", "fisheye")
+#: Parts of the pairs, each of which is held out of a fit to the others.
+FOLDS = 5

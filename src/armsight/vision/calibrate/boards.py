@@ -26,6 +26,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.calibrate import FOLDS, MODELS
 from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary, unfinished
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, PairErrors, RejectedPair
@@ -227,10 +228,7 @@ class LensModelSearch(Record):
         return rig_of(solution), model.body(solution.state.shape), motion
 
 
-#: Distortion models tried, simplest first.
-MODELS = ("brown4", "brown5", "brown8", "fisheye")
 LEAST_PAIRS = 3
-FOLDS = 5
 Progress = Callable[[str], None]
 
 

@@ -20,6 +20,7 @@ from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.calibrate import FOLDS
 from armsight.vision.calibrate.heldout import (
     cross_validate,
     folds_of,
@@ -45,7 +46,6 @@ TOLERANCES_M = (0.0, 1e-4, 2e-4, 4e-4, 1e-3, 2e-3)
 WORTH = 0.005
 _START_TOLERANCE_M = 4e-4
 LEAST_SHOTS = 5
-FOLDS = 5
 _START_SIGMA_PX = 2.0
 _START_SHOTS = 40
 Found = tuple[list[Candidate], list[Candidate]]

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
+from typing import TYPE_CHECKING
 
 from armsight.errors import InputError
-from armsight.vision.dense.block import Block
-from armsight.vision.dense.method import Method
-from armsight.vision.dense.opencv import OpenCV
-from armsight.vision.dense.scanline import Scanline
-from armsight.vision.dense.semiglobal import Semiglobal
 
-#: Name -> what makes the method with its usual settings.
-METHODS: dict[str, Callable[[], Method]] = {
-    "block": Block,
-    "scanline": Scanline,
-    "semiglobal": Semiglobal,
-    "opencv": OpenCV,
-}
+if TYPE_CHECKING:
+    from armsight.vision.dense.method import Method
+
+#: Name, which is that of the method's module, -> its class; imported when it is opened.
+METHODS = {"block": "Block", "scanline": "Scanline", "semiglobal": "Semiglobal", "opencv": "OpenCV"}
 
 
 def open_method(name: str) -> Method:
-    """Return a method by its name.
+    """Return a method with its usual settings by its name.
 
     Raises:
         InputError: an unknown name.
     """
     if name not in METHODS:
         raise InputError(f"unknown dense method {name!r}; known are {', '.join(METHODS)}")
-    return METHODS[name]()
+    method: Method = getattr(importlib.import_module(f"armsight.vision.dense.{name}"), METHODS[name])()
+    return method

@@ -5,23 +5,33 @@ Foreign files go in and a StereoRig comes out, or the other way; what is lost on
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from armsight.errors import InputError
-from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles import kalibr, opencv_yaml, ros
-from armsight.vision.rigfiles.rigfile import ASSUMED_SIGMA_PX, ImportOptions, RigFormat
 
-#: Format name -> the module that reads and writes it.
-FORMATS: dict[str, RigFormat] = {"opencv": opencv_yaml, "ros": ros, "kalibr": kalibr}
+if TYPE_CHECKING:
+    from armsight.vision.rig import StereoRig
+    from armsight.vision.rigfiles.rigfile import RigFormat
+
+#: Format name -> the module here that reads and writes it; imported when it is opened.
+FORMATS = {"opencv": "opencv_yaml", "ros": "ros", "kalibr": "kalibr"}
+#: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A
+#: larger value widens every predicted uncertainty in proportion.
+ASSUMED_SIGMA_PX = 0.2
 
 
-def _format(name: str) -> RigFormat:
-    """Look a format up."""
+def open_format(name: str) -> RigFormat:
+    """Return a format by its name.
+
+    Raises:
+        InputError: an unknown name.
+    """
     if name not in FORMATS:
         raise InputError(f"unknown rig format {name!r}; known are {', '.join(FORMATS)}")
-    return FORMATS[name]
+    return cast("RigFormat", importlib.import_module(f"{__name__}.{FORMATS[name]}"))
 
 
 def import_rig(
@@ -44,9 +54,11 @@ def import_rig(
     Raises:
         InputError: unknown format, or files that are missing, damaged or not supported.
     """
+    from armsight.vision.rigfiles.rigfile import ImportOptions
+
     if unit_m is not None and not 0 < unit_m < float("inf"):
         raise InputError(f"unit_m must be a positive length in metres, got {unit_m}")
-    return _format(name).read([Path(p) for p in paths], ImportOptions(unit_m, image_size_px, sigma_px))
+    return open_format(name).read([Path(p) for p in paths], ImportOptions(unit_m, image_size_px, sigma_px))
 
 
 def export_rig(rig: StereoRig, name: str, paths: Sequence[str | Path]) -> tuple[str, ...]:
@@ -55,4 +67,4 @@ def export_rig(rig: StereoRig, name: str, paths: Sequence[str | Path]) -> tuple[
     Raises:
         InputError: unknown format, a rig that does not fit it, or a file that cannot be written.
     """
-    return _format(name).write(rig, [Path(p) for p in paths])
+    return open_format(name).write(rig, [Path(p) for p in paths])

@@ -23,12 +23,10 @@ from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
+from armsight.vision.rigfiles import ASSUMED_SIGMA_PX
 
 #: A value of a foreign file: a number, a text, a list or a mapping, unknown until checked.
 Foreign: TypeAlias = Any
-#: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A
-#: larger value widens every predicted uncertainty in proportion.
-ASSUMED_SIGMA_PX = 0.2
 #: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
 #: rectified images so that all of their pixels are valid; 1 would keep all pixels of the raw images, and black edges.
 ALPHA = 0.0

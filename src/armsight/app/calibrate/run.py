@@ -1,0 +1,145 @@
+"""One calibration: images or detections in, a calibration out; what ``armsight calibrate`` prints and records of it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+
+from armsight.app.calibrate.report import MOTION_FITTED
+from armsight.app.messages import weak
+from armsight.app.progress import bar, steps
+from armsight.app.report.page import PAGE
+from armsight.app.report.table import TextTable, print_table
+from armsight.data import SIDES, Detections
+from armsight.errors import InputError
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.bodies import calibrate_bodies
+from armsight.vision.calibrate.result import Calibration
+from armsight.vision.camera_file import read_cameras
+from armsight.vision.detections import read_detections
+from armsight.vision.image import grey
+from armsight.vision.markers.board import open_board
+from armsight.vision.markers.body_file import load_body_csv
+from armsight.vision.sources import PairsSource
+
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+
+
+def calibrate_images(
+    source: PairsSource, target: str, models: tuple[str, ...], *, flat: bool, folds: int
+) -> Calibration:
+    """Detect a board, given by its spec, in every pair of images and calibrate."""
+    board = open_board(target)
+    pairs: list[Pair] = []
+    sizes: Sizes | None = None
+    with bar("detecting the target", len(source.pairs)) as advance:
+        for stored in source.pairs:
+            shot = stored.load()
+            if shot.left is None or shot.right is None:
+                nothing = Detections.none(shot.problem or "no image")
+                unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
+                left, right = unread[::-1] if (shot.problem or "").startswith(f"{stored.right}:") else unread
+                pairs.append(Pair(shot.name, left, right))
+            else:
+                now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
+                sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
+                pairs.append(Pair(shot.name, board.detect(grey(shot.left)), board.detect(grey(shot.right))))
+            advance()
+    if sizes is None:
+        raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
+    with steps() as progress:
+        return calibrate_boards(board, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
+
+
+def calibrate_detections(detections: Path, cameras: Path, body: Path, *, refine_body: bool, folds: int) -> Calibration:
+    """Calibrate from detections of a known body, all read from their files."""
+    known, pair = load_body_csv(body), read_cameras(cameras)
+    with steps() as progress:
+        shots = read_detections(detections, known)
+        return calibrate_bodies(known, shots, pair, refine_body=refine_body, folds=folds, progress=progress)
+
+
+def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None) -> Sizes:
+    """Return the sizes of the images; raise an InputError if they differ from those before."""
+    for side, path in enumerate((left, right)):
+        if sizes is not None and sizes[side] != now[side]:
+            (w, h), (w0, h0) = now[side], sizes[side]
+            raise InputError(
+                f"{path}: is {w}x{h}, the {SIDES[side]} images before it are {w0}x{h0}: a calibration needs one size"
+            )
+    return now
+
+
+def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any]:
+    """Return how the rig was made, as its file records it."""
+    h = calibration.heldout
+    return {
+        "made_by": f"armsight {importlib.metadata.version('armsight')} calibrate, OpenCV {cv2.__version__}",
+        **given,
+        "pairs_used": len(calibration.pairs),
+        "heldout_epipolar_rms_px": h.epipolar_rms_px,
+        "heldout_rigid_rms_m": h.rigid_rms_m,
+        "heldout_scale_error": h.scale_error,
+    }
+
+
+def summary(
+    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
+) -> dict[str, Any]:
+    """Return the object that ``--json`` prints."""
+    c = calibration
+    return {
+        "pairs_found": c.pairs_found,
+        "pairs_used": len(c.pairs),
+        "rejected": [{"pair": r.pair, "reason": r.reason} for r in c.rejected],
+        "notes": list(c.notes),
+        "weaknesses": list(c.weaknesses),
+        "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
+        "heldout": vars(c.heldout),
+        "models": {name: vars(heldout) for name, heldout in c.models.items()},
+        "baseline_m": c.rig.baseline_m,
+        "convergence_deg": c.rig.convergence_deg,
+        "distortion_model": c.rig.left.model,
+        "sigma_px": c.rig.sigma_px,
+        "body_deviation_rms_m": c.deviation_m,
+        "rig": str(output),
+        "board": None if board_file is None else str(board_file),
+        "report": str(report / PAGE) if report is not None else None,
+        "seconds": seconds,
+    }
+
+
+def print_result(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> None:
+    """Print the held-out metrics first, then those of the fit, then what is weak."""
+    c, h = calibration, calibration.heldout
+    rows = (
+        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
+        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
+        ("scale error", f"{100 * h.scale_error:+.3f} %"),
+        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
+    )
+    print_table(
+        TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
+    )
+    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
+    lines = [
+        f"fit: epipolar {c.epipolar_rms_px:.3f} px, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
+        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
+        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
+        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
+        *(f"note: {note}" for note in c.notes),
+        *(weak(weakness) for weakness in c.weaknesses),
+        f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
+        *(
+            [f"board as found written to {board_file}; to measure this board: armsight measure --target {board_file}"]
+            if board_file is not None
+            else []
+        ),
+    ]
+    click.echo("\n".join(lines))

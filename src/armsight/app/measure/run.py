@@ -1,0 +1,222 @@
+"""One run of ``armsight measure``: a rig, a target and shots in; a line for each shot, poses as CSV and pictures out."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import click
+import numpy as np
+
+from armsight.app.measure.picture import SINGULAR
+from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
+from armsight.app.measure.view import CHART, PictureFolder, view_folder
+from armsight.app.progress import bar
+from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, InputError
+from armsight.files import check_writable, write_text
+from armsight.vision.detections import read_detections
+from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.measure import measure, measure_seen, size_problem
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import PairsSource, Source, open_source
+from armsight.vision.sources.pairs import StoredSource
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """How the follower found the body in a shot, what it noticed about a jump, and how long it took, ms."""
+
+    way: str
+    jump: str | None
+    took_ms: float
+
+
+#: Shot, result, and how a followed body was found; None where the body was not followed.
+Result = tuple[Shot, PoseEstimate | Missed, _Followed | None]
+
+
+def measure_shots(
+    rig: Path,
+    target: str,
+    *,
+    left: str | None,
+    right: str | None,
+    source: str | None,
+    detections: Path | None,
+    output: Path | None,
+    view_dir: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure the pose of a target in every shot, and print a line for each.
+
+    Args:
+        rig: the rig's file.
+        target: a board's spec or a body's file.
+        left: glob of the left images; with ``right``.
+        right: glob of the right images.
+        source: a source's spec, where the images are not given by globs.
+        detections: a file of detections, where there are no images.
+        output: CSV file of the poses.
+        view_dir: folder for pictures.
+        as_json: whether each line is a JSON object.
+
+    Raises:
+        ArmsightError: the input is wrong, or no shot could be measured.
+    """
+    stereo = StereoRig.load(rig)
+    folder = None if view_dir is None else view_folder(view_dir)
+    if output is not None:
+        check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
+    if not stereo.cov.any():
+        click.echo(f"note: {rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
+    records: list[ShotPose] = []
+    started = time.perf_counter()
+    results: Iterator[Result]
+    total: int | None
+    discs: DiscTarget | None = None
+    with contextlib.ExitStack() as stack:
+        if detections is not None:
+            body = open_body(target)
+            shots = read_detections(detections, body)
+            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None) for s in shots)
+            total = len(shots)
+        else:
+            found = open_target(target)
+            body, discs = found.body, found.discs
+            opened = (
+                PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
+            )
+            stack.enter_context(contextlib.closing(opened))
+            if output is not None and isinstance(opened, StoredSource):
+                check_writable(output, apart_from=opened.files)
+            results = _measured(stereo, found, _shots(opened, stereo, rig))
+            total = opened.count
+        view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
+        # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
+        if view is not None:
+            stack.callback(view.finish, records)
+        if output is not None:
+            stack.callback(_write, output, records)
+        try:
+            _run(results, total, body, records, as_json, view)
+        except KeyboardInterrupt:
+            kept = f", kept in {output}" if output is not None and records else ""
+            click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
+            raise
+    _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
+
+
+def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
+    """Yield a source's shots; the first image that can be read must have the rig's size."""
+    checked = False
+    while (shot := source.read()) is not None:
+        if not checked and shot.left is not None and shot.right is not None:
+            checked = True
+            for side, camera, image in zip(SIDES, rig.cameras, (shot.left, shot.right), strict=True):
+                if (problem := size_problem(camera.image_size_px, image, side)) is not None:
+                    raise InputError(f"{path}: shot {shot.name}: {problem}")
+        yield shot
+
+
+def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator[Result]:
+    """Measure shot after shot; a body of discs is followed from one to the next."""
+    if not follows(target):
+        yield from ((shot, measure(rig, target, shot), None) for shot in shots)
+        return
+    follower = Follower(rig, target)
+    for shot in shots:
+        begun = time.perf_counter()
+        result = follower.measure(shot)
+        yield shot, result, _Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun))
+
+
+def _run(
+    results: Iterator[Result],
+    total: int | None,
+    body: Body,
+    records: list[ShotPose],
+    as_json: bool,
+    view: PictureFolder | None,
+) -> None:
+    """Measure every shot, print its line, keep its record and draw it."""
+    with bar("measuring", total) as advance:
+        for shot, result, followed in results:
+            record = shot_pose(shot.name, shot.t_s, body, result)
+            if followed is not None:
+                record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
+            records.append(record)
+            click.echo(json.dumps(record.to_json()) if as_json else _line(record))
+            if view is not None:
+                view.add(shot, result, record)
+            advance()
+
+
+def _write(output: Path, records: list[ShotPose]) -> None:
+    """Write the poses, where there are any."""
+    if records:
+        write_text(output, csv_text(records))
+
+
+def _line(record: ShotPose) -> str:
+    """Return one shot as a line for people: mm and degrees, one sigma."""
+    if not record.ok:
+        return f"{record.shot}: missed: {record.reason}"
+    sigma = np.sqrt(np.diag(record.cov))
+    position = " ".join(
+        f"{axis} {1e3 * value:.3f} ± {1e3 * s:.3f}"
+        for axis, value, s in zip("xyz", record.position_m, sigma[:3], strict=True)
+    )
+    angles = " ".join(f"{name} {value:.3f}" for name, value in zip(ANGLES, record.euler_zyx_deg, strict=True))
+    sigma_deg = np.degrees(np.linalg.norm(sigma[3:]))
+    dropped = len(record.dropped)
+    note = f", {dropped} point{'' if dropped == 1 else 's'} dropped" if dropped else ""
+    note += f", misfit {record.misfit:.1f}" if record.misfit > 1 else ""
+    note += f", {record.jump}" if record.jump else ""
+    singular = SINGULAR if record.pitch_singular else ""
+    return (
+        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}, {len(record.points_m)} points{note}"
+    )
+
+
+def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
+    """Return the file of the board as the rig's calibration found it, where that board is measured by its drawing."""
+    name = rig.provenance.get("board")
+    if rig.provenance.get("target") != target or not isinstance(name, str):
+        return None
+    beside = path.parent / name
+    return beside if beside.exists() else None
+
+
+def _close(
+    records: list[ShotPose], seconds: float, output: Path | None, view: PictureFolder | None, board_file: Path | None
+) -> None:
+    """Print on stderr what was measured and missed; raise an error if nothing was measured."""
+    good = [r for r in records if r.ok]
+    missed = [r for r in records if not r.ok]
+    if not records:
+        raise ArmsightError("the source ended without a single shot")
+    if not good:
+        raise ArmsightError(f"none of {len(records)} shots could be measured; {missed[0].shot}: {missed[0].reason}")
+    summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
+    summary += f", {len(missed)} missed (their lines have the reasons)" if missed else ""
+    ways = Counter(r.way for r in records if r.way is not None)
+    if ways:
+        took = {way: np.median([r.took_ms for r in records if r.way == way and r.took_ms is not None]) for way in ways}
+        summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
+    if jumps := [r.shot for r in records if r.jump]:
+        summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
+    if odd := sum(r.misfit > 1 for r in good):
+        summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma includes it)"
+        if board_file is not None:
+            summary += f"; the rig's calibration found the shape of this board: measure with --target {board_file}"
+    summary += f"; {view.summary()}" if view is not None else ""
+    click.echo(summary + (f"; written to {output}" if output is not None else ""), err=True)
