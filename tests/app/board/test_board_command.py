@@ -92,7 +92,7 @@ def test_monitor_shows_faults(armsight, monkeypatch):
             super().__init__()
             self.supply_mv = 4000
 
-    monkeypatch.setattr("armsight.app.board.command.JointPlant", Broken)
+    monkeypatch.setattr("armsight.sim.joints.JointPlant", Broken)
     said = armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1", "--json")
     assert said.lines[0]["faults"] == [{"fault": Fault.SUPPLY_LOW.name, "joint": None}]
     assert "SUPPLY_LOW" in armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1").out

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.calibrate import command
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import assert_rejected, listening
@@ -81,7 +80,9 @@ def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
 
 def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monkeypatch):
     written = []  # its pages have their own tests
-    monkeypatch.setattr(command, "write_report", lambda calibration, folder: written.append((calibration, folder)))
+    monkeypatch.setattr(
+        "armsight.app.calibrate.report.write_report", lambda calibration, folder: written.append((calibration, folder))
+    )
     said = armsight(
         "calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--report", tmp_path / "r", "--json"
     )
@@ -247,7 +248,7 @@ with mock.patch("{module}.{name}", waiting):
 @pytest.mark.parametrize(
     ("module", "name", "wait"),
     [
-        ("armsight.app.calibrate.command", "calibrate_boards", "time.sleep(60)"),
+        ("armsight.app.calibrate.run", "calibrate_boards", "time.sleep(60)"),
         ("armsight.vision.sources.pairs", "read_image", "time.sleep(60)"),
         ("armsight.files", "os.replace", "time.sleep(60)"),
     ],

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 
-from armsight.app.cameras import command
 from armsight.app.main import main
 from armsight.vision.sources import v4l2 as cameras
 
@@ -153,7 +152,6 @@ def computer(tmp_path, monkeypatch):
     monkeypatch.setattr(cameras, "_ioctl", lambda handle, *rest: Driver(opened[handle])(handle, *rest))
     find = cameras.find_cameras
     monkeypatch.setattr(cameras, "find_cameras", lambda: find(sys_dir, dev))
-    monkeypatch.setattr(command, "find_cameras", cameras.find_cameras)
     return dev
 
 

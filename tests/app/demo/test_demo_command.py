@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app.demo import command, demo
+from armsight.app.demo import demo
 from armsight.app.demo.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
@@ -210,7 +210,7 @@ def test_the_study_of_rates_takes_the_same_cameras(cameras):
 
 def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):
     folder, values, summary = short
-    monkeypatch.setattr(command, "run_demo", lambda demo, **options: summary)
+    monkeypatch.setattr(demo, "run_demo", lambda demo, **options: summary)
     said = armsight("demo", "-o", tmp_path)
     assert said.code == 0
     lines = said.out.splitlines()

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from armsight.app.main import main
-from armsight.app.record import command, recording
+from armsight.app.record import recording
 from armsight.app.record.recording import record
 from armsight.data import Shot
 from armsight.errors import DeviceError, InputError
+from armsight.vision import sources
 from armsight.vision.sources import FolderSource, open_source
 from cli_runs import listening
 
@@ -260,7 +261,7 @@ def test_a_stop_in_the_middle_is_a_partial_result_that_says_so(monkeypatch, caps
         (DeviceError("/dev/video0: gone"), 2, "armsight: error: /dev/video0: gone; 3 shots are stored in"),
         (KeyboardInterrupt(), 130, "armsight: interrupted; 3 shots are stored in"),
     ):
-        monkeypatch.setattr(command, "open_source", lambda _, stop=stop: Played([*some(3), stop]))
+        monkeypatch.setattr(sources, "open_source", lambda _, stop=stop: Played([*some(3), stop]))
         folder = tmp_path / str(expected)
         code, out, err = run(monkeypatch, capsys, "record", "any", "-o", folder, "--json")
         assert code == expected
@@ -274,8 +275,8 @@ ENDLESS = """
 import itertools, time
 import numpy as np
 from armsight.app.main import main
-from armsight.app.record import command
 from armsight.data import Shot
+from armsight.vision import sources
 
 class Endless:
     def __init__(self):
@@ -286,7 +287,7 @@ class Endless:
     def close(self):
         print("closed")
 
-command.open_source = lambda spec: Endless()
+sources.open_source = lambda spec: Endless()
 main()
 """
 

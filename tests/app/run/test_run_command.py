@@ -7,6 +7,7 @@ import signal
 import numpy as np
 import pytest
 
+from armsight.app.progress import steps
 from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import command
 from armsight.sim.workcell.workcell import Workcell
@@ -98,8 +99,6 @@ def test_a_run_where_a_file_stands_and_one_over_a_strangers_shots(armsight, file
 
 @pytest.mark.parametrize("stage", ["opening the devices", "preparing to follow", "hand-eye: pose 1 "])
 def test_ctrl_c_before_and_in_motion(armsight, files, tmp_path, monkeypatch, stage):
-    steps = command.steps
-
     class Interrupting:
         def __enter__(self):
             self.shown = steps()
@@ -115,7 +114,7 @@ def test_ctrl_c_before_and_in_motion(armsight, files, tmp_path, monkeypatch, sta
         def __exit__(self, *ended):
             return self.shown.__exit__(*ended)
 
-    monkeypatch.setattr(command, "steps", Interrupting)
+    monkeypatch.setattr("armsight.app.progress.steps", Interrupting)
     said = armsight(*arguments(files, tmp_path / "run"))
     assert said.code == 130
     assert said.err.splitlines()[-1] == "armsight: interrupted"

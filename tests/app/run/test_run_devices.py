@@ -15,7 +15,8 @@ import pytest
 from pty_workcell import SILENT_TICKS, HostStamped, PtyWorkcell
 
 from armsight.app.run import calibrate as run_calibrate
-from armsight.app.run import command
+from armsight.app.run import command, experiment
+from armsight.app.run import setup as run_setup
 from armsight.app.run.loop import Loop
 from armsight.app.run.setup import HostClock
 from armsight.geometry.pose import inverse
@@ -51,8 +52,8 @@ def far(tmp_path, monkeypatch):
     there.workcell.truth.rig.save(tmp_path / "rig.json")
     (tmp_path / "body.toml").write_text(there.workcell.body_text)
     (tmp_path / "motion.toml").write_text(MOTION)
-    monkeypatch.setattr(command, "open_source", lambda spec: HostStamped(there))
-    monkeypatch.setattr(command, "HostClock", lambda: HostClock(there.now))
+    monkeypatch.setattr(run_setup, "open_source", lambda spec: HostStamped(there))
+    monkeypatch.setattr(run_setup, "HostClock", lambda: HostClock(there.now))
     monkeypatch.setattr(command, "_HANDEYE_POSES", 12)
     monkeypatch.setattr(run_calibrate, "SWEEP_S", 3.0)
     monkeypatch.setattr(run_calibrate, "DELAY_REST_S", 0.5)
@@ -144,7 +145,7 @@ def _agrees_with_the_truth(far, loop, tmp_path):
 
 def meanwhile(monkeypatch, stage, happens):
     """Let something happen when a run comes to a stage."""
-    real, done = command.run_experiment, []
+    real, done = experiment.run_experiment, []
 
     def run_experiment(*arguments, progress, **options):
         def watched(line):
@@ -155,7 +156,7 @@ def meanwhile(monkeypatch, stage, happens):
 
         return real(*arguments, progress=watched, **options)
 
-    monkeypatch.setattr(command, "run_experiment", run_experiment)
+    monkeypatch.setattr(experiment, "run_experiment", run_experiment)
     return done
 
 

@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 from worn_arm import poses, worn
 
 from armsight.errors import InputError
+from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.diagnose import check_plausible, misfit, without_tool
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.read import ROTATIONS, read_poses
+from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
 
 #: One whose axes lie in a plane but for its shoulder, one with a round wrist, and two with none.

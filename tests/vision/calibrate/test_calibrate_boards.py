@@ -8,7 +8,8 @@ from armsight.data import Detections
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
-from armsight.vision.calibrate.boards import LEAST_PAIRS, MODELS, Pair, calibrate_boards
+from armsight.vision.calibrate import MODELS
+from armsight.vision.calibrate.boards import LEAST_PAIRS, Pair, calibrate_boards
 from armsight.vision.match import renamed
 from board_views import SIZES, board_pairs, detections, rig_and_board, rig_error
 

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.opencv
 
 SEARCH = Search(0, 32)
 VARIANTS = {
-    **{name: make() for name, make in METHODS.items()},
+    **{name: open_method(name) for name in METHODS},
     "semiglobal 4": Semiglobal(4),
     "semiglobal 5": Semiglobal(5),
     "block 13x13": Block(6),
