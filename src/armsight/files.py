@@ -8,7 +8,6 @@ import io
 import math
 import os
 import re
-import secrets
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -161,7 +160,7 @@ def _target(path: str | Path) -> Path:
 
 def _beside(target: Path) -> Path:
     """Return the name of a temporary file beside another."""
-    return target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    return target.with_name(f".{target.name}.{os.urandom(4).hex()}")
 
 
 @contextlib.contextmanager

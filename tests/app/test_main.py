@@ -1,6 +1,7 @@
 """The command line as a whole: its own errors, its version, what it needs, its colours."""
 
 import importlib.metadata
+import json
 import os
 import pty
 import subprocess
@@ -92,6 +93,48 @@ def test_help_needs_no_optional_package():
     )
     ran = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True)
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
+
+
+#: Asks every command for its help and makes a mistake in its options; prints as JSON which slow packages each imported.
+LIGHT = """
+import contextlib, io, json, sys
+import click
+from armsight.app.main import group
+from armsight.errors import ArmsightError
+
+heavy = {"numpy", "cv2", "scipy", "matplotlib"}
+found = {}
+
+def ask(*words):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(click.exceptions.Exit):
+        try:
+            group.main(words, prog_name="armsight", standalone_mode=False)
+        except (click.UsageError, ArmsightError):
+            pass
+    found[" ".join(words)] = sorted(heavy & set(sys.modules))
+    heavy.difference_update(sys.modules)
+
+def walk(command, *words):
+    ask(*words, "-h")
+    if not command.context_settings.get("ignore_unknown_options"):  # of arm fk, which takes negative numbers
+        ask(*words, "--nothing")
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            walk(command.get_command(context, name), *words, name)
+
+walk(group)
+ask("demo", "--board", "real")
+ask("measure", "rig.json", "--target", "chessboard:9x6:25mm")
+print(json.dumps(found))
+"""
+
+
+def test_no_help_and_no_mistake_in_options_imports_what_is_slow():
+    ran = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, check=True)
+    found = json.loads(ran.stdout)
+    assert len(found) > 2 * len(COMMANDS)
+    assert {words: names for words, names in found.items() if names} == {}
 
 
 def test_help_says_what_identify_needs_and_lists_measure_first(armsight):

@@ -55,13 +55,14 @@ def list_(as_json: bool) -> None:
 @_JSON
 def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
+    if output is not None:
+        check_suffix(output, ".png", "a figure of the arm")
+        check_writable(output, apart_from=(arm_name,))
+
     from armsight.app.arm import description
     from armsight.app.arm.figure import write_arm_figure
     from armsight.robot.arm_file import open_arm
 
-    if output is not None:
-        check_suffix(output, ".png", "a figure of the arm")
-        check_writable(output, apart_from=(arm_name,))
     arm = open_arm(arm_name, tool_link=tool_link)
     if output is not None:
         write_arm_figure(arm, output)
@@ -144,11 +145,12 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 )
 def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     """Write an arm as a URDF file."""
+    check_suffix(output, ".urdf", "an arm")
+    check_writable(output, apart_from=(arm_name,))
+
     from armsight.robot.arm_file import open_arm
     from armsight.robot.urdf_write import write_urdf
 
-    check_suffix(output, ".urdf", "an arm")
-    check_writable(output, apart_from=(arm_name,))
     write_urdf(open_arm(arm_name, tool_link=tool_link), output)
     click.echo(str(output))
 

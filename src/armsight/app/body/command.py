@@ -42,15 +42,16 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
 
     Exit code 0: usable at every distance; 1: ambiguous or unusable at one of them; 2: no body file.
     """
+    for distance in distances:
+        if not 0.01 <= distance <= 100:
+            raise InputError(f"--distance {distance:g}: expected metres, between 0.01 and 100")
+
     from armsight.app.body.check import assess
     from armsight.app.body.text import assessment_json, assessment_lines, cameras_text
     from armsight.vision.discs.predict import plain_rig
     from armsight.vision.markers.body_layout import read_layout
     from armsight.vision.rig import StereoRig
 
-    for distance in distances:
-        if not 0.01 <= distance <= 100:
-            raise InputError(f"--distance {distance:g}: expected metres, between 0.01 and 100")
     layout = read_layout(path)
     rig = plain_rig() if rig_path is None else StereoRig.load(rig_path)
     assessment = assess(layout, rig, tuple(sorted(set(distances))) or (0.6, 0.8, 1.2))
@@ -81,9 +82,10 @@ def draw(path: str, output: str, paper: str, split: bool, dpi: int, as_json: boo
     BOARD is a spec such as chessboard:9x6:25mm. One page for each plane of a body; .svg and .png have a file for each page
     and sheet.
     """
+    check_writable(output, apart_from=(path,))
+
     from armsight.app.body.draw import draw_body
 
-    check_writable(output, apart_from=(path,))
     drawing = draw_body(path, output, paper=paper.lower(), dpi=dpi, split=split)
     for note in drawing.notes:
         click.echo(f"note: {note}", err=True)

@@ -61,6 +61,12 @@ def command(
     From images: --left, --right and --target. From detections of a known body with known intrinsics: --detections,
     --cameras and --body.
     """
+    images, points = (left, right, target), (detections, cameras, body)
+    if (None in images) == (None in points) or any(images) == any(points):
+        raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
+    if refine_body is not None and detections is None:
+        raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
+
     from armsight.app.calibrate.report import REPORT_FILES, write_report
     from armsight.app.calibrate.run import calibrate_detections, calibrate_images, print_result, provenance, summary
     from armsight.app.report.plotting import require_matplotlib
@@ -68,11 +74,6 @@ def command(
     from armsight.vision.markers.calibrated_board import save_board_file
     from armsight.vision.sources import PairsSource
 
-    images, points = (left, right, target), (detections, cameras, body)
-    if (None in images) == (None in points) or any(images) == any(points):
-        raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
-    if refine_body is not None and detections is None:
-        raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
     source = None if left is None or right is None else PairsSource.open(left, right)
     inputs = points if source is None else source.files
     board_file = None if source is None else output.parent / f"{output.stem}.board.toml"

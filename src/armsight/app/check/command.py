@@ -177,15 +177,16 @@ def plan(
 
     Poses and paths lie in the cube's diagonal plane, as ISO 9283 requires. Check them in your workcell before you run them.
     """
+    if output is not None:
+        check_writable(output, apart_from=(arm_name, visible_in))
+        if output.suffix not in _KINDS or (output.suffix == ".csv" and name in ("line", "circle")):
+            raise InputError(f"{output}: a plan is written as .toml, motions to run, or, of poses, as .csv")
+
     import numpy as np
 
     from armsight.app.check.plan import plan_csv, plan_json, plan_test
     from armsight.robot.arm_file import open_arm
 
-    if output is not None:
-        check_writable(output, apart_from=(arm_name, visible_in))
-        if output.suffix not in _KINDS or (output.suffix == ".csv" and name in ("line", "circle")):
-            raise InputError(f"{output}: a plan is written as .toml, motions to run, or, of poses, as .csv")
     middle = None if centre is None else np.array(centre) / 1e3
     test = plan_test(open_arm(arm_name), name, cycles, middle, speed / 1e3, visible_in)
     if output is not None:

@@ -62,6 +62,12 @@ def command(
     Simulated dynamics, rendered cameras, and the real ARM firmware under emulation; needs no hardware. DIR receives the
     run: report.html, summary.json, every track as CSV and Parquet (docs/howto/run.md).
     """
+    emulator = board.removeprefix("emulated:")
+    if emulator == board:
+        raise click.UsageError(
+            f"--board {board}: the workcell's board is emulated:unicorn, emulated:qemu or emulated:host"
+        )
+
     from armsight.app.demo.demo import Demo, run_demo
     from armsight.app.progress import steps
     from armsight.app.report.plotting import require_matplotlib
@@ -71,11 +77,6 @@ def command(
 
     require_matplotlib()
     require_pyarrow()
-    emulator = board.removeprefix("emulated:")
-    if emulator == board:
-        raise click.UsageError(
-            f"--board {board}: the workcell's board is emulated:unicorn, emulated:qemu or emulated:host"
-        )
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
     demo = Demo(output, arm, cameras, seed, emulator, layout, quick, nominal, nominal_arm)
     try:

@@ -69,6 +69,7 @@ def command(
         return
     if arm_name is None or data is None:
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
+
     from armsight.app.identify.report import write_identify_report
     from armsight.app.identify.run import headline, identify_json, results_in, run_identify, text, write_results
     from armsight.app.progress import steps
@@ -133,18 +134,19 @@ def plan(
     With --data the poses measured already count, and locate the arm; with --rig and --data only what both cameras see is
     chosen, weighted by how well they see it. Check the poses against your workcell before you move to them.
     """
-    from armsight.app.identify.plan import plan_csv, plan_from, plan_json, plan_text
-    from armsight.app.progress import steps
-    from armsight.loop.identify.read import read_poses
-    from armsight.robot.arm_file import open_arm
-    from armsight.vision.rig import StereoRig
-
     if rig is not None and data is None:
         raise InputError("--rig needs --data: without any pose measured, where the arm is to the cameras is not known")
     if output is not None:
         if output.suffix != ".csv":
             raise InputError(f"{output}: poses are written as .csv; name it so")
         check_writable(output, apart_from=(data, rig))
+
+    from armsight.app.identify.plan import plan_csv, plan_from, plan_json, plan_text
+    from armsight.app.progress import steps
+    from armsight.loop.identify.read import read_poses
+    from armsight.robot.arm_file import open_arm
+    from armsight.vision.rig import StereoRig
+
     with steps() as progress:
         progress("choosing poses")
         done = None if data is None else read_poses(data).measured

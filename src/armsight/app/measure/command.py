@@ -41,11 +41,12 @@ def command(
     be read or does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles
     about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll).
     """
-    from armsight.app.measure.run import measure_shots
-
     given = [left is not None or right is not None, source is not None, detections is not None]
     if sum(given) != 1 or (left is None) != (right is None):
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
+
+    from armsight.app.measure.run import measure_shots
+
     measure_shots(
         rig,
         target,
