@@ -1,0 +1,126 @@
+"""Random scenes with a body of discs before a stereo rig, seen through a camera of ``armsight.sim.camera``, with truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armsight.geometry.pose import inverse, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.camera.pipeline import SimulatedCamera
+from armsight.sim.camera.stages import CameraPipeline
+from armsight.sim.example_rig import example_rig, in_view
+from armsight.sim.render.background import BACKGROUNDS
+from armsight.sim.render.render import radiance
+from armsight.sim.render.scene import Pattern, PosedBody, plate
+from armsight.sim.workcell.body import body_patterns, body_target
+from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.rig import StereoRig
+from marker_plate import MARGIN_M, ellipses
+from marker_report import disc_target
+
+#: Tilt of the body, up to.
+TILT_DEG = 40.0
+#: Pairs that a camera has seen of a scene before the one that counts: automatic gain and temporal filter have settled.
+BEFORE = 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two images of a body of discs and what is true of them.
+
+    Attributes:
+        images: left and right, (H, W) uint8.
+        rig: the true cameras.
+        target: the body's discs.
+        T_left_body: (4, 4) its pose in the middle of the left exposure's middle row, m.
+        uv: left and right, (N, 2) centres of the discs' images, px: the centroids of their projected rims.
+        shapes: left and right, (N, 3) S11, S12, S22 of the discs' images, px^2: rim x^T S^-1 x = 1.
+        patterns: what was painted.
+    """
+
+    images: tuple[np.ndarray, np.ndarray]
+    rig: StereoRig
+    target: DiscTarget
+    T_left_body: np.ndarray
+    uv: tuple[np.ndarray, np.ndarray]
+    shapes: tuple[np.ndarray, np.ndarray]
+    patterns: tuple[Pattern, ...]
+
+
+def body(kind: str) -> tuple[DiscTarget, tuple[Pattern, ...]]:
+    """Return a target and its patterns.
+
+    Args:
+        kind: ``nine`` for the workcell's body of nine bright discs, ``three`` or ``four`` for a plate with so many.
+    """
+    if kind == "nine":
+        target = body_target().discs
+        assert target is not None
+        return target, body_patterns()
+    target = disc_target(count={"three": 3, "four": 4}[kind])
+    low, high = target.body.points.min(axis=0) - MARGIN_M, target.body.points.max(axis=0) + MARGIN_M
+    middle = (low + high) / 2
+    discs = [(*(p - middle)[:2], r, 0.85) for p, r in zip(target.body.points, target.radii_m, strict=True)]
+    return target, (plate(high[0] - low[0], high[1] - low[1], 0.06, discs).on_body(pose(np.eye(3), middle)),)
+
+
+def random_pose(
+    rig: StereoRig, patterns: tuple[Pattern, ...], distance_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Return T_left_body (4, 4) of a body in full view of both cameras, rotated and tilted anyhow."""
+    while True:
+        axis = rng.uniform(0, 2 * np.pi)
+        tilt = np.radians(rng.uniform(0, TILT_DEG)) * np.array([np.cos(axis), np.sin(axis), 0.0])
+        R = exp_so3(tilt) @ exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        where = np.array([rng.uniform(-0.4, 0.6), rng.uniform(-0.35, 0.35), 1.0]) * distance_m
+        T = pose(R, where)
+        if all(in_view(rig, T @ pattern.T_body_pattern, pattern) for pattern in patterns):
+            return T
+
+
+def scene(
+    seed: int,
+    preset: str | CameraPipeline,
+    distance_m: float | None = None,
+    *,
+    kind: str = "nine",
+    background: str = "cluttered",
+    size: tuple[int, int] = (1280, 720),
+    twist: np.ndarray | None = None,
+) -> Scene:
+    """Render a random scene.
+
+    Args:
+        seed: of pose, background, cameras and noise; the same for every preset, so that presets see the same scene.
+        preset: name or TOML file of the cameras, or their pipeline.
+        distance_m: of the body; sampled from 0.5 to 1.2 m by default.
+        kind: of the body, see :func:`body`.
+        background: a key of ``BACKGROUNDS``; what is behind differs between both images.
+        size: (width, height) of the images.
+        twist: (6,) velocity of the body in its own axes, m/s and rad/s; at rest by default. The pipeline's shutter decides
+            what it does to the image; both cameras expose at the same time.
+    """
+    pipeline = preset if isinstance(preset, CameraPipeline) else CameraPipeline.load(preset)
+    rng = np.random.default_rng([seed, 1])
+    rig = example_rig(size, 900 / 1280 * size[0])
+    target, patterns = body(kind)
+    distance = rng.uniform(0.5, 1.2) if distance_m is None else distance_m
+    T = random_pose(rig, patterns, distance, rng)
+    posed = PosedBody(patterns, T, np.zeros(6) if twist is None else twist)
+    views = (posed, posed.seen_from(inverse(rig.T_left_right)))
+    images, uv, shapes = [], [], []
+    for side, (camera, view) in enumerate(zip(rig.cameras, views, strict=True)):
+        behind = BACKGROUNDS[background](size, rng)
+        light = radiance(camera, [view], behind, shutter=pipeline.shutter(size[1]))
+        device = SimulatedCamera(pipeline, size, 2 * seed + side)
+        remembers = pipeline.auto_exposure is not None or pipeline.temporal_denoise is not None
+        for k in range(BEFORE if remembers else 0):  # of a body at rest; a moving one's past is where it was not
+            if twist is None:
+                device.expose(light, k / 30)
+        images.append(device.expose(light, BEFORE / 30))
+        centres, shape = ellipses(camera, target, view.T_camera_body)
+        uv.append(centres)
+        shapes.append(shape)
+    return Scene((images[0], images[1]), rig, target, T, (uv[0], uv[1]), (shapes[0], shapes[1]), patterns)
