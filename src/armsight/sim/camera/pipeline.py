@@ -24,12 +24,12 @@ from armsight.sim.camera.stages import (
     Flicker,
     Jpeg,
     Lamp,
-    Mosaic,
+    Photosensor,
     SpatialDenoise,
     TemporalDenoise,
     ToneCurve,
 )
-from armsight.sim.render.optics import Optics, Radiance, Sensor, exposed, shaded
+from armsight.sim.render.optics import Optics, Radiance, Sensor, exposed, noise_start, noise_strip, shaded
 
 _METHODS = {
     "nearest": cv2.INTER_NEAREST_EXACT,
@@ -44,6 +44,7 @@ _CHROMA = {
     "4:2:0": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
 }
 _FULL = np.float32(65535)  # linear light of one between the converter and the tone curve, which work on 16 bits
+_BAND = 32  # rows that are worked on together; even, as the mosaic's cells are
 _METERED = 8  # every so many pixels count for the automatic gain
 _HYSTERESIS = 0.75  # of a step: an error below it changes nothing
 
@@ -70,6 +71,8 @@ class SimulatedCamera:
         self._native = tuple(max(even, even * round(n * scale / even)) for n in image_size_px)
         self._lamp = None if pipeline.lamp is None else lamp_gain(image_size_px, pipeline.lamp)
         self._glint = self._highlight()
+        corner = pipeline.vignetting.corner if pipeline.vignetting else 0.0
+        self._shade = shaded(np.ones(image_size_px[::-1], np.float32), Optics(vignetting=corner)) if corner else None
         self._sensitivity, self._dark_e = self._fixed_pattern()
         self._table = _tone_table(pipeline.tone)
         self._count = 0
@@ -97,23 +100,18 @@ class SimulatedCamera:
         if radiance.shape != (self._height, self._width):
             raise InputError(f"the radiance is {radiance.shape}, must be ({self._height}, {self._width})")
         stages = self.pipeline
-        rng = np.random.Generator(
-            np.random.SFC64(np.random.SeedSequence([self._seed, 21, self._count if number is None else number]))
-        )
+        number = self._count if number is None else number
         self._count += 1
         light = self._lit(self._through_lens(radiance), time_s)
-        if stages.sensor is not None:
-            raw = self._read_out(light, rng)
-        elif stages.tone is not None:
-            sigma = stages.white_noise.sigma_grey / 255 if stages.white_noise else 0.0
-            raw = light + np.float32(sigma) * rng.standard_normal(light.shape, dtype=np.float32)
-        else:
+        if stages.sensor is None and stages.tone is None:
             sigma = stages.white_noise.sigma_grey if stages.white_noise else 0.0
+            rng = np.random.default_rng([self._seed, 21, number])
             return self._processed(exposed(light, Sensor(read_noise=sigma), rng), None)
+        raw = self._read_out(light, number)
         if stages.mosaic is None:
-            return self._processed(self._table[_sixteen_bits(raw)], None)
-        linear = cv2.demosaicing(self._balanced(raw, stages.mosaic), _DEMOSAIC[stages.mosaic.demosaic])
-        ycrcb = cv2.cvtColor(self._table[np.asarray(linear, np.uint16)], cv2.COLOR_BGR2YCrCb)
+            return self._processed(self._toned(raw), None)
+        linear = np.asarray(cv2.demosaicing(raw, _DEMOSAIC[stages.mosaic.demosaic]))
+        ycrcb = cv2.cvtColor(self._toned(linear), cv2.COLOR_BGR2YCrCb)
         return self._processed(cv2.extractChannel(ycrcb, 0), ycrcb)
 
     def _highlight(self) -> Radiance | None:
@@ -126,17 +124,20 @@ class SimulatedCamera:
         across, down = (np.exp(-0.5 * (t / glint.sigma_px) ** 2) for t in (x, y))
         return np.asarray(glint.peak * np.outer(down, across), dtype=np.float32)
 
-    def _fixed_pattern(self) -> tuple[Radiance | None, Radiance | None]:
-        """Return the sensitivity and the dark electrons of each pixel of the sensor, None where all are alike."""
-        sensor = self.pipeline.sensor
+    def _fixed_pattern(self) -> tuple[Radiance, Radiance]:
+        """Return what each pixel of the sensor makes of light of one, and its electrons in the dark."""
+        sensor, mosaic, shape = self.pipeline.sensor, self.pipeline.mosaic, self._native[::-1]
         if sensor is None:
-            return None, None
-        rng, shape = np.random.default_rng([self._seed, 20]), self._native[::-1]
+            return np.ones(shape, np.float32), np.zeros(shape, np.float32)
+        rng = np.random.default_rng([self._seed, 20])
         sensitivity = 1 + np.float32(sensor.prnu) * rng.standard_normal(shape, dtype=np.float32)
+        sensitivity *= np.float32(sensor.white_e)
+        if mosaic is not None:
+            sensitivity *= _mosaic(mosaic.response, shape)
         dark_e = np.float32(sensor.dsnu_e) * rng.standard_normal(shape, dtype=np.float32)
         hot = rng.integers(0, dark_e.size, round(sensor.hot_share * dark_e.size))
         dark_e.ravel()[hot] += rng.exponential(sensor.hot_e, hot.size).astype(np.float32)
-        return (sensitivity if sensor.prnu else None), (dark_e if sensor.dsnu_e or len(hot) else None)
+        return sensitivity, dark_e
 
     def _through_lens(self, radiance: Radiance) -> Radiance:
         """Return the light on the sensor's plane, (H, W)."""
@@ -148,7 +149,7 @@ class SimulatedCamera:
         if stages.defocus is not None and stages.defocus.radius_px > 0:
             kernel = disc_kernel(stages.defocus.radius_px)
             light = _single(cv2.filter2D(light, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE))
-        return light if stages.vignetting is None else shaded(light, Optics(vignetting=stages.vignetting.corner))
+        return light if self._shade is None else light * self._shade
 
     def _lit(self, light: Radiance, time_s: float) -> Radiance:
         """Return the light on the sensor's own pixels, with the lamps' flicker."""
@@ -163,42 +164,42 @@ class SimulatedCamera:
             light = light * flicker_gain(stages.flicker, time_s, len(light), exposure_ms, readout_ms)
         return light
 
-    def _read_out(self, light: Radiance, rng: np.random.Generator) -> Radiance:
-        """Return what the converter gives, (h, w) from 0 to 1, the dark level subtracted."""
-        sensor, mosaic = self.pipeline.sensor, self.pipeline.mosaic
-        assert sensor is not None
-        electrons = light * np.float32(sensor.white_e)
-        if mosaic is not None:
-            for site, response in zip(_SITES, _by_site(mosaic.response), strict=True):
-                electrons[site] *= np.float32(response)
-        gain = self._analogue_gain(electrons, sensor.full_well_e)
-        if self._sensitivity is not None:
-            electrons *= self._sensitivity
-        noise = rng.standard_normal(electrons.shape, dtype=np.float32)
-        noise *= np.sqrt(np.maximum(electrons, 0) + np.float32(sensor.read_noise_e**2))
-        electrons += noise
-        if self._dark_e is not None:
-            electrons += self._dark_e
-        np.minimum(electrons, np.float32(sensor.full_well_e), out=electrons)
-        most = 2**sensor.bits - 1
-        dark = round(sensor.dark_level * most)
-        electrons *= np.float32(gain * (most - dark) / sensor.full_well_e)
-        electrons += np.float32(dark)
-        np.rint(electrons, out=electrons)
-        np.clip(electrons, 0, most, out=electrons)
-        electrons -= np.float32(dark)
-        electrons *= np.float32(1 / (most - dark))
-        return electrons
+    def _read_out(self, light: Radiance, number: int) -> Image:
+        """Return what the converter gives, the dark level subtracted and the white balance applied, uint16."""
+        stages, shape = self.pipeline, light.shape
+        start = noise_start(self._seed, 0, number)
+        noise = _strip(0, self._native)[start : start + light.size].reshape(shape)
+        balance = _mosaic(stages.mosaic.white_balance if stages.mosaic else (1.0, 1.0, 1.0), (_BAND, shape[1]))
+        if stages.sensor is None:
+            sigma = np.float32(stages.white_noise.sigma_grey / 255 if stages.white_noise else 0.0)
+        else:
+            gain = self._analogue_gain(light, stages.sensor)
+        out = np.empty(shape, np.uint16)
+        for top in range(0, shape[0], _BAND):  # what is in the cache is fast
+            rows = slice(top, top + _BAND)
+            if stages.sensor is None:
+                raw = light[rows] + sigma * noise[rows]
+            else:
+                electrons = light[rows] * self._sensitivity[rows] + self._dark_e[rows]
+                raw = converted(electrons, noise[rows], stages.sensor, gain)
+            raw *= _FULL * balance[: len(raw)]
+            out[rows] = np.clip(np.rint(raw), 0, _FULL)
+        return out
 
-    def _analogue_gain(self, electrons: Radiance, full_well_e: float) -> float:
+    def _toned(self, linear: Image) -> Image:
+        """Return grey levels of linear light, uint16."""
+        out = np.empty(linear.shape, np.uint8)
+        for top in range(0, len(linear), _BAND):
+            np.take(self._table, linear[top : top + _BAND], out=out[top : top + _BAND], mode="clip")
+        return out
+
+    def _analogue_gain(self, light: Radiance, sensor: Photosensor) -> float:
         """Return the gain of this image, and choose the next one's."""
         auto = self.pipeline.auto_exposure
         if auto is None:
             return 1.0
-        seen, last = (
-            electrons[::_METERED, 1::_METERED] / full_well_e,
-            math.floor(math.log2(auto.gain_max) / auto.step_ev),
-        )
+        seen = light[::_METERED, ::_METERED] * np.float32(sensor.white_e / sensor.full_well_e)
+        last = math.floor(math.log2(auto.gain_max) / auto.step_ev)
 
         def missing(step: int) -> float:
             """Return by how many steps the image is too dark at a gain."""
@@ -211,13 +212,6 @@ class SimulatedCamera:
         change = (error > _HYSTERESIS) - (error < -_HYSTERESIS)
         self._gain_step = min(max(step + change, 0), last)
         return float(2 ** (step * auto.step_ev))
-
-    @staticmethod
-    def _balanced(raw: Radiance, mosaic: Mosaic) -> Image:
-        """Return a mosaic with its white balance, uint16."""
-        for site, factor in zip(_SITES, _by_site(mosaic.white_balance), strict=True):
-            raw[site] *= np.float32(factor)
-        return _sixteen_bits(raw)
 
     def _processed(self, luma: Image, ycrcb: Image | None) -> Image:
         """Return the file's image: luma (h, w) uint8 denoised, sharpened, resized, compressed; colour from ``ycrcb``."""
@@ -249,23 +243,39 @@ class SimulatedCamera:
         return np.asarray(cv2.resize(image, (self._width, self._height), interpolation=method))
 
 
-#: The pixels of the mosaic's cell: red, green, green, blue.
-_SITES = tuple((slice(v, None, 2), slice(u, None, 2)) for v in range(2) for u in range(2))
+_strip = lru_cache(maxsize=2)(noise_strip)
+
+
+def _mosaic(rgb: tuple[float, float, float], shape: tuple[int, ...]) -> Radiance:
+    """Return the value of each pixel's colour, of red, green and blue, in a mosaic (h, w) that begins with red."""
+    cell = np.array([[rgb[0], rgb[1]], [rgb[1], rgb[2]]], np.float32)
+    return np.tile(cell, (-(-shape[0] // 2), -(-shape[1] // 2)))[: shape[0], : shape[1]]
+
+
+def converted(electrons: Radiance, noise: Radiance, sensor: Photosensor, gain: float) -> Radiance:
+    """Return the converter's numbers, the dark level subtracted, as shares of their range.
+
+    Args:
+        electrons: (h, w) expected electrons of each pixel; overwritten.
+        noise: (h, w) standard normal.
+        sensor: its full well, readout and converter.
+        gain: before the converter.
+    """
+    most = 2**sensor.bits - 1
+    dark = round(sensor.dark_level * most)
+    electrons += noise * np.sqrt(np.maximum(electrons, 0) + np.float32(sensor.read_noise_e**2))
+    np.minimum(electrons, np.float32(sensor.full_well_e), out=electrons)
+    electrons *= np.float32(gain * (most - dark) / sensor.full_well_e)
+    electrons += np.float32(dark)
+    np.clip(np.rint(electrons, out=electrons), 0, most, out=electrons)
+    electrons -= np.float32(dark)
+    electrons *= np.float32(1 / (most - dark))
+    return electrons
 
 
 def _single(image: Image) -> Radiance:
     """Return an image of OpenCV's as what it is: single precision."""
     return np.asarray(image, dtype=np.float32)
-
-
-def _by_site(rgb: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """Return the values of red, green and blue for the four pixels of a cell."""
-    return rgb[0], rgb[1], rgb[1], rgb[2]
-
-
-def _sixteen_bits(light: Radiance) -> Image:
-    """Return linear light of 0 to 1 as uint16."""
-    return np.asarray(np.clip(np.rint(light * _FULL), 0, _FULL), dtype=np.uint16)
 
 
 def _tone_table(tone: ToneCurve | None) -> Image:
@@ -323,7 +333,7 @@ def _bilateral(luma: Image, stage: SpatialDenoise) -> Image:
 def _mix(y: Radiance, previous: Radiance, stage: TemporalDenoise) -> None:
     """Mix the previous image into a luma, where little has changed."""
     difference = previous - y
-    change = np.abs(cv2.blur(difference, (3, 3)))
+    change = np.abs(_single(cv2.blur(difference, (3, 3))))
     change *= np.float32(-stage.weight / stage.threshold_grey)
     change += np.float32(stage.weight)
     np.maximum(change, 0, out=change)

@@ -1,0 +1,55 @@
+"""What cameras do to discs, on images with truth: simulated cameras of ``armsight.sim.camera``, in one thread.
+
+    python benchmarks/cameras.py                   all sections
+    python benchmarks/cameras.py 0                 only these
+    python benchmarks/cameras.py --seed 7          another seed
+    python benchmarks/cameras.py --json found.json metrics as JSON, too
+
+Sections: 0 each stage of a camera alone. ``camera_scene.scene`` renders the scenes.
+"""
+
+from __future__ import annotations
+
+import os
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[name] = "1"  # before numpy is imported
+
+import argparse  # noqa: E402
+import json  # noqa: E402
+import time  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import cv2  # noqa: E402
+
+import camera_stages  # noqa: E402
+from marker_report import Report  # noqa: E402
+
+SECTIONS = {
+    "0": ("Each stage of a camera alone", camera_stages.section),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {' '.join(SECTIONS)}; all by default")
+    parser.add_argument("--seed", type=int, default=3, help="of poses, scenes and noise; 3 by default")
+    parser.add_argument("--json", type=Path, help="write the metrics to this file")
+    options = parser.parse_args()
+    for name in options.sections:
+        if name not in SECTIONS:
+            parser.error(f"no section {name!r}; there are {' '.join(SECTIONS)}")
+    cv2.setNumThreads(1)
+    report = Report()
+    for name in options.sections or SECTIONS:
+        title, section = SECTIONS[name]
+        report.say(f"\n{name}. {title}")
+        start = time.perf_counter()
+        section(options.seed, report)
+        report.say(f"  ({time.perf_counter() - start:.0f} s)")
+    if options.json is not None:
+        options.json.write_text(json.dumps(report.found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
