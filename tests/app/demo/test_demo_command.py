@@ -12,7 +12,7 @@ from armsight.app.demo.demo import Demo, run_demo
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
-from armsight.sim.workcell.cameras import open_timing
+from armsight.sim.workcell.cameras import open_cameras
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
@@ -201,9 +201,9 @@ def test_names_that_are_not_known(armsight, tmp_path, options, said):
     assert len(got.err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("cameras", ["webcams", "webcams:640x480@15", "1280x720@60"])
+@pytest.mark.parametrize("cameras", ["webcams", "webcams:640x480@15", "1280x720@60", "industrial:640x480@15"])
 def test_the_study_of_rates_takes_the_same_cameras(cameras):
-    given, at = open_timing(cameras), open_timing(demo.cameras_at(cameras, 4.0))
+    (given, _), (at, _) = open_cameras(cameras), open_cameras(demo.cameras_at(cameras, 4.0))
     assert at.rate_hz == 4.0
     assert replace(at, rate_hz=given.rate_hz) == given
 

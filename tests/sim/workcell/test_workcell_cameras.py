@@ -6,13 +6,14 @@ import pytest
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.robot.arm_file import open_arm
+from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.workcell.cameras import (
     DISTANCE_M,
     RIGS,
     WEBCAMS,
     CameraTiming,
+    open_cameras,
     open_rig,
-    open_timing,
     rig_pose,
     shot_times,
 )
@@ -43,14 +44,28 @@ def test_a_shot_is_the_same_whatever_came_before():
 
 
 def test_what_can_be_asked_for():
-    assert open_timing("1280x720@60") == CameraTiming()
-    fast = open_timing("1920x1080@120")
+    assert open_cameras("1280x720@60") == open_cameras("clean") == (CameraTiming(), None)
+    fast, _ = open_cameras("1920x1080@120")
     assert (fast.image_size_px, fast.rate_hz, fast.exposure_s) == ((1920, 1080), 120.0, 0.002)
-    assert open_timing("webcams") == WEBCAMS
+    assert open_cameras("webcams") == (WEBCAMS, None)
     assert WEBCAMS.skew_s > 1e-3
     assert WEBCAMS.row_s > 0
-    assert open_timing("webcams:640x480@15").rate_hz == 15.0
-    assert open_timing("1280x720@400").exposure_s <= 1 / 800
+    assert open_cameras("webcams:640x480@15")[0].rate_hz == 15.0
+    assert open_cameras("1280x720@400")[0].exposure_s <= 1 / 800
+
+
+def test_a_preset_brings_its_timing_and_its_stages():
+    timing, pipeline = open_cameras("webcam-good-light:640x480@30")
+    assert (timing.image_size_px, timing.exposure_s, timing.skew_s) == ((640, 480), 0.008, 0.004)
+    assert timing.row_s * 480 == pytest.approx(0.0144)
+    assert pipeline == CameraPipeline.load("webcam-good-light")
+
+
+def test_a_camera_that_is_faster_than_its_preset_gets_less_light():
+    timing, pipeline = open_cameras("webcam-poor-light:1280x720@60")
+    assert timing.exposure_s == pytest.approx(0.95 / 60)
+    assert 1e-3 * pipeline.timing.exposure_ms == timing.exposure_s
+    assert pipeline.sensor.white_e == pytest.approx(500 * timing.exposure_s / 0.030)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +74,7 @@ def test_what_can_be_asked_for():
 )
 def test_what_cannot_be_is_rejected(spec):
     with pytest.raises(InputError, match="cameras"):
-        open_timing(spec)
+        open_cameras(spec)
 
 
 def test_rigs_are_parallel_or_verge():

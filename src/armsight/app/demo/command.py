@@ -25,7 +25,13 @@ import click
     show_default=True,
     help="The simulated arm: nominal, used, worn, or a TOML file (docs/howto/workcell.md).",
 )
-@click.option("--cameras", default="1280x720@60", show_default=True, help="WIDTHxHEIGHT@HZ, or webcams.")
+@click.option(
+    "--cameras",
+    default="1280x720@60",
+    show_default=True,
+    help="[NAME:]WIDTHxHEIGHT@HZ or NAME: webcams, a camera preset such as webcam-good-light, or its TOML file "
+    "(docs/concepts/camera.md).",
+)
 @click.option(
     "--board",
     default="emulated:unicorn",

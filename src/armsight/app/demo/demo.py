@@ -27,7 +27,7 @@ from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
-from armsight.sim.workcell.cameras import open_timing
+from armsight.sim.workcell.cameras import camera_name, open_cameras
 from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.calibrate.result import Calibration
 
@@ -43,7 +43,7 @@ class Demo:
     Attributes:
         folder: the folder of the run.
         arm: the simulated arm: nominal, used, worn, or a TOML file.
-        cameras: as the workcell names them, such as 1280x720@60.
+        cameras: as the workcell names them, such as 1280x720@60 or webcam-good-light.
         seed: of everything that is random.
         emulator: what runs the firmware: unicorn, qemu or host.
         layout: of the cameras: parallel or verging.
@@ -144,9 +144,8 @@ def _truth(workcell: Workcell, outcome: RunResult) -> tuple[Array, Array] | None
 
 def cameras_at(cameras: str, rate_hz: float) -> str:
     """Return the name of the same cameras at another rate, Hz."""
-    width, height = open_timing(cameras).image_size_px
-    kind = "webcams:" if cameras.strip().startswith("webcams") else ""
-    return f"{kind}{width}x{height}@{rate_hz:g}"
+    (width, height), (name, _) = open_cameras(cameras)[0].image_size_px, camera_name(cameras)
+    return f"{name + ':' if name else ''}{width}x{height}@{rate_hz:g}"
 
 
 def _studies(

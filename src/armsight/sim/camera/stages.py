@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -378,6 +378,14 @@ class CameraPipeline:
         if self.timing is None:
             return Shutter()
         return Shutter(1e-3 * self.timing.exposure_ms, 1e-3 * self.timing.readout_ms / height)
+
+    def exposed_for(self, exposure_s: float) -> Self:
+        """Return the same camera with another exposure time, s, which changes the electrons in proportion."""
+        if self.timing is None:
+            return self
+        share = 1e3 * exposure_s / self.timing.exposure_ms if self.timing.exposure_ms else 1.0
+        sensor = self.sensor and replace(self.sensor, white_e=share * self.sensor.white_e)
+        return replace(self, timing=replace(self.timing, exposure_ms=1e3 * exposure_s), sensor=sensor)
 
 
 #: Table of a file -> what it holds.

@@ -19,8 +19,10 @@ from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.robot.arm import Arm
+from armsight.sim.camera.pipeline import SimulatedCamera
+from armsight.sim.camera.stages import CameraPipeline, preset_names
 from armsight.sim.example_rig import example_rig
-from armsight.sim.render.optics import noise_start, noise_strip
+from armsight.sim.render.optics import Radiance, noise_start, noise_strip
 from armsight.sim.render.render import Shutter, outline
 from armsight.sim.render.scene import Pattern, PosedBody, plate
 from armsight.sim.workcell.images import ArmSeen, WorkcellCamera
@@ -29,10 +31,12 @@ from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
 from armsight.vision.rig import StereoRig
 
-_FORM = "WIDTHxHEIGHT@HZ, webcams, or webcams:WIDTHxHEIGHT@HZ; such as 1280x720@60 or 1920x1080@120"
+_FORM = "WIDTHxHEIGHT@HZ, NAME or NAME:WIDTHxHEIGHT@HZ; such as 1280x720@60 or webcams:640x480@30"
 #: Focal length over the image's width: 900 px at 1280.
 _FOCAL = 900 / 1280
 _WIDTHS, _RATES = (320, 3840), (1.0, 500.0)
+_OPEN_AT_MOST = 0.95  # share of the period that a camera with a pipeline exposes
+_SETTLED = 5  # images of what stands still before a camera's gain and temporal filter have settled
 #: Where the cameras' middle is, seen from where the body is at home: distance, m; to the side and up, degrees.
 DISTANCE_M, ASIDE_DEG, ABOVE_DEG = 0.85, 14.0, 12.0
 _AIM_M = 0.10  # they aim at a point so far behind the body, at home: the arm works there
@@ -104,33 +108,58 @@ def shot_times(timing: CameraTiming, seed: int, shot: int) -> ShotTimes:
     return ShotTimes(left, left + apart, left + max(late, timing.exposure_s / 2))
 
 
-def open_timing(spec: str) -> CameraTiming:
-    """Return the timing that a user asks for.
+def open_cameras(spec: str) -> tuple[CameraTiming, CameraPipeline | None]:
+    """Return the timing that a user asks for, and what lies between light and file.
 
     Args:
-        spec: ``WIDTHxHEIGHT@HZ``, ``webcams`` or ``webcams:WIDTHxHEIGHT@HZ``.
+        spec: ``WIDTHxHEIGHT@HZ``, ``NAME`` or ``NAME:WIDTHxHEIGHT@HZ``; a name is ``webcams``, a preset of
+            :class:`~armsight.sim.camera.stages.CameraPipeline`, or a TOML file of its stages.
+
+    Returns:
+        The timing, and the pipeline; None where nothing but white noise is between light and file.
 
     Raises:
-        InputError: of another form, or out of range.
+        InputError: of another form, an unknown name, a bad file, or out of range.
     """
-    text = spec.strip()
-    base = WEBCAMS if text.startswith("webcams") else CameraTiming()
-    if text == "webcams":
-        return base
-    match = re.fullmatch(r"(?:webcams:)?(\d+)x(\d+)@(\d+(?:\.\d+)?)", text)
-    if not match:
-        raise InputError(f"cameras {spec!r}: expected {_FORM}")
-    width, height, rate = int(match[1]), int(match[2]), float(match[3])
+    name, size_rate = camera_name(spec)
+    pipeline, base = None, WEBCAMS if name == "webcams" else CameraTiming()
+    if name not in ("webcams", "clean") and (name or size_rate is None):
+        if name not in preset_names() and not name.endswith(".toml"):
+            known = ", ".join(("webcams", *preset_names()))
+            raise InputError(f"cameras {spec!r}: expected {_FORM}; a NAME is one of {known}, or a TOML file")
+        pipeline = CameraPipeline.load(name)
+        base = _timing(pipeline)
+    if size_rate is None:
+        return base, pipeline
+    width, height, rate = size_rate
     if not _WIDTHS[0] <= width <= _WIDTHS[1] or not 240 <= height <= width:
         raise InputError(
             f"cameras {spec!r}: images must be {_WIDTHS[0]} to {_WIDTHS[1]} px wide, 240 px to the width high"
         )
     if not _RATES[0] <= rate <= _RATES[1]:
         raise InputError(f"cameras {spec!r}: the rate must be {_RATES[0]:g} to {_RATES[1]:g} Hz")
-    exposure = min(base.exposure_s, 0.5 / rate)
-    return replace(
+    exposure = min(base.exposure_s, (_OPEN_AT_MOST if pipeline else 0.5) / rate)
+    timing = replace(
         base, image_size_px=(width, height), rate_hz=rate, exposure_s=exposure, row_s=base.row_s * 720 / height
     )
+    return timing, None if pipeline is None else pipeline.exposed_for(exposure)
+
+
+def camera_name(spec: str) -> tuple[str, tuple[int, int, float] | None]:
+    """Return the name in what a user asks for, empty where there is none, and width, height and rate, None without."""
+    text = spec.strip()
+    match = re.fullmatch(r"(?:(.+):)?(\d+)x(\d+)@(\d+(?:\.\d+)?)", text)
+    return (text, None) if match is None else (match[1] or "", (int(match[2]), int(match[3]), float(match[4])))
+
+
+def _timing(pipeline: CameraPipeline) -> CameraTiming:
+    """Return a preset's timing, at 1280 x 720."""
+    given = pipeline.timing
+    if given is None:
+        return CameraTiming()
+    shutter = pipeline.shutter(720)
+    delay, jitter, sync, skew = (1e-3 * ms for ms in (given.delay_ms, given.jitter_ms, given.sync_ms, given.skew_ms))
+    return CameraTiming((1280, 720), given.rate_hz, shutter.exposure_s, delay, jitter, sync, skew, shutter.row_s)
 
 
 #: Name -> by how much the right camera is rotated to the left one's axis, as a share of what would make them look at one
@@ -215,6 +244,7 @@ class WorkcellSource:
         body: tuple[tuple[Pattern, ...], Array],
         clock: tuple[Callable[[], float], Callable[[float], None]],
         seed: int,
+        pipeline: CameraPipeline | None = None,
     ) -> None:
         """Point the cameras at the arm.
 
@@ -225,6 +255,7 @@ class WorkcellSource:
             body: the patterns on the tool, and T_tool_body (4, 4), m.
             clock: returns the workcell's time, s; lets so many seconds of it pass.
             seed: of noise and timing.
+            pipeline: what lies between light and file; white noise by default.
         """
         self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
         self._now, self._advance = clock
@@ -236,7 +267,11 @@ class WorkcellSource:
         plant.stepped = self._render_ahead
         self._covers: list[tuple[float, float]] = []
         self._gone_s, self._gone = np.inf, ""
-        self._pool = ThreadPoolExecutor(2)
+        #: A thread for each side: a camera that remembers its images exposes them one after the other.
+        self._threads = (ThreadPoolExecutor(1), ThreadPoolExecutor(1))
+        self._devices: list[SimulatedCamera] | None = None
+        if pipeline is not None:
+            self._devices = [SimulatedCamera(pipeline, timing.image_size_px, 2 * seed + side) for side in range(2)]
         #: Name of each shot that was handed out -> when it was taken, for evaluation only.
         self.taken: dict[str, ShotTimes] = {}
 
@@ -276,7 +311,8 @@ class WorkcellSource:
 
     def close(self) -> None:
         """End the threads."""
-        self._pool.shutdown()
+        for thread in self._threads:
+            thread.shutdown()
 
     def clear(self, pattern: Pattern, T_left_body: Array) -> bool:
         """Return whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
@@ -346,7 +382,9 @@ class WorkcellSource:
         frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
         bodies = self._bodies(t_s, shutter)
         return [
-            self._pool.submit(self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held)
+            self._threads[side].submit(
+                self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held
+            )
             for side in range(2)
         ]
 
@@ -368,9 +406,21 @@ class WorkcellSource:
             bodies.append(held.seen_from(T_this_left))
         if any(start <= t_s < end for start, end in self._covers):
             bodies.append(_card(body.T_camera_body))
+        arm = ArmSeen(self._plant.parts, frames)
+        if self._devices is not None:
+            return self._through(self._devices[side], camera.radiance(arm, bodies, shutter), t_s, number)
         # A shot for the calibration takes its noise from numbers of its own.
         start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
-        return camera.image(ArmSeen(self._plant.parts, frames), bodies, shutter, self._strip, start)
+        return camera.image(arm, bodies, shutter, self._strip, start)
+
+    @staticmethod
+    def _through(device: SimulatedCamera, light: Radiance, t_s: float, number: int) -> Image:
+        """Return what a camera makes of the light; a board that is held still has been there for some images."""
+        if number >= 0:
+            return device.expose(light, t_s, number)
+        device.forget()
+        first = 2**40 - _SETTLED * number  # noise of numbers of its own
+        return [device.expose(light, t_s, first + k) for k in range(_SETTLED)][-1]
 
     def _q(self, t_s: Array) -> Array:
         """Return the links' true angles (N, 6) at times (N,), by a cubic through the four nearest milliseconds."""

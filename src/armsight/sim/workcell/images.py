@@ -264,7 +264,8 @@ class WorkcellCamera:
         self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
-        self._still_grey = spread(self.still.light, LENS.psf_sigma_px) * self._gain
+        self._still_light = spread(self.still.light, LENS.psf_sigma_px)
+        self._still_grey = self._still_light * self._gain
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
         self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
 
@@ -283,6 +284,25 @@ class WorkcellCamera:
         Returns:
             (H, W) uint8.
         """
+        seen, window, core = self._seen(arm, bodies, shutter)
+        out: Image = np.empty(self._still_grey.shape, np.uint8)
+        s = self._sensor
+        noises = (s.offset, s.read_noise, s.shot_noise)
+        exposed_window(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
+        return out
+
+    def radiance(self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter) -> Radiance:
+        """Return the light (H, W) of each pixel before the lens's shading and the sensor; arguments as :meth:`image`."""
+        seen, window, core = self._seen(arm, bodies, shutter)
+        out = self._still_light.copy()
+        if seen.size:
+            out[_part(core, (0, 0, 0, 0))] = seen[_part(core, window)]
+        return out
+
+    def _seen(
+        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter
+    ) -> tuple[Radiance, Window, Window]:
+        """Return the light of a window that holds all that moves, the window, and its core, which is exact."""
         ends, radius, albedo = (np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
         if arm is not None:
             ends, radius, albedo = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
@@ -300,11 +320,7 @@ class WorkcellCamera:
             core = self._core(crop, margin)
             painted = self._painted(exposure, crop, window, (light, depth, ids))
             seen[_part(core, window)] = painted[_part(core, crop)]
-        out: Image = np.empty(self._still_grey.shape, np.uint8)
-        s = self._sensor
-        core, noises = self._core(window, margin), (s.offset, s.read_noise, s.shot_noise)
-        exposed_window(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
-        return out
+        return seen, window, self._core(window, margin)
 
     def arm_ids(self, arm: ArmSeen) -> Image:
         """Return (H, W) which of the arm's moving solids each pixel sees, counted from 1; 0 where it sees none."""

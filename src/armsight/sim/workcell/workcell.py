@@ -25,6 +25,7 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
+from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.scene import chessboard
@@ -36,8 +37,8 @@ from armsight.sim.workcell.cameras import (
     DISTANCE_M,
     CameraTiming,
     WorkcellSource,
+    open_cameras,
     open_rig,
-    open_timing,
     rig_pose,
 )
 from armsight.sim.workcell.images import WorkcellCamera, picture
@@ -107,6 +108,7 @@ class _Parts(NamedTuple):
         T_tool_body: (4, 4) where the body is on the tool, m.
         cameras: left and right.
         room: what must be the same for another workcell to use these cameras.
+        pipeline: what lies between light and file; None for white noise.
         link: to the board.
         board: configured.
     """
@@ -123,6 +125,7 @@ class _Parts(NamedTuple):
     T_tool_body: Array
     cameras: tuple[WorkcellCamera, WorkcellCamera]
     room: tuple[object, ...]
+    pipeline: CameraPipeline | None
     link: EmulatedLink
     board: Board
 
@@ -162,7 +165,7 @@ class Workcell:
         self.body_text, self.chessboard_spec = body_text(), CHESSBOARD
         clock = (lambda: self.t_s, self.advance)
         body = (body_patterns(), self._T_tool_body)
-        self.source = WorkcellSource(self.plant, self._cameras, self.timing, body, clock, self._seed)
+        self.source = WorkcellSource(self.plant, self._cameras, self.timing, body, clock, self._seed, parts.pipeline)
 
     @classmethod
     def open(
@@ -184,7 +187,7 @@ class Workcell:
 
         Args:
             arm: how far the arm is from its table: nominal, used, worn, or a TOML file.
-            cameras: ``1280x720@60``, ``1920x1080@120``, ``webcams`` and their like.
+            cameras: ``1280x720@60``, ``1920x1080@120``, ``webcams``, a preset or TOML file of a camera, and their like.
             seed: of all that is sampled; the same seed gives the same numbers.
             emulator: the emulator that runs the firmware: unicorn, qemu or host.
             rig: parallel or verging.
@@ -192,7 +195,7 @@ class Workcell:
             assumed: the table that it is assumed to have, as an identification found; ``model`` by default.
             distance_m: from the cameras to the body of the arm at home.
             baseline_m: between the cameras.
-            noise: of the sensors, grey levels.
+            noise: of the sensors, grey levels; a preset has its own.
             like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
 
         Raises:
@@ -203,7 +206,7 @@ class Workcell:
             raise InputError(f"seed {seed!r}: must be a whole number from 0 to {2**32 - 1}")
         if not 0 <= noise <= 50:
             raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
-        timing, amounts = open_timing(cameras), imperfections(arm)
+        (timing, pipeline), amounts = open_cameras(cameras), imperfections(arm)
         built_to = model if model is not None else open_arm("six_r")
         true_rig, links = open_rig(rig, timing.image_size_px, baseline_m), solids(built_to)
         motors = chosen(built_to, links)  # as the drawing has them: friction as usual
@@ -222,7 +225,7 @@ class Workcell:
         known = assumed if assumed is not None else built_to
         T_tool_body = mount @ exp_se3(off)
         parts = (built_to, known, timing, seed, links, motors, plant, true_rig, T_base_rig, T_tool_body, seen, room)
-        return cls(_Parts(*parts, link, board))
+        return cls(_Parts(*parts, pipeline, link, board))
 
     @property
     def t_s(self) -> float:
