@@ -191,6 +191,8 @@ def test_options_typed_wrong(armsight, options):
     [
         (("--arm", "rusty"), "arm 'rusty' is unknown"),
         (("--cameras", "big"), "cameras 'big'"),
+        (("--cameras", "webcam:640x480@30"), "a NAME is one of webcams, clean, cheap-webcam"),
+        (("--cameras", "none.toml"), "none.toml: no such file"),
         (("--board", "emulated:cray"), "cray"),
     ],
 )

@@ -222,3 +222,17 @@ def test_a_workcell_like_another_sees_the_same_room_at_another_rate():
                 np.testing.assert_array_equal(other.source.read().left, alone.source.read().left)
         with pytest.raises(InputError, match="like"):
             Workcell.open(seed=5, emulator="host", cameras=SMALL, like=one)
+
+
+def test_cameras_of_a_preset_give_the_same_images_again():
+    def shots(cameras):
+        with Workcell.open(seed=4, emulator="host", cameras=cameras) as workcell:
+            board = next(workcell.chessboard_shots(1))
+            return [board, *(workcell.source.read() for _ in range(3))]
+
+    first, second, clean = (shots(f"{name}320x240@30") for name in ("cheap-webcam:", "cheap-webcam:", ""))
+    for one, other, plain in zip(first, second, clean, strict=True):
+        np.testing.assert_array_equal(one.left, other.left)
+        np.testing.assert_array_equal(one.right, other.right)
+        assert (one.left != plain.left).any()
+        assert np.corrcoef(one.left.ravel(), plain.left.ravel())[0, 1] > 0.9  # of the same scene

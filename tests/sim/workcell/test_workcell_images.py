@@ -182,3 +182,14 @@ def test_a_ball_is_rendered_though_no_tile_has_a_corner_in_it():
         counts.append(int((ids > 0).sum()))
     assert counts[0] == pytest.approx(np.pi * 6.0**2, rel=0.05)
     assert counts[1] == pytest.approx(counts[0], rel=0.06)
+
+
+def test_the_light_before_the_sensor_is_what_the_image_is_made_of(camera):
+    arm = ArmSeen(PARTS, row_frames(MODEL, MODEL.home))
+    bodies = [PosedBody(body_patterns(), somewhere(np.random.default_rng(4)), np.array([0.3, 0.1, 0, 0, 0.5, 0]))]
+    for seen in ((arm, bodies), (None, [])):
+        light = camera.radiance(*seen, Shutter(0.004))
+        image = camera.image(*seen, Shutter(0.004), QUIET, 0)
+        expected = exposed(shaded(light, LENS), Sensor(read_noise=0.0), None)
+        assert np.abs(image.astype(int) - expected).max() <= 1  # 255 is multiplied before the shading, or after
+        assert (image != expected).mean() < 1e-3
