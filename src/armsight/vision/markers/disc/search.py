@@ -23,6 +23,11 @@ _RAYS = 16
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
 
+#: Turns in which an outline's level settles.
+_TURNS = 4
+#: Steps from a pixel of a blurred rim onto the disc, at most, and the least difference of grey that is a step.
+_CLIMB, _CLIMB_GREY = 8, 5
+
 Grey = NDArray[np.uint8]
 Room: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 
@@ -42,6 +47,39 @@ def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int) -
 
 
 @kernel
+def _uphill(image: Grey, x: int, y: int, sign: int) -> tuple[int, int]:
+    """Return the pixel that is reached from (x, y), on a disc's rim perhaps, by steps to a neighbour more like a disc."""
+    height, width = image.shape
+    for _ in range(_CLIMB):
+        u, v, most = x, y, sign * np.int64(image[y, x]) + _CLIMB_GREY
+        for i, j in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
+            if 0 <= i < width and 0 <= j < height and sign * np.int64(image[j, i]) > most:
+                u, v, most = i, j, sign * np.int64(image[j, i])
+        if u == x and v == y:
+            break
+        x, y = u, v
+    return x, y
+
+
+@kernel
+def _beyond(image: Grey, x: int, y: int, across: int, down: int, sign: int) -> int:
+    """Return the surround's level a little beyond the ends of two chords through (x, y): the second most unlike the disc."""
+    height, width = image.shape
+    i, j = across // 2 + 4, down // 2 + 4
+    first = sign * np.int64(image[y, max(x - i, 0)])
+    second = sign * np.int64(image[y, min(x + i, width - 1)])
+    if second < first:
+        first, second = second, first
+    for k in range(2):
+        level = sign * np.int64(image[max(y - j, 0) if k == 0 else min(y + j, height - 1), x])
+        if level < first:
+            first, second = level, first
+        elif level < second:
+            second = level
+    return int(sign * second)
+
+
+@kernel
 def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room) -> int:
     """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
 
@@ -58,8 +96,9 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         0, or the reason why there is no disc (``fit.REASONS``).
     """
     height, width = image.shape
+    x, y = _uphill(image, x, y, sign)
     half = 0
-    for _ in range(2):
+    for turn in range(_TURNS):
         half = (low + int(image[y, x])) // 2
         left, right = _walk(image, x, y, -1, 0, half, sign), _walk(image, x, y, 1, 0, half, sign)
         if left < 0 or right < 0:
@@ -69,6 +108,14 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         if up < 0 or down < 0:
             return 9
         y += (down - up) // 2
+        if turn > 0:
+            # The first pixel may have been noise beside the disc: is the level half-way between disc and surround?
+            low = _beyond(image, x, y, left + right, up + down, sign)
+            contrast = int(image[y, x]) - low
+            if sign * contrast <= 0:
+                return 2
+            if 8 * abs(2 * half - low - int(image[y, x])) < sign * contrast:
+                break
     if left + right < 2 or up + down < 2 or left + right + up + down + 2 < 8:
         return 7
     H, g, a, L, scale, p = room
