@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.camera.pipeline import SimulatedCamera
-from armsight.sim.camera.stages import CameraPipeline
+from armsight.sim.camera.stages import CameraPipeline, preset_names
 from armsight.sim.example_rig import example_rig, in_view
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.render import radiance
@@ -124,3 +126,23 @@ def scene(
         uv.append(centres)
         shapes.append(shape)
     return Scene((images[0], images[1]), rig, target, T, (uv[0], uv[1]), (shapes[0], shapes[1]), patterns)
+
+
+def sheet(path: Path, seed: int = 1, distance_m: float = 0.8) -> None:
+    """Write the same body through every preset, its middle 3 times enlarged and one of its discs 10 times."""
+    columns = []
+    for name in preset_names():
+        found = scene(seed, name, distance_m)
+        image, middle = found.images[0], found.uv[0].mean(axis=0)
+        largest = found.uv[0][found.shapes[0][:, 0].argmax()]
+        parts = [_enlarged(image, at, half, times) for at, half, times in ((middle, 60, 3), (largest, 18, 10))]
+        label = np.full((36, parts[0].shape[1]), 255, np.uint8)
+        cv2.putText(label, name, (8, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 0, 2, cv2.LINE_AA)
+        columns.append(np.pad(np.vstack([label, *parts]), ((0, 0), (0, 8)), constant_values=255))
+    cv2.imwrite(str(path), np.hstack(columns)[:, :-8])
+
+
+def _enlarged(image: np.ndarray, at: np.ndarray, half: int, times: int) -> np.ndarray:
+    """Return a square about a point of an image, each pixel as a square; (2 half times, 2 half times)."""
+    u, v = np.round(at).astype(int)
+    return np.kron(image[v - half : v + half, u - half : u + half], np.ones((times, times), np.uint8))

@@ -4,6 +4,7 @@
     python benchmarks/cameras.py 0                 only these
     python benchmarks/cameras.py --seed 7          another seed
     python benchmarks/cameras.py --json found.json metrics as JSON, too
+    python benchmarks/cameras.py --sheet sheet.png only this: the same body through every preset
 
 Sections: 0 each stage of a camera alone. ``camera_scene.scene`` renders the scenes.
 """
@@ -22,6 +23,7 @@ from pathlib import Path  # noqa: E402
 
 import cv2  # noqa: E402
 
+import camera_scene  # noqa: E402
 import camera_stages  # noqa: E402
 from marker_report import Report  # noqa: E402
 
@@ -35,7 +37,11 @@ def main() -> None:
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {' '.join(SECTIONS)}; all by default")
     parser.add_argument("--seed", type=int, default=3, help="of poses, scenes and noise; 3 by default")
     parser.add_argument("--json", type=Path, help="write the metrics to this file")
+    parser.add_argument("--sheet", type=Path, help="write an image of the same body through every preset, and no more")
     options = parser.parse_args()
+    if options.sheet is not None:
+        camera_scene.sheet(options.sheet)
+        return
     for name in options.sections:
         if name not in SECTIONS:
             parser.error(f"no section {name!r}; there are {' '.join(SECTIONS)}")

@@ -262,6 +262,12 @@ def test_the_same_seed_gives_the_same_images(name):
     np.testing.assert_array_equal(light, before)
 
 
+def test_images_of_odd_size():
+    for name in preset_names():
+        image = SimulatedCamera(CameraPipeline.load(name), (161, 97)).expose(np.full((97, 161), 0.4, np.float32))
+        assert image.shape == (97, 161)
+
+
 def test_light_of_another_size():
     with pytest.raises(InputError, match=r"radiance is \(4, 4\), must be \(96, 160\)"):
         SimulatedCamera(CameraPipeline(), SIZE).expose(np.zeros((4, 4), np.float32))

@@ -66,9 +66,10 @@ class SimulatedCamera:
         """
         self.pipeline, self._seed = pipeline, seed
         self._width, self._height = image_size_px
-        scale = pipeline.resizing.native_scale if pipeline.resizing else 1.0
-        even = 2 if pipeline.mosaic else 1  # whole cells of the mosaic
-        self._native = tuple(max(even, even * round(n * scale / even)) for n in image_size_px)
+        self._native = image_size_px
+        if pipeline.resizing is not None:  # whole cells of a mosaic
+            width, height = (max(2, 2 * round(n * pipeline.resizing.native_scale / 2)) for n in image_size_px)
+            self._native = width, height
         self._lamp = None if pipeline.lamp is None else lamp_gain(image_size_px, pipeline.lamp)
         self._glint = self._highlight()
         corner = pipeline.vignetting.corner if pipeline.vignetting else 0.0
@@ -227,7 +228,7 @@ class SimulatedCamera:
             amount = stages.sharpening.amount
             y = luma.astype(np.float32)
             blurred = cv2.GaussianBlur(y, (0, 0), stages.sharpening.sigma_px, borderType=cv2.BORDER_REPLICATE)
-            luma = np.clip(np.rint(cv2.addWeighted(y, 1 + amount, blurred, -amount, 0)), 0, 255).astype(np.uint8)
+            luma = np.asarray(cv2.addWeighted(y, 1 + amount, blurred, -amount, 0, dtype=cv2.CV_8U))
         if ycrcb is None or stages.jpeg is None:
             image = self._resized(luma)
         else:
@@ -332,13 +333,11 @@ def _bilateral(luma: Image, stage: SpatialDenoise) -> Image:
 
 def _mix(y: Radiance, previous: Radiance, stage: TemporalDenoise) -> None:
     """Mix the previous image into a luma, where little has changed."""
-    difference = previous - y
-    change = np.abs(_single(cv2.blur(difference, (3, 3))))
-    change *= np.float32(-stage.weight / stage.threshold_grey)
-    change += np.float32(stage.weight)
-    np.maximum(change, 0, out=change)
-    difference *= change
-    y += difference
+    change = _single(cv2.blur(previous - y, (3, 3)))
+    for top in range(0, len(y), _BAND):
+        rows = slice(top, top + _BAND)
+        weight = np.maximum(stage.weight - np.float32(stage.weight / stage.threshold_grey) * np.abs(change[rows]), 0)
+        y[rows] += weight * (previous[rows] - y[rows])
 
 
 def compressed(image: Image, stage: Jpeg) -> Image:
