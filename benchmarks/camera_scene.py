@@ -115,7 +115,7 @@ def scene(
     images, uv, shapes = [], [], []
     for side, (camera, view) in enumerate(zip(rig.cameras, views, strict=True)):
         behind = BACKGROUNDS[background](size, rng)
-        light = radiance(camera, [view], behind, shutter=pipeline.shutter(size[1]))
+        light = radiance(camera, [view], behind, psf_sigma_px=pipeline.psf_sigma_px, shutter=pipeline.shutter(size[1]))
         device = SimulatedCamera(pipeline, size, 2 * seed + side)
         remembers = pipeline.auto_exposure is not None or pipeline.temporal_denoise is not None
         for k in range(BEFORE if remembers else 0):  # of a body at rest; a moving one's past is where it was not

@@ -24,6 +24,7 @@ from armsight.sim.camera.stages import (
     Glint,
     Jpeg,
     Lamp,
+    Lens,
     Mosaic,
     Photosensor,
     Resizing,
@@ -88,6 +89,8 @@ def cases() -> Iterator[Case]:
     yield Case("lamp at 0.5 m, 1 mm a pixel, in a corner", replace(alone, lamp=Lamp(0.5, (0.0, 0.0), 1.0)))
     for peak in (0.1, 1.0):
         yield Case(f"glint of 3 px at the rim, peak {peak:g}", replace(alone, glint=Glint(peak, 3.0, (0.0, 0.0))))
+    for sigma in (0.35, 0.5, 1.0):
+        yield Case(f"lens, blur of {sigma:g} px", replace(alone, lens=Lens(sigma)))
     for radius in (1.0, 2.0):
         yield Case(f"defocus, radius {radius:g} px", replace(alone, defocus=Defocus(radius)))
     yield Case("vignetting, 40 % in the corners", replace(alone, vignetting=Vignetting(0.4)))
@@ -138,7 +141,8 @@ def images(case: Case, rng: np.random.Generator, seed: int) -> Iterator[tuple[np
         for k in range(-case.before, 1):
             T = body.T_camera_body.copy()
             T[0, 3] = 1e-3 * case.speed * k / 30
-            light = radiance(CAMERA, [PosedBody(body.patterns, T, twist)], shutter=shutter)
+            posed = PosedBody(body.patterns, T, twist)
+            light = radiance(CAMERA, [posed], psf_sigma_px=pipeline.psf_sigma_px, shutter=shutter)
             if pipeline.glint is None:
                 image = device.expose(light, k / 30)
         if pipeline.glint is None:

@@ -156,6 +156,11 @@ def test_a_rolling_shutter_moves_each_row_by_speed_and_time():
     np.testing.assert_allclose(edge[3:-3], expected[3:-3], atol=0.001)  # the lens blurs rows at the border with less
 
 
+def test_the_renderer_is_given_the_lens_s_blur():
+    assert CameraPipeline().psf_sigma_px == 0.7
+    assert CameraPipeline.load("webcam-good-light").psf_sigma_px == 0.5
+
+
 def test_flicker_goes_round_once_a_period_and_not_at_all_over_whole_periods():
     light = Flicker(100, 0.3)
     rows = flicker_gain(light, 0.0, 101, 0.0, 20.0)[:, 0]

@@ -61,7 +61,7 @@ def test_a_file_may_have_stages_of_its_own(tmp_path):
     ("text", "said"),
     [
         ("[vignetting\n", "not TOML"),
-        ("[vigneting]\ncorner = 0.3\n", "unknown stage 'vigneting'; known are preset, timing, lamp"),
+        ("[vigneting]\ncorner = 0.3\n", "unknown stage 'vigneting'; known are preset, timing, lens, lamp"),
         ("[vignetting]\ncorners = 0.3\n", r"\[vignetting\] has an unknown key 'corners'; known are corner"),
         ("[vignetting]\ncorner = 1.5\n", r"\[vignetting\] corner must be a number from 0 to 0.9, got 1.5"),
         ("[vignetting]\ncorner = nan\n", "corner must be a number"),

@@ -3,9 +3,9 @@
     lamp, glint -> defocus -> vignetting -> flicker -> photons, fixed pattern, readout, converter -> white balance,
     demosaic -> tone curve -> denoise in space and time -> sharpen -> resize -> JPEG -> grey
 
-Motion blur and the rolling shutter come first and belong to the renderer, which knows the motion: it is to expose with
-``pipeline.shutter(height)``. The sensor's noise follows Jaehne, EMVA standard 1288, section 2: the variance of a pixel is
-its number of electrons plus that of the readout.
+The blur of the lens in focus, motion blur and the rolling shutter come first and belong to the renderer, which knows edges
+and motion exactly: it is to use ``pipeline.psf_sigma_px`` and ``pipeline.shutter(height)``. The sensor's noise follows the
+EMVA standard 1288, section 2: the variance of a pixel is its number of electrons plus that of the readout.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from typing import Any, Self
 
 from armsight.errors import InputError
 from armsight.files import read_text
+from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import Shutter
 
 _PRESETS = Path(__file__).parent / "presets"
@@ -90,6 +91,17 @@ class ExposureTiming(Stage):
 
 
 @dataclass(frozen=True)
+class Lens(Stage):
+    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`.
+
+    Attributes:
+        psf_sigma_px: standard deviation of the Gaussian blur, pixels of the output.
+    """
+
+    psf_sigma_px: float = _number(0.1, 5)
+
+
+@dataclass(frozen=True)
 class Lamp(Stage):
     """A lamp near a target plane: a smooth gain over the image, cos(angle) / distance^2 of a plane that faces it.
 
@@ -121,7 +133,7 @@ class Glint(Stage):
 
 @dataclass(frozen=True)
 class Defocus(Stage):
-    """The blur of a lens that is out of focus, beside the renderer's own: an even disc.
+    """The blur of a lens that is out of focus, beside that in focus: an even disc.
 
     Attributes:
         radius_px: of the disc, pixels of the output.
@@ -309,6 +321,7 @@ class CameraPipeline:
     """The stages of a camera, in the order in which the light and the numbers pass them; None leaves a stage out."""
 
     timing: ExposureTiming | None = None
+    lens: Lens | None = None
     lamp: Lamp | None = None
     glint: Glint | None = None
     defocus: Defocus | None = None
@@ -379,6 +392,11 @@ class CameraPipeline:
             return Shutter()
         return Shutter(1e-3 * self.timing.exposure_ms, 1e-3 * self.timing.readout_ms / height)
 
+    @property
+    def psf_sigma_px(self) -> float:
+        """The blur that the renderer has to apply, px; its own default without a lens."""
+        return Optics().psf_sigma_px if self.lens is None else self.lens.psf_sigma_px
+
     def exposed_for(self, exposure_s: float) -> Self:
         """Return the same camera with another exposure time, s, which changes the electrons in proportion."""
         if self.timing is None:
@@ -391,6 +409,7 @@ class CameraPipeline:
 #: Table of a file -> what it holds.
 STAGES: dict[str, type[Stage]] = {
     "timing": ExposureTiming,
+    "lens": Lens,
     "lamp": Lamp,
     "glint": Glint,
     "defocus": Defocus,

@@ -244,6 +244,7 @@ class WorkcellCamera:
         seed: int,
         *,
         sensor: Sensor | None = None,
+        psf_sigma_px: float = LENS.psf_sigma_px,
         more: Array | None = None,
     ) -> None:
         """Look at the workcell once.
@@ -254,17 +255,18 @@ class WorkcellCamera:
             foot: the arm's solids, whose base stands still.
             seed: of the clutter.
             sensor: noise of 2 grey levels by default.
+            psf_sigma_px: blur of its lens, px.
             more: boxes that stand there besides, see ``raycast``.
         """
         self.camera, self.T_base_camera = camera, T_base_camera
-        self._sensor = sensor or Sensor()
+        self._sensor, self._psf_sigma_px = sensor or Sensor(), psf_sigma_px
         self._corners = corner_rays(camera)
         rays = pixel_rays(self._corners)
         self.still: StillView = view(camera, rays, T_base_camera, seed, foot, more)
         self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
         width, height = camera.image_size_px
         self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
-        self._still_light = spread(self.still.light, LENS.psf_sigma_px)
+        self._still_light = spread(self.still.light, self._psf_sigma_px)
         self._still_grey = self._still_light * self._gain
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
         self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
@@ -308,14 +310,14 @@ class WorkcellCamera:
             ends, radius, albedo = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes = capsule_boxes(self.camera, ends, radius)
         exposure = self._exposure(bodies, shutter)
-        margin = _reach(LENS.psf_sigma_px)
+        margin = _reach(self._psf_sigma_px)
         crop = (0, 0, 0, 0) if exposure is None else self._around(exposure.shown(), 2 * margin)
         window = self._around(np.concatenate([[crop], boxes]), 2 * margin)
         u0, v0, u1, v1 = window
         light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
         moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
-        seen = spread(light, LENS.psf_sigma_px) if light.size else light
+        seen = spread(light, self._psf_sigma_px) if light.size else light
         if exposure is not None and crop[0] < crop[2] and crop[1] < crop[3]:
             core = self._core(crop, margin)
             painted = self._painted(exposure, crop, window, (light, depth, ids))
@@ -391,9 +393,9 @@ class WorkcellCamera:
         Ms = np.ascontiguousarray(Ms[:, :, v0:v1]) if Ms.shape[2] > 1 else Ms
         total, edges = np.empty((v1 - v0, u1 - u0), np.float32), np.zeros((v1 - v0, u1 - u0), np.float32)
         layers = (behind[0][_part(crop, window)], behind[1][_part(crop, window)], behind[2][_part(crop, window)])
-        shown, taps = exposure._replace(Ms=Ms, boxes=boxes), part_taps(LENS.psf_sigma_px)
+        shown, taps = exposure._replace(Ms=Ms, boxes=boxes), part_taps(self._psf_sigma_px)
         paint_faces(self._corners, self._rays, shown, (u0, v0), layers, taps, total, edges)
-        return np.asarray(spread(total, LENS.psf_sigma_px) + edges)
+        return np.asarray(spread(total, self._psf_sigma_px) + edges)
 
     def _core(self, window: Window, margin: int) -> Window:
         """Return a window but for a margin where its blur did not know what is around; none at the image's border."""

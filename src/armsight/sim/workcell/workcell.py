@@ -41,7 +41,7 @@ from armsight.sim.workcell.cameras import (
     open_rig,
     rig_pose,
 )
-from armsight.sim.workcell.images import WorkcellCamera, picture
+from armsight.sim.workcell.images import LENS, WorkcellCamera, picture
 from armsight.sim.workcell.motors import Motors, Solids, chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.vision.markers.targets import Composite
@@ -131,10 +131,10 @@ class _Parts(NamedTuple):
 
 
 def _standing(
-    rig: StereoRig, T_base_rig: Array, plant: ArmPlant, seed: int, sensor: Sensor
+    rig: StereoRig, T_base_rig: Array, plant: ArmPlant, seed: int, sensor: Sensor, psf_sigma_px: float
 ) -> tuple[WorkcellCamera, WorkcellCamera]:
     """Return a rig's cameras where they stand; each casts what stands still before it, in a thread of its own."""
-    stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor)
+    stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor, psf_sigma_px=psf_sigma_px)
     with ThreadPoolExecutor(2) as pool:
         left, right = pool.map(stand, rig.cameras, (T_base_rig, T_base_rig @ rig.T_left_right))
     return left, right
@@ -211,15 +211,26 @@ class Workcell:
         true_rig, links = open_rig(rig, timing.image_size_px, baseline_m), solids(built_to)
         motors = chosen(built_to, links)  # as the drawing has them: friction as usual
         plant = ArmPlant(built_to, sample_arm(built_to, amounts, seed), seed)
-        room = (arm, rig, seed, baseline_m, distance_m, noise, timing.image_size_px, built_to.table.tobytes())
+        psf_sigma_px = LENS.psf_sigma_px if pipeline is None else pipeline.psf_sigma_px
+        room = (
+            arm,
+            rig,
+            seed,
+            baseline_m,
+            distance_m,
+            noise,
+            psf_sigma_px,
+            timing.image_size_px,
+            built_to.table.tobytes(),
+        )
         if like is not None and like._room != room:
             both = f"this workcell is {room[:-1]}, the one it is to be like is {like._room[:-1]}"
-            raise InputError(f"{both}: arm, rig, seed, distances, noise, image size and table must be the same")
+            raise InputError(f"{both}: arm, rig, seed, distances, noise, blur, image size and table must be the same")
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         T_base_rig = rig_pose(built_to, true_rig, mount, seed, distance_m)
         sensor = Sensor(read_noise=noise)
-        seen = _standing(true_rig, T_base_rig, plant, seed, sensor) if like is None else like._cameras
+        seen = like._cameras if like is not None else _standing(true_rig, T_base_rig, plant, seed, sensor, psf_sigma_px)
         link = EmulatedLink(open_emulator(emulator), plant)
         board = configured(link, configuration(built_to, links, motors))
         known = assumed if assumed is not None else built_to
