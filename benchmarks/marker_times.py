@@ -9,8 +9,6 @@ import numpy as np
 
 from armsight.data import Missed
 from armsight.geometry.pose import inverse, log_se3, pose
-from armsight.vision.follow.kernel import look
-from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 from disc_images import disc_picture
 from marker_follow import Following
@@ -136,21 +134,8 @@ def pairs(seed: int, report: Report, count: int = 24) -> None:
     report.metric(
         "following four discs, pair to pose with covariance", ours, "<= 200", form=".0f", unit="us", good=ours <= 200
     )
-    report.metric("following four discs in one image", one_image(follow, still), "<= 60", form=".0f", unit="us")
     report.metric("the same over the library route", ours / library, "<= 1", form=".2f", good=ours <= library)
     report.say(f"  {'its error':62s} {accuracy(np.array(xi).reshape(-1, 6))}")
-
-
-def one_image(follow: Following, still: list) -> float:
-    """Return what the left image's share of the compiled call takes, us: windows, centres and covariances of its discs."""
-    own = follow.follower
-    arguments = (own._scene, own._track.margin_px, own._noise, 10.0, own._found, own._work, own._outline)
-
-    def left_only(pair: tuple) -> None:
-        own._found.T[:] = own._track.T_left_body
-        look(grey(pair[0]), 0, *arguments)
-
-    return float(np.median(timed(left_only, still, 60)[0]))
 
 
 def metric(seed: int, report: Report) -> None:

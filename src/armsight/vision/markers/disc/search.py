@@ -63,7 +63,7 @@ def _uphill(image: Grey, x: int, y: int, sign: int) -> tuple[int, int]:
 
 @kernel
 def _beyond(image: Grey, x: int, y: int, across: int, down: int, sign: int) -> int:
-    """Return the surround's level a little beyond the ends of two chords through (x, y): the second most unlike the disc."""
+    """Return the surround's level, beyond the ends of two chords through (x, y): the second most unlike the disc."""
     height, width = image.shape
     i, j = across // 2 + 4, down // 2 + 4
     first = sign * np.int64(image[y, max(x - i, 0)])
