@@ -447,10 +447,14 @@ def _object(bitcode: Path, target: Platform, level: str) -> Path:
         builder = ll.create_pass_builder(machine, tuning)
         passes = builder.getModulePassManager()
         if first:
+            passes.add_sroa_pass()
+            passes.add_simplify_cfg_pass()
             passes.add_loop_rotate_pass()
             passes.add_instruction_combine_pass()
             passes.add_jump_threading_pass()
         passes.add_refprune_pass()
+        if first:
+            passes.add_lower_atomic_pass()  # no array of a kernel's own is another thread's, too
         passes.run(module, builder)
     out.parent.mkdir(parents=True, exist_ok=True)
     for old in out.parent.glob(f"{bitcode.stem.rsplit('-', 1)[0]}-*"):

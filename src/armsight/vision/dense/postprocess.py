@@ -224,32 +224,33 @@ def _rows(
 ) -> None:
     """Smooth along rows."""
     width = source.shape[1]
-    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):
+        up, down = out[y], share[y]
         up[:], down[:] = 0, 0
         for k in range(1, _SMOOTH_REACH + 1):
             a, b, g, h = source[y, k:], source[y, :-k], image[y, k:], image[y, :-k]
             _add(b, h, a, g, tolerance, up[:-k], down[:-k])
             _add(a, g, b, h, tolerance, up[k:], down[k:])
         for x in range(width):
-            out[y, x] = source[y, x] + up[x] / (down[x] + np.float32(1))
-            share[y, x] = down[x] / np.float32(2 * _SMOOTH_REACH)
+            up[x] = source[y, x] + up[x] / (down[x] + np.float32(1))
+            down[x] /= np.float32(2 * _SMOOTH_REACH)
 
 
-@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
+@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[::1], f4[:, ::1], f4[:, ::1]", nogil=True)
 def _columns(
-    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
-) -> None:
-    """Smooth along columns."""
+    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, down: Singles, out: Singles,
+    share: Singles,
+) -> None:  # fmt: skip
+    """Smooth along columns; ``down`` (W,) is a buffer."""
     height, width = source.shape
-    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):
+        up = out[y]
         up[:], down[:] = 0, 0
         for k in range(-_SMOOTH_REACH, _SMOOTH_REACH + 1):
             if k != 0 and 0 <= y + k < height:
                 _add(source[y], image[y], source[y + k], image[y + k], tolerance, up, down)
         for x in range(width):
-            out[y, x] = source[y, x] + up[x] / (down[x] + np.float32(1))
+            up[x] = source[y, x] + up[x] / (down[x] + np.float32(1))
             share[y, x] = np.float32(0.5) * (share[y, x] + down[x] / np.float32(2 * _SMOOTH_REACH))
 
 
@@ -273,7 +274,7 @@ def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.floa
             _rows(source, image, limit, begin, end, half, share)
 
         def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
-            _columns(half, image, limit, begin, end, out, share)
+            _columns(half, image, limit, begin, end, np.empty(image.shape[1], np.float32), out, share)
 
         for_each_strip(height, _SMOOTH_STRIP_ROWS, rows)
         for_each_strip(height, _SMOOTH_STRIP_ROWS, columns)
