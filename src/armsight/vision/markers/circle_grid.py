@@ -1,0 +1,352 @@
+"""Grids of discs from outlines: by topology, from a seed outwards.
+
+The ellipse of a disc shows how the board lies there: in the coordinates that make the ellipse a circle the four neighbours
+are equally far away, at right angles. From such a seed the grid grows disc by disc; each next position is extrapolated from
+the known ones nearby, so neither perspective nor the distortion of a wide lens matters (as corners of chessboards in Geiger
+et al., "Automatic camera and range sensor calibration using a single shot", ICRA 2012). Blobs that do not fit stay outside,
+and single discs may be missing. A staggered grid is a square lattice too, rotated by 45 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from armsight.data import Array, Ids, Record
+from armsight.vision.markers.circle_blobs import Blobs
+
+#: Neighbours of a disc have up to this many times its area or contrast, and are 2 to this many radii away.
+_ALIKE, _FURTHEST = 3.0, 16.0
+#: Neighbours examined, and seeds from which grids are grown.
+_NEIGHBOURS, _SEEDS = 12, 60
+#: A disc of the grid is this near to where its neighbours put it, as a share of the step.
+_NEAR = 0.3
+#: Sides of the grid, rotated by 90 degrees from each to the next.
+_SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+T = TypeVar("T")
+Cell: TypeAlias = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice(Record):
+    """Discs that hang together as a square lattice, right-handed in the image (x to the right, y down).
+
+    Attributes:
+        cells: (N, 2) their integer positions.
+        blobs: (N,) rows of the outlines.
+    """
+
+    cells: Ids
+    blobs: Ids
+
+
+def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
+    """Assemble lattices from outlines, the largest first.
+
+    Args:
+        blobs: the outlines.
+        enough: no further seeds are tried once a lattice has so many discs.
+    """
+    if len(blobs.theta) < 4:
+        return []
+    beside = _neighbours(blobs)
+    regular = np.array([_regularity(blobs, i, js) for i, js in enumerate(beside)])
+    found: list[Lattice] = []
+    taken = np.zeros(len(beside), bool)
+    for i in np.argsort(-regular, kind="stable")[:_SEEDS]:
+        if taken[i] or regular[i] < 1:
+            continue
+        sides = _sides(blobs, int(i), beside[i])
+        if sides is None:
+            continue
+        cells = _grown(blobs, int(i), sides)
+        lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())))
+        taken[lattice.blobs] = True
+        found.append(lattice)
+        if len(cells) >= enough:
+            break
+    return sorted(found, key=lambda lattice: -len(lattice.blobs))
+
+
+def _neighbours(blobs: Blobs) -> list[Ids]:
+    """Return for every outline the nearest ones of its size and contrast."""
+    uv, size = blobs.theta[:, :2], np.log(blobs.radius_px)
+    span, out = 0.5 * np.log(_ALIKE), [np.zeros(0, np.int64)] * len(uv)
+    for band in np.arange(size.min(), size.max() + span, span):
+        mine = np.flatnonzero((size >= band) & (size < band + span))
+        pool = np.flatnonzero((size >= band - span) & (size < band + 2 * span))
+        if not len(mine) or len(pool) < 2:
+            continue
+        distance, rows = KDTree(uv[pool]).query(uv[mine], k=min(_NEIGHBOURS + 1, len(pool)))
+        for i, far, js in zip(mine, distance, pool[rows], strict=True):
+            alike = (js != i) & (far < _FURTHEST * blobs.radius_px[i]) & _alike(blobs, i, js)
+            out[i] = js[alike]
+    return out
+
+
+def _alike(blobs: Blobs, i: int, js: Ids) -> NDArray[np.bool_]:
+    """Whether outlines js have about the area and the contrast of outline i."""
+    area = (blobs.radius_px[js] / blobs.radius_px[i]) ** 2
+    contrast = blobs.contrast[js] / blobs.contrast[i]
+    return np.asarray((np.maximum(area, 1 / area) < _ALIKE) & (np.maximum(contrast, 1 / contrast) < _ALIKE))
+
+
+def _flattened(blobs: Blobs, i: int, js: Ids) -> Array:
+    """Return the offsets (n, 2) from outline i to outlines js in coordinates in which outline i is the unit circle."""
+    m11, m12, m22 = blobs.theta[i, 2:5]
+    a = np.sqrt(m11)
+    U = np.array([[a, m12 / a], [0.0, np.sqrt(max(m22 - m12 * m12 / m11, 1e-12))]])  # U^T U = M
+    return np.asarray((blobs.theta[js, :2] - blobs.theta[i, :2]) @ U.T)
+
+
+def _regularity(blobs: Blobs, i: int, js: Ids) -> int:
+    """Count the neighbours of an outline that have another one opposite or at a right angle, equally far away."""
+    if len(js) < 2:
+        return 0
+    z = _flattened(blobs, i, js)
+    length = np.hypot(*z.T)
+    count = 0
+    for turned in (-z, np.column_stack([-z[:, 1], z[:, 0]])):
+        gap = np.linalg.norm(z[:, None] - turned[None], axis=2)
+        count += int((gap.min(axis=0) < _NEAR * length).sum())
+    return count
+
+
+def _sides(blobs: Blobs, i: int, js: Ids) -> tuple[int, int] | None:
+    """Return two neighbours of an outline that span the lattice, the second one a right angle from the first."""
+    z = _flattened(blobs, i, js)
+    length = np.hypot(*z.T)
+    for a in np.argsort(length):
+        across = np.array([-z[a, 1], z[a, 0]])
+        gap = np.linalg.norm(z - across, axis=1)
+        b = int(np.argmin(gap))
+        if length[a] > 1.8 and gap[b] < 1.5 * _NEAR * length[a]:
+            return int(js[a]), int(js[b])
+    return None
+
+
+def _grown(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
+    """Grow a lattice from an outline and two of its neighbours: cell -> outline."""
+    uv = blobs.theta[:, :2]
+    tree = KDTree(uv)
+    cells = {(0, 0): seed, (1, 0): sides[0], (0, 1): sides[1]}
+    used, front = set(cells.values()), list(cells)
+    while front:
+        claims: dict[int, tuple[float, Cell]] = {}
+        around = {(x + dx, y + dy) for x, y in front for dx, dy in _SIDES} - cells.keys()
+        for cell in sorted(around):
+            expected = extrapolated(cell, {c: uv[i] for c, i in near(cell, cells).items()})
+            if expected is None:
+                continue
+            position, step = expected
+            known = next(cells[n] for n in _beside(cell) if n in cells)
+            js = np.array(tree.query_ball_point(position, _NEAR * step), dtype=np.int64)
+            js = js[_alike(blobs, known, js)] if len(js) else js
+            if len(js):
+                off = np.linalg.norm(uv[js] - position, axis=1)
+                j = int(js[np.argmin(off)])
+                if j not in used and off.min() / step < claims.get(j, (np.inf, cell))[0]:
+                    claims[j] = float(off.min() / step), cell
+        front = []
+        for j, (_, cell) in claims.items():
+            cells[cell] = j
+            used.add(j)
+            front.append(cell)
+    return cells
+
+
+def _beside(cell: Cell) -> list[Cell]:
+    """Return the four cells beside a cell."""
+    return [(cell[0] + dx, cell[1] + dy) for dx, dy in _SIDES]
+
+
+def near(cell: Cell, known: Mapping[Cell, T]) -> dict[Cell, T]:
+    """Return what is known at most three cells away along each side."""
+    cells = [(cell[0] + dx, cell[1] + dy) for dx in range(-3, 4) for dy in range(-3, 4)]
+    return {c: known[c] for c in cells if c in known}
+
+
+def extrapolated(cell: Cell, known: dict[Cell, Array]) -> tuple[Array, float] | None:
+    """Predict where a cell of a lattice is from the positions of cells nearby.
+
+    Args:
+        cell: the cell.
+        known: position (2,), px, of cells around it.
+
+    Returns:
+        The position (2,), px, and the step from its nearest neighbour, px; None where nothing beside it is known.
+    """
+    x, y = cell
+    guesses, steps = [], []
+    for dx, dy in _SIDES:
+        a = known.get((x - dx, y - dy))
+        if a is None:
+            continue
+        b, c = known.get((x - 2 * dx, y - 2 * dy)), known.get((x - 3 * dx, y - 3 * dy))
+        if b is not None:
+            guesses.append(_continued(a, b, c))
+            steps.append(np.hypot(*(a - b)))
+        for ex, ey in ((dy, dx), (-dy, -dx)):
+            diagonal, corner = known.get((x + ex, y + ey)), known.get((x + ex - dx, y + ey - dy))
+            if corner is not None and diagonal is not None:
+                guesses.append(a + diagonal - corner)
+                steps.append(np.hypot(*(diagonal - corner)))
+            elif corner is not None and b is None:  # a step along the same direction two rows away
+                further = known.get((x + ex - 2 * dx, y + ey - 2 * dy))
+                if further is not None:
+                    guesses.append(a + corner - further)
+                    steps.append(np.hypot(*(corner - further)))
+    if not guesses:
+        return _first_steps(cell, known)
+    return np.median(guesses, axis=0), float(np.median(steps))
+
+
+def _first_steps(cell: Cell, known: dict[Cell, Array]) -> tuple[Array, float] | None:
+    """Extrapolate beside a seed's corner, where only a step along the same direction nearby, perhaps reversed, is known."""
+    x, y = cell
+    for dx, dy in _SIDES:
+        a = known.get((x - dx, y - dy))
+        if a is None:
+            continue
+        for c, p in known.items():
+            q = known.get((c[0] + dx, c[1] + dy))
+            if q is not None:
+                return a + q - p, float(np.hypot(*(q - p)))
+    return None
+
+
+def _continued(a: Array, b: Array, c: Array | None) -> Array:
+    """Continue a line of equally spaced points c, b, a by one; in perspective where all three are known.
+
+    A pinhole maps index t on a line to p t / (1 + q t): of steps in the ratio k the next one has (k + 1) / (3 k - 1) of
+    the length of the last.
+    """
+    step = a - b
+    if c is None:
+        return a + step
+    k = float(np.clip(np.hypot(*(b - c)) / np.hypot(*step), 0.7, 1.4))
+    return a + step * (k + 1.0) / (3.0 * k - 1.0)
+
+
+#: A disc must be this many pixels inside the image to count as missing.
+_MARGIN_PX = 3.0
+#: How far, in cells, missing discs are predicted from the ones that are seen.
+_PREDICTED_CELLS = 3
+#: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
+#: what a ring in the wrong place counts.
+_MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Layout(Record):
+    """The cells of a board's discs on a square lattice.
+
+    Attributes:
+        cells: (M, 2) integer positions, in the order of the board's points.
+        rings: (M,) whether a disc is a ring.
+        symmetries: permutations (M,) under which the board looks the same, without identity.
+    """
+
+    cells: Ids
+    rings: NDArray[np.bool_]
+    symmetries: tuple[Ids, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement(Record):
+    """Which discs of a board a lattice shows.
+
+    Attributes:
+        ids: (N,) the board's disc at each place of the lattice, -1 beside the board.
+        lost: (K,) discs of the board that should be in view and were not found.
+        uv: (K, 2) where they should be, px.
+        wrong: how much speaks against it: discs missing or too many, rings in the wrong place.
+        rings_wrong: rings in the wrong place.
+    """
+
+    ids: Ids
+    lost: Ids
+    uv: Array
+    wrong: int
+    rings_wrong: int
+
+
+def place(
+    lattice: Lattice, blobs: Blobs, hollow: NDArray[np.bool_], layout: Layout, size_px: tuple[int, int]
+) -> Placement | str:
+    """Find which part of a board a lattice shows.
+
+    Args:
+        lattice: as grown.
+        blobs: its outlines.
+        hollow: (N,) whether a disc of the lattice has a hole.
+        layout: the board.
+        size_px: width and height of the image.
+
+    Returns:
+        The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
+        reason why there is none.
+    """
+    seen = {(int(x), int(y)): blobs.theta[i, :2] for (x, y), i in zip(lattice.cells, lattice.blobs, strict=True)}
+    expected = _expected(seen, float(np.median(blobs.radius_px[lattice.blobs])), size_px)
+    origin = layout.cells.min(axis=0) - 1
+    table = np.full(tuple(np.ptp(layout.cells, axis=0) + 3), -1)
+    table[tuple((layout.cells - origin).T)] = np.arange(len(layout.cells))
+
+    def at(cells: Ids) -> Ids:
+        return np.asarray(table[tuple(np.clip(cells - origin, 0, np.array(table.shape) - 1).T)])
+
+    placements, turn = [], np.eye(2, dtype=np.int64)
+    predicted = np.array(list(expected), dtype=np.int64).reshape(-1, 2)
+    predicted_uv = np.array(list(expected.values())).reshape(-1, 2)
+    for _ in range(4):
+        cells = lattice.cells @ turn
+        shifts, counts = np.unique((layout.cells[None] - cells[:, None]).reshape(-1, 2), axis=0, return_counts=True)
+        for shift in shifts[counts >= 0.5 * counts.max()]:
+            ids, lost = at(cells + shift), at(predicted @ turn + shift)
+            matched = ids >= 0
+            ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0
+            wrong = int((~matched).sum() + (lost >= 0).sum()) + _RING_COST * ring_errors
+            placements.append(Placement(ids, lost[lost >= 0], predicted_uv[lost >= 0], wrong, ring_errors))
+        turn = turn @ np.array([[0, 1], [-1, 0]])
+    return _unambiguous(placements, layout)
+
+
+def _unambiguous(placements: list[Placement], layout: Layout) -> Placement | str:
+    """Return the placement with the least wrong, or the reason why it is none."""
+    best = min(placements, key=lambda p: (p.wrong, -int((p.ids >= 0).sum())))
+    matched = int((best.ids >= 0).sum())
+    if best.wrong - _RING_COST * best.rings_wrong > _MOST_WRONG * (matched + len(best.lost)):
+        return f"{len(best.ids)} discs in a grid were found, which do not make the board"
+    if best.rings_wrong > 1:
+        return "its discs were found, but the rings among them are not where the board has them"
+    same = [best.ids, *(np.where(best.ids >= 0, perm[best.ids], -1) for perm in layout.symmetries)]
+    others = [p.wrong for p in placements if not any((p.ids == ids).all() for ids in same)]
+    if min(others, default=best.wrong + _WORSE) < best.wrong + _WORSE:
+        return (
+            f"{matched} of its {len(layout.cells)} discs were found, and which ones cannot be told: show all of it"
+            + ("" if layout.rings.any() else ", or use a board with rings")
+        )
+    return best
+
+
+def _expected(seen: dict[Cell, Array], radius_px: float, size_px: tuple[int, int]) -> dict[Cell, Array]:
+    """Return where discs next to those of a lattice would be, as far as they would be in the image."""
+    known, front, size = dict(seen), set(seen), np.array(size_px)
+    for _ in range(_PREDICTED_CELLS):
+        fresh: dict[Cell, Array] = {}
+        for cell in sorted({n for c in front for n in _beside(c)} - known.keys()):
+            guess = extrapolated(cell, near(cell, known))
+            if guess is not None:
+                margin = _MARGIN_PX + radius_px
+                if (guess[0] > margin).all() and (guess[0] < size - 1 - margin).all():
+                    fresh[cell] = guess[0]
+        known.update(fresh)
+        front = set(fresh)
+    return {cell: uv for cell, uv in known.items() if cell not in seen}
