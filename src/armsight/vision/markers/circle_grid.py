@@ -136,11 +136,10 @@ def _grown(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
     uv = blobs.theta[:, :2]
     tree = KDTree(uv)
     cells = {(0, 0): seed, (1, 0): sides[0], (0, 1): sides[1]}
-    used, front = set(cells.values()), list(cells)
+    used, front, all_round = set(cells.values()), list(cells), False
     while front:
         claims: dict[int, tuple[float, Cell]] = {}
-        around = {(x + dx, y + dy) for x, y in front for dx, dy in _SIDES} - cells.keys()
-        for cell in sorted(around):
+        for cell in sorted({n for c in front for n in _beside(c)} - cells.keys()):
             expected = extrapolated(cell, {c: uv[i] for c, i in near(cell, cells).items()})
             if expected is None:
                 continue
@@ -153,11 +152,13 @@ def _grown(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
                 j = int(js[np.argmin(off)])
                 if j not in used and off.min() / step < claims.get(j, (np.inf, cell))[0]:
                     claims[j] = float(off.min() / step), cell
-        front = []
         for j, (_, cell) in claims.items():
             cells[cell] = j
             used.add(j)
-            front.append(cell)
+        # With more of the grid known, discs may be found where they were not before.
+        front, all_round = [cell for _, cell in claims.values()], not claims and not all_round
+        if all_round:
+            front = list(cells)
     return cells
 
 
