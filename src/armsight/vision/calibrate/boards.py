@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Detections, Record
 from armsight.errors import CalibrationError
-from armsight.geometry.pose import transform
+from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary, unfinished
@@ -41,9 +41,10 @@ from armsight.vision.calibrate.screen import (
 from armsight.vision.calibrate.start import fits, imitated, start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
+from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.match import join, renamed
-from armsight.vision.projection import smooth
+from armsight.vision.projection import of_middles, smooth
 from armsight.vision.rig import StereoRig
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
@@ -63,6 +64,9 @@ BOARD_DEGREE = 4
 BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
 _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
+#: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show, since print
+#: and lens widen or narrow what is dark.
+_RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
 
 
 def rigid_board(points: Array) -> BundleModel:
@@ -168,6 +172,7 @@ class LensModelSearch(Record):
                 model.points,
                 self.screened.unscreened,
                 self.folds,
+                model.disc_radius_m,
             )
         except (CalibrationError, np.linalg.LinAlgError):
             return None
@@ -284,6 +289,8 @@ def calibrate_boards(
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
     progress("looking for gross errors")
     model = rigid_board(points) if flat else printed_board(points)
+    radius_m, first = _disc_radius(board, usable, first, observations)
+    model = replace(model, disc_radius_m=radius_m or 0.0)
     selection = _Selection(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
     screened, trial, tried = selection.chosen(first.state, models)
     lens = trial.solution.state.cameras[0].model
@@ -311,7 +318,7 @@ def calibrate_boards(
         len(pairs),
         screened.observations,
         trial.solution,
-        residual_epipolar_rms(rig, screened.observations),
+        residual_epipolar_rms(rig, of_middles(trial.model, state, screened.observations)),
         trial.heldout,
         trial.errors,
         tried,
@@ -319,8 +326,46 @@ def calibrate_boards(
         (*notes, *screened.notes, *unfinished(trial.solution)),
         (),
         None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
+        radius_m,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
+
+
+def _disc_radius(
+    board: CalibrationBoard, usable: list[Pair], first: BundleSolution, observations: Observations
+) -> tuple[float | None, BundleSolution]:
+    """Return the radius of a board's discs, m, None where it has none, and an adjustment with their perspective bias.
+
+    The images show a radius: the areas of the ellipses against the spacing of the discs, at the poses found.
+
+    Raises:
+        CalibrationError: it is not the one that the board is said to have.
+    """
+    seen = [
+        (side, j, d) for j, pair in enumerate(usable) for side, d in enumerate((pair.left, pair.right)) if len(d.shape)
+    ]
+    if not seen:
+        return None, first
+    points = board.body.points
+    about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
+    for _ in range(_RADIUS_ROUNDS):
+        T_right_left = inverse(first.state.T_left_right)
+        radii = []
+        for side, j, found in seen:
+            T = first.state.Ts_left_body[j]
+            T = T if side == 0 else T_right_left @ T
+            camera = first.state.cameras[side]
+            radii.append(apparent_radii(camera, T, points[found.ids], found.shape, about_m))
+        about_m = float(np.nanmedian(np.concatenate(radii)))
+        model = replace(rigid_board(points), disc_radius_m=about_m)
+        first = minimise(model, first.state, observations, 1.0, max_steps=_STEPS, least_decrease=_ROUGHLY)
+    given_m = board.disc_radius_m
+    if given_m is not None and not 1 / _RADIUS_RATIO < given_m / about_m < _RADIUS_RATIO:
+        raise CalibrationError(
+            f"{board.body.name} has discs with a radius of {1e3 * given_m:.4g} mm, and the images show {1e3 * about_m:.4g} mm: "
+            "measure pitch and radius (not the diameter), or leave the radius out"
+        )
+    return about_m if given_m is None else given_m, first
 
 
 def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:

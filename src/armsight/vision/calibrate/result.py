@@ -88,6 +88,7 @@ class Calibration(Record):
         notes: what was corrected or partly dropped, and why.
         weaknesses: what is weak, and what to do about it.
         motion: how far the board moved between the two exposures of a pair; None where it stood still.
+        disc_radius_m: radius of the board's discs, m, given or as the images show it; None for other boards.
     """
 
     rig: StereoRig
@@ -105,6 +106,7 @@ class Calibration(Record):
     notes: tuple[str, ...]
     weaknesses: tuple[str, ...]
     motion: ExposureMotion | None = None
+    disc_radius_m: float | None = None
 
     @property
     def reprojection_rms_px(self) -> float:

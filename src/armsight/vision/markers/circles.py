@@ -53,7 +53,7 @@ class CircleGrid(Record, Target):
         rows: rows.
         pitch_m: distance of the grid's lines, m.
         staggered: whether every other row is shifted by a pitch.
-        radius_m: radius of a disc, m; None where the spec does not give it.
+        disc_radius_m: radius of a disc, m; None where the spec does not give it.
         light: whether the discs are light on a dark board; None where the spec does not say.
         rings: (column, row) of the discs that have a hole.
     """
@@ -62,7 +62,7 @@ class CircleGrid(Record, Target):
     rows: int
     pitch_m: float
     staggered: bool
-    radius_m: float | None = None
+    disc_radius_m: float | None = None
     light: bool | None = None
     rings: tuple[tuple[int, int], ...] = ()
 
@@ -93,8 +93,8 @@ class CircleGrid(Record, Target):
     def spec(self) -> str:
         """The spec that describes it."""
         parts = [f"{'acircles' if self.staggered else 'circles'}:{self.columns}x{self.rows}:{self.pitch_m * 1e3:g}mm"]
-        if self.radius_m is not None:
-            parts.append(f"radius={self.radius_m * 1e3:.6g}mm")
+        if self.disc_radius_m is not None:
+            parts.append(f"radius={self.disc_radius_m * 1e3:.6g}mm")
         if self.light is not None:
             parts.append(POLARITIES[self.light])
         if self.rings:
