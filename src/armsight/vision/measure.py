@@ -72,7 +72,9 @@ def _without_bias(
         ]
         radius_m = float(np.nanmedian(np.concatenate(radii)))
     count = len(points)
-    discs = DiscTarget(target.body, np.full(count, radius_m), np.zeros(count, bool), np.tile([0.0, 0.0, -1.0], (count, 1)))
+    discs = DiscTarget(
+        target.body, np.full(count, radius_m), np.zeros(count, bool), np.tile([0.0, 0.0, -1.0], (count, 1))
+    )
     nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
     seen = match(rig, target.body, left, right, symmetries=target.symmetries)
     return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body, rough.cov)

@@ -64,8 +64,8 @@ BOARD_DEGREE = 4
 BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
 _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
-#: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show, since print
-#: and lens widen or narrow what is dark.
+#: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
+#: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
 
 
@@ -362,7 +362,7 @@ def _disc_radius(
     given_m = board.disc_radius_m
     if given_m is not None and not 1 / _RADIUS_RATIO < given_m / about_m < _RADIUS_RATIO:
         raise CalibrationError(
-            f"{board.body.name} has discs with a radius of {1e3 * given_m:.4g} mm, and the images show {1e3 * about_m:.4g} mm: "
+            f"{board.body.name}: a radius of {1e3 * given_m:.4g} mm is given, and the images show {1e3 * about_m:.4g} mm: "
             "measure pitch and radius (not the diameter), or leave the radius out"
         )
     return about_m if given_m is None else given_m, first

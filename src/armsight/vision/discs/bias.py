@@ -40,6 +40,8 @@ from armsight.vision.rig import StereoRig
 _STEP = 1e-4  # for the Hessian of the distortion, focal lengths
 #: A share of the lens in the bias beyond which second order is not enough, px; points of the rim, and steps of its fit.
 _BENT_PX, _RIM, _RIM_STEPS = 0.05, 24, 3
+#: A fisheye's disc is projected where the cosine between its normal and its direction is above this.
+_LEAST_SIDEWAYS = 0.05
 _RIM_COS, _RIM_SIN = np.cos(2 * np.pi * np.arange(_RIM) / _RIM), np.sin(2 * np.pi * np.arange(_RIM) / _RIM)
 
 
@@ -129,6 +131,30 @@ def disc_image(
 
 
 @kernel
+def _sideways(k: Array, d: Array, P: Array, n: Array, radius: float, uv: Array, shape: Array, J_P: Array) -> bool:
+    """Project a disc that only a fisheye sees, 90 degrees off the axis or more, to first order; False if it is edge-on."""
+    distance = np.sqrt(P[0] * P[0] + P[1] * P[1] + P[2] * P[2])
+    facing = abs(P[0] * n[0] + P[1] * n[1] + P[2] * n[2]) / distance
+    if not (distance > 2.0 * radius and facing > _LEAST_SIDEWAYS and np.hypot(P[0], P[1]) > radius):
+        return False
+    xy, J_d = np.empty(2), np.empty((2, 8))
+    distort(True, d, P, xy, J_P, J_d)
+    for i in range(2):
+        uv[i] = k[i] * xy[i] + k[2 + i]
+        for j in range(3):
+            J_P[i, j] *= k[i]
+    for i in range(2):
+        for j in range(i, 2):  # S = r^2 J (I - n n^T) J^T
+            total, along_i, along_j = 0.0, 0.0, 0.0
+            for m in range(3):
+                total += J_P[i, m] * J_P[j, m]
+                along_i += J_P[i, m] * n[m]
+                along_j += J_P[j, m] * n[m]
+            shape[i + j] = radius * radius * (total - along_i * along_j)
+    return True
+
+
+@kernel
 def _refine(fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: float, uv: Array, shape: Array) -> None:
     """Fit the ellipse uv (2,), shape (3,) to the projected rim, point by point, as the image's fit does: by distance."""
     a, b, rim, xy, at = np.zeros(3), np.empty(3), np.empty((_RIM, 2)), np.empty(2), np.empty(3)
@@ -204,6 +230,10 @@ def _each(
     xy, J_p, J_d, Q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3)
     for i in range(len(P)):
         if not disc_image(fisheye, k, d, P[i], n[i], radius[i], uv[i], shape[i], J_P[i], J_n[i]):
+            if fisheye and _sideways(k, d, P[i], n[i], radius[i], uv[i], shape[i], J_P[i]):
+                _refine(fisheye, k, d, P[i], n[i], radius[i], uv[i], shape[i])
+                J_n[i] = 0.0
+                continue
             uv[i] = np.nan
             shape[i] = np.nan
             J_P[i] = np.nan

@@ -174,7 +174,7 @@ def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:
         if min(small.shape) < 2 * _LEAST_SIDE_PX:
             break
         half = (small.shape[1] // 2, small.shape[0] // 2)
-        level, small = level + 1, cv2.resize(small, half, interpolation=cv2.INTER_AREA)
+        level, small = level + 1, np.asarray(cv2.resize(small, half, interpolation=cv2.INTER_AREA), np.uint8)
     theta, contrast, signs = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return _without_repeats(theta[signs < 0], contrast[signs < 0]), _without_repeats(
         theta[signs > 0], contrast[signs > 0]
@@ -294,7 +294,7 @@ class Fits(Record):
     def kept(self) -> NDArray[np.bool_]:
         """(N,) which fits are good; where a harmless reason speaks against many, it is the image that is so."""
         good, harmless = self.codes == 0, np.isin(self.codes, HARMLESS)
-        return good | harmless if harmless.sum() > _ODD_SHARE * len(good) else good
+        return np.asarray(good | harmless if harmless.sum() > _ODD_SHARE * len(good) else good)
 
     def odd_sized(self) -> NDArray[np.bool_]:
         """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect."""
@@ -328,7 +328,7 @@ def contrasts(image: Grey, theta: Array, sign: int) -> tuple[Array, NDArray[np.b
 
 
 def like_neighbours(uv: Array, theta: Array) -> Array:
-    """Return starts (K, 10) of discs at positions uv (K, 2) that look like the four nearest of known ones, theta (N, 10)."""
+    """Return starts (K, 10) of discs at positions uv (K, 2) that look like the four nearest known ones, theta (N, 10)."""
     out = np.empty((len(uv), UNKNOWNS))
     for i, position in enumerate(uv):
         nearest = np.argsort(np.linalg.norm(theta[:, :2] - position, axis=1))[:4]
@@ -338,7 +338,7 @@ def like_neighbours(uv: Array, theta: Array) -> Array:
 
 
 def fit_discs(image: Grey, starts: Array, before: Fits | None = None, which: NDArray[np.bool_] | None = None) -> Fits:
-    """Fit discs in one grey image (H, W) from starts (N, 10); with ``before``, only those ``which`` (N,), the others stay."""
+    """Fit discs in a grey image (H, W) from starts (N, 10); with ``before``, only those ``which`` (N,), the others stay."""
     theta, n = np.array(starts, order="C"), len(starts)
     cov, shape, codes = np.zeros((n, 2, 2)), np.ones((n, 3)), np.zeros(n, np.int64)
     if not hasattr(_KEPT, "work"):

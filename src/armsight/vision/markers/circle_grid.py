@@ -84,7 +84,7 @@ def _neighbours(blobs: Blobs) -> list[Ids]:
         if not len(mine) or len(pool) < 2:
             continue
         distance, rows = KDTree(uv[pool]).query(uv[mine], k=min(_NEIGHBOURS + 1, len(pool)))
-        for i, far, js in zip(mine, distance, pool[rows], strict=True):
+        for i, far, js in zip(mine.tolist(), np.asarray(distance), pool[rows], strict=True):
             alike = (js != i) & (far < _FURTHEST * blobs.radius_px[i]) & _alike(blobs, i, js)
             out[i] = js[alike]
     return out

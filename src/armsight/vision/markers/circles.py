@@ -3,12 +3,12 @@
 Laid out as OpenCV's ``findCirclesGrid`` takes them; the points are the discs' middles, row by row, z = 0. In the staggered
 grid rows are one pitch apart, discs of a row two pitches, and every other row is shifted by one pitch. Discs are dark on a
 light board or light on a dark one. Options follow the pitch: ``radius=5mm``; ``dark`` or ``light``, by default whichever is
-found; ``rings=2x7,11x7,2x2``, the discs (column x row, from 0) that have a hole and so show which part of the board is in view.
+found; ``rings=2x7,11x7,2x2``, the discs (column x row, from 0) that have a hole, by which a part of the board is recognised.
 
-A disc's pixel position is the centre of the ellipse that fits its rim (:mod:`~armsight.vision.markers.disc.fit`). That is not
-the image of its middle (:mod:`~armsight.vision.discs.bias`): a disc of radius r at distance z, tilted by t, is off by about
-``f r^2 sin(t) cos(t) / z^2`` pixels. Calibration and measurement know the pose and model what is measured; for that they need
-the radius, which the sizes of the ellipses give where the spec does not.
+A disc's pixel position is the centre of the ellipse that fits its rim (:mod:`~armsight.vision.markers.disc.fit`). That is
+not the image of its middle (:mod:`~armsight.vision.discs.bias`): a disc of radius r at distance z, tilted by t, is off by
+about ``f r^2 sin(t) cos(t) / z^2`` pixels. Calibration and measurement know the pose and model what is measured. For that
+they need the radius, which the sizes of the ellipses give where the spec does not.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.circle_blobs import (
     Blobs,
-    Grey,
     contrasts,
     find_blobs,
     fit_discs,
@@ -30,6 +29,7 @@ from armsight.vision.markers.circle_blobs import (
     without_holes,
 )
 from armsight.vision.markers.circle_grid import Lattice, Layout, extrapolated, grow_lattices, near, place
+from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
@@ -66,7 +66,7 @@ class CircleGrid(Record, Target):
     light: bool | None = None
     rings: tuple[tuple[int, int], ...] = ()
 
-    form = "circles:COLUMNSxROWS:PITCH[:OPTION...], such as circles:7x6:20mm or circles:7x6:20mm:radius=5mm:light:rings=2x1,5x1,2x4"
+    form = "circles:COLUMNSxROWS:PITCH[:OPTION...], such as circles:7x6:20mm or circles:7x6:20mm:radius=5mm:light"
     staggered_form = "acircles:COLUMNSxROWS:PITCH[:OPTION...] (staggered), such as acircles:4x11:20mm"
 
     @staticmethod
@@ -181,7 +181,9 @@ class CircleGrid(Record, Target):
             good = fits.kept()
         good &= ~fits.odd_sized()
         if good.sum() < least:
-            return f"{found} of its {len(self._ring)} discs were found, but only {good.sum()} can be measured{fits.why_not()}"
+            return (
+                f"{found} of {len(self._ring)} discs were found, but only {good.sum()} can be measured{fits.why_not()}"
+            )
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
         return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows])
 
