@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from statistics import median
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,6 @@ _NEAR = 0.3
 #: Sides of the grid, rotated by 90 degrees from each to the next.
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
-T = TypeVar("T")
 Cell: TypeAlias = tuple[int, int]
 
 
@@ -136,24 +136,25 @@ def _grown(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
     uv = blobs.theta[:, :2]
     tree = KDTree(uv)
     cells = {(0, 0): seed, (1, 0): sides[0], (0, 1): sides[1]}
+    at = {cell: complex(*uv[i]) for cell, i in cells.items()}
     used, front, all_round = set(cells.values()), list(cells), False
     while front:
         claims: dict[int, tuple[float, Cell]] = {}
         for cell in sorted({n for c in front for n in _beside(c)} - cells.keys()):
-            expected = extrapolated(cell, {c: uv[i] for c, i in near(cell, cells).items()})
+            expected = extrapolated(cell, at)
             if expected is None:
                 continue
-            position, step = expected
+            (u, v), step = (expected[0].real, expected[0].imag), expected[1]
             known = next(cells[n] for n in _beside(cell) if n in cells)
-            js = np.array(tree.query_ball_point(position, _NEAR * step), dtype=np.int64)
+            js = np.array(tree.query_ball_point((u, v), _NEAR * step), dtype=np.int64)
             js = js[_alike(blobs, known, js)] if len(js) else js
             if len(js):
-                off = np.linalg.norm(uv[js] - position, axis=1)
+                off = np.hypot(uv[js, 0] - u, uv[js, 1] - v)
                 j = int(js[np.argmin(off)])
                 if j not in used and off.min() / step < claims.get(j, (np.inf, cell))[0]:
                     claims[j] = float(off.min() / step), cell
         for j, (_, cell) in claims.items():
-            cells[cell] = j
+            cells[cell], at[cell] = j, complex(*uv[j])
             used.add(j)
         # With more of the grid known, discs may be found where they were not before.
         front, all_round = [cell for _, cell in claims.values()], not claims and not all_round
@@ -167,49 +168,43 @@ def _beside(cell: Cell) -> list[Cell]:
     return [(cell[0] + dx, cell[1] + dy) for dx, dy in _SIDES]
 
 
-def near(cell: Cell, known: Mapping[Cell, T]) -> dict[Cell, T]:
-    """Return what is known at most three cells away along each side."""
-    cells = [(cell[0] + dx, cell[1] + dy) for dx in range(-3, 4) for dy in range(-3, 4)]
-    return {c: known[c] for c in cells if c in known}
-
-
-def extrapolated(cell: Cell, known: dict[Cell, Array]) -> tuple[Array, float] | None:
+def extrapolated(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
     """Predict where a cell of a lattice is from the positions of cells nearby.
 
     Args:
         cell: the cell.
-        known: position (2,), px, of cells around it.
+        known: positions u + iv, px, of cells.
 
     Returns:
-        The position (2,), px, and the step from its nearest neighbour, px; None where nothing beside it is known.
+        The position, px, and the step from its neighbours, px; None where nothing beside it is known.
     """
     x, y = cell
-    guesses, steps = [], []
+    guesses: list[complex] = []
+    steps: list[float] = []
     for dx, dy in _SIDES:
         a = known.get((x - dx, y - dy))
         if a is None:
             continue
-        b, c = known.get((x - 2 * dx, y - 2 * dy)), known.get((x - 3 * dx, y - 3 * dy))
+        b = known.get((x - 2 * dx, y - 2 * dy))
         if b is not None:
-            guesses.append(_continued(a, b, c))
-            steps.append(np.hypot(*(a - b)))
+            guesses.append(_continued(a, b, known.get((x - 3 * dx, y - 3 * dy))))
+            steps.append(abs(a - b))
         for ex, ey in ((dy, dx), (-dy, -dx)):
-            diagonal, corner = known.get((x + ex, y + ey)), known.get((x + ex - dx, y + ey - dy))
-            if corner is not None and diagonal is not None:
-                guesses.append(a + diagonal - corner)
-                steps.append(np.hypot(*(diagonal - corner)))
-            elif corner is not None and b is None:  # a step along the same direction two rows away
-                further = known.get((x + ex - 2 * dx, y + ey - 2 * dy))
-                if further is not None:
-                    guesses.append(a + corner - further)
-                    steps.append(np.hypot(*(corner - further)))
+            corner = known.get((x + ex - dx, y + ey - dy))
+            # The same step in the next row, or where that is not known either, the one before it.
+            last, first = (x + ex, y + ey), (x + ex - 2 * dx, y + ey - 2 * dy)
+            if corner is not None and (last in known or (b is None and first in known)):
+                step = known[last] - corner if last in known else corner - known[first]
+                guesses.append(a + step)
+                steps.append(abs(step))
     if not guesses:
-        return _first_steps(cell, known)
-    return np.median(guesses, axis=0), float(np.median(steps))
+        return _any_step(cell, known)
+    middle = complex(median(g.real for g in guesses), median(g.imag for g in guesses))
+    return middle, median(steps)
 
 
-def _first_steps(cell: Cell, known: dict[Cell, Array]) -> tuple[Array, float] | None:
-    """Extrapolate beside a seed's corner, where only a step along the same direction nearby, perhaps reversed, is known."""
+def _any_step(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
+    """Extrapolate by any step known along the same direction: so it is beside a seed."""
     x, y = cell
     for dx, dy in _SIDES:
         a = known.get((x - dx, y - dy))
@@ -218,11 +213,11 @@ def _first_steps(cell: Cell, known: dict[Cell, Array]) -> tuple[Array, float] | 
         for c, p in known.items():
             q = known.get((c[0] + dx, c[1] + dy))
             if q is not None:
-                return a + q - p, float(np.hypot(*(q - p)))
+                return a + q - p, abs(q - p)
     return None
 
 
-def _continued(a: Array, b: Array, c: Array | None) -> Array:
+def _continued(a: complex, b: complex, c: complex | None) -> complex:
     """Continue a line of equally spaced points c, b, a by one; in perspective where all three are known.
 
     A pinhole maps index t on a line to p t / (1 + q t): of steps in the ratio k the next one has (k + 1) / (3 k - 1) of
@@ -231,7 +226,7 @@ def _continued(a: Array, b: Array, c: Array | None) -> Array:
     step = a - b
     if c is None:
         return a + step
-    k = float(np.clip(np.hypot(*(b - c)) / np.hypot(*step), 0.7, 1.4))
+    k = min(max(abs(b - c) / abs(step), 0.7), 1.4)
     return a + step * (k + 1.0) / (3.0 * k - 1.0)
 
 
@@ -294,7 +289,7 @@ def place(
         The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
         reason why there is none.
     """
-    seen = {(int(x), int(y)): blobs.theta[i, :2] for (x, y), i in zip(lattice.cells, lattice.blobs, strict=True)}
+    seen = positions(lattice.cells, blobs.theta[lattice.blobs, :2])
     expected = _expected(seen, float(np.median(blobs.radius_px[lattice.blobs])), size_px)
     origin = layout.cells.min(axis=0) - 1
     table = np.full(tuple(np.ptp(layout.cells, axis=0) + 3), -1)
@@ -305,7 +300,7 @@ def place(
 
     placements, turn = [], np.eye(2, dtype=np.int64)
     predicted = np.array(list(expected), dtype=np.int64).reshape(-1, 2)
-    predicted_uv = np.array(list(expected.values())).reshape(-1, 2)
+    predicted_uv = np.array([(p.real, p.imag) for p in expected.values()]).reshape(-1, 2)
     for _ in range(4):
         cells = lattice.cells @ turn
         shifts, counts = np.unique((layout.cells[None] - cells[:, None]).reshape(-1, 2), axis=0, return_counts=True)
@@ -337,17 +332,22 @@ def _unambiguous(placements: list[Placement], layout: Layout) -> Placement | str
     return best
 
 
-def _expected(seen: dict[Cell, Array], radius_px: float, size_px: tuple[int, int]) -> dict[Cell, Array]:
+def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
+    """Return the positions uv (N, 2) of cells (N, 2) as :func:`extrapolated` takes them."""
+    return {(x, y): complex(u, v) for (x, y), (u, v) in zip(cells.tolist(), uv.tolist(), strict=True)}
+
+
+def _expected(seen: dict[Cell, complex], radius_px: float, size_px: tuple[int, int]) -> dict[Cell, complex]:
     """Return where discs next to those of a lattice would be, as far as they would be in the image."""
-    known, front, size = dict(seen), set(seen), np.array(size_px)
+    known, front, margin = dict(seen), set(seen), _MARGIN_PX + radius_px
     for _ in range(_PREDICTED_CELLS):
-        fresh: dict[Cell, Array] = {}
+        fresh: dict[Cell, complex] = {}
         for cell in sorted({n for c in front for n in _beside(c)} - known.keys()):
-            guess = extrapolated(cell, near(cell, known))
+            guess = extrapolated(cell, known)
             if guess is not None:
-                margin = _MARGIN_PX + radius_px
-                if (guess[0] > margin).all() and (guess[0] < size - 1 - margin).all():
+                u, v = guess[0].real, guess[0].imag
+                if margin < u < size_px[0] - 1 - margin and margin < v < size_px[1] - 1 - margin:
                     fresh[cell] = guess[0]
         known.update(fresh)
         front = set(fresh)
-    return {cell: uv for cell, uv in known.items() if cell not in seen}
+    return {cell: p for cell, p in known.items() if cell not in seen}

@@ -3,7 +3,7 @@
 Laid out as OpenCV's ``findCirclesGrid`` takes them; the points are the discs' middles, row by row, z = 0. In the staggered
 grid rows are one pitch apart, discs of a row two pitches, and every other row is shifted by one pitch. Discs are dark on a
 light board or light on a dark one. Options follow the pitch: ``radius=5mm``; ``dark`` or ``light``, by default whichever is
-found; ``rings=2x7,11x7,2x2``, the discs (column x row, from 0) that have a hole, by which a part of the board is recognised.
+found; ``rings=2x7,11x7,2x2``, the discs (column x row, from 0) that have a hole, by which a part of the board is known.
 
 A disc's pixel position is the centre of the ellipse that fits its rim (:mod:`~armsight.vision.markers.disc.fit`). That is
 not the image of its middle (:mod:`~armsight.vision.discs.bias`): a disc of radius r at distance z, tilted by t, is off by
@@ -28,7 +28,7 @@ from armsight.vision.markers.circle_blobs import (
     like_neighbours,
     without_holes,
 )
-from armsight.vision.markers.circle_grid import Lattice, Layout, extrapolated, grow_lattices, near, place
+from armsight.vision.markers.circle_grid import Lattice, Layout, extrapolated, grow_lattices, place, positions
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
 from armsight.vision.markers.marker import Target
@@ -199,13 +199,12 @@ class CircleGrid(Record, Target):
 
     def _predicted(self, ids: Ids, uv: Array, good: NDArray[np.bool_]) -> Array:
         """Return where the good discs around each of the others put it, (K, 2); where it was where they do not."""
-        cells = [(int(x), int(y)) for x, y in self._layout.cells[ids]]
-        known = {cell: p for cell, p, ok in zip(cells, uv, good, strict=True) if ok}
-        out = []
-        for i in np.flatnonzero(~good):
-            guess = extrapolated(cells[i], near(cells[i], known))
-            out.append(uv[i] if guess is None else guess[0])
-        return np.array(out).reshape(-1, 2)
+        known, out = positions(self._layout.cells[ids[good]], uv[good]), uv[~good].copy()
+        for k, (x, y) in enumerate(self._layout.cells[ids[~good]].tolist()):
+            guess = extrapolated((x, y), known)
+            if guess is not None:
+                out[k] = guess[0].real, guess[0].imag
+        return out
 
 
 def _from_fields(fields: Fields, staggered: bool) -> CircleGrid:
