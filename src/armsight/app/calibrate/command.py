@@ -26,11 +26,12 @@ from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.image import grey
+from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.sources import PairsSource
+from armsight.vision.sources.pairs import image_files, natural_key
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -38,6 +39,8 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
+@click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
+@click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
 @click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
 @click.option(
     "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
@@ -65,6 +68,8 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 def command(
     left: str | None,
     right: str | None,
+    left_intrinsics: str | None,
+    right_intrinsics: str | None,
     target: str | None,
     lens_model: str | None,
     flat_target: bool,
@@ -87,8 +92,11 @@ def command(
         raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
+    if (left_intrinsics or right_intrinsics) and left is None:
+        raise InputError("--left-intrinsics and --right-intrinsics go with --left, --right and --target")
     source = None if left is None or right is None else PairsSource.open(left, right)
-    inputs = points if source is None else source.files
+    alone = (_images(left_intrinsics), _images(right_intrinsics))
+    inputs = points if source is None else (*source.files, *alone[0], *alone[1])
     board_file = None if source is None else output.parent / f"{output.stem}.board.toml"
     check_outputs((output, refine_body, board_file), inputs)
     if report is not None:
@@ -102,8 +110,10 @@ def command(
     started = time.perf_counter()
     if source is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        calibration = _from_images(source, open_board(target), models, flat_target, folds)
+        calibration = _from_images(source, alone, open_board(target), models, flat_target, folds)
         given = {"left": str(left), "right": str(right), "target": target, "board": board_file.name}
+        more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
+        given |= {name: pattern for name, pattern in more.items() if pattern is not None}
     elif detections is not None and cameras is not None and body is not None:
         known, pair = load_body_csv(body), read_cameras(cameras)
         with steps() as progress:
@@ -117,7 +127,7 @@ def command(
         save_body_csv(calibration.body, refine_body)
     calibration.rig.save(output)
     if board_file is not None and target is not None:
-        save_board_file(board_file, target, calibration.body.points)
+        save_board_file(board_file, _with_radius(target, calibration.disc_radius_m), calibration.body.points)
     if report is not None:
         write_report(calibration, report)
     if as_json:
@@ -126,13 +136,56 @@ def command(
         _print(calibration, output, board_file, report)
 
 
+def _with_radius(spec: str, disc_radius_m: float | None) -> str:
+    """Return a board's spec with the radius of its discs that the images showed, where it has discs and no radius."""
+    return spec if disc_radius_m is None or "radius=" in spec else f"{spec}:radius={1e3 * disc_radius_m:.6g}mm"
+
+
+def _images(pattern: str | None) -> list[Path]:
+    """Return the images that a glob matches, sorted; none without one."""
+    if pattern is None:
+        return []
+    files = sorted(image_files(pattern), key=natural_key)
+    if not files:
+        raise InputError(f"{pattern}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
+    return files
+
+
+def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, int]) -> Pair:
+    """Detect the target in an image of one camera alone; pixels of another resolution are converted to those of the pairs.
+
+    Raises:
+        InputError: not an image, or of another shape than those of the pairs.
+    """
+    image = grey(read_image(path))
+    height, width = image.shape
+    scale = size[0] / width
+    if abs(height * scale - size[1]) > 0.5 * max(scale, 1.0):
+        raise InputError(
+            f"{path}: is {width}x{height}, and the {SIDES[side]} images in the pairs {size[0]}x{size[1]}: take both with "
+            "the same field of view, and so the same ratio of width to height"
+        )
+    found = target.detect(image)
+    found = replace(
+        found, uv=(found.uv + 0.5) * scale - 0.5, cov_uv=found.cov_uv * scale**2, shape=found.shape * scale**2
+    )
+    nothing = Detections.none(f"{path.name} is of the {SIDES[side]} camera alone")
+    return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
+
+
 def _from_images(
-    source: PairsSource, target: CalibrationBoard, models: tuple[str, ...], flat: bool, folds: int
+    source: PairsSource,
+    alone: tuple[list[Path], list[Path]],
+    target: CalibrationBoard,
+    models: tuple[str, ...],
+    flat: bool,
+    folds: int,
 ) -> Calibration:
-    """Detect the target in every pair of images and calibrate."""
+    """Detect the target in every pair of images, and in those of one camera alone, and calibrate."""
     pairs: list[Pair] = []
+    singles: list[Pair] = []
     sizes: Sizes | None = None
-    with bar("detecting the target", len(source.pairs)) as advance:
+    with bar("detecting the target", len(source.pairs) + sum(map(len, alone))) as advance:
         for stored in source.pairs:
             shot = stored.load()
             if shot.left is None or shot.right is None:
@@ -145,10 +198,16 @@ def _from_images(
                 sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
                 pairs.append(Pair(shot.name, target.detect(grey(shot.left)), target.detect(grey(shot.right))))
             advance()
+        for side, paths in enumerate(alone if sizes is not None else ()):
+            for path in paths:
+                singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
+                advance()
     if sizes is None:
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
     with steps() as progress:
-        return calibrate_boards(target, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
+        return calibrate_boards(
+            target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+        )
 
 
 def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None) -> Sizes:
@@ -194,6 +253,7 @@ def _summary(
         "distortion_model": c.rig.left.model,
         "sigma_px": c.rig.sigma_px,
         "body_deviation_rms_m": c.deviation_m,
+        "disc_radius_m": c.disc_radius_m,
         "rig": str(output),
         "board": None if board_file is None else str(board_file),
         "report": str(report / PAGE) if report is not None else None,
@@ -219,6 +279,7 @@ def _print(calibration: Calibration, output: Path, board_file: Path | None, repo
         f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
         *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
         *(f"note: {note}" for note in c.notes),
         *(weak(weakness) for weakness in c.weaknesses),

@@ -262,6 +262,7 @@ def calibrate_boards(
     models: tuple[str, ...] = MODELS,
     flat: bool = False,
     folds: int = FOLDS,
+    singles: Sequence[Pair] = (),
     progress: Progress = lambda message: None,
 ) -> Calibration:
     """Calibrate two cameras from pairs of images of one board.
@@ -273,6 +274,8 @@ def calibrate_boards(
         models: distortion models to choose from by held-out error.
         flat: hold the board to its drawing.
         folds: how many parts the pairs are split into for the held-out errors.
+        singles: detections of further images of the same board by one camera alone, the other side empty and with a
+            reason: they help to determine what is inside the camera.
         progress: called with a line about what is being done.
 
     Returns:
@@ -284,6 +287,9 @@ def calibrate_boards(
     points = board.body.points
     usable, rejected = _usable(pairs)
     _enough(len(usable), len(pairs), rejected)
+    pair_count = len(usable)
+    alone, without_board = _usable_alone(singles)
+    usable, rejected = usable + alone, rejected + without_board
     progress("estimating poses of cameras and boards")
     first, usable, notes = _start(board, usable, sizes, models)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
@@ -291,7 +297,9 @@ def calibrate_boards(
     model = rigid_board(points) if flat else printed_board(points)
     radius_m, first = _disc_radius(board, usable, first, observations)
     model = replace(model, disc_radius_m=radius_m or 0.0)
-    selection = _Selection(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
+    selection = _Selection(
+        model, observations, tuple(pair.name for pair in usable), sizes, folds, pair_count, len(pairs), progress
+    )
     screened, trial, tried = selection.chosen(first.state, models)
     lens = trial.solution.state.cameras[0].model
     if lens != first.state.cameras[0].model and (screened.rejected or screened.notes):
@@ -305,7 +313,7 @@ def calibrate_boards(
                 screened, trial = again, trial_again
                 tried = {**tried, lens: trial.heldout}
     rejected += screened.rejected
-    names = tuple(usable[j].name for j in screened.kept)
+    names = tuple(usable[j].name for j in screened.kept if j < pair_count)
     rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
     found = trial.model.body(state.shape)
@@ -385,6 +393,18 @@ def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
     return usable, rejected
 
 
+def _usable_alone(singles: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
+    """Split images of one camera alone into those that show the board and those that do not, with reasons."""
+    usable, rejected = [], []
+    for single in singles:
+        seen = max(single.left, single.right, key=lambda found: len(found.ids))
+        if len(seen.ids) >= LEAST_CORNERS:
+            usable.append(single)
+        else:
+            rejected.append(RejectedPair(single.name, single.left.problem or single.right.problem or "too few points"))
+    return usable, rejected
+
+
 def _enough(usable: int, given: int, rejected: list[RejectedPair]) -> None:
     """Raise unless there are enough pairs, with the first reasons why not."""
     if usable >= LEAST_PAIRS:
@@ -438,6 +458,7 @@ class _Selection(Record):
     names: tuple[str, ...]
     sizes: tuple[tuple[int, int], tuple[int, int]]
     folds: int
+    pair_count: int
     given: int
     progress: Progress
 
@@ -451,12 +472,16 @@ class _Selection(Record):
             eased = replace(self.model, motion_sigmas=MOTION_EASE * moving.sigmas)
             screened = self._screened(eased, start, robust_sigma(screened.solution))
             motion = moving.shots(screened.kept)
-        folds = min(self.folds, len(screened.kept))
+        folds = min(self.folds, self._pairs(screened))
         search = LensModelSearch(self.model, motion, screened, folds, self.sizes, self.progress)
         return screened, *search.best(models)
 
     def _screened(self, model: BundleModel, start: BundleState, sigma_px: float = 1.0) -> Screened:
         """Reject gross errors; too few pairs are an error."""
         screened = screen(model, start, self.observations, self.names, sigma_px=sigma_px)
-        _enough(len(screened.kept), self.given, list(screened.rejected))
+        _enough(self._pairs(screened), self.given, list(screened.rejected))
         return screened
+
+    def _pairs(self, screened: Screened) -> int:
+        """Return how many pairs remain; images of one camera alone come after them and do not count."""
+        return int((screened.kept < self.pair_count).sum())

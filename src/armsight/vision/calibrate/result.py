@@ -76,7 +76,8 @@ class Calibration(Record):
         rig: the result.
         body: the board or body as estimated, aligned to its drawing.
         deviation_m: RMS distance of the estimated body from its drawing, m; zero where it was held to it.
-        pairs: names of the pairs used, in the order of the observations' shots.
+        pairs: names of the pairs used, in the order of the observations' shots; images of one camera alone come last and
+            have no name here.
         pairs_found: how many pairs were given.
         observations: the detections that were fitted.
         solution: the adjusted state and residuals.

@@ -146,7 +146,7 @@ class CircleGrid(Record, Target):
         """Find the board by its dark discs, its light ones, or whichever make the board."""
         least = max(4, int((_KEPT_WITH_RINGS if self.rings else _KEPT_SHARE) * len(self._ring)))
         grids: list[tuple[int, bool, Blobs, Lattice]] = []
-        for polarity, blobs in zip((False, True), find_blobs(image, dark, light), strict=True):
+        for polarity, blobs in zip((False, True), find_blobs(image, light, dark), strict=True):
             lattices = grow_lattices(blobs, len(self._ring))
             grids += [(len(g.blobs), polarity, blobs, g) for g in lattices if len(g.blobs) >= least]
         problem = f"no {self.body.name} found"
