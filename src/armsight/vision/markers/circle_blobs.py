@@ -211,6 +211,8 @@ _HOLE, _SOLID = 0.66, 0.8
 
 def without_holes(image: Grey, theta: Array) -> Grey:
     """Fill the holes of rings theta (N, 10) with grey of the rings around them, pixel by pixel, noise and all."""
+    if not len(theta):
+        return image
     filled = image.copy()
     for u, v, m11, m12, m22 in theta[:, :5]:
         reach = int(np.ceil((m11 * m22 - m12 * m12) ** -0.5 * np.sqrt(max(m11, m22)))) + 1
@@ -230,8 +232,6 @@ def without_holes(image: Grey, theta: Array) -> Grey:
 HARMLESS = (5, 8, 10)
 #: If more than this share of the fits have such a reason, the image is like that.
 _ODD_SHARE = 0.3
-#: A disc may have so many times the area that is expected.
-_ODD_AREA = 1.7
 
 
 @kernel("const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], FitBuffers")
@@ -296,19 +296,32 @@ class Fits(Record):
         good, harmless = self.codes == 0, np.isin(self.codes, HARMLESS)
         return np.asarray(good | harmless if harmless.sum() > _ODD_SHARE * len(good) else good)
 
-    def odd_sized(self) -> NDArray[np.bool_]:
-        """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect."""
-        area = 0.5 * np.log(np.maximum(self.shape[:, 0] * self.shape[:, 2] - self.shape[:, 1] ** 2, 1e-12))
-        good = self.kept()
-        middle = self.uv[good].mean(axis=0)
-        basis = np.column_stack([np.ones(len(area)), (self.uv - middle) / max(np.ptp(self.uv), 1.0)])
-        plane, *_ = np.linalg.lstsq(basis[good], area[good], rcond=None)
-        return np.asarray(np.abs(area - basis @ plane) > np.log(_ODD_AREA))
-
     def why_not(self) -> str:
         """Return the most frequent reason against a disc, for a message."""
         bad = self.codes[~self.kept()]
         return f", mostly: {REASONS[int(np.bincount(bad).argmax())]}" if len(bad) else ""
+
+
+def odd_sized(theta: Array, factor: float, good: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
+
+    Args:
+        theta: (N, 10) discs of one grid.
+        factor: by which an area may be larger or smaller, beyond what is usual among them.
+        good: (N,) which of them count; all by default.
+    """
+    area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
+    keep = np.ones(len(area), bool) if good is None else good.copy()
+    basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])
+    odd = np.zeros(len(area), bool)
+    for _ in range(3):
+        plane, *_ = np.linalg.lstsq(basis[keep], area[keep], rcond=None)
+        off = np.abs(area - basis @ plane)
+        odd = off > np.log(factor) + 2.0 * np.median(off[keep])
+        if not (odd & keep).any() or (keep & ~odd).sum() < 4:
+            break
+        keep &= ~odd
+    return odd
 
 
 def contrasts(image: Grey, theta: Array, sign: int) -> tuple[Array, NDArray[np.bool_]]:

@@ -274,14 +274,14 @@ class Placement(Record):
 
 
 def place(
-    lattice: Lattice, blobs: Blobs, hollow: NDArray[np.bool_], layout: Layout, size_px: tuple[int, int]
+    cells: Ids, theta: Array, hollow: NDArray[np.bool_], layout: Layout, size_px: tuple[int, int]
 ) -> Placement | str:
     """Find which part of a board a lattice shows.
 
     Args:
-        lattice: as grown.
-        blobs: its outlines.
-        hollow: (N,) whether a disc of the lattice has a hole.
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
+        hollow: (N,) whether a disc has a hole.
         layout: the board.
         size_px: width and height of the image.
 
@@ -289,8 +289,7 @@ def place(
         The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
         reason why there is none.
     """
-    seen = positions(lattice.cells, blobs.theta[lattice.blobs, :2])
-    expected = _expected(seen, float(np.median(blobs.radius_px[lattice.blobs])), size_px)
+    predicted, predicted_uv = expected(cells, theta, size_px)
     origin = layout.cells.min(axis=0) - 1
     table = np.full(tuple(np.ptp(layout.cells, axis=0) + 3), -1)
     table[tuple((layout.cells - origin).T)] = np.arange(len(layout.cells))
@@ -299,13 +298,11 @@ def place(
         return np.asarray(table[tuple(np.clip(cells - origin, 0, np.array(table.shape) - 1).T)])
 
     placements, turn = [], np.eye(2, dtype=np.int64)
-    predicted = np.array(list(expected), dtype=np.int64).reshape(-1, 2)
-    predicted_uv = np.array([(p.real, p.imag) for p in expected.values()]).reshape(-1, 2)
     for _ in range(4):
-        cells = lattice.cells @ turn
-        shifts, counts = np.unique((layout.cells[None] - cells[:, None]).reshape(-1, 2), axis=0, return_counts=True)
+        turned = cells @ turn
+        shifts, counts = np.unique((layout.cells[None] - turned[:, None]).reshape(-1, 2), axis=0, return_counts=True)
         for shift in shifts[counts >= 0.5 * counts.max()]:
-            ids, lost = at(cells + shift), at(predicted @ turn + shift)
+            ids, lost = at(turned + shift), at(predicted @ turn + shift)
             matched = ids >= 0
             ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0
             wrong = int((~matched).sum() + (lost >= 0).sum()) + _RING_COST * ring_errors
@@ -337,8 +334,19 @@ def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
     return {(x, y): complex(u, v) for (x, y), (u, v) in zip(cells.tolist(), uv.tolist(), strict=True)}
 
 
-def _expected(seen: dict[Cell, complex], radius_px: float, size_px: tuple[int, int]) -> dict[Cell, complex]:
-    """Return where discs next to those of a lattice would be, as far as they would be in the image."""
+def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, Array]:
+    """Predict where discs next to those of a lattice would be, as far as they would be in the image.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs.
+        size_px: width and height of the image.
+
+    Returns:
+        (K, 2) further cells; (K, 2) where they would be, px.
+    """
+    seen = positions(cells, theta[:, :2])
+    radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)
     known, front, margin = dict(seen), set(seen), _MARGIN_PX + radius_px
     for _ in range(_PREDICTED_CELLS):
         fresh: dict[Cell, complex] = {}
@@ -350,4 +358,5 @@ def _expected(seen: dict[Cell, complex], radius_px: float, size_px: tuple[int, i
                     fresh[cell] = guess[0]
         known.update(fresh)
         front = set(fresh)
-    return {cell: p for cell, p in known.items() if cell not in seen}
+    more = {cell: (p.real, p.imag) for cell, p in known.items() if cell not in seen}
+    return np.array(list(more), np.int64).reshape(-1, 2), np.array(list(more.values())).reshape(-1, 2)

@@ -26,9 +26,10 @@ from armsight.vision.markers.circle_blobs import (
     find_blobs,
     fit_discs,
     like_neighbours,
+    odd_sized,
     without_holes,
 )
-from armsight.vision.markers.circle_grid import Lattice, Layout, extrapolated, grow_lattices, place, positions
+from armsight.vision.markers.circle_grid import Lattice, Layout, expected, extrapolated, grow_lattices, place, positions
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
 from armsight.vision.markers.marker import Target
@@ -38,8 +39,11 @@ from armsight.vision.markers.spec import Fields
 _KEPT_SHARE, _KEPT_WITH_RINGS = 0.5, 0.2
 #: Grids in one image that may be the board, the largest first.
 _GRIDS = 4
-#: A lost disc is looked for where its contrast is at least this share of the others'.
-_LOST_CONTRAST = 0.3
+#: A disc that the search missed is there if its contrast is at least this share of the others'; rounds in which such are
+#: added.
+_LOST_CONTRAST, _COMPLETED = 0.4, 2
+#: An outline, and a fit, may have so many times the area that the others let expect.
+_ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
 #: Whether discs are light -> how the spec says so.
 POLARITIES = {False: "dark", True: "light"}
 
@@ -159,31 +163,25 @@ class CircleGrid(Record, Target):
 
     def _measured(self, image: Grey, blobs: Blobs, grid: Lattice, light: bool, least: int) -> Detections | str:
         """Number the discs of a grid and fit them; the reason where they do not make the board."""
-        sign, theta = (1 if light else -1), blobs.theta[grid.blobs]
-        contrast, hollow = contrasts(image, theta, sign)
-        placement = place(grid, blobs, hollow, self._layout, (image.shape[1], image.shape[0]))
+        sign, size = (1 if light else -1), (image.shape[1], image.shape[0])
+        cells, starts, hollow = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size)
+        placement = place(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
             return placement
         seen = placement.ids >= 0
-        starts = np.concatenate([theta[seen], like_neighbours(placement.uv, theta[seen])])
-        ids, found = np.concatenate([placement.ids[seen], placement.lost]), int(seen.sum())
-        of_lost, hollow_lost = contrasts(image, starts[found:], sign)
-        there = np.concatenate([np.ones(found, bool), of_lost > _LOST_CONTRAST * np.median(contrast)])
-        hollow = np.concatenate([hollow[seen], hollow_lost])[there]
-        ids, starts = self._upright(ids[there], starts[there, :2]), starts[there]
-        fits = fit_discs(without_holes(image, starts[hollow]) if hollow.any() else image, starts)
+        starts, hollow = starts[seen], hollow[seen]
+        ids = self._upright(placement.ids[seen], starts[:, :2])
+        fits = fit_discs(without_holes(image, starts[hollow]), starts)
         good = fits.kept()
         if not good.all() and good.sum() >= least:
             again = ~good
             starts[again] = like_neighbours(self._predicted(ids, fits.uv, good), fits.theta[good])
-            hollow &= again
-            fits = fit_discs(without_holes(image, starts[hollow]) if hollow.any() else image, starts, fits, again)
+            hollow = again & contrasts(image, starts, sign)[1]
+            fits = fit_discs(without_holes(image, starts[hollow]), starts, fits, again)
             good = fits.kept()
-        good &= ~fits.odd_sized()
+        good &= ~odd_sized(fits.theta, _ODD_FIT, good)
         if good.sum() < least:
-            return (
-                f"{found} of {len(self._ring)} discs were found, but only {good.sum()} can be measured{fits.why_not()}"
-            )
+            return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
         return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows])
 
@@ -205,6 +203,36 @@ class CircleGrid(Record, Target):
             if guess is not None:
                 out[k] = guess[0].real, guess[0].imag
         return out
+
+
+def _completed(
+    image: Grey, cells: Ids, theta: Array, sign: int, size_px: tuple[int, int]
+) -> tuple[Ids, Array, NDArray[np.bool_]]:
+    """Replace the odd outlines of a grid by what their neighbours let expect, and add discs that the search missed.
+
+    Args:
+        image: (H, W) grey.
+        cells: (N, 2) the grid's cells.
+        theta: (N, 10) its outlines.
+        sign: 1 for light discs, -1 for dark ones.
+        size_px: width and height of the image.
+
+    Returns:
+        (M, 2) cells, (M, 10) outlines, (M,) whether a disc has a hole.
+    """
+    kept = ~odd_sized(theta, _ODD_OUTLINE)
+    cells, theta = cells[kept], theta[kept]
+    contrast, hollow = contrasts(image, theta, sign)
+    for _ in range(_COMPLETED):
+        more, uv = expected(cells, theta, size_px)
+        like = like_neighbours(uv, theta)
+        there, ring = contrasts(image, like, sign)
+        found = there > _LOST_CONTRAST * np.median(contrast)
+        if not found.any():
+            break
+        cells, theta = np.concatenate([cells, more[found]]), np.concatenate([theta, like[found]])
+        contrast, hollow = np.concatenate([contrast, there[found]]), np.concatenate([hollow, ring[found]])
+    return cells, theta, hollow
 
 
 def _from_fields(fields: Fields, staggered: bool) -> CircleGrid:
