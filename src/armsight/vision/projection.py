@@ -243,7 +243,7 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         by_normal, normals = np.zeros((0, 2, 3)), by_point[:, :, 2]
         if model.disc_radius_m > 0:
             uv[rows], J_p, by_normal = _ellipses(camera, p, normals, model.disc_radius_m, uv[rows], J_p)
-            turned = by_normal @ by_body @ skew(np.array([0.0, 0.0, 1.0]))
+            turned = by_normal @ skew(normals) @ by_body
         by_body, by_point = J_p @ by_body, J_p @ by_point
         J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
         if side == 1 and len(state.motions):
