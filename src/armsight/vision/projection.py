@@ -243,7 +243,7 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         by_normal, normals = np.zeros((0, 2, 3)), by_point[:, :, 2]
         if model.disc_radius_m > 0:
             uv[rows], J_p, by_normal = _ellipses(camera, p, normals, model.disc_radius_m, uv[rows], J_p)
-            turned = by_normal @ skew(normals) @ by_body
+            by_tilt = by_normal @ skew(normals) @ by_body
         by_body, by_point = J_p @ by_body, J_p @ by_point
         J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
         if side == 1 and len(state.motions):
@@ -252,7 +252,7 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         start = 0 if side == 0 else sizes[0]
         by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
         if len(by_normal):
-            J_shot[rows, :, 3:6] -= turned
+            J_shot[rows, :, 3:6] -= by_tilt
             by_rig[:, :, 3:] += by_normal[: len(by_rig)] @ skew(normals[: len(by_rig)])
         _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, by_point, points, modes, J_shared)
     return uv, J_shared, J_shot

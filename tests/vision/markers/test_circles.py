@@ -85,11 +85,11 @@ def ringed():
     return open_board(spec), circle_grid(7, 6, 0.012, radius_m=0.004, rings=RINGS)
 
 
-@pytest.mark.parametrize("turn", [0.1, 1.7, 3.2, -1.5])
-def test_rings_number_a_part_of_the_board(turn):
+@pytest.mark.parametrize("rotation", [0.1, 1.7, 3.2, -1.5])
+def test_rings_number_a_part_of_the_board(rotation):
     board, pattern = ringed()
     assert not board.symmetries
-    T = posed(pattern, (0.2 * np.cos(turn), 0.2 * np.sin(turn), turn), 0.13, (0.012, 0.02))
+    T = posed(pattern, (0.2 * np.cos(rotation), 0.2 * np.sin(rotation), rotation), 0.13, (0.012, 0.02))
     image = picture(LONG, pattern, T)
     found = board.detect(image)
     assert found.problem is None
@@ -104,10 +104,10 @@ def test_rings_number_a_part_of_the_board(turn):
     if len(same.ids):
         assert np.abs(off_middles(plain, same, LONG, T, 0.004)).max() < 0.1
     else:
-        assert "which ones cannot be told" in (same.problem or "")
+        assert "which ones they are is unknown" in (same.problem or "")
 
 
-def test_rings_in_the_wrong_places_are_a_reason():
+def test_rings_in_wrong_positions_are_a_reason():
     _, pattern = ringed()
     image = picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))
     problem = open_board("circles:7x6:12mm:rings=2x2,4x2,2x4").detect(image).problem

@@ -23,7 +23,7 @@ from armsight.vision.markers.circle_blobs import Blobs
 
 #: Neighbours of a disc have up to this many times its area or contrast, and are 2 to this many radii away.
 _ALIKE, _FURTHEST = 3.0, 16.0
-#: Neighbours examined, and seeds from which grids are grown.
+#: Neighbours examined, and seeds from which grids grow.
 _NEIGHBOURS, _SEEDS = 12, 60
 #: A disc of the grid is this near to where its neighbours put it, as a share of the step.
 _NEAR = 0.3
@@ -65,7 +65,7 @@ def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
         sides = _sides(blobs, int(i), beside[i])
         if sides is None:
             continue
-        cells = _grown(blobs, int(i), sides)
+        cells = _spread(blobs, int(i), sides)
         lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())))
         taken[lattice.blobs] = True
         found.append(lattice)
@@ -112,8 +112,8 @@ def _regularity(blobs: Blobs, i: int, js: Ids) -> int:
     z = _flattened(blobs, i, js)
     length = np.hypot(*z.T)
     count = 0
-    for turned in (-z, np.column_stack([-z[:, 1], z[:, 0]])):
-        gap = np.linalg.norm(z[:, None] - turned[None], axis=2)
+    for rotated in (-z, np.column_stack([-z[:, 1], z[:, 0]])):
+        gap = np.linalg.norm(z[:, None] - rotated[None], axis=2)
         count += int((gap.min(axis=0) < _NEAR * length).sum())
     return count
 
@@ -131,7 +131,7 @@ def _sides(blobs: Blobs, i: int, js: Ids) -> tuple[int, int] | None:
     return None
 
 
-def _grown(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
+def _spread(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
     """Grow a lattice from an outline and two of its neighbours: cell -> outline."""
     uv = blobs.theta[:, :2]
     tree = KDTree(uv)
@@ -235,12 +235,12 @@ _MARGIN_PX = 3.0
 #: How far, in cells, missing discs are predicted from the ones that are seen.
 _PREDICTED_CELLS = 3
 #: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
-#: what a ring in the wrong place counts.
+#: what a ring in the wrong position counts.
 _MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Layout(Record):
+class GridLayout(Record):
     """The cells of a board's discs on a square lattice.
 
     Attributes:
@@ -259,22 +259,20 @@ class Placement(Record):
     """Which discs of a board a lattice shows.
 
     Attributes:
-        ids: (N,) the board's disc at each place of the lattice, -1 beside the board.
-        lost: (K,) discs of the board that should be in view and were not found.
-        uv: (K, 2) where they should be, px.
-        wrong: how much speaks against it: discs missing or too many, rings in the wrong place.
-        rings_wrong: rings in the wrong place.
+        ids: (N,) the board's disc at each position of the lattice, -1 beside the board.
+        lost: how many discs of the board should be in view and were not found.
+        wrong: how much speaks against it: discs missing or too many, rings in the wrong position.
+        rings_wrong: rings in the wrong position.
     """
 
     ids: Ids
-    lost: Ids
-    uv: Array
+    lost: int
     wrong: int
     rings_wrong: int
 
 
-def place(
-    cells: Ids, theta: Array, hollow: NDArray[np.bool_], layout: Layout, size_px: tuple[int, int]
+def number_cells(
+    cells: Ids, theta: Array, hollow: NDArray[np.bool_], layout: GridLayout, size_px: tuple[int, int]
 ) -> Placement | str:
     """Find which part of a board a lattice shows.
 
@@ -289,7 +287,7 @@ def place(
         The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
         reason why there is none.
     """
-    predicted, predicted_uv = expected(cells, theta, size_px)
+    predicted, _ = expected(cells, theta, size_px)
     origin = layout.cells.min(axis=0) - 1
     table = np.full(tuple(np.ptp(layout.cells, axis=0) + 3), -1)
     table[tuple((layout.cells - origin).T)] = np.arange(len(layout.cells))
@@ -297,25 +295,25 @@ def place(
     def at(cells: Ids) -> Ids:
         return np.asarray(table[tuple(np.clip(cells - origin, 0, np.array(table.shape) - 1).T)])
 
-    placements, turn = [], np.eye(2, dtype=np.int64)
+    placements, rotation = [], np.eye(2, dtype=np.int64)
     for _ in range(4):
-        turned = cells @ turn
-        shifts, counts = np.unique((layout.cells[None] - turned[:, None]).reshape(-1, 2), axis=0, return_counts=True)
+        rotated = cells @ rotation
+        shifts, counts = np.unique((layout.cells[None] - rotated[:, None]).reshape(-1, 2), axis=0, return_counts=True)
         for shift in shifts[counts >= 0.5 * counts.max()]:
-            ids, lost = at(turned + shift), at(predicted @ turn + shift)
+            ids, lost = at(rotated + shift), int((at(predicted @ rotation + shift) >= 0).sum())
             matched = ids >= 0
             ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0
-            wrong = int((~matched).sum() + (lost >= 0).sum()) + _RING_COST * ring_errors
-            placements.append(Placement(ids, lost[lost >= 0], predicted_uv[lost >= 0], wrong, ring_errors))
-        turn = turn @ np.array([[0, 1], [-1, 0]])
+            wrong = int((~matched).sum()) + lost + _RING_COST * ring_errors
+            placements.append(Placement(ids, lost, wrong, ring_errors))
+        rotation = rotation @ np.array([[0, 1], [-1, 0]])
     return _unambiguous(placements, layout)
 
 
-def _unambiguous(placements: list[Placement], layout: Layout) -> Placement | str:
+def _unambiguous(placements: list[Placement], layout: GridLayout) -> Placement | str:
     """Return the placement with the least wrong, or the reason why it is none."""
     best = min(placements, key=lambda p: (p.wrong, -int((p.ids >= 0).sum())))
     matched = int((best.ids >= 0).sum())
-    if best.wrong - _RING_COST * best.rings_wrong > _MOST_WRONG * (matched + len(best.lost)):
+    if best.wrong - _RING_COST * best.rings_wrong > _MOST_WRONG * (matched + best.lost):
         return f"{len(best.ids)} discs in a grid were found, which do not make the board"
     if best.rings_wrong > 1:
         return "its discs were found, but the rings among them are not where the board has them"
@@ -323,7 +321,7 @@ def _unambiguous(placements: list[Placement], layout: Layout) -> Placement | str
     others = [p.wrong for p in placements if not any((p.ids == ids).all() for ids in same)]
     if min(others, default=best.wrong + _WORSE) < best.wrong + _WORSE:
         return (
-            f"{matched} of its {len(layout.cells)} discs were found, and which ones cannot be told: show all of it"
+            f"{matched} of its {len(layout.cells)} discs were found, and which ones they are is unknown: show all of it"
             + ("" if layout.rings.any() else ", or use a board with rings")
         )
     return best

@@ -29,7 +29,15 @@ from armsight.vision.markers.circle_blobs import (
     odd_sized,
     without_holes,
 )
-from armsight.vision.markers.circle_grid import Lattice, Layout, expected, extrapolated, grow_lattices, place, positions
+from armsight.vision.markers.circle_grid import (
+    GridLayout,
+    Lattice,
+    expected,
+    extrapolated,
+    grow_lattices,
+    number_cells,
+    positions,
+)
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
 from armsight.vision.markers.marker import Target
@@ -128,11 +136,11 @@ class CircleGrid(Record, Target):
         return tuple(perm for _, perm in rotations(self.body.points) if (ring[perm] == ring).all())
 
     @cached_property
-    def _layout(self) -> Layout:
+    def _layout(self) -> GridLayout:
         """The discs on a square lattice; that of a staggered grid lies diagonally."""
         x, y = np.rint(self.body.points[:, :2] / self.pitch_m).astype(np.int64).T
         cells = np.stack([(x + y) // 2, (y - x) // 2] if self.staggered else [x, y], axis=1)
-        return Layout(cells, self._ring, self.symmetries)
+        return GridLayout(cells, self._ring, self.symmetries)
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
@@ -165,7 +173,7 @@ class CircleGrid(Record, Target):
         """Number the discs of a grid and fit them; the reason where they do not make the board."""
         sign, size = (1 if light else -1), (image.shape[1], image.shape[0])
         cells, starts, hollow = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size)
-        placement = place(cells, starts, hollow, self._layout, size)
+        placement = number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
             return placement
         seen = placement.ids >= 0
