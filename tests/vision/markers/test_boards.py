@@ -229,6 +229,8 @@ def test_both_layouts_of_charuco_are_read():
         layout.setLegacyPattern(legacy)
         found = target.detect(layout.generateImage((7 * 50, 6 * 50), marginSize=0))
         assert len(found.ids) == 30
+        inverted = target.detect(255 - layout.generateImage((7 * 50, 6 * 50), marginSize=0))
+        np.testing.assert_allclose(inverted.uv, found.uv, atol=1e-3)
         truth = 50.0 * (target.body.points[found.ids, :2] / 0.03 + 1) - 0.5
         assert np.abs(found.uv - truth).max() < 0.05
 
