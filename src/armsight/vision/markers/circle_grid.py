@@ -27,6 +27,8 @@ _ALIKE, _FURTHEST = 3.0, 16.0
 _NEIGHBOURS, _SEEDS = 12, 60
 #: A disc of the grid is this near to where its neighbours put it, as a share of the step.
 _NEAR = 0.3
+#: Unevenness that halves a lattice's weight; share of the weight of a whole, even board that ends the search.
+_UNEVEN, _ENOUGH = 0.1, 0.8
 #: Sides of the grid, rotated by 90 degrees from each to the next.
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
@@ -40,18 +42,20 @@ class Lattice(Record):
     Attributes:
         cells: (N, 2) their integer positions.
         blobs: (N,) rows of the outlines.
+        weight: how much speaks for it: its discs, fewer the more unevenly they stand. Texture may be large, but not even.
     """
 
     cells: Ids
     blobs: Ids
+    weight: float
 
 
 def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
-    """Assemble lattices from outlines, the largest first.
+    """Assemble lattices from outlines, the best first.
 
     Args:
         blobs: the outlines.
-        enough: no further seeds are tried once a lattice has so many discs.
+        enough: no further seeds are tried once a lattice has nearly the weight of so many discs.
     """
     if len(blobs.theta) < 4:
         return []
@@ -66,12 +70,25 @@ def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
         if sides is None:
             continue
         cells = _spread(blobs, int(i), sides)
-        lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())))
-        taken[lattice.blobs] = True
+        weight = len(cells) / (1.0 + (_unevenness(blobs, cells) / _UNEVEN) ** 2)
+        lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())), weight)
+        taken[lattice.blobs if weight > 0.5 * len(cells) else i] = True
         found.append(lattice)
-        if len(cells) >= enough:
+        if weight >= _ENOUGH * enough:
             break
-    return sorted(found, key=lambda lattice: -len(lattice.blobs))
+    return sorted(found, key=lambda lattice: -lattice.weight)
+
+
+def _unevenness(blobs: Blobs, cells: dict[Cell, int]) -> float:
+    """Return how far discs are from the middle of the two beside them: median, as a share of the step; 1 if unknown."""
+    at = {cell: complex(*blobs.theta[i, :2]) for cell, i in cells.items()}
+    off = []
+    for (x, y), here in at.items():
+        for dx, dy in _SIDES[:2]:
+            before, after = at.get((x - dx, y - dy)), at.get((x + dx, y + dy))
+            if before is not None and after is not None:
+                off.append(abs(before + after - 2 * here) / abs(after - before))
+    return median(off) if off else 1.0
 
 
 def _neighbours(blobs: Blobs) -> list[Ids]:
@@ -298,8 +315,11 @@ def number_cells(
     placements, rotation = [], np.eye(2, dtype=np.int64)
     for _ in range(4):
         rotated = cells @ rotation
-        shifts, counts = np.unique((layout.cells[None] - rotated[:, None]).reshape(-1, 2), axis=0, return_counts=True)
-        for shift in shifts[counts >= 0.5 * counts.max()]:
+        shifts = (layout.cells[None] - rotated[:, None]).reshape(-1, 2)
+        low, span = shifts.min(axis=0), int(np.ptp(shifts[:, 1])) + 1
+        counts = np.bincount((shifts - low) @ [span, 1])
+        for code in np.flatnonzero(counts >= 0.5 * counts.max()).tolist():
+            shift = low + np.array(divmod(code, span))
             ids, lost = at(rotated + shift), int((at(predicted @ rotation + shift) >= 0).sum())
             matched = ids >= 0
             ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0

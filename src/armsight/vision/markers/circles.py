@@ -45,7 +45,7 @@ from armsight.vision.markers.spec import Fields
 
 #: The share of a board's discs that must be measured; with rings a smaller part is enough.
 _KEPT_SHARE, _KEPT_WITH_RINGS = 0.5, 0.2
-#: Grids in one image that may be the board, the largest first.
+#: Grids in one image that may be the board, the best first.
 _GRIDS = 4
 #: A disc that the search missed is there if its contrast is at least this share of the others'; rounds in which such are
 #: added.
@@ -157,10 +157,10 @@ class CircleGrid(Record, Target):
     def _found(self, image: Grey, dark: bool, light: bool) -> Detections:
         """Find the board by its dark discs, its light ones, or whichever make the board."""
         least = max(4, int((_KEPT_WITH_RINGS if self.rings else _KEPT_SHARE) * len(self._ring)))
-        grids: list[tuple[int, bool, Blobs, Lattice]] = []
+        grids: list[tuple[float, bool, Blobs, Lattice]] = []
         for polarity, blobs in zip((False, True), find_blobs(image, light, dark), strict=True):
             lattices = grow_lattices(blobs, len(self._ring))
-            grids += [(len(g.blobs), polarity, blobs, g) for g in lattices if len(g.blobs) >= least]
+            grids += [(g.weight, polarity, blobs, g) for g in lattices if len(g.blobs) >= least]
         problem = f"no {self.body.name} found"
         for n, (_, polarity, blobs, grid) in enumerate(sorted(grids, key=lambda g: -g[0])[:_GRIDS]):
             found = self._measured(image, blobs, grid, polarity, least)
