@@ -4,7 +4,8 @@
     python benchmarks/calibration.py 1 4        only these
 
 Metrics: 1 held-out errors on real sets, 2 half-subsets, 3 uncertainty, 4 the Motoman arm and its laser tracker,
-5 coverage of the pose's covariance, 6 time. Real recordings are looked for at ARMSIGHT_DATA or ../shared/data.
+5 coverage of the pose's covariance, 6 time, 7 boards of discs. Real recordings are looked for at ARMSIGHT_DATA or
+../shared/data.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import sys
 import cv2
 
 import motoman
+import real_discs
 import real_sets
 import rendered
 
@@ -24,6 +26,7 @@ METRICS = {
     "4": motoman.tracker,
     "5": rendered.pose_coverage,
     "6": rendered.time_beside_opencv,
+    "7": lambda: (real_discs.found_beside_opencv(), real_discs.heldout_beside_opencv(), real_discs.rendered_wide()),
 }
 
 

@@ -8,7 +8,7 @@ Arrays in a record are read-only. Frames, units and the meaning of a covariance:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -115,12 +115,14 @@ class Detections(Record):
         uv: (N, 2) their positions, raw pixels.
         cov_uv: (N, 2, 2) covariance of the positions from the image's own noise, px^2; zero where unknown.
         problem: why nothing was found; None when something was.
+        shape: (N, 3) S11, S12, S22 of the ellipses of a board's discs, px^2, as in :class:`Discs`; (0, 3) for other points.
     """
 
     ids: Ids
     uv: Array
     cov_uv: Array
     problem: str | None = None
+    shape: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @staticmethod
     def none(problem: str) -> Detections:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
+from armsight.geometry.pose import inverse
 from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
-from armsight.vision.discs.locate import locate_composite
+from armsight.vision.discs.bias import apparent_radii
+from armsight.vision.discs.locate import locate_composite, locate_discs
 from armsight.vision.image import grey
 from armsight.vision.locate import locate
+from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.match import gate, join, match
 from armsight.vision.rig import StereoRig
@@ -49,7 +52,32 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
     problems = [f"{side}: {d.problem}" for side, d in zip(SIDES, found, strict=True) if d.problem is not None]
     if problems:
         return Missed("; ".join(problems))
-    return measure_detections(rig, target.body, *found, symmetries=target.symmetries)
+    result = measure_detections(rig, target.body, *found, symmetries=target.symmetries)
+    if isinstance(result, Missed) or not any(len(d.shape) for d in found):
+        return result
+    return _without_bias(rig, target, *found, result)
+
+
+def _without_bias(
+    rig: StereoRig, target: Target, left: Detections, right: Detections, rough: PoseEstimate
+) -> PoseEstimate | Missed:
+    """Measure a board of discs again from a rough pose: the centres of ellipses are not the images of the middles."""
+    points, radius_m = target.body.points, target.disc_radius_m
+    if radius_m is None:
+        Ts = rough.T_left_body, inverse(rig.T_left_right) @ rough.T_left_body
+        about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
+        radii = [
+            apparent_radii(camera, T, points[d.ids], d.shape, about_m)
+            for camera, T, d in zip(rig.cameras, Ts, (left, right), strict=True)
+        ]
+        radius_m = float(np.nanmedian(np.concatenate(radii)))
+    count = len(points)
+    discs = DiscTarget(
+        target.body, np.full(count, radius_m), np.zeros(count, bool), np.tile([0.0, 0.0, -1.0], (count, 1))
+    )
+    nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
+    seen = match(rig, target.body, left, right, symmetries=target.symmetries)
+    return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body, rough.cov)
 
 
 def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:

@@ -19,6 +19,7 @@ from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.geometry.rotation import exp_so3, skew
 from armsight.kernels import kernel
 from armsight.vision.camera import Camera
+from armsight.vision.discs.bias import project_discs
 
 
 def without_gauge(points: Array, modes: Array) -> Array:
@@ -147,6 +148,8 @@ class BundleModel(Record):
         free_cameras: whether intrinsics and distortion are estimated.
         motion_sigmas: (S, 6) standard deviation of every shot's motion between the exposures before any image, m and
             rad, as in :class:`BundleState`; (0, 6) where the body stands still.
+        disc_radius_m: radius of the discs in the plane z = 0 of which the points are the middles and the centres of their
+            ellipses are observed, m; 0 where the points themselves are.
     """
 
     points: Array
@@ -154,6 +157,7 @@ class BundleModel(Record):
     shape_sigma_m: float
     free_cameras: bool
     motion_sigmas: Array = field(default_factory=_still)
+    disc_radius_m: float = 0.0
 
     def body(self, shape: Array) -> Array:
         """(M, 3) points of the body of a given shape, m."""
@@ -236,6 +240,10 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
             by_point = by_body @ R
         p = transform(T, p_body)
         uv[rows], J_p, J_k = camera.project_jacobians(p)
+        by_normal, normals = np.zeros((0, 2, 3)), by_point[:, :, 2]
+        if model.disc_radius_m > 0:
+            uv[rows], J_p, by_normal = _ellipses(camera, p, normals, model.disc_radius_m, uv[rows], J_p)
+            by_tilt = by_normal @ skew(normals) @ by_body
         by_body, by_point = J_p @ by_body, J_p @ by_point
         J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
         if side == 1 and len(state.motions):
@@ -243,8 +251,39 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
             J_shot[rows, :, 6:] = np.concatenate([by_body, by_rotation], axis=2)
         start = 0 if side == 0 else sizes[0]
         by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
+        if len(by_normal):
+            J_shot[rows, :, 3:6] -= by_tilt
+            by_rig[:, :, 3:] += by_normal[: len(by_rig)] @ skew(normals[: len(by_rig)])
         _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, by_point, points, modes, J_shared)
     return uv, J_shared, J_shot
+
+
+def _ellipses(
+    camera: Camera, p: Array, normals: Array, radius_m: float, uv: Array, J_p: Array
+) -> tuple[Array, Array, Array]:
+    """Project discs instead of their middles: centres of the ellipses (N, 2), derivatives by p and by normals (N, 2, 3).
+
+    Args:
+        camera: the camera.
+        p: (N, 3) middles, m, camera's frame.
+        normals: (N, 3) unit normals.
+        radius_m: radius, m.
+        uv: (N, 2) images of the middles, which stay where a disc has no ellipse.
+        J_p: (N, 2, 3) their derivative.
+    """
+    centres, _, J_disc, J_normal = project_discs(camera, p, np.ascontiguousarray(normals), np.full(len(p), radius_m))
+    seen = np.isfinite(centres[:, 0])
+    one, all_three = seen[:, None], seen[:, None, None]
+    return np.where(one, centres, uv), np.where(all_three, J_disc, J_p), np.where(all_three, J_normal, 0.0)
+
+
+def of_middles(model: BundleModel, state: BundleState, observations: Observations) -> Observations:
+    """Return the observations that discs' middles would give: less the perspective bias at a state."""
+    if not model.disc_radius_m > 0:
+        return observations
+    points = replace(model, disc_radius_m=0.0)
+    bias = predict(model, state, observations)[0] - predict(points, state, observations)[0]
+    return replace(observations, uv=observations.uv - bias)
 
 
 def _right_jacobians(rotations: Array) -> Array:

@@ -70,6 +70,31 @@ def test_json_has_what_was_promised(rendered, armsight, tmp_path):
     assert summary["convergence_deg"] == pytest.approx(rig.convergence_deg, rel=1e-9)
 
 
+def test_images_of_one_camera_alone_in_another_resolution_are_used(few, armsight, tmp_path):
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    for path in sorted(few.glob("left*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(alone / path.name), cv2.resize(image, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
+    more = ("--left-intrinsics", alone / "*.png")
+    out = tmp_path / "rig.json"
+    said = armsight("calibrate", *images(few), *more, *CHESS, *QUICK, "-o", out, "--json")
+    assert said.code == 0, said.err
+    (summary,) = said.lines
+    assert (summary["pairs_found"], summary["pairs_used"], summary["rejected"]) == (5, 5, [])
+    assert summary["heldout"]["epipolar_rms_px"] < 0.1
+    assert StereoRig.load(out).provenance["left_intrinsics"] == str(more[1])
+    square = np.zeros((300, 300), np.uint8)
+    cv2.imwrite(str(alone / "square.png"), square)
+    for options, words in (
+        (("--left-intrinsics", alone / "*.png"), ("square.png", "300x300", "same ratio")),
+        (("--right-intrinsics", alone / "*.jpg"), ("*.jpg", "no such file")),
+    ):
+        assert_rejected(armsight("calibrate", *images(few), *options, *CHESS, *QUICK, "-o", out), *words)
+    known = ("--detections", "d.csv", "--cameras", "c.json", "--body", "b.csv")
+    assert_rejected(armsight("calibrate", *more, *known, "-o", out), "--left-intrinsics")
+
+
 def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
     said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json")
     assert said.code == 0, said.err

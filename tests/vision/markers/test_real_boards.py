@@ -1,4 +1,4 @@
-"""Chessboards in the real recordings: found in every image, and located more smoothly than by OpenCV."""
+"""Boards in the real recordings: found in every image; chessboards located more smoothly than by OpenCV."""
 
 import cv2
 import numpy as np
@@ -61,3 +61,24 @@ def test_left_and_right_agree_on_the_first_corner(data_dir):
             found.uv[np.searchsorted(found.ids, 8)] - found.uv[np.searchsorted(found.ids, 0)] for found in (left, right)
         ]
         assert along[0] @ along[1] > 0.7 * np.linalg.norm(along[0]) * np.linalg.norm(along[1])
+
+
+@pytest.mark.parametrize(
+    ("folder", "images", "spec", "least"),
+    [
+        ("discocal", "*.png", "circles:4x3:90mm", 11),
+        ("dice-dots", "*_?4.jpg", "circles:14x10:7mm:rings=2x7,11x7,2x2", 100),
+        ("boof-circle-regular", "*.jpg", "circles:10x8:25mm", 80),
+        ("boof-circle-asym", "*.jpg", "acircles:4x5:30mm", 18),
+        ("open3dv-discs", "*.png", "acircles:7x11:10mm", 77),
+    ],
+)
+def test_boards_of_discs_are_found_in_every_image(data_dir, folder, images, spec, least):
+    board = open_board(spec)
+    paths = sorted((data_dir / "real" / folder).glob(images))
+    if not paths:
+        pytest.skip(f"real/{folder} is not in the recordings")
+    for path in paths:
+        found = board.detect(grey(read_image(path)))
+        assert found.problem is None, f"{path.name}: {found.problem}"
+        assert len(found.ids) >= least, path.name

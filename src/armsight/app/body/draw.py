@@ -14,7 +14,7 @@ import contextlib
 import hashlib
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -51,7 +51,16 @@ _PARALLEL, _LEVEL_MM = float(np.cos(np.radians(0.5))), 0.2
 BOARD_PATTERNS: dict[type, Callable[[Any], Pattern]] = {
     Chessboard: lambda b: chessboard(b.columns, b.rows, b.square_m, black=0.0, white=1.0),
     Charuco: lambda b: charuco(b.columns, b.rows, b.square_m, b.marker_m, b.family, black=0.0, white=1.0),
-    CircleGrid: lambda b: circle_grid(b.columns, b.rows, b.pitch_m, asymmetric=b.staggered, black=0.0, white=1.0),
+    CircleGrid: lambda b: circle_grid(
+        b.columns,
+        b.rows,
+        b.pitch_m,
+        asymmetric=b.staggered,
+        radius_m=b.disc_radius_m,
+        rings=b.rings,
+        black=float(bool(b.light)),
+        white=float(not b.light),
+    ),
     AprilGrid: lambda b: aprilgrid(b.columns, b.rows, b.tag_m, b.spacing, black=0.0, white=1.0),
 }
 
@@ -68,6 +77,7 @@ class Mark(Record):
         square: whether that surround is a square, else a circle.
         polygons: (N, 4, 2) its dark squares.
         box: (2, 2) low and high corner of what it needs for itself, margins included.
+        holes: (H, 3) x, y, radius of the white discs printed over all that.
     """
 
     name: str
@@ -77,6 +87,7 @@ class Mark(Record):
     square: bool
     polygons: Array
     box: Array
+    holes: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +229,8 @@ def _pattern(name: str, pattern: Pattern, T_body_pattern: Array) -> Callable[[Ar
         outer = on_page(np.array([[xs[0], ys[0]], [xs[-1], ys[0]], [xs[-1], ys[-1]], [xs[0], ys[-1]]]))
         circles = np.column_stack([on_page(pattern.discs[:, :2]), 1e3 * pattern.discs[:, 2]])
         quads = np.array(_runs(pattern)).reshape(-1, 4, 2)
-        return Mark(name, circles, True, 0.0, False, on_page(quads), np.stack([outer.min(axis=0), outer.max(axis=0)]))
+        box, dark = np.stack([outer.min(axis=0), outer.max(axis=0)]), pattern.discs[:, 3] < 0.5
+        return Mark(name, circles[dark], True, 0.0, False, on_page(quads), box, circles[~dark])
 
     return mark
 
@@ -361,7 +373,9 @@ def _board_page(spec: str) -> Page:
     corners = [mark.polygons.reshape(-1, 2)]
     corners += [mark.circles[:, :2] + sign * mark.circles[:, 2:] for sign in (-1.0, 1.0)]
     dark = np.concatenate(corners)
-    whole = Mark("", mark.circles, True, 0.0, False, mark.polygons, np.array([dark.min(axis=0), dark.max(axis=0)]))
+    whole = Mark(
+        "", mark.circles, True, 0.0, False, mark.polygons, np.array([dark.min(axis=0), dark.max(axis=0)]), mark.holes
+    )
     return Page(-axes[:, 2], axes, (whole,))
 
 
@@ -522,6 +536,8 @@ def _print(axes: Axes, mark: Mark, shift: Array) -> None:
         corners = np.concatenate([mark.polygons, mark.polygons[:, :1]], axis=1) + shift
         codes = np.tile([Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY], len(corners))
         axes.add_patch(PathPatch(Outline(corners.reshape(-1, 2), codes), facecolor="black", **_PLAIN))
+    for x, y, radius in mark.holes:
+        axes.add_patch(Circle((x + shift[0], y + shift[1]), radius, facecolor="white", zorder=2, **_PLAIN))
 
 
 def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:

@@ -17,6 +17,8 @@ from armsight.vision.calibrate import FOLDS, MODELS
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
+@click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
+@click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
 @click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
 @click.option(
     "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
@@ -44,6 +46,8 @@ from armsight.vision.calibrate import FOLDS, MODELS
 def command(
     left: str | None,
     right: str | None,
+    left_intrinsics: str | None,
+    right_intrinsics: str | None,
     target: str | None,
     lens_model: str | None,
     flat_target: bool,
@@ -66,16 +70,27 @@ def command(
         raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
+    if (left_intrinsics or right_intrinsics) and left is None:
+        raise InputError("--left-intrinsics and --right-intrinsics go with --left, --right and --target")
 
     from armsight.app.calibrate.report import REPORT_FILES, write_report
-    from armsight.app.calibrate.run import calibrate_detections, calibrate_images, print_result, provenance, summary
+    from armsight.app.calibrate.run import (
+        calibrate_detections,
+        calibrate_images,
+        files_of,
+        print_result,
+        provenance,
+        summary,
+        with_radius,
+    )
     from armsight.app.report.plotting import require_matplotlib
     from armsight.vision.markers.body_file import save_body_csv
     from armsight.vision.markers.calibrated_board import save_board_file
     from armsight.vision.sources import PairsSource
 
     source = None if left is None or right is None else PairsSource.open(left, right)
-    inputs = points if source is None else source.files
+    alone = (files_of(left_intrinsics), files_of(right_intrinsics))
+    inputs = points if source is None else (*source.files, *alone[0], *alone[1])
     board_file = None if source is None else output.parent / f"{output.stem}.board.toml"
     check_outputs((output, refine_body, board_file), inputs)
     if report is not None:
@@ -89,8 +104,10 @@ def command(
     started = time.perf_counter()
     if source is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        calibration = calibrate_images(source, target, models, flat=flat_target, folds=folds)
+        calibration = calibrate_images(source, alone, target, models, flat=flat_target, folds=folds)
         given = {"left": str(left), "right": str(right), "target": target, "board": board_file.name}
+        more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
+        given |= {name: pattern for name, pattern in more.items() if pattern is not None}
     elif detections is not None and cameras is not None and body is not None:
         calibration = calibrate_detections(detections, cameras, body, refine_body=refine_body is not None, folds=folds)
         given = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
@@ -99,7 +116,7 @@ def command(
         save_body_csv(calibration.body, refine_body)
     calibration.rig.save(output)
     if board_file is not None and target is not None:
-        save_board_file(board_file, target, calibration.body.points)
+        save_board_file(board_file, with_radius(target, calibration.disc_radius_m), calibration.body.points)
     if report is not None:
         write_report(calibration, report)
     if as_json:

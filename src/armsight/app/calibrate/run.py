@@ -22,22 +22,67 @@ from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.image import grey
-from armsight.vision.markers.board import open_board
+from armsight.vision.image import grey, read_image
+from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import PairsSource
+from armsight.vision.sources.pairs import image_files, natural_key
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
+def with_radius(spec: str, disc_radius_m: float | None) -> str:
+    """Return a board's spec with the radius of its discs that the images showed, where it has discs and no radius."""
+    return spec if disc_radius_m is None or "radius=" in spec else f"{spec}:radius={1e3 * disc_radius_m:.6g}mm"
+
+
+def files_of(pattern: str | None) -> list[Path]:
+    """Return the images that a glob matches, sorted; none without one."""
+    if pattern is None:
+        return []
+    files = sorted(image_files(pattern), key=natural_key)
+    if not files:
+        raise InputError(f"{pattern}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
+    return files
+
+
+def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, int]) -> Pair:
+    """Detect the target in an image of one camera alone; pixels of another resolution are converted to those of the pairs.
+
+    Raises:
+        InputError: not an image, or of another shape than those of the pairs.
+    """
+    image = grey(read_image(path))
+    height, width = image.shape
+    scale = size[0] / width
+    if abs(height * scale - size[1]) > 0.5 * max(scale, 1.0):
+        raise InputError(
+            f"{path}: is {width}x{height}, and the {SIDES[side]} images in the pairs {size[0]}x{size[1]}: take both with "
+            "the same field of view, and so the same ratio of width to height"
+        )
+    found = target.detect(image)
+    found = replace(
+        found, uv=(found.uv + 0.5) * scale - 0.5, cov_uv=found.cov_uv * scale**2, shape=found.shape * scale**2
+    )
+    nothing = Detections.none(f"{path.name} is of the {SIDES[side]} camera alone")
+    return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
+
+
 def calibrate_images(
-    source: PairsSource, target: str, models: tuple[str, ...], *, flat: bool, folds: int
+    source: PairsSource,
+    alone: tuple[list[Path], list[Path]],
+    spec: str,
+    models: tuple[str, ...],
+    *,
+    flat: bool,
+    folds: int,
 ) -> Calibration:
-    """Detect a board, given by its spec, in every pair of images and calibrate."""
-    board = open_board(target)
+    """Detect a board, given by its spec, in every pair of images, and in those of one camera alone, and calibrate."""
+    target = open_board(spec)
     pairs: list[Pair] = []
+    singles: list[Pair] = []
     sizes: Sizes | None = None
-    with bar("detecting the target", len(source.pairs)) as advance:
+    with bar("detecting the target", len(source.pairs) + sum(map(len, alone))) as advance:
         for stored in source.pairs:
             shot = stored.load()
             if shot.left is None or shot.right is None:
@@ -48,12 +93,18 @@ def calibrate_images(
             else:
                 now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
                 sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
-                pairs.append(Pair(shot.name, board.detect(grey(shot.left)), board.detect(grey(shot.right))))
+                pairs.append(Pair(shot.name, target.detect(grey(shot.left)), target.detect(grey(shot.right))))
             advance()
+        for side, paths in enumerate(alone if sizes is not None else ()):
+            for path in paths:
+                singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
+                advance()
     if sizes is None:
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
     with steps() as progress:
-        return calibrate_boards(board, pairs, sizes, models=models, flat=flat, folds=folds, progress=progress)
+        return calibrate_boards(
+            target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+        )
 
 
 def calibrate_detections(detections: Path, cameras: Path, body: Path, *, refine_body: bool, folds: int) -> Calibration:
@@ -107,6 +158,7 @@ def summary(
         "distortion_model": c.rig.left.model,
         "sigma_px": c.rig.sigma_px,
         "body_deviation_rms_m": c.deviation_m,
+        "disc_radius_m": c.disc_radius_m,
         "rig": str(output),
         "board": None if board_file is None else str(board_file),
         "report": str(report / PAGE) if report is not None else None,
@@ -132,6 +184,7 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
         f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
         *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
         *(f"note: {note}" for note in c.notes),
         *(weak(weakness) for weakness in c.weaknesses),

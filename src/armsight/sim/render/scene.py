@@ -22,6 +22,8 @@ from armsight.geometry.check import checked
 #: Reflectance of a cell where nothing is: what stands behind shows.
 CLEAR = -1.0
 BLACK, WHITE = 0.08, 0.85
+#: Radius of the hole of a ring on a board of discs, as a share of the disc's.
+RING_HOLE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +117,7 @@ def circle_grid(
     *,
     asymmetric: bool = False,
     radius_m: float | None = None,
+    rings: Sequence[tuple[int, int]] = (),
     black: float = BLACK,
     white: float = WHITE,
 ) -> Pattern:
@@ -127,6 +130,7 @@ def circle_grid(
             odd rows are shifted by it, as OpenCV has it.
         asymmetric: whether odd rows are shifted.
         radius_m: radius of a disc, a quarter of the distance to its nearest neighbour by default (m).
+        rings: (column, row) of the discs with a hole of RING_HOLE of their radius.
         black: reflectance of the discs.
         white: reflectance of the plate.
     """
@@ -135,11 +139,18 @@ def circle_grid(
     y = row * pitch_m
     radius = radius_m if radius_m is not None else pitch_m * (np.sqrt(2) if asymmetric else 1.0) / 4
     margin = 1.5 * pitch_m
+    discs = np.stack([x, y, np.full(x.size, radius), np.full(x.size, black)], axis=1)
+    holes = discs[[row * columns + column for column, row in rings]] * [1.0, 1.0, RING_HOLE, 0.0] + [
+        0.0,
+        0.0,
+        0.0,
+        white,
+    ]
     return Pattern(
         np.array([-margin, x.max() + margin]),
         np.array([-margin, y.max() + margin]),
         np.array([[white]]),
-        np.stack([x, y, np.full(x.size, radius), np.full(x.size, black)], axis=1),
+        np.concatenate([discs, holes]),
     )
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Detections, Record
 from armsight.errors import CalibrationError
-from armsight.geometry.pose import transform
+from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate import FOLDS, MODELS
@@ -42,9 +42,10 @@ from armsight.vision.calibrate.screen import (
 from armsight.vision.calibrate.start import fits, imitated, start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
+from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.match import join, renamed
-from armsight.vision.projection import smooth
+from armsight.vision.projection import of_middles, smooth
 from armsight.vision.rig import StereoRig
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
@@ -64,6 +65,9 @@ BOARD_DEGREE = 4
 BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
 _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
+#: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
+#: lens widen or narrow what is dark.
+_RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
 
 
 def rigid_board(points: Array) -> BundleModel:
@@ -169,6 +173,7 @@ class LensModelSearch(Record):
                 model.points,
                 self.screened.unscreened,
                 self.folds,
+                model.disc_radius_m,
             )
         except (CalibrationError, np.linalg.LinAlgError):
             return None
@@ -255,6 +260,7 @@ def calibrate_boards(
     models: tuple[str, ...] = MODELS,
     flat: bool = False,
     folds: int = FOLDS,
+    singles: Sequence[Pair] = (),
     progress: Progress = lambda message: None,
 ) -> Calibration:
     """Calibrate two cameras from pairs of images of one board.
@@ -266,6 +272,8 @@ def calibrate_boards(
         models: distortion models to choose from by held-out error.
         flat: hold the board to its drawing.
         folds: how many parts the pairs are split into for the held-out errors.
+        singles: detections of further images of the same board by one camera alone, the other side empty and with a
+            reason: they help to determine what is inside the camera.
         progress: called with a line about what is being done.
 
     Returns:
@@ -277,12 +285,19 @@ def calibrate_boards(
     points = board.body.points
     usable, rejected = _usable(pairs)
     _enough(len(usable), len(pairs), rejected)
+    pair_count = len(usable)
+    alone, without_board = _usable_alone(singles)
+    usable, rejected = usable + alone, rejected + without_board
     progress("estimating poses of cameras and boards")
     first, usable, notes = _start(board, usable, sizes, models)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
     progress("looking for gross errors")
     model = rigid_board(points) if flat else printed_board(points)
-    selection = _Selection(model, observations, tuple(pair.name for pair in usable), sizes, folds, len(pairs), progress)
+    radius_m, first = _disc_radius(board, usable, first, observations)
+    model = replace(model, disc_radius_m=radius_m or 0.0)
+    selection = _Selection(
+        model, observations, tuple(pair.name for pair in usable), sizes, folds, pair_count, len(pairs), progress
+    )
     screened, trial, tried = selection.chosen(first.state, models)
     lens = trial.solution.state.cameras[0].model
     if lens != first.state.cameras[0].model and (screened.rejected or screened.notes):
@@ -296,7 +311,7 @@ def calibrate_boards(
                 screened, trial = again, trial_again
                 tried = {**tried, lens: trial.heldout}
     rejected += screened.rejected
-    names = tuple(usable[j].name for j in screened.kept)
+    names = tuple(usable[j].name for j in screened.kept if j < pair_count)
     rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
     found = trial.model.body(state.shape)
@@ -309,7 +324,7 @@ def calibrate_boards(
         len(pairs),
         screened.observations,
         trial.solution,
-        residual_epipolar_rms(rig, screened.observations),
+        residual_epipolar_rms(rig, of_middles(trial.model, state, screened.observations)),
         trial.heldout,
         trial.errors,
         tried,
@@ -317,8 +332,46 @@ def calibrate_boards(
         (*notes, *screened.notes, *unfinished(trial.solution)),
         (),
         None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
+        radius_m,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
+
+
+def _disc_radius(
+    board: CalibrationBoard, usable: list[Pair], first: BundleSolution, observations: Observations
+) -> tuple[float | None, BundleSolution]:
+    """Return the radius of a board's discs, m, None where it has none, and an adjustment with their perspective bias.
+
+    The images show a radius: the areas of the ellipses against the spacing of the discs, at the poses found.
+
+    Raises:
+        CalibrationError: it is not the one that the board is said to have.
+    """
+    seen = [
+        (side, j, d) for j, pair in enumerate(usable) for side, d in enumerate((pair.left, pair.right)) if len(d.shape)
+    ]
+    if not seen:
+        return None, first
+    points = board.body.points
+    about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
+    for _ in range(_RADIUS_ROUNDS):
+        T_right_left = inverse(first.state.T_left_right)
+        radii = []
+        for side, j, found in seen:
+            T = first.state.Ts_left_body[j]
+            T = T if side == 0 else T_right_left @ T
+            camera = first.state.cameras[side]
+            radii.append(apparent_radii(camera, T, points[found.ids], found.shape, about_m))
+        about_m = float(np.nanmedian(np.concatenate(radii)))
+        model = replace(rigid_board(points), disc_radius_m=about_m)
+        first = minimise(model, first.state, observations, 1.0, max_steps=_STEPS, least_decrease=_ROUGHLY)
+    given_m = board.disc_radius_m
+    if given_m is not None and not 1 / _RADIUS_RATIO < given_m / about_m < _RADIUS_RATIO:
+        raise CalibrationError(
+            f"{board.body.name}: a radius of {1e3 * given_m:.4g} mm is given, and the images show {1e3 * about_m:.4g} mm: "
+            "measure pitch and radius (not the diameter), or leave the radius out"
+        )
+    return about_m if given_m is None else given_m, first
 
 
 def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
@@ -335,6 +388,18 @@ def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
             )
         else:
             usable.append(pair)
+    return usable, rejected
+
+
+def _usable_alone(singles: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
+    """Split images of one camera alone into those that show the board and those that do not, with reasons."""
+    usable, rejected = [], []
+    for single in singles:
+        seen = max(single.left, single.right, key=lambda found: len(found.ids))
+        if len(seen.ids) >= LEAST_CORNERS:
+            usable.append(single)
+        else:
+            rejected.append(RejectedPair(single.name, single.left.problem or single.right.problem or "too few points"))
     return usable, rejected
 
 
@@ -391,6 +456,7 @@ class _Selection(Record):
     names: tuple[str, ...]
     sizes: tuple[tuple[int, int], tuple[int, int]]
     folds: int
+    pair_count: int
     given: int
     progress: Progress
 
@@ -404,12 +470,16 @@ class _Selection(Record):
             eased = replace(self.model, motion_sigmas=MOTION_EASE * moving.sigmas)
             screened = self._screened(eased, start, robust_sigma(screened.solution))
             motion = moving.shots(screened.kept)
-        folds = min(self.folds, len(screened.kept))
+        folds = min(self.folds, self._pairs(screened))
         search = LensModelSearch(self.model, motion, screened, folds, self.sizes, self.progress)
         return screened, *search.best(models)
 
     def _screened(self, model: BundleModel, start: BundleState, sigma_px: float = 1.0) -> Screened:
         """Reject gross errors; too few pairs are an error."""
         screened = screen(model, start, self.observations, self.names, sigma_px=sigma_px)
-        _enough(len(screened.kept), self.given, list(screened.rejected))
+        _enough(self._pairs(screened), self.given, list(screened.rejected))
         return screened
+
+    def _pairs(self, screened: Screened) -> int:
+        """Return how many pairs remain; images of one camera alone come after them and do not count."""
+        return int((screened.kept < self.pair_count).sum())

@@ -19,11 +19,14 @@ from armsight.geometry.rotation import skew
 from armsight.vision.bundle import BundleSolution, Observations
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import HeldOutErrors, PairErrors
+from armsight.vision.discs.bias import disc_bias
 from armsight.vision.match import epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
 _LEAST_SIGMA_PX = 1e-6
+#: The perspective bias depends on the pose and the pose on the bias: it shrinks a hundredfold each round.
+_BIAS_ROUNDS = 4
 #: A point this many times as far from the rigid fit as the usual one is an outlier, which a measurement drops by name.
 OUTLIER_RATIO = 10.0
 
@@ -46,6 +49,7 @@ def pair_errors(
     *,
     estimated: Array | None = None,
     motion: ExposureMotion | None = None,
+    disc_radius_m: float = 0.0,
 ) -> PairErrors:
     """Measure every pair of ``observations`` with a rig and compare with the perfect body.
 
@@ -56,6 +60,7 @@ def pair_errors(
         estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is evaluated:
             the deviation of a print from its drawing is not an error of the cameras; the drawing by default.
         motion: how far the body is expected to move between the two exposures; it stands still by default.
+        disc_radius_m: radius of a board's discs, as in :class:`~armsight.vision.projection.BundleModel`.
 
     Returns:
         One row for each shot that has three or more matched points.
@@ -63,17 +68,46 @@ def pair_errors(
     rows = []
     found = drawing if estimated is None else estimated
     for shot in range(observations.shot_count):
-        row = _pair_error(rig, drawing, found, correspondences(observations, shot), motion)
+        row = _pair_error(rig, drawing, found, correspondences(observations, shot), motion, disc_radius_m)
         if row is not None:
             rows.append((float(shot), *row))
     return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 1 + len(_FIELDS)).T)
 
 
+def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: float) -> Correspondences:
+    """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show.
+
+    Args:
+        rig: the calibrated pair.
+        body: (M, 3) the discs' middles, m.
+        seen: correspondences that both cameras have.
+        disc_radius_m: radius of the discs, m.
+    """
+    centres = seen
+    for _ in range(_BIAS_ROUNDS):
+        p, _, _ = optimal_points(rig, centres.uv, centres.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2))
+        good = np.isfinite(p).all(axis=1)
+        if good.sum() < 3:
+            break
+        T, points = fit_rigid(body[seen.ids[good]], p[good]), body[seen.ids]
+        Ts = (T, inverse(rig.T_left_right) @ T)
+        bias = [disc_bias(camera, T, points, disc_radius_m) for camera, T in zip(rig.cameras, Ts, strict=True)]
+        centres = replace(seen, uv=seen.uv - np.stack(bias, axis=1))
+    return centres
+
+
 def _pair_error(
-    rig: StereoRig, drawing: Array, estimated: Array, seen: Correspondences, motion: ExposureMotion | None
+    rig: StereoRig,
+    drawing: Array,
+    estimated: Array,
+    seen: Correspondences,
+    motion: ExposureMotion | None,
+    disc_radius_m: float,
 ) -> tuple[float, ...] | None:
     """Return one shot's metrics in the order of _FIELDS; None where it has too few points."""
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
+    if disc_radius_m > 0:
+        seen = middles(rig, estimated, seen, disc_radius_m)
     cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
     p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
     good = np.flatnonzero(np.isfinite(p).all(axis=1))
@@ -145,6 +179,7 @@ def cross_validate(
     drawing: Array,
     observations: Observations,
     folds: int,
+    disc_radius_m: float = 0.0,
 ) -> PairErrors:
     """Fit on all folds but one and measure that one, for every fold.
 
@@ -154,6 +189,7 @@ def cross_validate(
         drawing: (M, 3) points of the perfect body, m.
         observations: all detections, bad ones included: a measurement meets them too.
         folds: number of folds, at most the number of shots.
+        disc_radius_m: as in :func:`pair_errors`.
 
     Returns:
         The held-out errors of every shot.
@@ -161,7 +197,9 @@ def cross_validate(
     parts = []
     for held in folds_of(observations.shot_count, folds):
         rig, estimated, motion = fit(np.setdiff1d(np.arange(observations.shot_count), held))
-        errors = pair_errors(rig, drawing, observations.shots(held), estimated=estimated, motion=motion)
+        errors = pair_errors(
+            rig, drawing, observations.shots(held), estimated=estimated, motion=motion, disc_radius_m=disc_radius_m
+        )
         fields = [getattr(errors, name) for name in _FIELDS]
         parts.append(np.stack([held[errors.pair.astype(int)].astype(float), *fields]))
     merged = np.concatenate(parts, axis=1)

@@ -76,7 +76,8 @@ class Calibration(Record):
         rig: the result.
         body: the board or body as estimated, aligned to its drawing.
         deviation_m: RMS distance of the estimated body from its drawing, m; zero where it was held to it.
-        pairs: names of the pairs used, in the order of the observations' shots.
+        pairs: names of the pairs used, in the order of the observations' shots; images of one camera alone come last and
+            have no name here.
         pairs_found: how many pairs were given.
         observations: the detections that were fitted.
         solution: the adjusted state and residuals.
@@ -88,6 +89,7 @@ class Calibration(Record):
         notes: what was corrected or partly dropped, and why.
         weaknesses: what is weak, and what to do about it.
         motion: how far the board moved between the two exposures of a pair; None where it stood still.
+        disc_radius_m: radius of the board's discs, m, given or as the images show it; None for other boards.
     """
 
     rig: StereoRig
@@ -105,6 +107,7 @@ class Calibration(Record):
     notes: tuple[str, ...]
     weaknesses: tuple[str, ...]
     motion: ExposureMotion | None = None
+    disc_radius_m: float | None = None
 
     @property
     def reprojection_rms_px(self) -> float:

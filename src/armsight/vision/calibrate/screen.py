@@ -183,7 +183,7 @@ def _bad_pairs(
             )
         elif lost > LOST_SHARE:
             bad[int(j)] = f"{100 * lost:.0f}% of its corners are gross errors"
-        elif len(common) < LEAST_CORNERS:
+        elif len(common) < LEAST_CORNERS and np.ptp(observations.camera[mine]) > 0:
             bad[int(j)] = f"only {len(common)} corners are good in both images, {LEAST_CORNERS} are needed"
     worst = max(level.values(), default=0.0)
     return {j: reason for j, reason in bad.items() if level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}
@@ -210,6 +210,8 @@ def correct_symmetries(
         rows = [(observations.shot == shot) & (observations.camera == side) for side in (0, 1)]
         uv = [observations.uv[r] for r in rows]
         ids = [observations.point[r] for r in rows]
+        if not all(len(seen) for seen in ids):
+            continue  # an image of one camera alone
         candidates = body_poses(points[ids[0]], state.cameras[0], uv[0])
         scores = []
         for order in (np.arange(len(points)), *symmetries):

@@ -11,6 +11,8 @@ fits its rim best moves by the curvature of the distortion over the ellipse, to 
 
     1/8 (tr G_k + 2 sum_l G_l,kl)     (k, l: axes in which the ellipse is a unit circle, G_l: Hessians of the distortion).
 
+Where that is more than _BENT_PX, :func:`project_discs` fits the ellipse to points of the projected rim instead.
+
 :func:`expect` predicts what both cameras see of a body's discs at a pose, with that bias and its derivatives;
 :func:`centred` subtracts it. The bias depends on the orientation of the disc, so it is known once the pose is. For a
 disc of unknown normal only its distribution is known: the centre seems to move by -(r^2 / z) times the part of the
@@ -31,10 +33,16 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
 from armsight.kernels import kernel
 from armsight.vision.camera import Camera, distort
+from armsight.vision.markers.disc.fit import factor, solve
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 _STEP = 1e-4  # for the Hessian of the distortion, focal lengths
+#: A share of the lens in the bias beyond which second order is not enough, px; points of the rim, and steps of its fit.
+_BENT_PX, _RIM, _RIM_STEPS = 0.05, 24, 3
+#: A fisheye's disc is projected where the cosine between its normal and its direction is above this.
+_LEAST_SIDEWAYS = 0.05
+_RIM_COS, _RIM_SIN = np.cos(2 * np.pi * np.arange(_RIM) / _RIM), np.sin(2 * np.pi * np.arange(_RIM) / _RIM)
 
 
 @kernel
@@ -122,6 +130,86 @@ def disc_image(
     return True
 
 
+@kernel
+def _sideways(k: Array, d: Array, P: Array, n: Array, radius: float, uv: Array, shape: Array, J_P: Array) -> bool:
+    """Project a disc that only a fisheye sees, 90 degrees off the axis or more, to first order; False if it is edge-on."""
+    distance = np.sqrt(P[0] * P[0] + P[1] * P[1] + P[2] * P[2])
+    facing = abs(P[0] * n[0] + P[1] * n[1] + P[2] * n[2]) / distance
+    if not (distance > 2.0 * radius and facing > _LEAST_SIDEWAYS and np.hypot(P[0], P[1]) > radius):
+        return False
+    xy, J_d = np.empty(2), np.empty((2, 8))
+    distort(True, d, P, xy, J_P, J_d)
+    for i in range(2):
+        uv[i] = k[i] * xy[i] + k[2 + i]
+        for j in range(3):
+            J_P[i, j] *= k[i]
+    for i in range(2):
+        for j in range(i, 2):  # S = r^2 J (I - n n^T) J^T
+            total, along_i, along_j = 0.0, 0.0, 0.0
+            for m in range(3):
+                total += J_P[i, m] * J_P[j, m]
+                along_i += J_P[i, m] * n[m]
+                along_j += J_P[j, m] * n[m]
+            shape[i + j] = radius * radius * (total - along_i * along_j)
+    return True
+
+
+@kernel
+def _refine(fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: float, uv: Array, shape: Array) -> None:
+    """Fit the ellipse uv (2,), shape (3,) to the projected rim, point by point, as the image's fit does: by distance."""
+    a, b, rim, xy, at = np.zeros(3), np.empty(3), np.empty((_RIM, 2)), np.empty(2), np.empty(3)
+    J_p, J_d = np.empty((2, 3)), np.empty((2, 8))
+    least = 0
+    for i in range(1, 3):
+        least = i if abs(n[i]) < abs(n[least]) else least
+    for i in range(3):
+        a[i] = (1.0 if i == least else 0.0) - n[least] * n[i]
+    length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    for i in range(3):
+        a[i] /= length
+    for i in range(3):
+        b[i] = n[(i + 1) % 3] * a[(i + 2) % 3] - n[(i + 2) % 3] * a[(i + 1) % 3]
+    for m in range(_RIM):
+        for i in range(3):
+            at[i] = P[i] + radius * (_RIM_COS[m] * a[i] + _RIM_SIN[m] * b[i])
+        distort(fisheye, d, at, xy, J_p, J_d)
+        rim[m, 0], rim[m, 1] = k[0] * xy[0] + k[2], k[1] * xy[1] + k[3]
+    H, g, L, scale, x, J = np.empty((5, 5)), np.empty(5), np.empty((5, 5)), np.empty(5), np.empty(5), np.empty(5)
+    for _ in range(_RIM_STEPS):
+        det = shape[0] * shape[2] - shape[1] * shape[1]
+        m11, m12, m22 = shape[2] / det, -shape[1] / det, shape[0] / det
+        H[:, :] = 0.0
+        g[:] = 0.0
+        for m in range(_RIM):
+            u, v = rim[m, 0] - uv[0], rim[m, 1] - uv[1]
+            before, after = rim[m - 1], rim[(m + 1) % _RIM]
+            weight = np.hypot(after[0] - before[0], after[1] - before[1])  # the rim's length
+            mu, mv = m11 * u + m12 * v, m12 * u + m22 * v
+            s, slope = np.sqrt(u * mu + v * mv), np.hypot(mu, mv)
+            inside = (1.0 - s) * s / slope
+            J[0], J[1], J[2], J[3], J[4] = (
+                mu / slope,
+                mv / slope,
+                -u * u / (2 * slope),
+                -u * v / slope,
+                -v * v / (2 * slope),
+            )
+            for i in range(5):
+                g[i] -= weight * J[i] * inside
+                for j in range(i + 1):
+                    H[i, j] += weight * J[i] * J[j]
+        if not factor(H, L, scale):
+            return
+        solve(L, scale, g, x)
+        m11, m12, m22 = m11 + x[2], m12 + x[3], m22 + x[4]
+        det = m11 * m22 - m12 * m12
+        if not (m11 > 0.0 and det > 0.0):
+            return
+        uv[0] += x[0]
+        uv[1] += x[1]
+        shape[0], shape[1], shape[2] = m22 / det, -m12 / det, m11 / det
+
+
 @kernel(
     "b1, const f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], const f8[::1], f8[:, ::1], f8[:, ::1], "
     "f8[:, :, ::1], f8[:, :, ::1]",
@@ -139,12 +227,25 @@ def _each(
     J_n: Array,
 ) -> None:
     """Project discs one after the other; NaN where one has no image."""
+    xy, J_p, J_d, Q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3)
     for i in range(len(P)):
         if not disc_image(fisheye, k, d, P[i], n[i], radius[i], uv[i], shape[i], J_P[i], J_n[i]):
+            if fisheye and _sideways(k, d, P[i], n[i], radius[i], uv[i], shape[i], J_P[i]):
+                _refine(fisheye, k, d, P[i], n[i], radius[i], uv[i], shape[i])
+                J_n[i] = 0.0
+                continue
             uv[i] = np.nan
             shape[i] = np.nan
             J_P[i] = np.nan
             J_n[i] = np.nan
+            continue
+        f = radius[i] * radius[i] / P[i, 2]
+        for j in range(3):
+            Q[j] = P[i, j] + f * n[i, 2] * n[i, j]
+        Q[2] -= f
+        distort(fisheye, d, Q, xy, J_p, J_d)
+        if np.hypot(uv[i, 0] - k[0] * xy[0] - k[2], uv[i, 1] - k[1] * xy[1] - k[3]) > _BENT_PX:
+            _refine(fisheye, k, d, P[i], n[i], radius[i], uv[i], shape[i])
 
 
 def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> tuple[Array, Array, Array, Array]:
@@ -158,8 +259,8 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
 
     Returns:
         (N, 2) centres of the ellipses, raw px; (N, 3) S11, S12, S22 of the ellipses, px^2; (N, 2, 3) derivative of the
-        centres by p; (N, 2, 3) by the normals. NaN where a disc is not all in front of the camera or seen edge-on. To
-        second order in the size of the ellipse where the lens distorts, exact where it does not.
+        centres by p; (N, 2, 3) by the normals. NaN where a disc is not all in front of the camera or seen edge-on. The
+        derivatives leave out the lens's curvature over the ellipse.
     """
     p = checked(p, (None, 3), "disc centres")
     normals = checked(normals, p.shape, "disc normals")
@@ -168,6 +269,40 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
     out = np.empty((len(p), 2)), np.empty((len(p), 3)), np.empty((len(p), 2, 3)), np.empty((len(p), 2, 3))
     _each(fisheye, k, d, p, normals, radii_m, *out)
     return out
+
+
+def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: float) -> Array:
+    """Return by how much the centres of the ellipses of a board's discs are off the images of their middles.
+
+    Args:
+        camera: the camera.
+        T_camera_board: (4, 4) pose of the board, whose discs face along z.
+        points: (N, 3) the discs' middles, m, board frame.
+        radius_m: their radius, m.
+
+    Returns:
+        (N, 2) px; zero where a disc has no ellipse.
+    """
+    p = transform(T_camera_board, points)
+    normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
+    return np.nan_to_num(project_discs(camera, p, normals, np.full(len(p), radius_m))[0] - camera.project(p))
+
+
+def apparent_radii(camera: Camera, T_camera_board: Array, points: Array, shape: Array, about_m: float) -> Array:
+    """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area.
+
+    Args:
+        camera: the camera.
+        T_camera_board: (4, 4) pose of the board, whose discs face along z.
+        points: (N, 3) the discs' middles, m, board frame.
+        shape: (N, 3) S11, S12, S22 of the ellipses, px^2.
+        about_m: a radius of about the right size.
+    """
+    p = transform(T_camera_board, points)
+    normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
+    expected = project_discs(camera, p, normals, np.full(len(p), about_m))[1]
+    areas2 = [s[:, 0] * s[:, 2] - s[:, 1] ** 2 for s in (shape, expected)]
+    return np.asarray(about_m * (areas2[0] / areas2[1]) ** 0.25)
 
 
 #: A disc is not found where the cosine between its normal and the direction to the camera is below this.

@@ -4,7 +4,8 @@ The contract is :class:`~armsight.vision.markers.marker.Target` in ``marker.py``
 spec or its file.
 
 - Calibration boards: ``board.py`` (contract and registry), ``spec.py`` (parser), ``chessboard.py``, ``charuco.py``,
-  ``circles.py``, ``aprilgrid.py``, and ``grid.py`` for what regular grids share.
+  ``circles.py`` (with ``circle_blobs.py`` and ``circle_grid.py``), ``aprilgrid.py``, and ``grid.py`` for what regular
+  grids share.
 - Bodies: ``body_file.py`` (file formats and checks), ``body_layout.py`` (markers by kind), ``tag.py``,
   ``board_marker.py``, ``disc/`` (plain discs).
 - Sub-pixel fits: ``corner.py`` with its kernels in ``crossing.py``; ``square.py`` for tags found by ``aruco.py``;

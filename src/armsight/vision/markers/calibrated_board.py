@@ -55,6 +55,11 @@ class EstimatedBoard(Record, Target):
         """Those of the drawing: in one image the board looks the same all the same."""
         return self.drawing.symmetries
 
+    @property
+    def disc_radius_m(self) -> float | None:
+        """That of the drawing."""
+        return self.drawing.disc_radius_m
+
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
         return self.drawing.detect(image)

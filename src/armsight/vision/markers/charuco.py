@@ -1,8 +1,9 @@
 """Charuco boards: ``charuco:8x11:15mm:11mm:DICT_5X5_100``, squares columns x rows, sides of square and marker, family.
 
-As OpenCV prints them, in both layouts it has had. Points are the inner corners of the chessboard, row by row from the
-upper left; x runs along the columns, y down, z into the board. OpenCV finds them through the markers, so no order is
-ambiguous and a part of the board is enough; :mod:`~armsight.vision.markers.corner` fits them to a fraction of a pixel.
+As OpenCV prints them, in both layouts it has had, black on white or inverted. Points are the inner corners of the
+chessboard, row by row from the upper left; x runs along the columns, y down, z into the board. OpenCV finds them through
+the markers, so no order is ambiguous and a part of the board is enough; :mod:`~armsight.vision.markers.corner` fits them to
+a fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -78,7 +79,18 @@ class Charuco(Record, Target):
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
-        """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
+        """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`.
+
+        Where it is not found black on white, it is looked for white on black.
+        """
+        found = self._found(image)
+        if found.problem is not None:
+            inverted = self._found(255 - image)
+            return found if inverted.problem is not None else inverted
+        return found
+
+    def _found(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the board with dark markers on light squares."""
         markers = detect_markers(image, self.family)
         layouts = [self._rough(image, *markers, legacy) for legacy in (False, True)]
         rough = max(layouts, key=lambda uv: np.isfinite(uv).sum())

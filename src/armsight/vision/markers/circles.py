@@ -1,12 +1,14 @@
-"""Grids of dark discs on white: ``circles:7x6:20mm`` and, staggered, ``acircles:4x11:20mm``; discs columns x rows, pitch.
+"""Grids of discs: ``circles:7x6:20mm`` and, staggered, ``acircles:4x11:20mm``; discs columns x rows, pitch.
 
-As OpenCV's ``findCirclesGrid`` takes them, which finds the discs; the points are the discs' middles, row by row, z = 0.
-In the staggered grid rows are one pitch apart, discs of a row two pitches, and every other row is shifted by one pitch.
+Laid out as OpenCV's ``findCirclesGrid`` takes them; the points are the discs' middles, row by row, z = 0. In the staggered
+grid rows are one pitch apart, discs of a row two pitches, and every other row is shifted by one pitch. Discs are dark on a
+light board or light on a dark one. Options follow the pitch: ``radius=5mm``; ``dark`` or ``light``, by default whichever is
+found; ``rings=2x7,11x7,2x2``, the discs (column x row, from 0) that have a hole, by which a part of the board is known.
 
-The pixel positions are the centroids of darkness, with the covariance of the image's noise. The centroid of a tilted
-disc's image is not the image of its middle (perspective bias): for a disc of radius r at distance z, tilted by t, it is
-off by about ``f r^2 sin(t) cos(t) / z^2`` pixels, some hundredths on a board of many small discs and more on large
-ones. The bias is not corrected here. Chessboards have no such bias.
+A disc's pixel position is the centre of the ellipse that fits its rim (:mod:`~armsight.vision.markers.disc.fit`). That is
+not the image of its middle (:mod:`~armsight.vision.discs.bias`): a disc of radius r at distance z, tilted by t, is off by
+about ``f r^2 sin(t) cos(t) / z^2`` pixels. Calibration and measurement know the pose and model what is measured. For that
+they need the radius, which the sizes of the ellipses give where the spec does not.
 """
 
 from __future__ import annotations
@@ -14,18 +16,44 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
-from armsight.vision.markers.grid import grid_points, local_squares, rotations
+from armsight.vision.markers.circle_blobs import (
+    Blobs,
+    contrasts,
+    find_blobs,
+    fit_discs,
+    like_neighbours,
+    odd_sized,
+    without_holes,
+)
+from armsight.vision.markers.circle_grid import (
+    GridLayout,
+    Lattice,
+    expected,
+    extrapolated,
+    grow_lattices,
+    number_cells,
+    positions,
+)
+from armsight.vision.markers.disc.search import Grey
+from armsight.vision.markers.grid import grid_points, rotations
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
-#: The window reaches this many radii out; white is read between its two ends.
-_WHITE_RADII = (1.4, 1.8)
-_CONTRAST_MIN = 8.0  # grey levels
+#: The share of a board's discs that must be measured; with rings a smaller part is enough.
+_KEPT_SHARE, _KEPT_WITH_RINGS = 0.5, 0.2
+#: Grids in one image that may be the board, the best first.
+_GRIDS = 4
+#: A disc that the search missed is there if its contrast is at least this share of the others'; rounds in which such are
+#: added.
+_LOST_CONTRAST, _COMPLETED = 0.4, 2
+#: An outline, and a fit, may have so many times the area that the others let expect.
+_ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
+#: Whether discs are light -> how the spec says so.
+POLARITIES = {False: "dark", True: "light"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,27 +65,31 @@ class CircleGrid(Record, Target):
         rows: rows.
         pitch_m: distance of the grid's lines, m.
         staggered: whether every other row is shifted by a pitch.
+        disc_radius_m: radius of a disc, m; None where the spec does not give it.
+        light: whether the discs are light on a dark board; None where the spec does not say.
+        rings: (column, row) of the discs that have a hole.
     """
 
     columns: int
     rows: int
     pitch_m: float
     staggered: bool
+    disc_radius_m: float | None = None
+    light: bool | None = None
+    rings: tuple[tuple[int, int], ...] = ()
 
-    form = "circles:COLUMNSxROWS:PITCH, such as circles:7x6:20mm"
-    staggered_form = "acircles:COLUMNSxROWS:PITCH (staggered), such as acircles:4x11:20mm"
+    form = "circles:COLUMNSxROWS:PITCH[:OPTION...], such as circles:7x6:20mm or circles:7x6:20mm:radius=5mm:light"
+    staggered_form = "acircles:COLUMNSxROWS:PITCH[:OPTION...] (staggered), such as acircles:4x11:20mm"
 
     @staticmethod
     def from_fields(fields: Fields) -> CircleGrid:
         """Build the square grid a spec names."""
-        columns, rows = fields.counts(0, least=2)
-        return CircleGrid(columns, rows, fields.length_m(1), False)
+        return _from_fields(fields, staggered=False)
 
     @staticmethod
     def staggered_from_fields(fields: Fields) -> CircleGrid:
         """Build the staggered grid a spec names."""
-        columns, rows = fields.counts(0, least=2)
-        return CircleGrid(columns, rows, fields.length_m(1), True)
+        return _from_fields(fields, staggered=True)
 
     @property
     def y_up(self) -> bool:
@@ -70,87 +102,158 @@ class CircleGrid(Record, Target):
         return "", 0
 
     @cached_property
+    def spec(self) -> str:
+        """The spec that describes it."""
+        parts = [f"{'acircles' if self.staggered else 'circles'}:{self.columns}x{self.rows}:{self.pitch_m * 1e3:g}mm"]
+        if self.disc_radius_m is not None:
+            parts.append(f"radius={self.disc_radius_m * 1e3:.6g}mm")
+        if self.light is not None:
+            parts.append(POLARITIES[self.light])
+        if self.rings:
+            parts.append("rings=" + ",".join(f"{column}x{row}" for column, row in self.rings))
+        return ":".join(parts)
+
+    @cached_property
     def body(self) -> Body:
         """The discs' middles, m, z = 0, named by their number."""
         points = grid_points(self.columns, self.rows, self.pitch_m)
         if self.staggered:
             row = np.arange(len(points)) // self.columns
             points[:, 0] = 2.0 * points[:, 0] + (row % 2) * self.pitch_m
-        name = f"{'acircles' if self.staggered else 'circles'}:{self.columns}x{self.rows}:{self.pitch_m * 1e3:g}mm"
-        return Body(name, tuple(str(i) for i in range(len(points))), points)
+        return Body(self.spec, tuple(str(i) for i in range(len(points))), points)
+
+    @cached_property
+    def _ring(self) -> NDArray[np.bool_]:
+        """(M,) whether a disc is a ring."""
+        ring = np.zeros(self.columns * self.rows, bool)
+        ring[[row * self.columns + column for column, row in self.rings]] = True
+        return ring
 
     @cached_property
     def symmetries(self) -> tuple[Ids, ...]:
         """Permutations (M,) under which the board looks the same, without identity: disc i may as well be perm[i]."""
-        return tuple(perm for _, perm in rotations(self.body.points))
+        ring = self._ring
+        return tuple(perm for _, perm in rotations(self.body.points) if (ring[perm] == ring).all())
+
+    @cached_property
+    def _layout(self) -> GridLayout:
+        """The discs on a square lattice; that of a staggered grid lies diagonally."""
+        x, y = np.rint(self.body.points[:, :2] / self.pitch_m).astype(np.int64).T
+        cells = np.stack([(x + y) // 2, (y - x) // 2] if self.staggered else [x, y], axis=1)
+        return GridLayout(cells, self._ring, self.symmetries)
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
-        kind = cv2.CALIB_CB_ASYMMETRIC_GRID if self.staggered else cv2.CALIB_CB_SYMMETRIC_GRID
-        for extra in (0, cv2.CALIB_CB_CLUSTERING):
-            found, rough = cv2.findCirclesGrid(image, (self.columns, self.rows), flags=kind | extra)
-            if found and rough is not None:
-                break
-        else:
-            return Detections.none(f"no {self.body.name} found")
-        uv = rough.reshape(self.rows, self.columns, 2).astype(np.float64)
-        if not self.staggered:
-            uv = _upright(uv)
-        squares, _ = local_squares(uv)
-        nearest = np.linalg.norm(squares, axis=-1).min(axis=-1).ravel()  # of the next disc, in the row or the next row
-        centroids = [centroid(image, start, gap) for start, gap in zip(uv.reshape(-1, 2), nearest, strict=True)]
-        kept = np.array([found_centroid is not None for found_centroid in centroids])
-        if kept.sum() < 4:
+        found = self._found(image, self.light is not True, self.light is not False)
+        if found.problem is None or self.light is None:
+            return found
+        if self._found(image, self.light, not self.light).problem is None:
             return Detections.none(
-                f"{self.body.name} was found but its discs are too faint or too near the image border"
+                f"{self.body.name}: the discs in the image are {POLARITIES[not self.light]}, and the board is said to have "
+                f"{POLARITIES[self.light]} ones"
             )
-        good = [found_centroid for found_centroid in centroids if found_centroid is not None]
-        return Detections(np.flatnonzero(kept), np.array([p for p, _ in good]), np.array([c for _, c in good]))
+        return found
+
+    def _found(self, image: Grey, dark: bool, light: bool) -> Detections:
+        """Find the board by its dark discs, its light ones, or whichever make the board."""
+        least = max(4, int((_KEPT_WITH_RINGS if self.rings else _KEPT_SHARE) * len(self._ring)))
+        grids: list[tuple[float, bool, Blobs, Lattice]] = []
+        for polarity, blobs in zip((False, True), find_blobs(image, light, dark), strict=True):
+            lattices = grow_lattices(blobs, len(self._ring))
+            grids += [(g.weight, polarity, blobs, g) for g in lattices if len(g.blobs) >= least]
+        problem = f"no {self.body.name} found"
+        for n, (_, polarity, blobs, grid) in enumerate(sorted(grids, key=lambda g: -g[0])[:_GRIDS]):
+            found = self._measured(image, blobs, grid, polarity, least)
+            if isinstance(found, Detections):
+                return found
+            problem = problem if n else f"{self.body.name}: {found}"
+        return Detections.none(problem)
+
+    def _measured(self, image: Grey, blobs: Blobs, grid: Lattice, light: bool, least: int) -> Detections | str:
+        """Number the discs of a grid and fit them; the reason where they do not make the board."""
+        sign, size = (1 if light else -1), (image.shape[1], image.shape[0])
+        cells, starts, hollow = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size)
+        placement = number_cells(cells, starts, hollow, self._layout, size)
+        if isinstance(placement, str):
+            return placement
+        seen = placement.ids >= 0
+        starts, hollow = starts[seen], hollow[seen]
+        ids = self._upright(placement.ids[seen], starts[:, :2])
+        fits = fit_discs(without_holes(image, starts[hollow]), starts)
+        good = fits.kept()
+        if not good.all() and good.sum() >= least:
+            again = ~good
+            starts[again] = like_neighbours(self._predicted(ids, fits.uv, good), fits.theta[good])
+            hollow = again & contrasts(image, starts, sign)[1]
+            fits = fit_discs(without_holes(image, starts[hollow]), starts, fits, again)
+            good = fits.kept()
+        good &= ~odd_sized(fits.theta, _ODD_FIT, good)
+        if good.sum() < least:
+            return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
+        rows = np.flatnonzero(good)[np.argsort(ids[good])]
+        return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows])
+
+    def _upright(self, ids: Ids, uv: Array) -> Ids:
+        """Return the numbering, of those that look the same, whose rows run most to the right."""
+        orders = [ids, *(perm[ids] for perm in self.symmetries)]
+        rightwards = []
+        for order in orders:
+            p = self.body.points[order, :2]
+            (across, _), *_ = np.linalg.lstsq(p - p.mean(axis=0), uv - uv.mean(axis=0), rcond=None)
+            rightwards.append(across[0] / np.hypot(*across))
+        return orders[int(np.argmax(rightwards))]
+
+    def _predicted(self, ids: Ids, uv: Array, good: NDArray[np.bool_]) -> Array:
+        """Return where the good discs around each of the others put it, (K, 2); where it was where they do not."""
+        known, out = positions(self._layout.cells[ids[good]], uv[good]), uv[~good].copy()
+        for k, (x, y) in enumerate(self._layout.cells[ids[~good]].tolist()):
+            guess = extrapolated((x, y), known)
+            if guess is not None:
+                out[k] = guess[0].real, guess[0].imag
+        return out
 
 
-def _upright(uv: Array) -> Array:
-    """Return the square grid (rows, columns, 2) in the right-handed order whose rows run most to the right."""
-    across, down = (uv[:, -1] - uv[:, 0]).sum(axis=0), (uv[-1] - uv[0]).sum(axis=0)
-    if across[0] * down[1] - across[1] * down[0] < 0:
-        uv, across = uv[:, ::-1], -across
-    return np.ascontiguousarray(uv if across[0] >= 0 else uv[::-1, ::-1])
-
-
-def centroid(image: NDArray[np.uint8], start: Array, pitch_px: float) -> tuple[Array, Array] | None:
-    """Measure the centroid of one dark disc on white.
+def _completed(
+    image: Grey, cells: Ids, theta: Array, sign: int, size_px: tuple[int, int]
+) -> tuple[Ids, Array, NDArray[np.bool_]]:
+    """Replace the odd outlines of a grid by what their neighbours let expect, and add discs that the search missed.
 
     Args:
-        image: (H, W) grey image.
-        start: (2,) rough middle, px.
-        pitch_px: distance of the next disc's middle, px.
+        image: (H, W) grey.
+        cells: (N, 2) the grid's cells.
+        theta: (N, 10) its outlines.
+        sign: 1 for light discs, -1 for dark ones.
+        size_px: width and height of the image.
 
     Returns:
-        (2,) the centroid of darkness and (2, 2) its covariance, px^2; None where the disc is faint or cut by the
-        border.
+        (M, 2) cells, (M, 10) outlines, (M,) whether a disc has a hole.
     """
-    c, radius = start, 0.3 * pitch_px
-    for _ in range(3):
-        reach = min(_WHITE_RADII[1] * radius, 0.55 * pitch_px)
-        low, high = np.floor(c - reach).astype(int), np.ceil(c + reach).astype(int)
-        if (low < 0).any() or (high >= np.array(image.shape[::-1])).any() or reach < 2.0:
-            return None
-        v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
-        d = np.stack([u, v], axis=1) - c
-        distance = np.linalg.norm(d, axis=1)
-        inside = distance <= reach
-        grey, d, distance = image[v[inside], u[inside]].astype(np.float64), d[inside], distance[inside]
-        white = distance > max(reach - 2.0, _WHITE_RADII[0] / _WHITE_RADII[1] * reach)
-        basis = np.column_stack([np.ones(len(d)), d])
-        plane, *_ = np.linalg.lstsq(basis[white], grey[white], rcond=None)
-        dark = np.where(white, 0.0, basis @ plane - grey)
-        depth = float(np.percentile(dark, 90))
-        mass = float(dark.sum())
-        if depth < _CONTRAST_MIN or mass <= 0:
-            return None
-        shift = dark @ d / mass
-        c, radius = c + shift, float(np.sqrt(mass / depth / np.pi))
-    noise = float(np.sum((grey[white] - basis[white] @ plane) ** 2) / (white.sum() - 3)) + 1.0 / 12.0
-    lever = (d - shift)[~white]
-    carried = lever.T @ basis[~white]  # how the white's uncertain plane moves the centroid
-    spread = lever.T @ lever + carried @ np.linalg.inv(basis[white].T @ basis[white]) @ carried.T
-    return c, noise * spread / mass**2
+    kept = ~odd_sized(theta, _ODD_OUTLINE)
+    cells, theta = cells[kept], theta[kept]
+    contrast, hollow = contrasts(image, theta, sign)
+    for _ in range(_COMPLETED):
+        more, uv = expected(cells, theta, size_px)
+        like = like_neighbours(uv, theta)
+        there, ring = contrasts(image, like, sign)
+        found = there > _LOST_CONTRAST * np.median(contrast)
+        if not found.any():
+            break
+        cells, theta = np.concatenate([cells, more[found]]), np.concatenate([theta, like[found]])
+        contrast, hollow = np.concatenate([contrast, there[found]]), np.concatenate([hollow, ring[found]])
+    return cells, theta, hollow
+
+
+def _from_fields(fields: Fields, staggered: bool) -> CircleGrid:
+    """Build the grid a spec names."""
+    columns, rows = fields.counts(0, least=2)
+    pitch_m, options = fields.length_m(1), fields.options("radius=", "dark", "light", "rings=")
+    radius_m = fields.length_of(options["radius"]) if "radius" in options else None
+    if radius_m is not None and not 2 * radius_m < pitch_m * (np.sqrt(2) if staggered else 1.0):
+        raise fields.error("has discs that overlap")
+    if "dark" in options and "light" in options:
+        raise fields.error("has discs both dark and light")
+    rings = tuple(fields.pair(text, "column x row such as 2x7") for text in options.get("rings", "").split(",") if text)
+    if any(column >= columns or row >= rows for column, row in rings) or len(set(rings)) < len(rings):
+        raise fields.error("has rings beside the grid or twice: columns and rows are counted from 0")
+    light = "light" in options if options.keys() & {"dark", "light"} else None
+    return CircleGrid(columns, rows, pitch_m, staggered, radius_m, light, rings)

@@ -33,6 +33,11 @@ class Target(Protocol):
         return ()
 
     @property
+    def disc_radius_m(self) -> float | None:
+        """Radius of the discs of a board of discs, m, if it is known; None for everything else."""
+        return None
+
+    @property
     def discs(self) -> DiscTarget | None:
         """Its plain discs, which carry no code and whose points come last in ``body``; None where it has none."""
         return None

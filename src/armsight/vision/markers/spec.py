@@ -17,7 +17,8 @@ class Fields:
 
     Attributes:
         spec: the whole spec, for messages.
-        form: the form it must have, up to the first space, then an explanation for messages.
+        form: the form it must have, up to the first space, then an explanation for messages; ``[:OPTION...]`` at its end
+            where options may follow.
         values: the texts between the colons after the kind.
     """
 
@@ -27,8 +28,27 @@ class Fields:
 
     def __post_init__(self) -> None:
         """Check how many fields there are."""
-        if len(self.values) != self.form.split()[0].count(":"):
+        if len(self.values) < self._count or (len(self.values) > self._count and "[" not in self.form):
             raise self.error(f"has {len(self.values)} fields after its kind")
+
+    @property
+    def _count(self) -> int:
+        """How many fields there must be."""
+        return self.form.split()[0].partition("[")[0].count(":")
+
+    def options(self, *known: str) -> dict[str, str]:
+        """Read what follows the fields: the names of options, and their values where they have one (``name=value``).
+
+        Args:
+            known: names, with a trailing ``=`` where a value belongs to them.
+        """
+        found: dict[str, str] = {}
+        for text in self.values[self._count :]:
+            name, equals, value = text.partition("=")
+            if name + equals not in known or name in found or (equals and not value):
+                raise self.error(f"has {text!r} where an option ({', '.join(known)}), each once, belongs")
+            found[name] = value
+        return found
 
     def error(self, what: str) -> InputError:
         """Return the error of a spec that ``what`` is wrong with."""
@@ -36,18 +56,26 @@ class Fields:
 
     def counts(self, index: int, least: int) -> tuple[int, int]:
         """Read columns x rows, each at least ``least``."""
-        text = self.values[index]
+        columns, rows = self.pair(self.values[index], "columns x rows such as 9x6")
+        if min(columns, rows) < least or columns * rows > 10_000:
+            raise self.error(
+                f"has {self.values[index]}: each count must be {least} or more, and their product at most 10000"
+            )
+        return columns, rows
+
+    def pair(self, text: str, what: str) -> tuple[int, int]:
+        """Read two whole numbers with an x between them."""
         match = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)
         if not match:
-            raise self.error(f"has {text!r} where columns x rows such as 9x6 belong")
-        columns, rows = int(match[1]), int(match[2])
-        if min(columns, rows) < least or columns * rows > 10_000:
-            raise self.error(f"has {text}: each count must be {least} or more, and their product at most 10000")
-        return columns, rows
+            raise self.error(f"has {text!r} where {what} belong")
+        return int(match[1]), int(match[2])
 
     def length_m(self, index: int) -> float:
         """Read a length with its unit, m."""
-        text = self.values[index]
+        return self.length_of(self.values[index])
+
+    def length_of(self, text: str) -> float:
+        """Convert a text such as 25mm to m."""
         match = re.fullmatch(rf"({_NUMBER})\s*([A-Za-z]*)", text)
         if not match:
             raise self.error(f"has {text!r} where a length such as 25mm belongs")

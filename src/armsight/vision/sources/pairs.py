@@ -80,7 +80,7 @@ class PairsSource(StoredSource):
         Raises:
             InputError: no files, or files that do not pair up.
         """
-        return PairsSource(match(_files(left_glob), _files(right_glob), left_glob, right_glob))
+        return PairsSource(match(image_files(left_glob), image_files(right_glob), left_glob, right_glob))
 
 
 def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
@@ -118,8 +118,8 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
     return tuple(StoredPair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
 
 
-def _files(pattern: str) -> list[Path]:
-    """Return the files a glob matches."""
+def image_files(pattern: str) -> list[Path]:
+    """Return the files a glob matches, in no order."""
     return [Path(name) for name in glob.glob(os.path.expanduser(pattern), recursive=True) if os.path.isfile(name)]
 
 

@@ -1,0 +1,363 @@
+"""Discs of a board in one image: where they may be at every size, and their fits.
+
+Discs are searched in the image and in copies of half, a quarter, ... its size with the search of disc markers
+(:mod:`~armsight.vision.markers.disc.search`), so a disc may have any size, and a soft edge becomes a sharp one in a smaller
+copy. Only the outline is taken there: it is cheap, and it need not be good. Which outlines are discs of a board is decided
+by the grid that they form (:mod:`~armsight.vision.markers.circle_grid`); those are fitted in the image itself
+(:func:`fit_discs`).
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from armsight.data import Array, Record
+from armsight.kernels import kernel
+from armsight.vision.markers.disc.fit import (
+    REASONS,
+    SURROUND,
+    UNKNOWNS,
+    FitBuffers,
+    factor,
+    fit,
+    gather,
+    linearise,
+    normal_equations,
+    of_centre,
+    shape_of,
+)
+from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
+from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
+
+#: Copies are made down to this many pixels of the shorter side.
+_LEAST_SIDE_PX = 48
+#: Most candidates examined in one copy.
+_MOST_CANDIDATES = 8192
+#: Directions in which the contrast at a rim is compared, and how many must have this share of the median contrast.
+_RAYS, _RAYS_GOOD, _RAY_SHARE = 12, 10, 0.35
+
+_COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
+_SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
+_KEPT = threading.local()
+
+
+@kernel
+def _level(image: Grey, u: float, v: float) -> float:
+    """Return the grey at a position, bilinear; -1 outside the image."""
+    if not (u >= 0.0 and v >= 0.0 and u < image.shape[1] - 1.0 and v < image.shape[0] - 1.0):
+        return -1.0
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    top = (1 - a) * image[j, i] + a * image[j, i + 1]
+    return float((1 - b) * top + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]))
+
+
+@kernel
+def _rim_contrast(image: Grey, theta: Array, sign: int, across: Array) -> tuple[float, bool]:
+    """Compare grey inside and outside an ellipse.
+
+    Args:
+        image: (H, W) grey.
+        theta: (10,) the ellipse: centre and M.
+        sign: 1 for a bright disc, -1 for a dark one.
+        across: (_RAYS,) buffer.
+
+    Returns:
+        The median contrast in grey levels, 0 where it is no closed rim; whether the middle has the surround's level.
+    """
+    det = theta[2] * theta[4] - theta[3] * theta[3]
+    s11, s12, s22 = theta[4] / det, -theta[3] / det, theta[2] / det
+    l11 = np.sqrt(s11)
+    l21 = s12 / l11
+    l22 = np.sqrt(max(s22 - l21 * l21, 0.0))
+    beyond = 1.2 + 1.0 / np.sqrt(np.sqrt(s11 * s22 - s12 * s12))
+    outside = 0.0
+    for k in range(_RAYS):
+        du, dv = l11 * _COS[k], l21 * _COS[k] + l22 * _SIN[k]
+        near = _level(image, theta[0] + 0.75 * du, theta[1] + 0.75 * dv)
+        far = _level(image, theta[0] + beyond * du, theta[1] + beyond * dv)
+        if near < 0.0 or far < 0.0:
+            return 0.0, False
+        across[k] = sign * (near - far)
+        outside += far / _RAYS
+    ordered = np.sort(across)
+    median = 0.5 * (ordered[_RAYS // 2 - 1] + ordered[_RAYS // 2])
+    if not (median > 0.0 and ordered[_RAYS - _RAYS_GOOD] > _RAY_SHARE * median):
+        return 0.0, False
+    middle = 0.0
+    for y in range(-1, 2):
+        for x in range(-1, 2):
+            middle += _level(image, theta[0] + 0.5 * x, theta[1] + 0.5 * y) / 9
+    return median, sign * (middle - outside) < 0.6 * median
+
+
+@kernel(
+    "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], f8[::1], "
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+)
+def _outlines(
+    image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    signs: NDArray[np.int64], contrast: Array, room: Room,
+) -> int:  # fmt: skip
+    """Search an image for outlines of discs.
+
+    Args:
+        image: as in :func:`~armsight.vision.markers.disc.search.search`, and words, bright, dark, codes, room.
+        words: see there.
+        bright: see there.
+        dark: see there.
+        starts: (N, 10) filled with the outlines: centre, M, blur, contrast, base, gradient.
+        codes: see there.
+        signs: (N,) filled with 1 for bright ones, -1 for dark ones.
+        contrast: (N,) filled with their contrast, grey levels.
+        room: see there.
+
+    Returns:
+        The number of outlines.
+    """
+    n = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
+    across, good = np.empty(_RAYS), 0
+    for i in range(n):
+        if codes[i] != 0:
+            continue
+        found, _ = _rim_contrast(image, starts[i], signs[i], across)
+        if found > 0.0:
+            for a in range(starts.shape[1]):
+                starts[good, a] = starts[i, a]
+            signs[good], contrast[good] = signs[i], found
+            good += 1
+    return good
+
+
+@kernel("const u1[:, ::1], f8[:, ::1], i8, f8[::1], b1[::1]")
+def _each_contrast(image: Grey, theta: Array, sign: int, contrast: Array, hollow: NDArray[np.bool_]) -> None:
+    """Fill contrast (N,) and hollow (N,) of ellipses theta (N, 10) as :func:`_rim_contrast` gives them."""
+    across = np.empty(_RAYS)
+    for i in range(len(theta)):
+        contrast[i], hollow[i] = _rim_contrast(image, theta[i], sign, across)
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs(Record):
+    """Outlines of what may be discs of one polarity, in one image.
+
+    Attributes:
+        theta: (N, 10) start of a fit: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient.
+        contrast: (N,) contrast at the rim, grey levels, positive.
+        radius_px: (N,) geometric mean of the half axes.
+    """
+
+    theta: Array
+    contrast: Array
+    radius_px: Array
+
+
+def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:
+    """Find outlines of discs of any size in one grey image (H, W): the dark ones, and the bright ones."""
+    found: list[tuple[Array, Array, NDArray[np.int64]]] = []
+    level, small = 0, image
+    while True:
+        padded = np.ascontiguousarray(np.pad(small, ((0, 0), (0, -small.shape[1] % 8)), mode="edge"))
+        starts, codes, signs, contrast, room = _room()
+        n = _outlines(padded, padded.view(np.uint64), bright, dark, starts, codes, signs, contrast, room)
+        theta = starts[:n].copy()
+        theta[:, :2] = (theta[:, :2] + 0.5) * 2**level - 0.5
+        theta[:, 2:5] *= 0.25**level
+        theta[:, 5] *= 2**level
+        found.append((theta, contrast[:n].copy(), signs[:n].copy()))
+        if min(small.shape) < 2 * _LEAST_SIDE_PX:
+            break
+        half = (small.shape[1] // 2, small.shape[0] // 2)
+        level, small = level + 1, np.asarray(cv2.resize(small, half, interpolation=cv2.INTER_AREA), np.uint8)
+    theta, contrast, signs = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _without_repeats(theta[signs < 0], contrast[signs < 0]), _without_repeats(
+        theta[signs > 0], contrast[signs > 0]
+    )
+
+
+def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room]:
+    """Return this thread's buffers."""
+    if not hasattr(_KEPT, "room"):
+        n = _MOST_CANDIDATES
+        _KEPT.room = np.empty((n, UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), workspace()
+    room: tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room] = _KEPT.room
+    return room
+
+
+def _without_repeats(theta: Array, contrast: Array) -> Blobs:
+    """Drop outlines of one disc that the next larger copies gave again; the one of the sharpest copy stays."""
+    radius = (theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25
+    keep = np.ones(len(theta), bool)
+    if len(theta) > 1:
+        tree = KDTree(theta[:, :2])
+        near = tree.query_ball_point(theta[:, :2], 0.4 * radius)
+        for i, others in enumerate(near):
+            if keep[i]:
+                again = [j for j in others if j > i and 0.6 < radius[j] / radius[i] < 1.7]
+                keep[again] = False
+    return Blobs(theta[keep], contrast[keep], radius[keep])
+
+
+#: A hole in a disc and its soft edge end within this share of the disc's radius; the ring from there to the next shows the
+#: disc's own grey.
+_HOLE, _SOLID = 0.66, 0.8
+
+
+def without_holes(image: Grey, theta: Array) -> Grey:
+    """Fill the holes of rings theta (N, 10) with grey of the rings around them, pixel by pixel, noise and all."""
+    if not len(theta):
+        return image
+    filled = image.copy()
+    for u, v, m11, m12, m22 in theta[:, :5]:
+        reach = int(np.ceil((m11 * m22 - m12 * m12) ** -0.5 * np.sqrt(max(m11, m22)))) + 1
+        left, top = max(int(u) - reach, 0), max(int(v) - reach, 0)
+        window = filled[top : int(v) + reach + 2, left : int(u) + reach + 2]
+        y, x = np.mgrid[: window.shape[0], : window.shape[1]]
+        x, y = x + left - u, y + top - v
+        size = np.sqrt(m11 * x * x + 2 * m12 * x * y + m22 * y * y)
+        hole, solid = size < _HOLE, window[(size >= _HOLE) & (size < _SOLID)]
+        if len(solid):
+            window[hole] = np.resize(solid, int(hole.sum()))
+    return filled
+
+
+#: Reasons of the fit that leave a usable centre: what surrounds a board's disc is known, and sharpening or a wide lens
+#: bends every rim a little.
+HARMLESS = (5, 8, 10)
+#: If more than this share of the fits have such a reason, the image is like that.
+_ODD_SHARE = 0.3
+
+
+@kernel("const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], FitBuffers")
+def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArray[np.int64], work: FitBuffers) -> None:
+    """Fit discs.
+
+    Args:
+        image: (H, W) grey.
+        theta: (N, 10) starts, replaced by the results.
+        cov: (N, 2, 2) filled with the covariance of the centres, px^2; also of those with a harmless reason.
+        shape: (N, 3) filled with the ellipses S11, S12, S22, px^2.
+        codes: (N,) filled with 0 or the reason why it is not a disc (``fit.REASONS``).
+        work: buffers.
+    """
+    noise = noise_of(image)
+    for i in range(len(theta)):
+        codes[i] = fit(image, noise, theta[i], cov[i], work)
+        if codes[i] in HARMLESS:
+            n, _ = gather(image, theta[i], work)
+            if n < 4 * UNKNOWNS:
+                codes[i] = 1
+                continue
+            for a in range(UNKNOWNS):
+                work.at[a] = theta[i, a]
+            work.at[0], work.at[1] = theta[i, 0] - np.rint(theta[i, 0]), theta[i, 1] - np.rint(theta[i, 1])
+            square = linearise(n, SURROUND, 0.0, work)
+            normal_equations(n, work)
+            if not factor(work.H, work.L, work.scale):
+                codes[i] = 2
+                continue
+            of_centre(work, cov[i])
+            for a in range(2):
+                for b in range(2):
+                    cov[i, a, b] *= square / (n - UNKNOWNS)
+        if codes[i] == 0 or codes[i] in HARMLESS:
+            shape_of(theta[i], shape[i])
+
+
+@dataclass(frozen=True, eq=False)
+class Fits(Record):
+    """Fitted discs.
+
+    Attributes:
+        theta: (N, 10) their parameters, as in :class:`Blobs`.
+        cov: (N, 2, 2) covariance of the centres, px^2.
+        shape: (N, 3) their ellipses S11, S12, S22, px^2.
+        codes: (N,) 0 or the reason why it is not a disc (``fit.REASONS``).
+    """
+
+    theta: Array
+    cov: Array
+    shape: Array
+    codes: NDArray[np.int64]
+
+    @property
+    def uv(self) -> Array:
+        """(N, 2) the centres of the ellipses, raw px."""
+        return self.theta[:, :2]
+
+    def kept(self) -> NDArray[np.bool_]:
+        """(N,) which fits are good; where a harmless reason speaks against many, it is the image that is so."""
+        good, harmless = self.codes == 0, np.isin(self.codes, HARMLESS)
+        return np.asarray(good | harmless if harmless.sum() > _ODD_SHARE * len(good) else good)
+
+    def why_not(self) -> str:
+        """Return the most frequent reason against a disc, for a message."""
+        bad = self.codes[~self.kept()]
+        return f", mostly: {REASONS[int(np.bincount(bad).argmax())]}" if len(bad) else ""
+
+
+def odd_sized(theta: Array, factor: float, good: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
+
+    Args:
+        theta: (N, 10) discs of one grid.
+        factor: by which an area may be larger or smaller, beyond what is usual among them.
+        good: (N,) which of them count; all by default.
+    """
+    area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
+    keep = np.ones(len(area), bool) if good is None else good.copy()
+    basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])
+    odd = np.zeros(len(area), bool)
+    for _ in range(3):
+        plane, *_ = np.linalg.lstsq(basis[keep], area[keep], rcond=None)
+        off = np.abs(area - basis @ plane)
+        odd = off > np.log(factor) + 2.0 * np.median(off[keep])
+        if not (odd & keep).any() or (keep & ~odd).sum() < 4:
+            break
+        keep &= ~odd
+    return odd
+
+
+def contrasts(image: Grey, theta: Array, sign: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Compare grey inside and outside of ellipses.
+
+    Args:
+        image: (H, W) grey.
+        theta: (N, 10) the ellipses.
+        sign: 1 for bright discs, -1 for dark ones.
+
+    Returns:
+        (N,) contrast in grey levels, 0 where the rim is not closed; (N,) whether the middle has the surround's level.
+    """
+    contrast, hollow = np.empty(len(theta)), np.empty(len(theta), bool)
+    _each_contrast(np.ascontiguousarray(image), np.ascontiguousarray(theta), sign, contrast, hollow)
+    return contrast, hollow
+
+
+def like_neighbours(uv: Array, theta: Array) -> Array:
+    """Return starts (K, 10) of discs at positions uv (K, 2) that look like the four nearest known ones, theta (N, 10)."""
+    out = np.empty((len(uv), UNKNOWNS))
+    for i, position in enumerate(uv):
+        nearest = np.argsort(np.linalg.norm(theta[:, :2] - position, axis=1))[:4]
+        out[i] = np.median(theta[nearest], axis=0)
+        out[i, :2] = position
+    return out
+
+
+def fit_discs(image: Grey, starts: Array, before: Fits | None = None, which: NDArray[np.bool_] | None = None) -> Fits:
+    """Fit discs in a grey image (H, W) from starts (N, 10); with ``before``, only those ``which`` (N,), the others stay."""
+    theta, n = np.array(starts, order="C"), len(starts)
+    cov, shape, codes = np.zeros((n, 2, 2)), np.ones((n, 3)), np.zeros(n, np.int64)
+    if not hasattr(_KEPT, "work"):
+        _KEPT.work = workspace_of_fits()
+    _fit_each(np.ascontiguousarray(image), theta, cov, shape, codes, _KEPT.work)
+    if before is not None and which is not None:
+        for now, then in ((theta, before.theta), (cov, before.cov), (shape, before.shape), (codes, before.codes)):
+            now[~which] = then[~which]
+    return Fits(theta, cov, shape, codes)

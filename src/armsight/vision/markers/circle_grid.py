@@ -1,0 +1,380 @@
+"""Grids of discs from outlines: by topology, from a seed outwards.
+
+The ellipse of a disc shows how the board lies there: in the coordinates that make the ellipse a circle the four neighbours
+are equally far away, at right angles. From such a seed the grid grows disc by disc; each next position is extrapolated from
+the known ones nearby, so neither perspective nor the distortion of a wide lens matters (as corners of chessboards in Geiger
+et al., "Automatic camera and range sensor calibration using a single shot", ICRA 2012). Blobs that do not fit stay outside,
+and single discs may be missing. A staggered grid is a square lattice too, rotated by 45 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import median
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from armsight.data import Array, Ids, Record
+from armsight.vision.markers.circle_blobs import Blobs
+
+#: Neighbours of a disc have up to this many times its area or contrast, and are 2 to this many radii away.
+_ALIKE, _FURTHEST = 3.0, 16.0
+#: Neighbours examined, and seeds from which grids grow.
+_NEIGHBOURS, _SEEDS = 12, 60
+#: A disc of the grid is this near to where its neighbours put it, as a share of the step.
+_NEAR = 0.3
+#: Unevenness that halves a lattice's weight; share of the weight of a whole, even board that ends the search.
+_UNEVEN, _ENOUGH = 0.1, 0.8
+#: Sides of the grid, rotated by 90 degrees from each to the next.
+_SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+Cell: TypeAlias = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice(Record):
+    """Discs that hang together as a square lattice, right-handed in the image (x to the right, y down).
+
+    Attributes:
+        cells: (N, 2) their integer positions.
+        blobs: (N,) rows of the outlines.
+        weight: how much speaks for it: its discs, fewer the more unevenly they stand. Texture may be large, but not even.
+    """
+
+    cells: Ids
+    blobs: Ids
+    weight: float
+
+
+def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
+    """Assemble lattices from outlines, the best first.
+
+    Args:
+        blobs: the outlines.
+        enough: no further seeds are tried once a lattice has nearly the weight of so many discs.
+    """
+    if len(blobs.theta) < 4:
+        return []
+    beside = _neighbours(blobs)
+    regular = np.array([_regularity(blobs, i, js) for i, js in enumerate(beside)])
+    found: list[Lattice] = []
+    taken = np.zeros(len(beside), bool)
+    for i in np.argsort(-regular, kind="stable")[:_SEEDS]:
+        if taken[i] or regular[i] < 1:
+            continue
+        sides = _sides(blobs, int(i), beside[i])
+        if sides is None:
+            continue
+        cells = _spread(blobs, int(i), sides)
+        weight = len(cells) / (1.0 + (_unevenness(blobs, cells) / _UNEVEN) ** 2)
+        lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())), weight)
+        taken[lattice.blobs if weight > 0.5 * len(cells) else i] = True
+        found.append(lattice)
+        if weight >= _ENOUGH * enough:
+            break
+    return sorted(found, key=lambda lattice: -lattice.weight)
+
+
+def _unevenness(blobs: Blobs, cells: dict[Cell, int]) -> float:
+    """Return how far discs are from the middle of the two beside them: median, as a share of the step; 1 if unknown."""
+    at = {cell: complex(*blobs.theta[i, :2]) for cell, i in cells.items()}
+    off = []
+    for (x, y), here in at.items():
+        for dx, dy in _SIDES[:2]:
+            before, after = at.get((x - dx, y - dy)), at.get((x + dx, y + dy))
+            if before is not None and after is not None:
+                off.append(abs(before + after - 2 * here) / abs(after - before))
+    return median(off) if off else 1.0
+
+
+def _neighbours(blobs: Blobs) -> list[Ids]:
+    """Return for every outline the nearest ones of its size and contrast."""
+    uv, size = blobs.theta[:, :2], np.log(blobs.radius_px)
+    span, out = 0.5 * np.log(_ALIKE), [np.zeros(0, np.int64)] * len(uv)
+    for band in np.arange(size.min(), size.max() + span, span):
+        mine = np.flatnonzero((size >= band) & (size < band + span))
+        pool = np.flatnonzero((size >= band - span) & (size < band + 2 * span))
+        if not len(mine) or len(pool) < 2:
+            continue
+        distance, rows = KDTree(uv[pool]).query(uv[mine], k=min(_NEIGHBOURS + 1, len(pool)))
+        for i, far, js in zip(mine.tolist(), np.asarray(distance), pool[rows], strict=True):
+            alike = (js != i) & (far < _FURTHEST * blobs.radius_px[i]) & _alike(blobs, i, js)
+            out[i] = js[alike]
+    return out
+
+
+def _alike(blobs: Blobs, i: int, js: Ids) -> NDArray[np.bool_]:
+    """Whether outlines js have about the area and the contrast of outline i."""
+    area = (blobs.radius_px[js] / blobs.radius_px[i]) ** 2
+    contrast = blobs.contrast[js] / blobs.contrast[i]
+    return np.asarray((np.maximum(area, 1 / area) < _ALIKE) & (np.maximum(contrast, 1 / contrast) < _ALIKE))
+
+
+def _flattened(blobs: Blobs, i: int, js: Ids) -> Array:
+    """Return the offsets (n, 2) from outline i to outlines js in coordinates in which outline i is the unit circle."""
+    m11, m12, m22 = blobs.theta[i, 2:5]
+    a = np.sqrt(m11)
+    U = np.array([[a, m12 / a], [0.0, np.sqrt(max(m22 - m12 * m12 / m11, 1e-12))]])  # U^T U = M
+    return np.asarray((blobs.theta[js, :2] - blobs.theta[i, :2]) @ U.T)
+
+
+def _regularity(blobs: Blobs, i: int, js: Ids) -> int:
+    """Count the neighbours of an outline that have another one opposite or at a right angle, equally far away."""
+    if len(js) < 2:
+        return 0
+    z = _flattened(blobs, i, js)
+    length = np.hypot(*z.T)
+    count = 0
+    for rotated in (-z, np.column_stack([-z[:, 1], z[:, 0]])):
+        gap = np.linalg.norm(z[:, None] - rotated[None], axis=2)
+        count += int((gap.min(axis=0) < _NEAR * length).sum())
+    return count
+
+
+def _sides(blobs: Blobs, i: int, js: Ids) -> tuple[int, int] | None:
+    """Return two neighbours of an outline that span the lattice, the second one a right angle from the first."""
+    z = _flattened(blobs, i, js)
+    length = np.hypot(*z.T)
+    for a in np.argsort(length):
+        across = np.array([-z[a, 1], z[a, 0]])
+        gap = np.linalg.norm(z - across, axis=1)
+        b = int(np.argmin(gap))
+        if length[a] > 1.8 and gap[b] < 1.5 * _NEAR * length[a]:
+            return int(js[a]), int(js[b])
+    return None
+
+
+def _spread(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
+    """Grow a lattice from an outline and two of its neighbours: cell -> outline."""
+    uv = blobs.theta[:, :2]
+    tree = KDTree(uv)
+    cells = {(0, 0): seed, (1, 0): sides[0], (0, 1): sides[1]}
+    at = {cell: complex(*uv[i]) for cell, i in cells.items()}
+    used, front, all_round = set(cells.values()), list(cells), False
+    while front:
+        claims: dict[int, tuple[float, Cell]] = {}
+        for cell in sorted({n for c in front for n in _beside(c)} - cells.keys()):
+            expected = extrapolated(cell, at)
+            if expected is None:
+                continue
+            (u, v), step = (expected[0].real, expected[0].imag), expected[1]
+            known = next(cells[n] for n in _beside(cell) if n in cells)
+            js = np.array(tree.query_ball_point((u, v), _NEAR * step), dtype=np.int64)
+            js = js[_alike(blobs, known, js)] if len(js) else js
+            if len(js):
+                off = np.hypot(uv[js, 0] - u, uv[js, 1] - v)
+                j = int(js[np.argmin(off)])
+                if j not in used and off.min() / step < claims.get(j, (np.inf, cell))[0]:
+                    claims[j] = float(off.min() / step), cell
+        for j, (_, cell) in claims.items():
+            cells[cell], at[cell] = j, complex(*uv[j])
+            used.add(j)
+        # With more of the grid known, discs may be found where they were not before.
+        front, all_round = [cell for _, cell in claims.values()], not claims and not all_round
+        if all_round:
+            front = list(cells)
+    return cells
+
+
+def _beside(cell: Cell) -> list[Cell]:
+    """Return the four cells beside a cell."""
+    return [(cell[0] + dx, cell[1] + dy) for dx, dy in _SIDES]
+
+
+def extrapolated(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
+    """Predict where a cell of a lattice is from the positions of cells nearby.
+
+    Args:
+        cell: the cell.
+        known: positions u + iv, px, of cells.
+
+    Returns:
+        The position, px, and the step from its neighbours, px; None where nothing beside it is known.
+    """
+    x, y = cell
+    guesses: list[complex] = []
+    steps: list[float] = []
+    for dx, dy in _SIDES:
+        a = known.get((x - dx, y - dy))
+        if a is None:
+            continue
+        b = known.get((x - 2 * dx, y - 2 * dy))
+        if b is not None:
+            guesses.append(_continued(a, b, known.get((x - 3 * dx, y - 3 * dy))))
+            steps.append(abs(a - b))
+        for ex, ey in ((dy, dx), (-dy, -dx)):
+            corner = known.get((x + ex - dx, y + ey - dy))
+            # The same step in the next row, or where that is not known either, the one before it.
+            last, first = (x + ex, y + ey), (x + ex - 2 * dx, y + ey - 2 * dy)
+            if corner is not None and (last in known or (b is None and first in known)):
+                step = known[last] - corner if last in known else corner - known[first]
+                guesses.append(a + step)
+                steps.append(abs(step))
+    if not guesses:
+        return _any_step(cell, known)
+    middle = complex(median(g.real for g in guesses), median(g.imag for g in guesses))
+    return middle, median(steps)
+
+
+def _any_step(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
+    """Extrapolate by any step known along the same direction: so it is beside a seed."""
+    x, y = cell
+    for dx, dy in _SIDES:
+        a = known.get((x - dx, y - dy))
+        if a is None:
+            continue
+        for c, p in known.items():
+            q = known.get((c[0] + dx, c[1] + dy))
+            if q is not None:
+                return a + q - p, abs(q - p)
+    return None
+
+
+def _continued(a: complex, b: complex, c: complex | None) -> complex:
+    """Continue a line of equally spaced points c, b, a by one; in perspective where all three are known.
+
+    A pinhole maps index t on a line to p t / (1 + q t): of steps in the ratio k the next one has (k + 1) / (3 k - 1) of
+    the length of the last.
+    """
+    step = a - b
+    if c is None:
+        return a + step
+    k = min(max(abs(b - c) / abs(step), 0.7), 1.4)
+    return a + step * (k + 1.0) / (3.0 * k - 1.0)
+
+
+#: A disc must be this many pixels inside the image to count as missing.
+_MARGIN_PX = 3.0
+#: How far, in cells, missing discs are predicted from the ones that are seen.
+_PREDICTED_CELLS = 3
+#: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
+#: what a ring in the wrong position counts.
+_MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
+
+
+@dataclass(frozen=True, eq=False)
+class GridLayout(Record):
+    """The cells of a board's discs on a square lattice.
+
+    Attributes:
+        cells: (M, 2) integer positions, in the order of the board's points.
+        rings: (M,) whether a disc is a ring.
+        symmetries: permutations (M,) under which the board looks the same, without identity.
+    """
+
+    cells: Ids
+    rings: NDArray[np.bool_]
+    symmetries: tuple[Ids, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement(Record):
+    """Which discs of a board a lattice shows.
+
+    Attributes:
+        ids: (N,) the board's disc at each position of the lattice, -1 beside the board.
+        lost: how many discs of the board should be in view and were not found.
+        wrong: how much speaks against it: discs missing or too many, rings in the wrong position.
+        rings_wrong: rings in the wrong position.
+    """
+
+    ids: Ids
+    lost: int
+    wrong: int
+    rings_wrong: int
+
+
+def number_cells(
+    cells: Ids, theta: Array, hollow: NDArray[np.bool_], layout: GridLayout, size_px: tuple[int, int]
+) -> Placement | str:
+    """Find which part of a board a lattice shows.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
+        hollow: (N,) whether a disc has a hole.
+        layout: the board.
+        size_px: width and height of the image.
+
+    Returns:
+        The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
+        reason why there is none.
+    """
+    predicted, _ = expected(cells, theta, size_px)
+    origin = layout.cells.min(axis=0) - 1
+    table = np.full(tuple(np.ptp(layout.cells, axis=0) + 3), -1)
+    table[tuple((layout.cells - origin).T)] = np.arange(len(layout.cells))
+
+    def at(cells: Ids) -> Ids:
+        return np.asarray(table[tuple(np.clip(cells - origin, 0, np.array(table.shape) - 1).T)])
+
+    placements, rotation = [], np.eye(2, dtype=np.int64)
+    for _ in range(4):
+        rotated = cells @ rotation
+        shifts = (layout.cells[None] - rotated[:, None]).reshape(-1, 2)
+        low, span = shifts.min(axis=0), int(np.ptp(shifts[:, 1])) + 1
+        counts = np.bincount((shifts - low) @ [span, 1])
+        for code in np.flatnonzero(counts >= 0.5 * counts.max()).tolist():
+            shift = low + np.array(divmod(code, span))
+            ids, lost = at(rotated + shift), int((at(predicted @ rotation + shift) >= 0).sum())
+            matched = ids >= 0
+            ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0
+            wrong = int((~matched).sum()) + lost + _RING_COST * ring_errors
+            placements.append(Placement(ids, lost, wrong, ring_errors))
+        rotation = rotation @ np.array([[0, 1], [-1, 0]])
+    return _unambiguous(placements, layout)
+
+
+def _unambiguous(placements: list[Placement], layout: GridLayout) -> Placement | str:
+    """Return the placement with the least wrong, or the reason why it is none."""
+    best = min(placements, key=lambda p: (p.wrong, -int((p.ids >= 0).sum())))
+    matched = int((best.ids >= 0).sum())
+    if best.wrong - _RING_COST * best.rings_wrong > _MOST_WRONG * (matched + best.lost):
+        return f"{len(best.ids)} discs in a grid were found, which do not make the board"
+    if best.rings_wrong > 1:
+        return "its discs were found, but the rings among them are not where the board has them"
+    same = [best.ids, *(np.where(best.ids >= 0, perm[best.ids], -1) for perm in layout.symmetries)]
+    others = [p.wrong for p in placements if not any((p.ids == ids).all() for ids in same)]
+    if min(others, default=best.wrong + _WORSE) < best.wrong + _WORSE:
+        return (
+            f"{matched} of its {len(layout.cells)} discs were found, and which ones they are is unknown: show all of it"
+            + ("" if layout.rings.any() else ", or use a board with rings")
+        )
+    return best
+
+
+def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
+    """Return the positions uv (N, 2) of cells (N, 2) as :func:`extrapolated` takes them."""
+    return {(x, y): complex(u, v) for (x, y), (u, v) in zip(cells.tolist(), uv.tolist(), strict=True)}
+
+
+def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, Array]:
+    """Predict where discs next to those of a lattice would be, as far as they would be in the image.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs.
+        size_px: width and height of the image.
+
+    Returns:
+        (K, 2) further cells; (K, 2) where they would be, px.
+    """
+    seen = positions(cells, theta[:, :2])
+    radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)
+    known, front, margin = dict(seen), set(seen), _MARGIN_PX + radius_px
+    for _ in range(_PREDICTED_CELLS):
+        fresh: dict[Cell, complex] = {}
+        for cell in sorted({n for c in front for n in _beside(c)} - known.keys()):
+            guess = extrapolated(cell, known)
+            if guess is not None:
+                u, v = guess[0].real, guess[0].imag
+                if margin < u < size_px[0] - 1 - margin and margin < v < size_px[1] - 1 - margin:
+                    fresh[cell] = guess[0]
+        known.update(fresh)
+        front = set(fresh)
+    more = {cell: (p.real, p.imag) for cell, p in known.items() if cell not in seen}
+    return np.array(list(more), np.int64).reshape(-1, 2), np.array(list(more.values())).reshape(-1, 2)

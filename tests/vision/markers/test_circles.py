@@ -1,0 +1,161 @@
+"""Boards of discs in rendered images: found at any size and polarity, numbered by their rings, their middles located."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from armsight.data import PoseEstimate, Shot
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.example_rig import example_rig
+from armsight.sim.render.optics import Optics, Sensor
+from armsight.sim.render.render import render, render_pair
+from armsight.sim.render.scene import BLACK, WHITE, PosedBody, circle_grid
+from armsight.vision.camera import Camera
+from armsight.vision.discs.bias import disc_bias
+from armsight.vision.markers.board import open_board
+from armsight.vision.measure import measure
+
+SIZE = (640, 480)
+WIDE = Camera(SIZE, "brown4", np.array([230.0, 231.0, 322.0, 236.0]), np.array([-0.02, 0.004, 3e-4, -2e-4]))
+FISHEYE = Camera(SIZE, "fisheye", np.array([210.0, 211.0, 322.0, 236.0]), np.array([-0.01, 0.005, -0.003, 5e-4]))
+LONG = Camera(SIZE, "brown4", np.array([800.0, 801.0, 317.0, 242.0]), np.array([-0.1, 0.05, 3e-4, -2e-4]))
+RINGS = ((1, 1), (5, 1), (1, 4))
+
+
+def posed(pattern, rotation, distance, shift=(0.0, 0.0)):
+    """Pose a grid so that its middle is before the camera, rotated by a vector (3,), rad."""
+    middle = np.array(
+        [0.5 * (pattern.x_edges[0] + pattern.x_edges[-1]), 0.5 * (pattern.y_edges[0] + pattern.y_edges[-1]), 0]
+    )
+    R = exp_so3(np.array(rotation))
+    return pose(R, np.array([*shift, distance]) - R @ middle)
+
+
+def picture(camera, pattern, T, seed=0):
+    """Render a grid in uneven light."""
+    optics = Optics(psf_sigma_px=0.8, vignetting=0.3, light_gradient=(0.3, -0.2))
+    return render(camera, [PosedBody((pattern,), T)], optics=optics, sensor=Sensor(), rng=np.random.default_rng(seed))
+
+
+def off_middles(board, found, camera, T, radius_m):
+    """Errors (N, 2) of the discs' middles, px, in the numbering of those that look the same that fits best."""
+    errors = []
+    for order in (np.arange(len(board.body.points)), *board.symmetries):
+        points = board.body.points[order[found.ids]]
+        errors.append(found.uv - disc_bias(camera, T, points, radius_m) - camera.project(transform(T, points)))
+    return min(errors, key=lambda error: np.abs(error).sum())
+
+
+CASES = {
+    "few large discs before a wide lens": (WIDE, "circles:4x3:90mm", {"radius_m": 0.035}, (0.5, -0.4, 0.2), 0.3, 0.2),
+    "a fisheye": (FISHEYE, "circles:7x5:40mm", {"radius_m": 0.014}, (-0.4, 0.4, 1.8), 0.25, 0.1),
+    "small dense dots": (LONG, "circles:16x11:4mm", {"radius_m": 0.0013}, (0.3, 0.3, -0.4), 0.17, 0.0),
+    "staggered, light on dark": (
+        LONG, "acircles:4x9:8mm", {"radius_m": 0.004, "asymmetric": True, "black": WHITE, "white": BLACK}, (0.6, 0.1, 3.0),
+        0.25, 0.02,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_disc_is_found_and_its_middle_is_where_the_disc_has_it(case):
+    camera, spec, kind, rotation, distance, least_bias_px = CASES[case]
+    columns, rows = (int(n) for n in spec.split(":")[1].split("x"))
+    board = open_board(spec)
+    pattern = circle_grid(columns, rows, board.pitch_m, **kind)
+    T = posed(pattern, rotation, distance)
+    found = board.detect(picture(camera, pattern, T))
+    assert found.problem is None
+    assert len(found.ids) == columns * rows
+    assert found.shape.shape == (columns * rows, 3)
+    error = off_middles(board, found, camera, T, kind["radius_m"])
+    assert np.sqrt((error**2).mean()) < 0.03
+    normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov_uv), error)
+    assert np.sqrt(normalised.mean() / 2) < 1.4
+    bias = disc_bias(camera, T, board.body.points, kind["radius_m"])
+    assert np.sqrt((bias**2).mean()) > least_bias_px
+
+
+@lru_cache
+def ringed():
+    """Return a board with rings and its print."""
+    spec = "circles:7x6:12mm:rings=" + ",".join(f"{x}x{y}" for x, y in RINGS)
+    return open_board(spec), circle_grid(7, 6, 0.012, radius_m=0.004, rings=RINGS)
+
+
+@pytest.mark.parametrize("rotation", [0.1, 1.7, 3.2, -1.5])
+def test_rings_number_a_part_of_the_board(rotation):
+    board, pattern = ringed()
+    assert not board.symmetries
+    T = posed(pattern, (0.2 * np.cos(rotation), 0.2 * np.sin(rotation), rotation), 0.13, (0.012, 0.02))
+    image = picture(LONG, pattern, T)
+    found = board.detect(image)
+    assert found.problem is None
+    assert 15 < len(found.ids) < 42
+    assert set(found.ids) & {y * 7 + x for x, y in RINGS}
+    error = found.uv - disc_bias(LONG, T, board.body.points[found.ids], 0.004)
+    error -= LONG.project(transform(T, board.body.points[found.ids]))
+    assert np.abs(error).max() < 0.1
+    # Without rings a part has no numbers, unless one end of the rows and of the columns is in view.
+    plain = open_board("circles:7x6:12mm")
+    same = plain.detect(image)
+    if len(same.ids):
+        assert np.abs(off_middles(plain, same, LONG, T, 0.004)).max() < 0.1
+    else:
+        assert "which ones they are is unknown" in (same.problem or "")
+
+
+def test_rings_in_wrong_positions_are_a_reason():
+    _, pattern = ringed()
+    image = picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))
+    problem = open_board("circles:7x6:12mm:rings=2x2,4x2,2x4").detect(image).problem
+    assert "the rings among them are not where the board has them" in (problem or "")
+
+
+def test_the_other_polarity_is_found_unless_the_spec_says_which():
+    pattern = circle_grid(7, 6, 0.012, radius_m=0.004)
+    image = picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))
+    for pixels, right, wrong in ((image, "dark", "light"), (255 - image, "light", "dark")):
+        assert len(open_board("circles:7x6:12mm").detect(pixels).ids) == 42
+        assert len(open_board(f"circles:7x6:12mm:{right}").detect(pixels).ids) == 42
+        problem = open_board(f"circles:7x6:12mm:{wrong}").detect(pixels).problem or ""
+        assert f"the discs in the image are {right}, and the board is said to have {wrong} ones" in problem
+
+
+def test_a_covered_disc_is_left_out_and_dirt_is_no_disc():
+    board, pattern = open_board("circles:7x6:12mm"), circle_grid(7, 6, 0.012, radius_m=0.004)
+    T = posed(pattern, (0.2, 0.1, 0.1), 0.2)
+    image = picture(LONG, pattern, T)
+    clean = board.detect(image)
+    at = np.rint(clean.uv[16]).astype(int)
+    image[at[1] - 3 : at[1] + 25, at[0] - 22 : at[0] + 6] = 140
+    dirt = np.rint(0.5 * (clean.uv[24] + clean.uv[32])).astype(int)
+    image[dirt[1] - 3 : dirt[1] + 4, dirt[0] - 3 : dirt[0] + 4] = 30
+    found = board.detect(image)
+    assert set(clean.ids) - set(found.ids) == {16}
+    assert np.abs(off_middles(board, found, LONG, T, 0.004)).max() < 0.1
+
+
+@pytest.mark.parametrize("spec", ["circles:6x6:12mm", "circles:7x5:12mm", "circles:8x6:12mm"])
+def test_a_board_of_another_size_is_not_found(spec):
+    pattern = circle_grid(7, 6, 0.012, radius_m=0.004)
+    assert open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))).problem
+
+
+@pytest.mark.parametrize("option", ["", ":radius=20mm"])
+def test_measuring_subtracts_the_bias(option):
+    rig = example_rig(SIZE, focal_px=300.0, baseline_m=0.08, model="brown4")
+    pattern = circle_grid(4, 3, 0.05, radius_m=0.02)
+    T = posed(pattern, (0.6, 0.3, 0.1), 0.35, (0.03, 0.0))
+    images = render_pair(rig.cameras, rig.T_left_right, [PosedBody((pattern,), T)], rng=np.random.default_rng(1))
+    board = open_board("circles:4x3:50mm" + option)
+    result = measure(rig, board, Shot("one", *images))
+    assert isinstance(result, PoseEstimate)
+    flipped = pose(np.diag([-1.0, -1.0, 1.0]), board.body.points[-1])
+    error = min((log_se3(inverse(T @ same) @ result.T_left_body) for same in (np.eye(4), flipped)), key=np.linalg.norm)
+    # Without it the middles would be off by a pixel, which is a millimetre here.
+    assert np.linalg.norm(error[:3]) < 1e-4
+    assert np.linalg.norm(error[3:]) < 5e-4
+    assert np.abs(disc_bias(rig.left, T @ exp_se3(np.zeros(6)), board.body.points, 0.02)).max() > 0.3
