@@ -23,8 +23,8 @@ _RAYS = 16
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
 
-#: Turns in which an outline's level settles.
-_TURNS = 4
+#: Rounds in which the level of an outline settles.
+_ROUNDS = 4
 #: Steps from a pixel of a blurred rim onto the disc, at most, and the least difference of grey that is a step.
 _CLIMB, _CLIMB_GREY = 8, 5
 
@@ -98,7 +98,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     height, width = image.shape
     x, y = _uphill(image, x, y, sign)
     half = 0
-    for turn in range(_TURNS):
+    for round_ in range(_ROUNDS):
         half = (low + int(image[y, x])) // 2
         left, right = _walk(image, x, y, -1, 0, half, sign), _walk(image, x, y, 1, 0, half, sign)
         if left < 0 or right < 0:
@@ -108,7 +108,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         if up < 0 or down < 0:
             return 9
         y += (down - up) // 2
-        if turn > 0:
+        if round_ > 0:
             # The first pixel may have been noise beside the disc: is the level half-way between disc and surround?
             low = _beyond(image, x, y, left + right, up + down, sign)
             contrast = int(image[y, x]) - low
