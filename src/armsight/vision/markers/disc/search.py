@@ -112,9 +112,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
             # The first pixel may have been noise beside the disc: is the level half-way between disc and surround?
             low = _beyond(image, x, y, left + right, up + down, sign)
             contrast = int(image[y, x]) - low
-            if sign * contrast <= 0:
-                return 2
-            if 8 * abs(2 * half - low - int(image[y, x])) < sign * contrast:
+            if 8 * abs(2 * half - low - int(image[y, x])) < sign * contrast or sign * contrast <= 0:  # or a ring's hole
                 break
     if left + right < 2 or up + down < 2 or left + right + up + down + 2 < 8:
         return 7
