@@ -34,6 +34,8 @@ from armsight.vision.markers.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
 MOST_PIXELS = 3072
+#: Most discs of an image.
+MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
 #: Floats in a cache line.
@@ -54,7 +56,7 @@ Floats = NDArray[np.float32]
 
 @kernel_types(
     "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]"
 )
 class FitBuffers(NamedTuple):
     """The buffers of a fit; one set for each thread.
@@ -79,6 +81,8 @@ class FitBuffers(NamedTuple):
         start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
+        rim: (3,) what the rim of the last fit shows of the noise, see :func:`rim_noise`.
+        rims: (MOST_DISCS, 3) the same for each disc of an image.
     """
 
     px: Floats
@@ -100,6 +104,8 @@ class FitBuffers(NamedTuple):
     start: Array
     products: Array
     sums: Array
+    rim: Array
+    rims: Array
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -118,6 +124,7 @@ def workspace() -> FitBuffers:
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
         np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
+        np.empty(3), np.empty((MOST_DISCS, 3)),
     )  # fmt: skip
 
 
@@ -128,7 +135,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     Args:
         n: number of pixels.
         slope: kind of gradient: LIGHT, SURROUND, GLARE.
-        texture: variance of the surround over the noise's.
+        texture: variance of the surround beyond the noise's, over that; below zero: that of the disc, for shot noise.
         work: the pixels, and buffers.
 
     Returns:
@@ -138,7 +145,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     cx, cy, m11, m12, m22, blur, contrast, base, gx, gy = work.at
     i_blur = _ONE / blur
     square = _ZERO
-    v_texture = F(texture)
+    v_texture, v_disc = F(max(texture, 0.0)), F(max(-texture, 0.0))
     most = max(abs(base), abs(base + contrast), _ONE)
     k_out = base / most if slope == LIGHT else _ONE
     k_in = (base + contrast) / most if slope == LIGHT else (_ONE if slope == GLARE else _ZERO)
@@ -162,7 +169,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
         tail = density * b * (_B1 + b * (_B2 + b * (_B3 + b * (_B4 + b * _B5))))
         share = _HALF + np.copysign(_HALF - tail, z)
         rest = _ONE - share
-        w = _ONE / np.sqrt(_ONE + v_texture * rest * rest)
+        w = _ONE / np.sqrt(_ONE + v_texture * rest * rest + v_disc * share)
         k = k_in * share + k_out * rest
         inside[i] = share
         left = w * (level[i] - base - k * (gx * u + gy * v) - contrast * share)
@@ -393,6 +400,87 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: A
         sectors[0, k] /= max(sectors[1, k], 1e-12)
 
 
+def _odd_harmonics() -> Array:
+    """Return cosines and sines (6, SECTORS) of 3, 5 and 7 times the angle of each sector of :func:`rim`."""
+    angles = np.empty(SECTORS)
+    for k in range(SECTORS):
+        within = np.radians((33.75 if k & 1 else 11.25) if k & 2 else (56.25 if k & 1 else 78.75))
+        right, below = bool(k & 8), bool(k & 4)
+        angles[k] = np.arctan2(np.sin(within) * (1 if below else -1), np.cos(within) * (1 if right else -1))
+    return np.array([f(h * angles) for h in (3, 5, 7) for f in (np.cos, np.sin)])
+
+
+_ODD = _odd_harmonics()
+#: Median of chi-square of six degrees, over six.
+_CHI6_MEDIAN = 0.8914
+#: From so many discs on, what their rims have in common is the image's noise.
+_LEAST_RIMS = 3
+
+
+@kernel
+def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
+    """Compare the deviations of the rim's sectors with white noise, and fill ``work.rim``.
+
+    The centre moves with the first harmonic of what noise does along the rim. The odd harmonics after it (3, 5, 7) show
+    how much of that there is, where noise is correlated between neighbours: by a demosaic, a filter, a compression. The
+    even ones do not count: the pixel grid has them, too, and they do not move the centre.
+
+    Args:
+        variance: of the noise, as the residuals have it.
+        work: buffers; ``sectors`` is filled by :func:`rim`. ``rim`` is filled: power of the odd harmonics over that of
+            white noise; mean square of the sectors' deviations beyond white noise, px^2; what chance makes of that.
+
+    Returns:
+        Sum of the squared deviations beyond white noise, px^2; its variance; number of sectors.
+    """
+    sectors, off, chance, count, power, white = work.sectors, 0.0, 0.0, 0, 0.0, 1e-30
+    for k in range(SECTORS):
+        if sectors[1, k] > 0.0:
+            expected = variance / sectors[1, k]
+            off += sectors[0, k] ** 2 - expected
+            chance += 2.0 * expected * expected
+            count += 1
+            white += 3.0 * expected
+    for h in range(len(_ODD)):
+        total = 0.0
+        for k in range(SECTORS):
+            if sectors[1, k] > 0.0:
+                total += _ODD[h, k] * sectors[0, k]
+        power += total * total
+    work.rim[0], work.rim[1], work.rim[2] = power / white, off / max(count, 1), np.sqrt(chance) / max(count, 1)
+    return off, chance, count
+
+
+@kernel
+def common_noise(n: int, rims: Array) -> tuple[float, float]:
+    """Return what the rims (N, 3) of an image's first n discs have in common, see :func:`rim_noise`.
+
+    Returns:
+        The factor of the variance of centres by correlated noise, one at least; the mean square of the sectors' deviations
+        beyond white noise, px^2. Both are medians, so that a few discs that are none do not count.
+    """
+    if n < _LEAST_RIMS:
+        return 1.0, 0.0
+    power, off = np.sort(rims[:n, 0].copy()), np.sort(rims[:n, 1].copy())
+    factor = 0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN
+    return max(factor, 1.0), max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
+
+
+@kernel
+def widen(cov: Array, rim_of_disc: Array, factor: float, common_px2: float) -> None:
+    """Enlarge a centre's covariance (2, 2) by the image's noise, and by how far its own rim (3,) deviates beyond that.
+
+    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
+    """
+    for a in range(2):
+        for b in range(2):
+            cov[a, b] *= factor
+    own = rim_of_disc[1] - common_px2
+    if own > _RIM_CHANCE * rim_of_disc[2] * factor:
+        cov[0, 0] += own
+        cov[1, 1] += own
+
+
 @kernel
 def texture_factor(n: int, blur: float, texture: float, work: FitBuffers) -> float:
     """Return the factor by which the centre's variance grows because neighbouring pixels of a texture are correlated.
@@ -495,6 +583,8 @@ def slope_outside(theta: Array, work: FitBuffers) -> float:
 
 
 _STEPS = 8
+#: Least variance of a surround, grey levels^2, and how many times more that of a disc may be, for the weights.
+_LEAST_VARIANCE, _MOST_SHOT_NOISE = 0.1, 10.0
 #: A step of the centre after which the next one is negligible (a tenth of it at the most): px, and standard deviations
 #: of the centre.
 _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
@@ -592,8 +682,13 @@ def _minimise(
             spread(n, work, flat)
             v_in = flat[0] if flat[2] >= 30.0 else noise_sigma * noise_sigma
             v_in = max(v_in, 0.05, 1e-4 * theta[6] * theta[6])
-            if flat[1] > (2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))) * v_in:
+            v_out = max(flat[1], _LEAST_VARIANCE)
+            chance = 2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))
+            if flat[1] > chance * v_in:
                 texture = flat[1] / v_in - 1.0
+                continue
+            if flat[2] >= 30.0 and flat[0] > chance * v_out:
+                texture = -min(flat[0] / v_out - 1.0, _MOST_SHOT_NOISE)
                 continue
         if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
             return square, texture
@@ -686,17 +781,13 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     rim(n, theta, x0, y0, work, sectors)
-    off, chance, count = 0.0, 0.0, 0
-    for k in range(SECTORS):
-        if sectors[1, k] > 0.0:
-            off += sectors[0, k] ** 2 - variance / sectors[1, k]
-            chance += 2.0 * (variance / sectors[1, k]) ** 2
-            count += 1
+    off, chance, count = rim_noise(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
         return 5
     spread(n, work, sectors[0])
-    if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
+    v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
+    if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
     uneven = texture == 0.0 and (
         slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
@@ -712,11 +803,6 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
             cov[a, b] *= variance
     if uneven:
         _average(n, theta, x0, y0, noise_sigma, square, cov, work)
-    if off > _RIM_CHANCE * np.sqrt(chance):
-        # A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as
-        # much.
-        cov[0, 0] += off / count
-        cov[1, 1] += off / count
     return 0
 
 

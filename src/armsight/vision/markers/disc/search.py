@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.kernels import kernel
-from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, factor, fit, shape_of, solve
+from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, common_noise, factor, fit, shape_of, solve, widen
 
 #: Longest half chord, px: half of the largest disc, blur and all.
 _REACH = 44
@@ -426,5 +426,9 @@ def find(
             codes[good] = FOUND_TWICE
         else:
             shape_of(starts[good], shape[good])
+            work.rims[good, :] = work.rim
             good += 1
+    times, common = common_noise(good, work.rims)
+    for i in range(good):
+        widen(cov[i], work.rims[i], times, common)
     return good, n
