@@ -360,6 +360,19 @@ def spread(n: int, work: FitBuffers, flat: Array) -> None:
     flat[2], flat[3] = count_in, count_out
 
 
+@kernel
+def inside_noise(n: int, work: FitBuffers) -> float:
+    """Return the variance of the noise inside the disc, from the differences of the residuals of neighbours in a row."""
+    px, py, residual, inside = work.px, work.py, work.residual, work.inside
+    square, count = 0.0, 0
+    for i in range(n - 1):
+        if inside[i] > F(0.995) and inside[i + 1] > F(0.995) and py[i + 1] == py[i] and px[i + 1] == px[i] + _ONE:
+            step = residual[i + 1] - residual[i]
+            square += step * step
+            count += 1
+    return 0.5 * square / max(count, 1)
+
+
 @kernel(fastmath=True)
 def clipped(n: int, work: FitBuffers) -> int:
     """Count the pixels that are black or white to the last level."""
@@ -665,14 +678,15 @@ def _step(
 
 @kernel
 def _minimise(
-    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: FitBuffers
-) -> tuple[float, float]:
+    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, texture: float,
+    work: FitBuffers,
+) -> tuple[float, float]:  # fmt: skip
     """Step until the centre converges; return the sum of squared residuals, -1 without a minimum, and the texture.
 
-    ``weigh``: where the surround varies more than the disc, reduce its weight.
+    ``weigh``: where surround or disc varies more than the other, reduce its weight; ``texture``: how it is reduced before.
     """
     flat, H = work.sectors[0], work.H
-    texture, weighed = 0.0, not weigh
+    weighed = not weigh
     for _ in range(_STEPS):
         shift, square = _step(n, theta, x0, y0, slope, texture, work)
         if shift < 0.0:
@@ -688,8 +702,10 @@ def _minimise(
                 texture = flat[1] / v_in - 1.0
                 continue
             if flat[2] >= 30.0 and flat[0] > chance * v_out:
-                texture = -min(flat[0] / v_out - 1.0, _MOST_SHOT_NOISE)
-                continue
+                v_in = inside_noise(n, work)  # light that slopes over the disc is no noise
+                if v_in > chance * v_out:
+                    texture = -min(v_in / v_out - 1.0, _MOST_SHOT_NOISE)
+                    continue
         if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
             return square, texture
     return -1.0, 0.0
@@ -697,8 +713,9 @@ def _minimise(
 
 @kernel
 def _average(
-    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: FitBuffers
-) -> None:
+    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, texture: float, cov: Array,
+    work: FitBuffers,
+) -> None:  # fmt: skip
     """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood (model averaging).
 
     The result of SURROUND, its sum of squares included, is the input. A kind that is not distinguishable from another
@@ -711,7 +728,7 @@ def _average(
     results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
     for kind in (LIGHT, GLARE):
         trial[:] = start
-        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
+        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, texture, work)
         results[kind, 0] = np.inf
         if square >= 0.0:
             of_centre(work, block)
@@ -762,7 +779,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
     if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
         return 2
-    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
+    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
         return 2
     # Clipped pixels have no noise and do not count for it.
@@ -789,7 +806,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
     if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
-    uneven = texture == 0.0 and (
+    uneven = texture <= 0.0 and (
         slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
         or slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
     )
@@ -802,7 +819,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         for b in range(2):
             cov[a, b] *= variance
     if uneven:
-        _average(n, theta, x0, y0, noise_sigma, square, cov, work)
+        _average(n, theta, x0, y0, noise_sigma, square, texture, cov, work)
     return 0
 
 
