@@ -636,7 +636,7 @@ _RIM_CHANCE = 4.0
 #: Largest residuals beyond the image's noise, as a share of the contrast.
 _MOST_RESIDUAL = 0.1
 #: A centre that a textured surround makes less certain than this is rejected, px.
-_MOST_SIGMA_PX = 0.08
+_MOST_SIGMA_PX = 0.2
 #: Largest variation of the inside beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
