@@ -1,4 +1,4 @@
-"""Cameras that moved against each other and bodies of another size: found, sized, and never found where nothing is wrong."""
+"""Cameras that moved against each other and bodies of another size: found, sized, and not found where nothing is wrong."""
 
 from dataclasses import replace
 

@@ -32,7 +32,6 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
 from armsight.vision.sources.pairs import StoredSource
 
-
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
 

@@ -6,11 +6,11 @@ the baseline), and the scale of body over baseline. Model of a shot's residuals,
 
     r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
 
-with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all shots
-share; f the six numbers, zero while all is well. The information of the shots is summed, weighted down with age, and f is
-estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r that
-needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of baseline have
-the same effect: which of them is wrong cannot be distinguished.
+with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
+shots share; f the six numbers, zero while all is well. The information of the shots is summed, weighted down with age, and
+f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r that
+needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of baseline
+have the same effect: which of them is wrong cannot be distinguished.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class RigChange(Record):
     """An estimate of the six numbers.
 
     Attributes:
-        f: (6,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both as
-            tangents of T_left_right on the right; size of the body over that of its file, less 1.
+        f: (6,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
+            as tangents of T_left_right on the right; size of the body over that of its file, less 1.
         cov: (6, 6) its covariance.
         chi_square: of all six against zero.
         rig_alone: the same of the first five alone, with the body right.
