@@ -2,9 +2,9 @@
 
 In: what the estimator did with each pose measurement. Out: the motion of the rig against the base, a jump or a drift, with
 the time of its beginning. The generalised likelihood ratio test of Willsky and Jones ("A generalized likelihood ratio
-approach to the detection and estimation of jumps in linear systems", 1976): a motion d of the arm's base in the rig changes six
-numbers of the filter's state at a time s; what a filter that does not know of it leaves of that, F, and its signature G in
-the innovations follow from the filter's own gains,
+approach to the detection and estimation of jumps in linear systems", 1976): a motion d of the arm's base in the rig
+changes six numbers of the filter's state at a time s; what a filter that does not know of it leaves of that, F, and its
+signature G in the innovations follow from the filter's own gains,
 
     G_k = H_k kept_k F_k-1,    F_k = kept_k F_k-1 - K_k G_k,    F_s = I in the rows of the base
 
@@ -31,6 +31,8 @@ MOST, _TESTS_HZ = 20, 5.0
 CORRELATED_S = 0.1
 #: A prior so wide that it decides nothing: m, rad; for a drift, of that much in a second.
 _WIDE = np.repeat([0.05, 0.1], 3)
+#: A drift must explain so much more than a jump to be preferred.
+_RARER = np.array([0.0, 10.0])
 _LIMIT = alarm_limit(6, _TESTS_HZ, 2 * MOST)
 
 
@@ -91,6 +93,8 @@ class FixedWatch:
             return
         if innovation.outcome is Outcome.REOPENED:
             self.reopened = (self.reopened[0] + 1, min(self.reopened[1], innovation.t_s))
+            if self._rejected:
+                self._begin(self._rejected[0].t_s)
             for rejected in self._rejected:
                 self._add(rejected)
         self._rejected = []
@@ -148,7 +152,7 @@ class FixedWatch:
         gained = np.einsum("nak,nak->na", b, d)
         excess = np.maximum((self._squares[:, None] - gained) / np.maximum(6.0 * self._weights, 1.0)[:, None], 1.0)
         chi_square = gained / excess
-        n, kind = np.unravel_index(int(np.argmax(chi_square)), chi_square.shape)
+        n, kind = np.unravel_index(int(np.argmax(chi_square - _RARER)), chi_square.shape)
         found = float(chi_square[n, kind])
         if found <= max(_LIMIT, 0.0 if self.moved is None else self.moved.chi_square):
             return

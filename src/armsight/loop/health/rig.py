@@ -8,9 +8,9 @@ the baseline), and the scale of body over baseline. Model of a shot's residuals,
 
 with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
 shots share; f the six numbers, zero while all is well. The information of the shots is summed, weighted down with age, and
-f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r that
-needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of baseline
-have the same effect: which of them is wrong cannot be distinguished.
+f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
+baseline have the same effect: which of them is wrong cannot be distinguished.
 """
 
 from __future__ import annotations
