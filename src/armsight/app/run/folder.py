@@ -176,7 +176,8 @@ def finish(finished: Finished, folder: Path) -> RunSummary:
         reason = f"{ended}, and not all could be written: " if ended else ""
         raise InputError(f"{reason}{error}; what was written before is in {folder}") from None
     if outcome.ended_by is not None:
-        raise ArmsightError(f"{ended}; what was measured until then is in {folder}")
+        suspected = "".join(f"; {line}" for line in health_lines(outcome.health))
+        raise ArmsightError(f"{ended}; what was measured until then is in {folder}{suspected}")
     if outcome.interrupted:
         raise KeyboardInterrupt
     return summary

@@ -24,7 +24,7 @@ from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.health.record import HealthFinding, alarm_limit
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
-EVERY_S, _FINE_S, _GROWTH = 0.2, 1.0, 1.4
+EVERY_S, _FINE_S, _RATIO = 0.2, 1.0, 1.4
 #: At most so many beginnings, and how often they are tested, Hz.
 MOST, _TESTS_HZ = 20, 5.0
 #: Errors of the arm's model last about so long, s: innovations closer than that count as one.
@@ -132,7 +132,7 @@ class FixedWatch:
         ages = t_s - self._begins
         keep, last = np.zeros(len(ages), bool), np.inf
         for k, age in enumerate(ages):  # from the oldest on
-            keep[k] = k == 0 or age <= _FINE_S or last >= _GROWTH * age
+            keep[k] = k == 0 or age <= _FINE_S or last >= _RATIO * age
             last = age if keep[k] else last
         rows = np.flatnonzero(keep)
         rows = rows if len(rows) < MOST else np.delete(rows, 1)
