@@ -1,7 +1,7 @@
 """The ``armsight`` command: the group of commands, and how errors are reported.
 
 Every command takes ``--json`` (JSON on stdout); progress and warnings go to stderr. A mistake in the input
-is one line on stderr and exit code 2; an interrupt is exit code 130.
+is one line on stderr and exit code 2; a result that must not be trusted is exit code 3; an interrupt is exit code 130.
 """
 
 from __future__ import annotations

@@ -6,6 +6,9 @@ import os
 
 import click
 
+#: Exit code of a command that is done, but whose result must not be trusted (docs/concepts/health.md).
+UNTRUSTED = 3
+
 
 def colour() -> bool | None:
     """Return whether text is in colour: False with NO_COLOR (no-color.org), None where the terminal decides."""

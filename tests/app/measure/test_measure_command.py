@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
-from armsight.geometry.pose import inverse, log_se3, pose, transform
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
@@ -366,3 +367,18 @@ def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsigh
     # Where the shape is known, what is left is the noise: a misfit by chance, and the recording's one bad pair.
     assert sum(misfit > 1 for misfit in misfits[0]) == 13
     assert sum(misfit > 1 for misfit in misfits[1]) <= 3
+
+
+def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, tmp_path, armsight):
+    rig = StereoRig.load(rendered.rig)
+    path = tmp_path / "moved.json"
+    replace(rig, T_left_right=rig.T_left_right @ exp_se3(np.radians([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))).save(path)
+    given = ("--target", rendered.plate, "--source", rendered.folder / "arm", "--json")
+    assert armsight("measure", rendered.rig, *given).code == 0
+    said = armsight("measure", path, *given)
+    (found,) = said.lines[-1]["health"]
+    assert said.code == 3, said.err
+    assert found["cause"] == "rig"
+    assert found.keys() == {"cause", "what", "since_s", "size", "sigma", "unit", "advice"}
+    assert abs(found["size"] - 0.3) < 4 * found["sigma"]
+    assert "do not trust this result: rig: " in said.err

@@ -10,12 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from armsight.app.demo import demo
 from armsight.app.run import folder as run_files
 from armsight.app.run import folder as run_folder
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.folder import Finished, finish, make_room, write_run, write_shots
+from armsight.app.run.report import RunReport, _page
+from armsight.app.run.summary import RunSummary
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.loop.health import HealthFinding
 
 BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
@@ -43,7 +47,7 @@ def test_what_is_not_known_is_null(tmp_path):
     assert summary["count"] == 3
     assert summary["said"] is True
     assert summary["ended_by"] is None
-    assert list(summary) == ["version", "arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
+    assert list(summary) == ["version", "health", "arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
 
 
 def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
@@ -67,6 +71,33 @@ def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
     assert json.loads((disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
     assert list(csv.reader((disk / "poses.csv").read_text().splitlines()))
     assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv"}
+
+
+FOUND = HealthFinding("rig", "a camera is rotated", 1.5, 0.05, 0.001, "deg", "calibrate again")
+
+
+def test_what_must_not_be_trusted_is_in_the_summary_and_in_the_error(tmp_path):
+    gone = DeviceError("left camera: gone")
+    with pytest.raises(
+        ArmsightError, match=r"gone; .*; do not trust this result: rig: a camera is rotated since 1\.5 s;"
+    ):
+        finish(finished(ended_by=gone, health=(FOUND,)), tmp_path)
+    (found,) = json.loads((tmp_path / "summary.json").read_text())["health"]
+    assert HealthFinding(**found) == FOUND
+
+
+@pytest.mark.parametrize("found", [(), (FOUND,)])
+def test_the_exit_code_says_whether_the_result_can_be_trusted(tmp_path, monkeypatch, armsight, found):
+    monkeypatch.setattr(demo, "run_demo", lambda given, progress: RunSummary({}, 1.0, None, {}, health=found))
+    said = armsight("demo", "--quick", "-o", tmp_path / "demo")
+    assert said.code == (3 if found else 0)
+    assert ("do not trust this result: rig: a camera is rotated" in said.err) is bool(found)
+
+
+def test_the_report_begins_with_what_must_not_be_trusted():
+    summary = RunSummary({"arm": "six_r"}, 1.0, None, {}, health=(FOUND,))
+    page = _page(RunReport(summary, None, None, None, None, None, ["a note"]), {})
+    assert 0 < page.index("Do not trust this result") < page.index("a camera is rotated") < page.index("a note")
 
 
 def shots(count):

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from armsight.app.messages import UNTRUSTED
+
 
 @click.command("demo")
 @click.option(
@@ -95,3 +97,5 @@ def command(
         click.echo(json.dumps(summary.to_json()))
     else:
         print_summary(summary, output)
+    if summary.health:
+        click.get_current_context().exit(UNTRUSTED)

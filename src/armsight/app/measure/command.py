@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 
 
@@ -39,7 +40,8 @@ def command(
 
     Give the images as --left and --right, as --source, or what was detected in them as --detections. A shot that cannot
     be read or does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles
-    about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll).
+    about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict
+    the rig or the body file, and the poses must not be trusted.
     """
     given = [left is not None or right is not None, source is not None, detections is not None]
     if sum(given) != 1 or (left is None) != (right is None):
@@ -47,7 +49,7 @@ def command(
 
     from armsight.app.measure.run import measure_shots
 
-    measure_shots(
+    health = measure_shots(
         rig,
         target,
         left=left,
@@ -58,3 +60,5 @@ def command(
         view_dir=view_dir,
         as_json=as_json,
     )
+    if health:
+        click.get_current_context().exit(UNTRUSTED)

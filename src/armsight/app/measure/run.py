@@ -16,10 +16,12 @@ import numpy as np
 from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
+from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
+from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
 from armsight.vision.detections import read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
@@ -29,6 +31,9 @@ from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, Source, open_source
 from armsight.vision.sources.pairs import StoredSource
+
+#: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
+_SYNC_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ def measure_shots(
     output: Path | None,
     view_dir: Path | None,
     as_json: bool,
-) -> None:
+) -> tuple[HealthFinding, ...]:
     """Measure the pose of a target in every shot, and print a line for each.
 
     Args:
@@ -68,6 +73,9 @@ def measure_shots(
         output: CSV file of the poses.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
+
+    Returns:
+        Why the poses must not be trusted; empty where nothing says so.
 
     Raises:
         ArmsightError: the input is wrong, or no shot could be measured.
@@ -106,13 +114,20 @@ def measure_shots(
             stack.callback(view.finish, records)
         if output is not None:
             stack.callback(_write, output, records)
+        monitor = HealthMonitor(stereo, body, _SYNC_S)
         try:
-            _run(results, total, body, records, as_json, view)
+            _run(results, total, body, records, as_json, view, monitor)
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
+    health = monitor.findings()
+    for line in health_lines(health):
+        click.echo(weak(line), err=True, color=colour())
+    if as_json and health:
+        click.echo(json.dumps({"health": [found.to_json() for found in health]}))
+    return health
 
 
 def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
@@ -146,10 +161,12 @@ def _run(
     records: list[ShotPose],
     as_json: bool,
     view: PictureFolder | None,
+    monitor: HealthMonitor,
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
-        for shot, result, followed in results:
+        for shot, measured, followed in results:
+            result = monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
             record = shot_pose(shot.name, shot.t_s, body, result)
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)

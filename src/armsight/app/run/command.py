@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -162,6 +163,8 @@ def command(
         click.echo(json.dumps(summary.to_json()))
     else:
         print_summary(summary, output)
+    if summary.health:
+        click.get_current_context().exit(UNTRUSTED)
 
 
 def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:

@@ -24,6 +24,8 @@ from armsight.app.run.setup import Setup
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
+from armsight.loop.health import HealthFinding
+from armsight.loop.health.fixed import BaseMotion
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
@@ -134,6 +136,8 @@ class RunResult:
         covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
         kept: the first shots of the motions.
         picture: the first shot in motion in which the body was found, and its pose.
+        health: why the result must not be trusted; empty where nothing says so.
+        moved: a motion of the rig against the base of the arm; None where none was found.
         ended_by: the error that ended the run early; None where there was none.
         interrupted: whether the keyboard ended the run.
     """
@@ -147,6 +151,8 @@ class RunResult:
     covered_s: tuple[float, float] | None = None
     kept: list[Shot] = field(default_factory=list)
     picture: tuple[Shot, PoseEstimate] | None = None
+    health: tuple[HealthFinding, ...] = ()
+    moved: BaseMotion | None = None
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
@@ -221,6 +227,7 @@ def _run(
             with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
                 _stopped(loop)
                 loop.close_record()
+                outcome.health, outcome.moved = loop.health.findings(), loop.health.moved
             outcome.interrupted = outcome.interrupted or bool(again)
 
 

@@ -40,6 +40,7 @@ from armsight.data import Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
 from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.health import health_lines
 from armsight.robot.arm import Arm
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
@@ -175,7 +176,8 @@ def finish(finished: Finished, folder: Path) -> RunSummary:
         reason = f"{ended}, and not all could be written: " if ended else ""
         raise InputError(f"{reason}{error}; what was written before is in {folder}") from None
     if outcome.ended_by is not None:
-        raise ArmsightError(f"{ended}; what was measured until then is in {folder}")
+        suspected = "".join(f"; {line}" for line in health_lines(outcome.health))
+        raise ArmsightError(f"{ended}; what was measured until then is in {folder}{suspected}")
     if outcome.interrupted:
         raise KeyboardInterrupt
     return summary
@@ -210,12 +212,12 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
-            summary = RunSummary(finished.properties, wall_s, outcome.ended_text, {})
+            summary = RunSummary(finished.properties, wall_s, outcome.ended_text, {}, health=outcome.health)
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
         mounting = outcome.handeye.mounting
-        run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth)
+        run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.moved)
         keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
         for name, track in _tracks(run).items():
             keep(write_track, folder, name, track)
@@ -307,6 +309,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
     reasons = Counter(p.reason for _, _, p in outcome.log.poses if isinstance(p, Missed))
     modes = Counter(run.modes.tolist())
     return [
+        *health_lines(outcome.health),
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: the error of the arm's nominal table",
         *outcome.handeye.missed,

@@ -28,6 +28,7 @@ from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate
 from armsight.errors import DeviceError
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
+from armsight.loop.health import HealthMonitor
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower
 
@@ -179,6 +180,7 @@ class Loop:
 
     Attributes:
         mounting: poses of cameras and body on the arm; None before they are known: then the estimator has the joints alone.
+        health: watches whether the calibrations still hold.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
         t_s: time of the newest reading, board's clock, s.
     """
@@ -190,6 +192,7 @@ class Loop:
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.t_s = 0.0
         self._shot_s = -np.inf
+        self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
         # intervals that are not computed yet, and the first batch of readings that is not noted completely.
@@ -231,6 +234,7 @@ class Loop:
         learn(self.log.joints[len(received) :])  # what arrived meanwhile
         self._write()
         self.estimator = estimator  # its memory covers what is not recorded yet
+        self.health.follow(estimator, self.setup.arm)
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
         """Run a long computation; on hardware the loop continues meanwhile and holds the arm.
@@ -314,9 +318,10 @@ class Loop:
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
-            result = self._skew.widened(result, shot.t_s)
+            result = self._skew.widened(self.health.measured(result, shot.t_s), shot.t_s)
             if self.mounting is not None:
-                self.log.outcomes.append(self.estimator.vision(self.mounting.pose_measurement(result, shot.t_s)))
+                measurement = self.health.widened(self.mounting.pose_measurement(result, shot.t_s))
+                self.log.outcomes.append(self.estimator.vision(measurement))
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
         return shot, self._taken_s, result
 

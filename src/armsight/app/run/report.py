@@ -405,6 +405,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
 
     tables = [html_table(each) for each in (track_table(s), loop_table(s)) if each is not None]
     sections = {
+        "health": ("Do not trust this result", bullets([found.line() for found in s.health]) if s.health else ""),
         "result": ("Result", "".join(tables) + bullets(report.notes)),
         "images": (
             "Images",

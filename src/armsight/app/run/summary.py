@@ -15,6 +15,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.messages import colour, weak
 from armsight.app.report.table import TextTable, print_table
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import (
@@ -32,6 +33,7 @@ from armsight.app.run.metrics import (
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.files import finite_json
+from armsight.loop.health import HealthFinding, health_lines
 from armsight.robot.arm import Arm
 
 #: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.
@@ -107,6 +109,7 @@ class RunSummary:
         delay_s: delay of the cameras' time stamps, s, and its sigma, s.
         shots: numbers of shots.
         studies: error of vision against one quantity after the other.
+        health: why the result must not be trusted; empty where nothing says so.
     """
 
     properties: Mapping[str, Any]
@@ -121,6 +124,7 @@ class RunSummary:
     delay_s: tuple[float, float] | None = None
     shots: ShotCounts | None = None
     studies: Sequence[Study] = ()
+    health: Sequence[HealthFinding] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of summary.json, SI units in the keys; numbers that are not known are None."""
@@ -143,6 +147,7 @@ class RunSummary:
             found["shots"] = asdict(self.shots)
         if self.handeye is not None:
             found["studies"] = [_study_json(study) for study in self.studies]
+        found["health"] = [each.to_json() for each in self.health]
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
         known: dict[str, Any] = finite_json(found)
         return known
@@ -232,6 +237,7 @@ def summary_of(
         (result.delay.delay_s, result.delay.sigma_s),
         ShotCounts(len(run.vision), run.missed, run.rejected),
         studies,
+        result.health,
     )
 
 
@@ -339,6 +345,8 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
     for table in (track_table(summary), loop_table(summary)):
         if table is not None:
             print_table(table)
+    for line in health_lines(summary.health):
+        click.echo(weak(line), err=True, color=colour())
     lines = []
     if (hidden := summary.occlusion) is not None:
         lines.append(

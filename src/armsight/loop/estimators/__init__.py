@@ -14,7 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Estimator, Learned, Outcome, PoseMeasurement, Track
+from armsight.loop.estimators.estimator import (
+    ArmEstimate,
+    Delay,
+    Estimator,
+    Innovation,
+    Learned,
+    Outcome,
+    PoseMeasurement,
+    Track,
+)
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.estimators.latest import LatestEstimator
 from armsight.loop.estimators.mounting import Mounting
@@ -24,6 +33,7 @@ __all__ = [
     "ArmEstimate",
     "Delay",
     "Estimator",
+    "Innovation",
     "KalmanEstimator",
     "LatestEstimator",
     "Learned",

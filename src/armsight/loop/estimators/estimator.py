@@ -43,6 +43,31 @@ class Outcome(Enum):
     TOO_LATE = "too late: older than what is kept"
 
 
+@dataclass(frozen=True, eq=False)
+class Innovation(Record):
+    """What a filter did with a pose measurement: what a monitor of its consistency needs.
+
+    Attributes:
+        t_s: time of the measurement, s, the delay removed.
+        T_base_tool: (4, 4) the measured pose of the tool, m.
+        z: (6,) right tangent from the predicted pose of the tool to the measured one, [m; rad].
+        cov: (6, 6) covariance of z, what all measurements share included.
+        by_state: (6, K) derivative of the prediction by the filter's state.
+        kept: (K,) share of the state that was kept since the measurement before.
+        gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
+        outcome: what became of it.
+    """
+
+    t_s: float
+    T_base_tool: Array
+    z: Array
+    cov: Array
+    by_state: Array
+    kept: Array
+    gain: Array
+    outcome: Outcome
+
+
 @dataclass(frozen=True)
 class Delay:
     """How late a camera's stamps are on the board's clock: the exposure was at ``t_s - delay_s``.

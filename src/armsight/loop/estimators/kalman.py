@@ -11,6 +11,7 @@ docs/concepts/loop.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from armsight.loop.estimators.errormodel import (
     chi_square,
     symmetric,
 )
-from armsight.loop.estimators.estimator import ArmEstimate, Delay, Learned, Outcome, PoseMeasurement, Track
+from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, anew, blended, by_state, intervals
 from armsight.robot.arm import Arm
@@ -66,6 +67,9 @@ class KalmanEstimator:
         delay: how late the camera's stamps are.
         learns_delay: whether the delay is corrected, as far as its sigma allows. If not, only its sigma is used, and what
             the model misses of the backlash cannot be taken for delay.
+
+    Attributes:
+        on_innovation: called with what became of each pose measurement that came in order of time.
     """
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
@@ -75,6 +79,7 @@ class KalmanEstimator:
         none, ones = np.zeros((1, 6)), np.ones((1, 6))
         nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, 6)), none, np.zeros((1, 2, 6)))
         self._states = [ErrorState(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
+        self.on_innovation: Callable[[Innovation], None] | None = None
         self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
@@ -116,7 +121,7 @@ class KalmanEstimator:
         ):
             return Outcome.TOO_LATE
         later = self._states[row:]
-        after, outcome = self._take(before, pose_measurement)
+        after, outcome = self._take(before, pose_measurement, None if later else self.on_innovation)
         if after is None:
             return outcome
         self._states[row:] = [after]
@@ -218,8 +223,13 @@ class KalmanEstimator:
         """Return the time of a measurement, s, by a state's estimate of the delay."""
         return pose_measurement.t_s - self._delay.delay_s - float(state.x[DELAY])
 
-    def _take(self, before: ErrorState, pose_measurement: PoseMeasurement) -> tuple[ErrorState | None, Outcome]:
-        """Return the state after a measurement, None where it is an outlier."""
+    def _take(
+        self,
+        before: ErrorState,
+        pose_measurement: PoseMeasurement,
+        report: Callable[[Innovation], None] | None = None,
+    ) -> tuple[ErrorState | None, Outcome]:
+        """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
@@ -230,13 +240,20 @@ class KalmanEstimator:
         P[np.abs(P) < _NOTHING] = 0.0
         z, H, R = first = self._innovation(x, joints, pose_measurement)
         PHt = P @ H.T
-        outcome = self._gate(z, H @ PHt + R + pose_measurement.cov_common)
+        S = H @ PHt + R + pose_measurement.cov_common
+        outcome = self._gate(z, S)
         if outcome is Outcome.OUTLIER:
+            if report is not None:
+                report(
+                    Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((SIZE, 6)), outcome)
+                )
             return None, outcome
         if outcome is Outcome.REOPENED:
             P[DIAGONAL] += OPENED
             PHt = P @ H.T
-        x, P = self._update(x, P, joints, pose_measurement, first, PHt)
+        x, P, K = self._update(x, P, joints, pose_measurement, first, PHt)
+        if report is not None:
+            report(Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], K, outcome))
         return ErrorState(t_s, x, P, joints, pose_measurement), outcome
 
     def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
@@ -258,8 +275,8 @@ class KalmanEstimator:
         pose_measurement: PoseMeasurement,
         first: tuple[Array, Array, Array],
         PHt: Array,
-    ) -> tuple[Array, Array]:
-        """Return state and covariance after a measurement: the iterated update (Bell and Cathey, 1993), from a first look.
+    ) -> tuple[Array, Array, Array]:
+        """Return state, covariance and gain after a measurement: the iterated update (Bell and Cathey, 1993).
 
         Args:
             x: the state.
@@ -285,7 +302,7 @@ class KalmanEstimator:
         if not self._learns_delay:  # its row is as it was, its column is right
             P[DELAY] = P[:, DELAY]
         symmetric(P)
-        return x + change, P
+        return x + change, P, np.asarray(K)
 
     def _gate(self, z: Array, S: Array) -> Outcome:
         """Return whether an innovation (6,) with covariance (6, 6) is used, an outlier, or one too many to ignore."""

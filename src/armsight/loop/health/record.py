@@ -1,0 +1,63 @@
+"""What a health monitor found: the record, its JSON and its line for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from scipy.special import chdtri
+
+#: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
+#: estimator: measurements that contradict what the estimator had learned, without another cause.
+Cause = Literal["rig", "body", "fixed", "estimator"]
+#: Probability of a false alarm of each test within a minute, while its noise model holds.
+FALSE_ALARMS_PER_MINUTE = 1e-4
+
+
+@dataclass(frozen=True)
+class HealthFinding:
+    """Something that no longer holds, and because of which results must not be trusted.
+
+    Attributes:
+        cause: what is wrong: rig, body, fixed, estimator.
+        what: what was found, one sentence.
+        since_s: since when, s on the clock of the shots; None where the shots have no times.
+        size: by how much, in ``unit``.
+        sigma: standard deviation of the size.
+        unit: deg, mm, %, or measurements.
+        advice: what to do.
+    """
+
+    cause: Cause
+    what: str
+    since_s: float | None
+    size: float
+    sigma: float
+    unit: str
+    advice: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that summary.json and ``--json`` hold."""
+        return asdict(self)
+
+    def line(self) -> str:
+        """Return the finding as one line for people."""
+        since = "" if self.since_s is None else f" since {self.since_s:.1f} s"
+        return f"{self.cause}: {self.what}{since}; {self.advice}"
+
+
+def health_lines(health: Sequence[HealthFinding]) -> list[str]:
+    """Return the lines for a log, a terminal or a report: none where nothing was found."""
+    return [f"do not trust this result: {found.line()}" for found in health]
+
+
+def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1) -> float:
+    """Return the chi-square of an alarm, so that FALSE_ALARMS_PER_MINUTE bounds the false ones (Bonferroni).
+
+    Args:
+        freedom: degrees of freedom.
+        tests_per_s: how often the test is made.
+        hypotheses: how many are tested each time.
+    """
+    return float(chdtri(freedom, FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)))

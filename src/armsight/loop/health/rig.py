@@ -1,0 +1,344 @@
+"""Cameras that moved against each other, and a body of another size: found in the residuals of the measured poses.
+
+In: measured poses with the detections they came from. Out: an estimate of six numbers that a calibration fixes: the five
+degrees of freedom of the right camera's pose in the left one that do not change the scale (rotation, and translation across
+the baseline), and the scale of body over baseline. Model of a shot's residuals, in standard deviations:
+
+    r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
+
+with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
+shots share; f the six numbers, zero while all is well. The information of the shots is summed, weighted down with age, and
+f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
+baseline have the same effect: which of them is wrong cannot be distinguished.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chdtri
+
+from armsight.data import Array, Body, PoseEstimate, Record
+from armsight.loop.health.record import HealthFinding, alarm_limit
+from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.rig import StereoRig
+
+#: Tolerance of a body that was built and measured with care: of each point, m, and of its scale.
+SHAPE_M, SCALE = 5e-5, 3e-4
+#: Points of a body that are used, at most: those of a large board would cost more than they say.
+MOST_POINTS = 24
+#: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
+#: translation over distance, and rotation, rad.
+_SAME = 0.01
+#: While nothing is suspected, shots closer in time than this are left out, s: they would cost time and add little.
+_LEAST_S = 0.025
+#: Fewer points than this say nothing of six numbers; shots further apart in time than this give no speed, s.
+_LEAST_POINTS, _APART_S = 4, 0.5
+#: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
+TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+#: Tests that are kept, to find since when.
+_KEPT = 600
+#: A prior so wide that it decides nothing: m, rad, scale.
+_WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0])
+#: A part of the six counts as necessary beyond this chance.
+_NECESSARY = 1e-4
+_ROTATIONS, _SCALED = slice(2, 5), 5
+_ALARM = alarm_limit(6, 1.0 / TEST_S)
+
+
+class _Sums:
+    """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
+
+    def __init__(self, size: int, begin_s: float) -> None:
+        self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
+        self.begin_s = begin_s
+
+    def add(self, other: _Sums, weight: float) -> None:
+        """Add another's."""
+        self.H += weight * other.H
+        self.b += weight * other.b
+        self.square += weight * other.square
+        self.freedom += weight * other.freedom
+
+
+@dataclass(frozen=True, eq=False)
+class RigChange(Record):
+    """An estimate of the six numbers.
+
+    Attributes:
+        f: (6,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
+            as tangents of T_left_right on the right; size of the body over that of its file, less 1.
+        cov: (6, 6) its covariance.
+        chi_square: of all six against zero.
+        rig_alone: the same of the first five alone, with the body right.
+        scale_alone: of the last alone, with the pose of the cameras right.
+        gained: sum of squares that the six explain.
+        left: sum of squares that nothing explains.
+    """
+
+    f: Array
+    cov: Array
+    chi_square: float
+    rig_alone: float
+    scale_alone: float
+    gained: float
+    left: float
+
+
+class RigWatch:
+    """Watches the calibrated pose of the cameras and the size of the body.
+
+    Args:
+        rig: the calibrated pair; without a covariance nothing can be tested.
+        body: the body that is measured.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
+
+    Attributes:
+        suspected: the change that the newest test found: significant, and moving the pose by more than its sigma; or None.
+    """
+
+    def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
+        self._rig, self._body, self._sync_s = rig, body, sync_s
+        self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
+        count, shape = rig.parameter_count, 3 * len(self._points)
+        self._size = count + 1 + shape
+        self._prior = np.zeros((self._size, self._size))
+        values, vectors = np.linalg.eigh(rig.cov)
+        self._prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
+        rest = np.arange(count, self._size)
+        self._prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
+        self._by_fault = _fault_directions(rig, self._size)
+        self._stay: _Sums | None = None
+        self._stay_shots, self._shots = 0, 0
+        self._row_of = np.full(len(body.points), -1)
+        self._row_of[self._points] = np.arange(len(self._points))
+        self._last = (-np.inf, np.eye(4))
+        self._began: Array | None = None
+        self._effect = (np.zeros((3, 6)), 0.0)
+        self._test, self._window = _Sums(self._size, 0.0), _Sums(self._size, 0.0)
+        self._history: deque[_Sums] = deque(maxlen=_KEPT)
+        self._timed = False
+        self._alarmed = False
+        self.suspected: RigChange | None = None
+
+    def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
+        """Take a measured pose.
+
+        Args:
+            estimate: the pose.
+            t_s: time of its shot, s; None where it has none.
+
+        Returns:
+            (6, 6) what the suspected errors add to the pose's covariance; zero while nothing is suspected.
+        """
+        now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
+        self._shots += 1
+        if self.suspected is None and self._timed and 0.0 <= now_s - self._last[0] < _LEAST_S:
+            return np.zeros((6, 6))
+        found = self._residuals(estimate, now_s)
+        self._last = (now_s, estimate.T_left_body)
+        if found is None:
+            return np.zeros((6, 6))
+        sums, by_fault = found
+        self._effect = (by_fault[:3], float(np.trace(estimate.cov[:3, :3])))
+        self._sum(sums, estimate.T_left_body, now_s)
+        if self.suspected is None:
+            return np.zeros((6, 6))
+        shift = by_fault @ self.suspected.f
+        return np.asarray(np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T)
+
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[_Sums, Array] | None:
+        """Return the sums of one shot, its pose eliminated, and the derivative (6, 6) of the pose by the six numbers."""
+        seen, rig, points = estimate.points.seen, self._rig, self._body.points
+        good = np.zeros(len(points), bool)
+        good[estimate.points.ids] = True
+        rows = np.flatnonzero(seen.paired & (good & (self._row_of >= 0))[seen.ids])
+        if len(rows) < _LEAST_POINTS:
+            return None
+        ids = np.repeat(seen.ids[rows], 2)
+        cov = seen.cov_uv[rows].reshape(-1, 2, 2) + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)
+        sides = np.arange(len(ids)) % 2
+        observations = PixelObservations(sides, ids, seen.uv[rows].reshape(-1, 2), cov)
+        T, cameras = estimate.T_left_body, rig.cameras
+        fit = fit_pose(cameras, rig.T_left_right, points, observations, T, robust=False, steps=0)
+        if fit is None:
+            return None
+        W, A, B = whitened(cameras, rig.T_left_right, points, observations, T)
+        count, n = rig.parameter_count, len(A)
+        rest = np.zeros((n, self._size + 1))
+        rest[:, :count] = B
+        by_point = A[:, :3].reshape(-1, 2, 3)
+        rest[:, count] = (by_point @ points[ids][:, :, None]).ravel()
+        columns = count + 1 + 3 * np.repeat(self._row_of[ids], 2)
+        rest[np.arange(n)[:, None], columns[:, None] + np.arange(3)] = A[:, :3]
+        rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
+        gain = np.linalg.solve(A.T @ A, A.T @ rest)
+        rest -= A @ gain
+        late = A @ self._skew(estimate.T_left_body, now_s)
+        late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
+        along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
+        whole = rest.T @ rest - np.outer(along, along) / (
+            1.0 + k2
+        )  # Sherman and Morrison: the skew has a variance of 1
+        sums = _Sums(self._size, now_s)
+        sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
+        return sums, -gain[:, :-1] @ self._by_fault
+
+    def _skew(self, T: Array, now_s: float) -> Array:
+        """Return how far the body moves (6,) in one sigma of the time between the exposures; zero where it is unknown."""
+        before_s, before = self._last
+        if not self._timed or not 0.0 < now_s - before_s < _APART_S:
+            return np.zeros(6)
+        R = before[:3, :3].T @ T[:3, :3]  # by a small angle
+        rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        shift = before[:3, :3].T @ (T[:3, 3] - before[:3, 3])
+        return np.asarray(np.concatenate([shift, rotation]) * (self._sync_s / (now_s - before_s)))
+
+    def _sum(self, sums: _Sums, T: Array, now_s: float) -> None:
+        """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
+        if self._stay is None or self._began is None or _differ(self._began, T):
+            self._close_stay()
+            self._stay, self._stay_shots, self._began = _Sums(self._size, now_s), 0, T
+        self._stay.add(sums, 1.0)
+        self._stay_shots += 1
+        begin_s = self._test.begin_s if self._test.freedom else self._stay.begin_s
+        if now_s - begin_s >= (TEST_S if self._timed else TEST_SHOTS):
+            self._close_stay()
+            self._began = None
+            self._decide()
+
+    def _close_stay(self) -> None:
+        """Add the mean of a stay's shots to the sums of the next test."""
+        if self._stay is not None and self._stay_shots:
+            if not self._test.freedom:
+                self._test.begin_s = self._stay.begin_s
+            self._test.add(self._stay, 1.0 / self._stay_shots)
+        self._stay, self._stay_shots = None, 0
+
+    def _decide(self) -> None:
+        """Test for a change with the newest sums; weigh the older ones down."""
+        if not self._test.freedom:
+            return
+        self._history.append(self._test)
+        weight = float(np.exp(-1.0 / FORGET_TESTS))
+        for name in ("H", "b", "square", "freedom"):
+            setattr(self._window, name, weight * getattr(self._window, name))
+        self._window.add(self._test, 1.0)
+        self._test = _Sums(self._size, 0.0)
+        change = self._estimated(self._window)
+        by_fault, variance = self._effect
+        shift = by_fault @ change.f
+        alarm = change.chi_square > _ALARM and float(shift @ shift) > variance
+        self.suspected = change if alarm else None
+        self._alarmed = self._alarmed or alarm
+
+    def _estimated(self, sums: _Sums) -> RigChange:
+        """Return the six numbers from sums, everything else eliminated."""
+        L, F = self._prior, self._by_fault * _WIDE
+        LH = L.T @ sums.H
+        inner = cho_factor(LH @ L + np.eye(self._size))
+        across, right = LH @ F, L.T @ sums.b
+        solved, from_right = cho_solve(inner, across), cho_solve(inner, right)
+        S = F.T @ sums.H @ F - across.T @ solved + np.eye(6)
+        s = F.T @ sums.b - solved.T @ right
+        square = sums.square - float(right @ from_right)
+        f = np.linalg.solve(S, s)
+        # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
+        excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
+        alone = [float(s[part] @ np.linalg.solve(S[part, part], s[part])) for part in (slice(0, 5), slice(5, 6))]
+        cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
+        gained = float(s @ f)
+        chi_squares = (gained / excess, alone[0] / excess, alone[1] / excess)
+        return RigChange(_WIDE * f, cov, *chi_squares, gained, square - gained)
+
+    def _since(self) -> tuple[float, RigChange]:
+        """Return since when there is a change, on the clock of the shots, and the change estimated from then on.
+
+        It is the beginning that leaves least unexplained: with the six numbers zero before it, and estimated after it.
+        """
+        after, found, least = _Sums(self._size, 0.0), None, np.inf
+        before = _Sums(self._size, 0.0)
+        for sums in self._history:
+            before.add(sums, 1.0)
+        for sums in reversed(self._history):
+            after.add(sums, 1.0)
+            before.add(sums, -1.0)
+            change, none = self._estimated(after), self._estimated(before)
+            if change.left + none.left + none.gained < least:
+                least, found = change.left + none.left + none.gained, (sums.begin_s, change)
+        assert found is not None
+        return found
+
+    def findings(self) -> tuple[HealthFinding, ...]:
+        """Return what was found so far: nothing where no test gave an alarm."""
+        self._close_stay()
+        self._decide()
+        if not self._alarmed:
+            return ()
+        began_s, change = self._since()
+        since_s = began_s if self._timed else None
+        rig_needed = change.chi_square - change.scale_alone > chdtri(5, _NECESSARY)
+        scale_needed = change.chi_square - change.rig_alone > chdtri(1, _NECESSARY)
+        found = []
+        if rig_needed or (not scale_needed and change.rig_alone >= change.scale_alone):
+            found.append(_rig_finding(change, since_s, alone=not rig_needed))
+        if scale_needed or (not rig_needed and change.scale_alone > change.rig_alone):
+            found.append(_scale_finding(change, since_s, alone=not scale_needed))
+        return tuple(found)
+
+
+def _fault_directions(rig: StereoRig, size: int) -> Array:
+    """Return (size, 6) what a unit of each of the six numbers changes of the parameters."""
+    by_fault, begin = np.zeros((size, 6)), rig.parameter_count - 6
+    baseline = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
+    by_fault[begin : begin + 3, :2] = np.linalg.svd(baseline[None])[2][1:].T
+    by_fault[begin + 3 : begin + 6, _ROTATIONS] = np.eye(3)
+    by_fault[rig.parameter_count, _SCALED] = 1.0
+    return by_fault
+
+
+def _differ(T: Array, other: Array) -> bool:
+    """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
+    apart = float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
+    cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0
+    return apart > _SAME * abs(float(T[2, 3])) or cosine < np.cos(_SAME)
+
+
+def _rig_finding(change: RigChange, since_s: float | None, *, alone: bool) -> HealthFinding:
+    """Return the finding of cameras that moved against each other."""
+    rotation = change.f[_ROTATIONS]
+    size = float(np.linalg.norm(rotation))
+    along = rotation / size if size > 0.0 else np.zeros(3)
+    sigma = float(np.sqrt(along @ change.cov[_ROTATIONS, _ROTATIONS] @ along))
+    unsure = "; a body of another size cannot be excluded" if alone else ""
+    moved_mm = 1e3 * float(np.linalg.norm(change.f[:2]))
+    return HealthFinding(
+        "rig",
+        f"the right camera is rotated by {np.degrees(size):.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
+        f"compared with the calibration{unsure}",
+        since_s,
+        float(np.degrees(size)),
+        float(np.degrees(sigma)),
+        "deg",
+        "fasten the cameras and calibrate the rig again",
+    )
+
+
+def _scale_finding(change: RigChange, since_s: float | None, *, alone: bool) -> HealthFinding:
+    """Return the finding of a body of another size, or a baseline of another length."""
+    size, sigma = 100.0 * float(change.f[_SCALED]), 100.0 * float(np.sqrt(change.cov[_SCALED, _SCALED]))
+    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
+    return HealthFinding(
+        "body",
+        f"the body looks {abs(size):.2f} % {'larger' if size > 0 else 'smaller'} than its file says: the body file or the "
+        f"baseline of the rig is wrong, and the two cannot be distinguished{unsure}",
+        since_s,
+        size,
+        sigma,
+        "%",
+        "measure the distances on the body with calipers; if they agree with its file, calibrate the rig again",
+    )

@@ -1,0 +1,108 @@
+"""Faults of rig, body and mounting in light simulations: projected points with noise, and an arm with errors.
+
+Used by the tests beside it and by benchmarks/health.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from arm_rig import ARM, legs, mounts, run, small, worn
+
+from armsight.data import Body, Correspondences, Points, PoseEstimate
+from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.loop.health import HealthMonitor
+from armsight.sim.example_rig import example_rig
+from armsight.sim.workcell.body import body_target
+from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.triangulate import triangulate
+from views import both_pixels
+
+RATE_HZ, SIGMA_PX, SYNC_S = 30.0, 0.03, 6e-5
+TRUE = example_rig(convergence_deg=1.0)
+#: As of a calibration with 30 pairs: focal lengths and centre, distortion; translation m, rotation rad.
+SIGMAS = np.concatenate([*2 * [[0.05] * 4 + [5e-4, 1e-3, 2e-5, 2e-5, 1e-3]], 3 * [1e-5], 3 * [2e-5]])
+BODY = body_target().body
+
+
+def measured(rig, body, T_start, uv):
+    """The pose of a body from pixels (N, 2, 2), as vision makes it."""
+    seen = Correspondences(np.arange(len(uv)), uv, np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 2, 1, 1)))
+    observations = PixelObservations.of(seen, rig.sigma_px)
+    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, observations, T_start, robust=False)
+    _, A, B = whitened(rig.cameras, rig.T_left_right, body.points, observations, fit.T_left_body)
+    noise = np.linalg.inv(fit.information)
+    gain = noise @ A.T @ B
+    points = triangulate(rig, body, seen)
+    points = Points(points.ids, points.p_left, points.cov, points.calibration, seen)
+    return PoseEstimate(fit.T_left_body, noise + gain @ rig.cov @ gain.T, noise, 0.0, 0.0, 1.0, points)
+
+
+def watched_body(seed, *, rotated=None, scale=1.0, at_s=0.0, seconds=12.0):
+    """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot."""
+    rng = np.random.default_rng(seed)
+    cov = np.diag(SIGMAS**2)
+    given = replace(TRUE.perturbed(SIGMAS * rng.normal(size=len(SIGMAS))), cov=cov, sigma_px=0.0)
+    moved = (
+        TRUE
+        if rotated is None
+        else replace(TRUE, T_left_right=TRUE.T_left_right @ exp_se3(np.append(np.zeros(3), rotated)))
+    )
+    body = Body(BODY.name, BODY.point_names, scale * BODY.points)
+    points = BODY.points + 2e-5 * rng.normal(size=BODY.points.shape)
+    monitor = HealthMonitor(given, body, SYNC_S)
+    rates, phases = rng.uniform(0.05, 0.2, 6), rng.uniform(0, 2 * np.pi, 6)
+    for k in range(round(seconds * RATE_HZ)):
+        t = k / RATE_HZ
+        u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
+        T = pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+        true = moved if t >= at_s else TRUE
+        uv = both_pixels(true, points @ T[:3, :3].T + T[:3, 3])
+        estimate = measured(given, body, T, uv + SIGMA_PX * rng.normal(size=uv.shape))
+        yield monitor, t, T, estimate, monitor.measured(estimate, t)
+
+
+def ended(seed, **fault):
+    """The findings at the end of a run."""
+    *_, (monitor, *_) = watched_body(seed, **fault)
+    return monitor.findings()
+
+
+LEARNED_S, AT_S = 5.0, 6.5
+
+
+class Moved:
+    """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
+
+    def __init__(self, estimator, T_base_rig, motion):
+        self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
+        self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
+        self.found_s = None
+
+    def joints(self, states):
+        self.estimator.joints(states)
+
+    def track(self, t_s):
+        return self.estimator.track(t_s)
+
+    def vision(self, measurement):
+        t_s, T = measurement.t_s, self.T_base_rig
+        if t_s >= LEARNED_S and self.estimator.on_innovation is None:
+            self.monitor.follow(self.estimator, ARM)
+        if t_s >= AT_S:
+            D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
+            measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
+        outcome = self.estimator.vision(measurement)
+        if self.found_s is None and self.monitor.findings():
+            self.found_s = t_s
+        return outcome
+
+
+def watched_arm(seed, motion, seconds=9.0):
+    """Run an arm with errors; return the estimator with its monitor."""
+    rng = np.random.default_rng(seed)
+    mount = mounts(rng)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion)
+    run(rng, moved, worn(rng), legs(rng, seconds), mount=mount)
+    return moved

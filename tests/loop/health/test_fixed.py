@@ -1,0 +1,34 @@
+"""A rig that moves against the arm's base: found at once, sized, and not found where nothing moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import AT_S, watched_arm
+
+
+@pytest.mark.parametrize("seed", [30, 31, 32])
+def test_a_rig_that_stands_still_is_not_suspected(seed):
+    assert watched_arm(seed, lambda t_s: np.zeros(6)).monitor.findings() == ()
+
+
+@pytest.mark.parametrize(("shift_mm", "rotation_deg"), [(10.0, 0.8), (2.0, 0.0)])
+def test_a_knocked_rig_is_found_at_once(shift_mm, rotation_deg):
+    motion = np.array([1e-3 * shift_mm, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0])
+    moved = watched_arm(33, lambda t_s: motion)
+    (found,) = moved.monitor.findings()
+    assert (found.cause, found.unit) == ("fixed", "mm")
+    assert moved.found_s - AT_S < 0.5
+    assert found.since_s == pytest.approx(AT_S, abs=0.3)
+    if not rotation_deg:
+        assert abs(found.size - shift_mm) < 4 * found.sigma
+
+
+def test_a_knock_widens_what_is_given_out_from_then_on():
+    moved = watched_arm(34, lambda t_s: np.array([4e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    (state,) = moved.estimator._states[-1:]
+    given = moved.monitor.widened(state.pose_measurement)
+    shift_m = np.sqrt(np.trace((given.cov_common - state.pose_measurement.cov_common)[:3, :3]))
+    assert 3e-3 < shift_m < 8e-3
+    early = replace(state.pose_measurement, t_s=AT_S - 1.0)
+    assert moved.monitor.widened(early) is early

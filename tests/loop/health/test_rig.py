@@ -1,0 +1,73 @@
+"""Cameras that moved against each other and bodies of another size: found, sized, and not found where nothing is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, watched_body
+
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.health import HealthMonitor
+from armsight.loop.health.rig import RigWatch
+
+
+def test_nothing_is_found_where_nothing_is_wrong():
+    assert [ended(seed, seconds=8.0) for seed in range(100, 110)] == 10 * [()]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_rotated_camera_is_found_and_sized(axis):
+    (found,) = ended(axis, rotated=np.radians(0.05) * np.eye(3)[axis])
+    assert (found.cause, found.unit) == ("rig", "deg")
+    assert abs(found.size - 0.05) < 4 * found.sigma
+    assert found.sigma < 0.015
+    assert found.since_s < 2.5
+
+
+@pytest.mark.parametrize("scale", [0.99, 1.01])
+def test_a_body_file_of_another_size_is_found_and_the_baseline_named_with_it(scale):
+    (found,) = ended(3, scale=scale)
+    assert (found.cause, found.unit) == ("body", "%")
+    assert abs(found.size - 100 * (1 / scale - 1)) < 4 * found.sigma
+    assert "cannot be distinguished" in found.what
+
+
+def test_a_camera_that_moves_during_a_run_is_found_with_the_time():
+    (found,) = ended(4, rotated=np.radians([0.0, 0.1, 0.0]), at_s=5.0)
+    assert found.cause == "rig"
+    assert found.since_s == pytest.approx(5.0, abs=1.5)
+
+
+def test_the_covariance_grows_until_it_covers_the_error():
+    errors = {False: [], True: []}
+    for _, t, T, estimate, given in watched_body(5, rotated=np.radians([0.0, 0.05, 0.0]), seconds=6.0):
+        off = log_se3(inverse(estimate.T_left_body) @ T)
+        errors[t > 2.0].append([off @ np.linalg.solve(each.cov, off) for each in (estimate, given)])
+    assert np.mean(errors[True], axis=0)[0] > 40.0
+    assert np.mean(errors[True], axis=0)[1] < 12.0
+
+
+def test_a_rig_without_covariance_is_not_tested():
+    *_, estimate, _ = next(watched_body(6))
+    monitor = HealthMonitor(replace(TRUE, cov=np.zeros_like(TRUE.cov)), BODY, SYNC_S)
+    assert monitor.measured(estimate, 0.0) is estimate
+    assert monitor.findings() == ()
+
+
+def test_the_estimate_is_what_dense_least_squares_gives():
+    """The sums with everything eliminated, against one dense fit of all parameters with their priors."""
+    rows = [
+        (t, estimate) for _, t, _, estimate, _ in watched_body(7, rotated=np.radians([0.02, 0.05, 0.0]), seconds=0.9)
+    ][::10]
+    rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    watch = RigWatch(rig, BODY, 0.0)
+    for t, estimate in rows:
+        watch.take(estimate, t)
+    watch._close_stay()
+    found, size = watch._estimated(watch._test), watch._size
+    sums, L, F = watch._test, watch._prior, watch._by_fault
+    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1]) ** 2.0)
+    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 6))], [np.zeros((6, size)), wide]]))
+    G = np.hstack([np.eye(size), F])
+    both = np.linalg.solve(G.T @ sums.H @ G + prior, G.T @ sums.b)
+    assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)
