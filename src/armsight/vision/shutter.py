@@ -1,0 +1,327 @@
+"""Two shutters: when each observation of a moving body was exposed, and how to move all of them to one time.
+
+In: the correspondences of shots with their times. Out: by how much the right camera exposes later than the left (skew), how
+long a rolling shutter takes from the first row to the last (readout), both with covariance, and poses in which every
+observation was moved to the shot's time by the body's own motion.
+
+A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + (v / (H - 1) - 1/2) readout. The motion of
+the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on the two parameters
+through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual and the
+shape of the body remain. Gauss-Newton over all shots, weights after Cauchy, covariance from the scatter of the shots'
+scores with their correlation over neighbours (Newey and West, Econometrica 55(3), 1987, with a flat window: shots that share
+poses), and H less what the noise of the velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
+from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
+from armsight.vision.bundle import CAUCHY_SCALE
+from armsight.vision.locate import locate
+from armsight.vision.match import gate
+from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+
+#: Shots on each side whose poses give the motion of one, and the largest gap between two of them in median intervals.
+_BESIDE, _GAP = 2, 2.5
+#: Fewest moving shots, and the largest sigma that counts as found, s.
+_SHOTS_MIN, _SIGMA_MOST_S = 5, 1e-3
+_STEPS, _DONE_S = 12, 1e-7
+#: Largest epipolar gap, as a sigma of every observation, while the shutters are unknown, px: half a frame at 0.5 m/s.
+LOOSE_PX = 3.0
+#: Largest share of H that may be noise of the velocity.
+_NOISE_MOST = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Shutters(Record):
+    """When the rows of two cameras are exposed.
+
+    Attributes:
+        skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
+        readout_s: from the first row to the last, s, of both cameras; 0 is a global shutter.
+        cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
+    """
+
+    skew_s: float
+    readout_s: float
+    cov: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """(2,) standard deviations of skew and readout, s."""
+        return np.sqrt(np.diag(self.cov))
+
+
+@dataclass(frozen=True, eq=False)
+class TimedShot(Record):
+    """What both cameras saw of a body in one shot, and when.
+
+    Attributes:
+        t_s: time of the left exposure's middle row, s.
+        seen: the correspondences as detected; pairs that a wrong skew takes off their epipolar lines included.
+        T_left_body: (4, 4) pose to begin with, m.
+        apart_s: by how much the right stamp is later than the left, s.
+    """
+
+    t_s: float
+    seen: Correspondences
+    T_left_body: Array
+    apart_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(Record):
+    """The motion of a body about the time of a shot: exp(twist t + acceleration t^2 / 2), in its own axes.
+
+    Attributes:
+        twist: (6,) velocity, m/s and rad/s.
+        acceleration: (6,) m/s^2 and rad/s^2.
+        cov: (6, 6) covariance of the twist.
+        centred: whether shots on both sides were there.
+    """
+
+    twist: Array
+    acceleration: Array
+    cov: Array
+    centred: bool
+
+    def moved(self, T: Array, dt_s: Array) -> Array:
+        """Return the poses (N, 4, 4) at N times after that of pose T (4, 4), s."""
+        dt = dt_s[:, None]
+        return np.asarray(T @ exp_se3(self.twist * dt + self.acceleration * dt**2 / 2))
+
+
+def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
+    """Fit the motion about each of N poses to those around it; None where there are fewer than three.
+
+    Args:
+        t_s: (N,) rising times, s.
+        Ts: (N, 4, 4) T_left_body.
+        covs: (N, 6, 6) covariance of each, perturbation on the right.
+    """
+    found: list[Motion | None] = []
+    widest = _GAP * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    for k in range(len(t_s)):
+        first = last = k
+        while first > max(k - _BESIDE, 0) and t_s[first] - t_s[first - 1] <= widest:
+            first -= 1
+        while last < min(k + _BESIDE, len(t_s) - 1) and t_s[last + 1] - t_s[last] <= widest:
+            last += 1
+        if last - first < 2:
+            found.append(None)
+            continue
+        rows, centred = np.arange(first, last + 1), first < k < last
+        xi, tau = log_se3(inverse(Ts[k]) @ Ts[rows]), t_s[rows] - t_s[k]
+        degree = min(len(rows) - 1, 3 if centred else 2)
+        X = tau[:, None] ** np.arange(degree + 1)
+        fit = np.linalg.pinv(X)
+        cov = np.einsum("n,nij->ij", fit[1] ** 2, covs[rows])
+        found.append(Motion(fit[1] @ xi, 2 * fit[2] @ xi, cov, centred))
+    return found
+
+
+def estimate_shutters(
+    rig: StereoRig, body: Body, shots: Sequence[TimedShot], *, known: Shutters | None = None, readout: bool = False
+) -> Shutters | Missed:
+    """Estimate the skew of two cameras, and the readout time of their rolling shutters, from a moving body.
+
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        shots: in the order of their time.
+        known: the readout that is given, and where to begin; nothing by default.
+        readout: estimate the readout too.
+
+    Returns:
+        Both with covariance, or why they cannot be found: too few shots that move, or too slow.
+    """
+    start = known or Shutters(0.0, 0.0, np.zeros((2, 2)))
+    t_s = np.array([shot.t_s for shot in shots])
+    if (np.diff(t_s) <= 0).any():
+        raise InputError("the times of the shots must rise")
+    count = 2 if readout else 1
+    theta, Ts = np.array([start.skew_s, start.readout_s]), np.array([shot.T_left_body for shot in shots])
+    observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
+    Ts, covs = _poses(rig, body, observed, Ts, [None] * len(shots))
+    scale2 = 1.0
+    for _ in range(_STEPS):
+        moving = motions(t_s, Ts, covs)
+        exposed = [_exposed(rig, o, shot.apart_s, theta) for o, shot in zip(observed, shots, strict=True)]
+        scores, curvatures, noises, distances, used = [], [], [], [], []
+        for k, (o, motion) in enumerate(zip(observed, moving, strict=True)):
+            if motion is None or not motion.centred:
+                continue
+            score, curvature, noise, d2 = _linear(rig, body, o, Ts[k], motion, exposed[k], count, scale2)
+            scores.append(score)
+            curvatures.append(curvature)
+            noises.append(noise)
+            distances.append(d2)
+            used.append(k)
+        if len(used) < _SHOTS_MIN:
+            return Missed(f"{len(used)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
+        H, noise = np.sum(curvatures, axis=0), np.sum(noises, axis=0)
+        scale2 = max(1.0, float(np.median(np.concatenate(distances))) / (2 * math.log(2)))
+        if np.linalg.eigvalsh(H - noise / _NOISE_MOST)[0] <= 0:
+            return Missed("the body does not move, or too slowly to tell when each camera looks")
+        step = np.linalg.solve(H - noise, np.sum(scores, axis=0))
+        theta[:count] += step
+        if abs(theta).max() > 1.0:
+            return Missed("the shots do not agree with one skew: are times and order of the shots right?")
+        moved_uv = [
+            _at_one_time(rig, body, o, T, motion, _exposed(rig, o, shot.apart_s, theta)[0])
+            for o, T, motion, shot in zip(observed, Ts, moving, shots, strict=True)
+        ]
+        Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
+        if np.abs(step).max() < _DONE_S:
+            break
+    cov = np.zeros((2, 2))
+    bread = np.linalg.inv(H - noise)
+    cov[:count, :count] = bread @ _scatter(np.array(scores), np.array(used), H) @ bread
+    sigma = np.sqrt(np.diag(cov))
+    for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
+        if s > _SIGMA_MOST_S:
+            return Missed(
+                f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
+                "the body faster, or longer"
+            )
+    return Shutters(float(theta[0]), float(theta[1]), cov)
+
+
+def _scatter(scores: Array, rows: Array, H: Array) -> Array:
+    """Return the (P, P) covariance of the sum of scores (S, P): those of shots that share poses are correlated."""
+    total = np.zeros_like(H)
+    for lag in range(2 * _BESIDE + 1):
+        pairs = np.isin(rows + lag, rows)
+        a, b = scores[pairs], scores[np.searchsorted(rows, rows[pairs] + lag)]
+        product = a.T @ b
+        total += product if lag == 0 else product + product.T
+    alone = scores.T @ scores
+    spread = len(scores) / max(len(scores) - len(H), 1)
+    larger = total if np.linalg.det(total - alone) > 0 and np.trace(total) > np.trace(alone) else alone
+    return np.asarray(spread * larger)
+
+
+def _exposed(rig: StereoRig, o: PixelObservations, apart_s: float, theta: Array) -> tuple[Array, Array]:
+    """Return when N observations were exposed, after the shot's time (N,), s, and its derivative (N, 2) by theta."""
+    heights = np.array([camera.image_size_px[1] for camera in rig.cameras])[o.camera]
+    by = np.column_stack([o.camera.astype(float), o.uv[:, 1] / (heights - 1) - 0.5])
+    return by @ theta + o.camera * apart_s, by
+
+
+def _at_one_time(
+    rig: StereoRig, body: Body, o: PixelObservations, T: Array, motion: Motion | None, dt_s: Array
+) -> PixelObservations:
+    """Move N observations that were exposed dt_s (N,) after the shot's time to that time."""
+    if motion is None:
+        return o
+    p_body, uv = body.points[o.point], np.array(o.uv)
+    p_then = np.einsum("nij,nj->ni", motion.moved(T, dt_s)[:, :3], np.column_stack([p_body, np.ones(len(p_body))]))
+    p_now = transform(T, p_body)
+    T_right_left = inverse(rig.T_left_right)
+    for side, camera in enumerate(rig.cameras):
+        rows = o.camera == side
+        now, then = p_now[rows], p_then[rows]
+        if side == 1:
+            now, then = transform(T_right_left, now), transform(T_right_left, then)
+        uv[rows] -= camera.project(then) - camera.project(now)
+    return replace(o, uv=uv)
+
+
+def _poses(
+    rig: StereoRig, body: Body, observed: Sequence[PixelObservations], Ts: Array, moving: Sequence[Motion | None]
+) -> tuple[Array, Array]:
+    """Fit every shot's pose (S, 4, 4), with its covariance (S, 6, 6), which holds the misfit."""
+    fitted, covs = np.array(Ts), np.empty((len(Ts), 6, 6))
+    for k, o in enumerate(observed):
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, o, Ts[k], robust=True)
+        if fit is None:
+            covs[k] = np.eye(6)
+            continue
+        fitted[k] = fit.T_left_body
+        covs[k] = np.linalg.inv(fit.information) * max(1.0, float(np.median(fit.distance2)) / (2 * math.log(2)))
+    return fitted, covs
+
+
+def _linear(
+    rig: StereoRig,
+    body: Body,
+    o: PixelObservations,
+    T: Array,
+    motion: Motion,
+    exposed: tuple[Array, Array],
+    count: int,
+    scale2: float,
+) -> tuple[Array, Array, Array, Array]:
+    """Return one shot's score (P,), curvature (P, P), what noise adds to it (P, P), and squared distances (N,)."""
+    dt, by = exposed
+    W, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, T)
+    now = _at_one_time(rig, body, o, T, motion, dt)
+    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, now, T, robust=False, steps=0)
+    if fit is None:
+        zero = np.zeros((count, count))
+        return np.zeros(count), zero, zero, np.zeros(0)
+    weight = 1.0 / (1.0 + fit.distance2 / (CAUCHY_SCALE**2 * scale2))
+    root = np.repeat(np.sqrt(weight / scale2), 2)
+    r, A = (W @ fit.residuals_px[..., None]).ravel() * root, A * root[:, None]
+    rates = (A.reshape(len(dt), 2, 6) @ (motion.twist + dt[:, None] * motion.acceleration)[..., None])[..., 0]
+    M = (rates[:, :, None] * by[:, None, :count]).reshape(-1, count)
+    Q = np.linalg.qr(A)[0]
+    across = M - Q @ (Q.T @ M)
+    D = [A * np.repeat(by[:, i], 2)[:, None] for i in range(count)]
+    D = [d - Q @ (Q.T @ d) for d in D]
+    noise = np.array([[np.trace(a.T @ b @ motion.cov) for b in D] for a in D])
+    return across.T @ r, across.T @ across, noise, fit.distance2
+
+
+def measure_moving(
+    rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters
+) -> list[PoseEstimate | Missed]:
+    """Measure a moving body with every observation moved to its shot's time.
+
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        shots: in the order of their time.
+        shutters: when the cameras look.
+
+    Returns:
+        A pose for each shot at its own time, or why there is none; the covariance holds that of the shutters, which is
+        common to all shots, and of the motion. Where too few neighbours tell the motion, nothing is moved.
+    """
+    t_s = np.array([shot.t_s for shot in shots])
+    theta = np.array([shutters.skew_s, shutters.readout_s])
+    observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
+    Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
+    moving = motions(t_s, Ts, covs)
+    exposed = [_exposed(rig, o, shot.apart_s, theta) for o, shot in zip(observed, shots, strict=True)]
+    for _ in range(2):
+        moved_uv = [
+            _at_one_time(rig, body, o, T, m, e[0]) for o, T, m, e in zip(observed, Ts, moving, exposed, strict=True)
+        ]
+        Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
+        moving = motions(t_s, Ts, covs)
+    results: list[PoseEstimate | Missed] = []
+    for shot, o, T, motion, (dt, by) in zip(shots, observed, Ts, moving, exposed, strict=True):
+        moved = _at_one_time(rig, body, o, T, motion, dt)
+        uv = np.array(shot.seen.uv)
+        uv[shot.seen.seen] = moved.uv
+        result = locate(rig, body, triangulate(rig, body, gate(rig, body, replace(shot.seen, uv=uv))))
+        if isinstance(result, PoseEstimate) and motion is not None:
+            _, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, result.T_left_body)
+            gain = np.linalg.pinv(A).reshape(6, len(dt), 2)
+            rates = A.reshape(len(dt), 2, 6)
+            by_twist = np.einsum("inj,njk,n->ik", gain, rates, dt)
+            by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, motion.twist, by)
+            extra = by_theta @ shutters.cov @ by_theta.T + by_twist @ motion.cov @ by_twist.T
+            result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
+        results.append(result)
+    return results
