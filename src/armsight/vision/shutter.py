@@ -7,9 +7,9 @@ observation was moved to the shot's time by the body's own motion.
 A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + (v / (H - 1) - 1/2) readout. The motion of
 the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on the two parameters
 through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual and the
-shape of the body remain. Gauss-Newton over all shots, weights after Cauchy, covariance from the scatter of the shots'
-scores with their correlation over neighbours (Newey and West, Econometrica 55(3), 1987, with a flat window: shots that share
-poses), and H less what the noise of the velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2).
+shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what the noise of the
+velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2); the covariance grows where the scores of the
+shots scatter more than their curvature predicts (Birge ratio).
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ from armsight.vision.triangulate import triangulate
 
 #: Shots on each side whose poses give the motion of one, and the largest gap between two of them in median intervals.
 _BESIDE, _GAP = 2, 2.5
-#: Fewest moving shots, and the largest sigma that counts as found, s.
-_SHOTS_MIN, _SIGMA_MOST_S = 5, 1e-3
+#: Fewest moving shots, and the largest sigma that counts as found, as a share of the time between shots: without any
+#: estimate, frames paired by time have one of 0.29.
+_SHOTS_MIN, _SIGMA_MOST = 5, 0.05
 _STEPS, _DONE_S = 12, 1e-7
-#: Largest epipolar gap, as a sigma of every observation, while the shutters are unknown, px: half a frame at 0.5 m/s.
-LOOSE_PX = 3.0
+#: Sigma of every detection while the shutters are unknown, px: a few px of gap pass, and names of discs stay unambiguous.
+LOOSE_PX = 1.0
 #: Largest share of H that may be noise of the velocity.
 _NOISE_MOST = 0.3
 
@@ -149,14 +150,14 @@ def estimate_shutters(
     if (np.diff(t_s) <= 0).any():
         raise InputError("the times of the shots must rise")
     count = 2 if readout else 1
-    theta, Ts = np.array([start.skew_s, start.readout_s]), np.array([shot.T_left_body for shot in shots])
+    theta, Ts = np.array([start.skew_s, start.readout_s], dtype=float), np.array([s.T_left_body for s in shots])
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
     Ts, covs = _poses(rig, body, observed, Ts, [None] * len(shots))
     scale2 = 1.0
     for _ in range(_STEPS):
         moving = motions(t_s, Ts, covs)
         exposed = [_exposed(rig, o, shot.apart_s, theta) for o, shot in zip(observed, shots, strict=True)]
-        scores, curvatures, noises, distances, used = [], [], [], [], []
+        scores, curvatures, noises, distances = [], [], [], []
         for k, (o, motion) in enumerate(zip(observed, moving, strict=True)):
             if motion is None or not motion.centred:
                 continue
@@ -165,9 +166,8 @@ def estimate_shutters(
             curvatures.append(curvature)
             noises.append(noise)
             distances.append(d2)
-            used.append(k)
-        if len(used) < _SHOTS_MIN:
-            return Missed(f"{len(used)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
+        if len(scores) < _SHOTS_MIN:
+            return Missed(f"{len(scores)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
         H, noise = np.sum(curvatures, axis=0), np.sum(noises, axis=0)
         scale2 = max(1.0, float(np.median(np.concatenate(distances))) / (2 * math.log(2)))
         if np.linalg.eigvalsh(H - noise / _NOISE_MOST)[0] <= 0:
@@ -184,11 +184,11 @@ def estimate_shutters(
         if np.abs(step).max() < _DONE_S:
             break
     cov = np.zeros((2, 2))
-    bread = np.linalg.inv(H - noise)
-    cov[:count, :count] = bread @ _scatter(np.array(scores), np.array(used), H) @ bread
+    inverted = np.linalg.inv(H - noise)
+    cov[:count, :count] = _birge(np.array(scores), H) * inverted @ H @ inverted
     sigma = np.sqrt(np.diag(cov))
     for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
-        if s > _SIGMA_MOST_S:
+        if s > _SIGMA_MOST * float(np.median(np.diff(t_s))):
             return Missed(
                 f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
                 "the body faster, or longer"
@@ -196,18 +196,10 @@ def estimate_shutters(
     return Shutters(float(theta[0]), float(theta[1]), cov)
 
 
-def _scatter(scores: Array, rows: Array, H: Array) -> Array:
-    """Return the (P, P) covariance of the sum of scores (S, P): those of shots that share poses are correlated."""
-    total = np.zeros_like(H)
-    for lag in range(2 * _BESIDE + 1):
-        pairs = np.isin(rows + lag, rows)
-        a, b = scores[pairs], scores[np.searchsorted(rows, rows[pairs] + lag)]
-        product = a.T @ b
-        total += product if lag == 0 else product + product.T
-    alone = scores.T @ scores
-    spread = len(scores) / max(len(scores) - len(H), 1)
-    larger = total if np.linalg.det(total - alone) > 0 and np.trace(total) > np.trace(alone) else alone
-    return np.asarray(spread * larger)
+def _birge(scores: Array, H: Array) -> float:
+    """Return how many times the scatter of the shots' scores (S, P) exceeds what their curvature H predicts, 1 at least."""
+    count, size = scores.shape
+    return max(1.0, float(np.einsum("si,ij,sj", scores, np.linalg.inv(H), scores)) / size * count / (count - size))
 
 
 def _exposed(rig: StereoRig, o: PixelObservations, apart_s: float, theta: Array) -> tuple[Array, Array]:
