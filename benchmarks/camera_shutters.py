@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from armsight.data import PoseEstimate, Shot
-from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline
@@ -76,7 +76,9 @@ def recorded(seed: int, speed: float, skew_s: float, readout_s: float) -> tuple[
 def errors_mm(rig: StereoRig, shots: list[TimedShot], truth: np.ndarray, shutters: Shutters) -> np.ndarray:
     """Return the position errors (S, 3) of the shots that were measured, mm."""
     results = measure_moving(rig, body_target().body, shots, shutters)
-    pairs = [(r.T_left_body, T) for r, T in zip(results, truth, strict=True) if isinstance(r, PoseEstimate)]
+    pairs = [
+        (r.T_left_body, T) for r, T in zip((r for r, _ in results), truth, strict=True) if isinstance(r, PoseEstimate)
+    ]
     return np.array([1e3 * (T[:3, 3] - T_true[:3, 3]) for T, T_true in pairs])
 
 
@@ -107,8 +109,8 @@ def section(seed: int, report: Report) -> None:
         worst, by_sigma = 1e3 * np.abs(off).max(axis=0), np.sqrt(np.mean(np.square(z), axis=0))
         each, bias = 1e3 * np.sqrt(np.mean(np.square(off), axis=0)), 1e3 * np.mean(off, axis=0)
         report.say(
-            f"  {speed} m/s: {len(off)} found, {missed} not; skew off by {each[0]:.3f} ms RMS, {worst[0]:.3f} at most (mean "
-            f"{bias[0]:+.3f}, {by_sigma[0]:.2f} sigma RMS); readout {each[1]:.2f} RMS, {worst[1]:.2f} at most (mean "
+            f"  {speed} m/s: {len(off)} found, {missed} not; skew off by {each[0]:.3f} ms RMS, {worst[0]:.3f} at most "
+            f"(mean {bias[0]:+.3f}, {by_sigma[0]:.2f} sigma RMS); readout {each[1]:.2f} RMS, {worst[1]:.2f} at most (mean "
             f"{bias[1]:+.2f}, {by_sigma[1]:.2f} sigma)"
         )
         line = f"    position: {rms(found):.3f} mm RMS moved to one time, {rms(none):.3f} as it is"

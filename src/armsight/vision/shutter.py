@@ -4,8 +4,8 @@ In: the correspondences of shots with their times. Out: by how much the right ca
 long a rolling shutter takes from the first row to the last (readout), both with covariance, and poses in which every
 observation was moved to the shot's time by the body's own motion.
 
-A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + (v / (H - 1) - 1/2) readout. The motion of
-the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on the two parameters
+A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + (v / (H - 1) - 1/2) readout. The motion
+of the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on both parameters
 through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual and the
 shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what the noise of the
 velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2); the covariance grows where the scores of the
@@ -27,7 +27,7 @@ from armsight.vision.bundle import CAUCHY_SCALE
 from armsight.vision.locate import locate
 from armsight.vision.match import gate
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.triangulate import triangulate
 
 #: Shots on each side whose poses give the motion of one, and the largest gap between two of them in median intervals.
@@ -40,26 +40,6 @@ _STEPS, _DONE_S = 12, 1e-7
 LOOSE_PX = 1.0
 #: Largest share of H that may be noise of the velocity.
 _NOISE_MOST = 0.3
-
-
-@dataclass(frozen=True, eq=False)
-class Shutters(Record):
-    """When the rows of two cameras are exposed.
-
-    Attributes:
-        skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
-        readout_s: from the first row to the last, s, of both cameras; 0 is a global shutter.
-        cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
-    """
-
-    skew_s: float
-    readout_s: float
-    cov: Array
-
-    @property
-    def sigmas(self) -> Array:
-        """(2,) standard deviations of skew and readout, s."""
-        return np.sqrt(np.diag(self.cov))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +124,12 @@ def estimate_shutters(
 
     Returns:
         Both with covariance, or why they cannot be found: too few shots that move, or too slow.
+
+    Raises:
+        InputError: the times do not rise.
     """
     start = known or Shutters(0.0, 0.0, np.zeros((2, 2)))
-    t_s = np.array([shot.t_s for shot in shots])
-    if (np.diff(t_s) <= 0).any():
-        raise InputError("the times of the shots must rise")
+    t_s = _times(shots)
     count = 2 if readout else 1
     theta, Ts = np.array([start.skew_s, start.readout_s], dtype=float), np.array([s.T_left_body for s in shots])
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
@@ -169,9 +150,10 @@ def estimate_shutters(
         if len(scores) < _SHOTS_MIN:
             return Missed(f"{len(scores)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
         H, noise = np.sum(curvatures, axis=0), np.sum(noises, axis=0)
-        scale2 = max(1.0, float(np.median(np.concatenate(distances))) / (2 * math.log(2)))
+        d2 = np.concatenate(distances)
+        scale2 = max(float(np.median(d2)) / (2 * math.log(2)) * 2 * len(d2) / (2 * len(d2) - 6 * len(scores)), 1e-6)
         if np.linalg.eigvalsh(H - noise / _NOISE_MOST)[0] <= 0:
-            return Missed("the body does not move, or too slowly to tell when each camera looks")
+            return Missed("the body does not move, or too slowly: when each camera exposes is not observable")
         step = np.linalg.solve(H - noise, np.sum(scores, axis=0))
         theta[:count] += step
         if abs(theta).max() > 1.0:
@@ -196,10 +178,20 @@ def estimate_shutters(
     return Shutters(float(theta[0]), float(theta[1]), cov)
 
 
+def _times(shots: Sequence[TimedShot]) -> Array:
+    """Return the times (S,) of shots, s, which must rise."""
+    t_s = np.array([shot.t_s for shot in shots])
+    if (np.diff(t_s) <= 0).any():
+        k = int(np.argmax(np.diff(t_s) <= 0))
+        raise InputError(f"the times of the shots must rise; {t_s[k + 1]:g} s comes after {t_s[k]:g} s")
+    return t_s
+
+
 def _birge(scores: Array, H: Array) -> float:
     """Return how many times the scatter of the shots' scores (S, P) exceeds what their curvature H predicts, 1 at least."""
     count, size = scores.shape
-    return max(1.0, float(np.einsum("si,ij,sj", scores, np.linalg.inv(H), scores)) / size * count / (count - size))
+    ratio = np.einsum("si,ij,sj", scores, np.linalg.inv(H), scores) / size * count / (count - size)
+    return max(1.0, float(ratio))
 
 
 def _exposed(rig: StereoRig, o: PixelObservations, apart_s: float, theta: Array) -> tuple[Array, Array]:
@@ -276,7 +268,7 @@ def _linear(
 
 def measure_moving(
     rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters
-) -> list[PoseEstimate | Missed]:
+) -> list[tuple[PoseEstimate | Missed, bool]]:
     """Measure a moving body with every observation moved to its shot's time.
 
     Args:
@@ -286,10 +278,14 @@ def measure_moving(
         shutters: when the cameras look.
 
     Returns:
-        A pose for each shot at its own time, or why there is none; the covariance holds that of the shutters, which is
-        common to all shots, and of the motion. Where too few neighbours tell the motion, nothing is moved.
+        Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where
+        too few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the
+        motion.
+
+    Raises:
+        InputError: the times do not rise.
     """
-    t_s = np.array([shot.t_s for shot in shots])
+    t_s = _times(shots)
     theta = np.array([shutters.skew_s, shutters.readout_s])
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
     Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
@@ -301,7 +297,7 @@ def measure_moving(
         ]
         Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
         moving = motions(t_s, Ts, covs)
-    results: list[PoseEstimate | Missed] = []
+    results: list[tuple[PoseEstimate | Missed, bool]] = []
     for shot, o, T, motion, (dt, by) in zip(shots, observed, Ts, moving, exposed, strict=True):
         moved = _at_one_time(rig, body, o, T, motion, dt)
         uv = np.array(shot.seen.uv)
@@ -315,5 +311,5 @@ def measure_moving(
             by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, motion.twist, by)
             extra = by_theta @ shutters.cov @ by_theta.T + by_twist @ motion.cov @ by_twist.T
             result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
-        results.append(result)
+        results.append((result, motion is not None))
     return results
