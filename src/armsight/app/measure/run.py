@@ -79,15 +79,15 @@ def measure_shots(
     Raises:
         ArmsightError: the input is wrong, or no shot could be measured.
     """
+    requested: Requested | Shutters | None = requested_shutters(skew, readout)
+    if requested is not None and detections is not None:
+        raise InputError("--skew and --readout need images with times: detections have none")
     stereo = StereoRig.load(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
         check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
     if not stereo.cov.any():
         click.echo(f"note: {rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
-    requested: Requested | Shutters | None = requested_shutters(skew, readout)
-    if requested is not None and detections is not None:
-        raise InputError("--skew and --readout need images with times: detections have none")
     records: list[ShotPose] = []
     started = time.perf_counter()
     results: Iterator[Result]
@@ -112,7 +112,7 @@ def measure_shots(
                 if timed:
                     requested = stereo.shutters
                 else:
-                    click.echo(f"note: {rig} has {stereo.shutters}; not used: no recording with times", err=True)
+                    click.echo(f"note: {rig} has {stereo.shutters}, not used: no recording with times", err=True)
             if requested is None:
                 results = _measured(stereo, found, _shots(opened, stereo, rig))
                 results = _noted(stereo, body, results) if timed else results
