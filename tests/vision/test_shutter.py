@@ -121,3 +121,24 @@ def test_moved_to_one_time_a_moving_body_is_measured_as_by_synchronised_cameras(
     unsure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.diag([1e-6, 0.0])))
     sure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.zeros((2, 2))))
     assert all(np.trace(a.cov[:3, :3]) > np.trace(b.cov[:3, :3]) for (a, _), (b, _) in zip(unsure, sure, strict=True))
+
+
+def test_skew_that_varies_is_followed_from_shot_to_shot():
+    jitter_s = 4e-3
+    shots, truth = recorded(6, 0.3, readout_s=0.0, stamped_s=jitter_s, count=40)
+    shots = [replace(shot, apart_s=0.0) for shot in shots]
+    found = estimate_shutters(RIG, BODY, shots)
+    assert isinstance(found, Shutters)
+    assert abs(found.skew_s - SKEW_S) < 4 * found.sigmas[0]
+    assert 0.6 * jitter_s < found.jitter_s < 1.5 * jitter_s
+    results = [r for r, _ in measure_moving(RIG, BODY, shots, found)]
+    blind = [r for r, _ in measure_moving(RIG, BODY, shots, replace(found, jitter_s=0.0))]
+
+    def gaps(estimates):
+        return [
+            r.T_left_body[:3, :3].T @ (T[:3, 3] - r.T_left_body[:3, 3]) for r, T in zip(estimates, truth, strict=True)
+        ]
+
+    assert np.sqrt(np.mean(np.square(gaps(results)))) < np.sqrt(np.mean(np.square(gaps(blind)))) / 5
+    nees = [g @ np.linalg.solve(r.cov[:3, :3], g) / 3 for g, r in zip(gaps(results), results, strict=True)]
+    assert 0.5 < np.mean(nees) < 1.8

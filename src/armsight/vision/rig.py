@@ -42,19 +42,22 @@ class Shutters(Record):
         skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
         readout_s: from the first row to the last, s, of both cameras; 0 is a global shutter.
         cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
+        jitter_s: standard deviation by which the skew of a shot differs from the mean, s, beyond the stamps.
     """
 
     skew_s: float
     readout_s: float
     cov: Array
+    jitter_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check that times are finite and the covariance is one."""
         super().__post_init__()
-        if not (np.isfinite([self.skew_s, self.readout_s]).all() and self.readout_s >= 0):
+        times = self.skew_s, self.readout_s, self.jitter_s
+        if not (np.isfinite(times).all() and min(times[1:]) >= 0):
             raise InputError(
-                f"skew and readout must be finite times, the readout not below zero, got {self.skew_s:g} s and "
-                f"{self.readout_s:g} s"
+                "skew, readout and jitter must be finite times, readout and jitter not below zero, got "
+                + ", ".join(f"{t:g} s" for t in times)
             )
         checked(self.cov, (2, 2), "covariance of skew and readout")
         _check_covariance(self.cov, ("skew_s", "readout_s"))
@@ -64,11 +67,17 @@ class Shutters(Record):
         skew, readout = (f" ± {1e3 * s:.2f}" if s > 0 else "" for s in self.sigmas)
         late = "right" if self.skew_s >= 0 else "left"
         rolling = f", readout {1e3 * self.readout_s:.2f}{readout} ms" if self.readout_s or readout else ""
-        return f"skew {1e3 * abs(self.skew_s):.2f}{skew} ms ({late} later){rolling}"
+        jitter = f", {1e3 * self.jitter_s:.2f} ms RMS from shot to shot" if self.jitter_s else ""
+        return f"skew {1e3 * abs(self.skew_s):.2f}{skew} ms ({late} later){jitter}{rolling}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that rig files and ``measure --json`` have."""
-        return {"skew_s": self.skew_s, "readout_s": self.readout_s, "covariance_s2": self.cov.tolist()}
+        return {
+            "skew_s": self.skew_s,
+            "readout_s": self.readout_s,
+            "covariance_s2": self.cov.tolist(),
+            "jitter_s": self.jitter_s,
+        }
 
     @property
     def sigmas(self) -> Array:
@@ -280,7 +289,7 @@ def _shutters(entry: dict[str, Any] | None) -> Shutters | None:
     if entry is None:
         return None
     cov = checked(entry["covariance_s2"], (2, 2), "covariance_s2 of shutters")
-    return Shutters(float(entry["skew_s"]), float(entry["readout_s"]), cov)
+    return Shutters(float(entry["skew_s"]), float(entry["readout_s"]), cov, float(entry.get("jitter_s", 0.0)))
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

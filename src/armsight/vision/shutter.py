@@ -24,7 +24,7 @@ from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Re
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.vision.bundle import CAUCHY_SCALE
-from armsight.vision.locate import locate
+from armsight.vision.locate import locate, misfit_limit
 from armsight.vision.match import gate
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.rig import Shutters, StereoRig
@@ -134,40 +134,52 @@ def estimate_shutters(
     theta, Ts = np.array([start.skew_s, start.readout_s], dtype=float), np.array([s.T_left_body for s in shots])
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
     Ts, covs = _poses(rig, body, observed, Ts, [None] * len(shots))
-    scale2 = 1.0
+    scale2, apart, jitter2 = 1.0, np.array([shot.apart_s for shot in shots]), 0.0
+    stamped = apart.copy()
     for _ in range(_STEPS):
         moving = motions(t_s, Ts, covs)
-        exposed = [_exposed(rig, o, shot.apart_s, theta) for o, shot in zip(observed, shots, strict=True)]
-        scores, curvatures, noises, distances = [], [], [], []
+        exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
+        scores, curvatures, noises, distances, rows = [], [], [], [], []
         for k, (o, motion) in enumerate(zip(observed, moving, strict=True)):
             if motion is None or not motion.centred:
                 continue
             score, curvature, noise, d2 = _linear(rig, body, o, Ts[k], motion, exposed[k], count, scale2)
-            scores.append(score)
+            rows.append(k)
+            scores.append(score + curvature[:, 0] * (apart[k] - stamped[k]))
             curvatures.append(curvature)
             noises.append(noise)
             distances.append(d2)
         if len(scores) < _SHOTS_MIN:
             return Missed(f"{len(scores)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
-        H, noise = np.sum(curvatures, axis=0), np.sum(noises, axis=0)
+        jitter2 = _jitter2(np.array(scores), np.array(curvatures))
+        shares = [jitter2 / (1.0 + jitter2 * h[0, 0]) for h in curvatures]
+        marginal = np.array(
+            [s - share * h[:, 0] * s[0] for s, h, share in zip(scores, curvatures, shares, strict=True)]
+        )
+        H = np.sum([h - share * np.outer(h[0], h[0]) for h, share in zip(curvatures, shares, strict=True)], axis=0)
+        noise = np.sum(
+            [n * (1 - share * h[0, 0]) for n, h, share in zip(noises, curvatures, shares, strict=True)], axis=0
+        )
         d2 = np.concatenate(distances)
         scale2 = max(float(np.median(d2)) / (2 * math.log(2)) * 2 * len(d2) / (2 * len(d2) - 6 * len(scores)), 1e-6)
         if np.linalg.eigvalsh(H - noise / _NOISE_MOST)[0] <= 0:
             return Missed("the body does not move, or too slowly: when each camera exposes is not observable")
-        step = np.linalg.solve(H - noise, np.sum(scores, axis=0))
+        step = np.linalg.solve(H - noise, marginal.sum(axis=0))
         theta[:count] += step
+        for k, s, h, share in zip(rows, scores, curvatures, shares, strict=True):
+            apart[k] = stamped[k] + share * (s[0] - h[0] @ step)
         if abs(theta).max() > 1.0:
             return Missed("the shots do not agree with one skew: are times and order of the shots right?")
         moved_uv = [
-            _at_one_time(rig, body, o, T, motion, _exposed(rig, o, shot.apart_s, theta)[0])
-            for o, T, motion, shot in zip(observed, Ts, moving, shots, strict=True)
+            _at_one_time(rig, body, o, T, motion, _exposed(rig, o, a, theta)[0])
+            for o, T, motion, a in zip(observed, Ts, moving, apart, strict=True)
         ]
         Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
         if np.abs(step).max() < _DONE_S:
             break
     cov = np.zeros((2, 2))
     inverted = np.linalg.inv(H - noise)
-    cov[:count, :count] = _birge(np.array(scores), H) * inverted @ H @ inverted
+    cov[:count, :count] = _birge(marginal - step @ H / len(marginal), H) * inverted @ H @ inverted
     sigma = np.sqrt(np.diag(cov))
     for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
         if s > _SIGMA_MOST * float(np.median(np.diff(t_s))):
@@ -175,7 +187,18 @@ def estimate_shutters(
                 f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
                 "the body faster, or longer"
             )
-    return Shutters(float(theta[0]), float(theta[1]), cov)
+    return Shutters(float(theta[0]), float(theta[1]), cov, math.sqrt(jitter2))
+
+
+def _jitter2(scores: Array, curvatures: Array) -> float:
+    """Return the variance of the skew between shots, s^2, from scores (S, P) and curvatures (S, P, P); 0 within chance.
+
+    By moments (DerSimonian and Laird, "Meta-analysis in clinical trials", 1986).
+    """
+    w = np.maximum(curvatures[:, 0, 0], 1e-12)
+    skews = scores[:, 0] / w
+    Q, freedom = float(w @ (skews - w @ skews / w.sum()) ** 2), len(w) - 1
+    return (Q - freedom) / float(w.sum() - w @ w / w.sum()) if misfit_limit(freedom) < Q else 0.0
 
 
 def _times(shots: Sequence[TimedShot]) -> Array:
@@ -290,15 +313,24 @@ def measure_moving(
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
     Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
     moving = motions(t_s, Ts, covs)
-    exposed = [_exposed(rig, o, shot.apart_s, theta) for o, shot in zip(observed, shots, strict=True)]
-    for _ in range(2):
+    apart, jitter2 = np.array([shot.apart_s for shot in shots]), shutters.jitter_s**2
+    stamped, variances = apart.copy(), np.zeros(len(shots))
+    exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
+    for _ in range(2 if jitter2 == 0 else _STEPS):
+        for k, motion in enumerate(moving):
+            if motion is None or jitter2 == 0:
+                continue
+            score, H, _, _ = _linear(rig, body, observed[k], Ts[k], motion, exposed[k], 1, 1.0)
+            variances[k] = jitter2 / (1.0 + jitter2 * H[0, 0])
+            apart[k] = stamped[k] + variances[k] * (score[0] + H[0, 0] * (apart[k] - stamped[k]))
+        exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
         moved_uv = [
             _at_one_time(rig, body, o, T, m, e[0]) for o, T, m, e in zip(observed, Ts, moving, exposed, strict=True)
         ]
         Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
         moving = motions(t_s, Ts, covs)
     results: list[tuple[PoseEstimate | Missed, bool]] = []
-    for shot, o, T, motion, (dt, by) in zip(shots, observed, Ts, moving, exposed, strict=True):
+    for shot, o, T, motion, (dt, by), variance in zip(shots, observed, Ts, moving, exposed, variances, strict=True):
         moved = _at_one_time(rig, body, o, T, motion, dt)
         uv = np.array(shot.seen.uv)
         uv[shot.seen.seen] = moved.uv
@@ -309,7 +341,8 @@ def measure_moving(
             rates = A.reshape(len(dt), 2, 6)
             by_twist = np.einsum("inj,njk,n->ik", gain, rates, dt)
             by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, motion.twist, by)
-            extra = by_theta @ shutters.cov @ by_theta.T + by_twist @ motion.cov @ by_twist.T
+            cov = shutters.cov * [[jitter2 == 0, jitter2 == 0], [jitter2 == 0, 1.0]] + np.diag([variance, 0.0])
+            extra = by_theta @ cov @ by_theta.T + by_twist @ motion.cov @ by_twist.T
             result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
         results.append((result, motion is not None))
     return results
