@@ -40,7 +40,8 @@ class Shutters(Record):
 
     Attributes:
         skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
-        readout_s: from the first row to the last, s, of both cameras; 0 is a global shutter.
+        readout_s: of all rows, s, in both cameras: a row begins by its H-th part later than the one above; 0 is a global
+            shutter.
         cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
         jitter_s: standard deviation by which the skew of a shot differs from the mean, s, beyond the stamps.
     """

@@ -4,7 +4,7 @@ In: the correspondences of shots with their times. Out: by how much the right ca
 long a rolling shutter takes from the first row to the last (readout), both with covariance, and poses in which every
 observation was moved to the shot's time by the body's own motion.
 
-A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + (v / (H - 1) - 1/2) readout. The motion
+A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + ((v + 1/2) / H - 1/2) readout. The motion
 of the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on both parameters
 through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual and the
 shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what the noise of the
@@ -220,7 +220,7 @@ def _birge(scores: Array, H: Array) -> float:
 def _exposed(rig: StereoRig, o: PixelObservations, apart_s: float, theta: Array) -> tuple[Array, Array]:
     """Return when N observations were exposed, after the shot's time (N,), s, and its derivative (N, 2) by theta."""
     heights = np.array([camera.image_size_px[1] for camera in rig.cameras])[o.camera]
-    by = np.column_stack([o.camera.astype(float), o.uv[:, 1] / (heights - 1) - 0.5])
+    by = np.column_stack([o.camera.astype(float), (o.uv[:, 1] + 0.5) / heights - 0.5])
     return by @ theta + o.camera * apart_s, by
 
 
@@ -289,6 +289,69 @@ def _linear(
     return across.T @ r, across.T @ across, noise, fit.distance2
 
 
+@dataclass(frozen=True, eq=False)
+class Alignment(Record):
+    """How the observations of one shot come to its time.
+
+    Attributes:
+        T_left_body: (4, 4) pose at the shot's time.
+        motion: of the body; None where too few neighbours show it.
+        apart_s: by how much the right exposure is later than the left, beyond the mean skew, s.
+        variance: what is not known of it, s^2.
+    """
+
+    T_left_body: Array
+    motion: Motion | None
+    apart_s: float
+    variance: float
+
+
+def aligned(rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters) -> list[Alignment]:
+    """Find pose, motion and, where the skew varies, the skew of every shot.
+
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        shots: in the order of their time.
+        shutters: when the cameras expose.
+
+    Raises:
+        InputError: the times do not rise.
+    """
+    t_s, theta, jitter2 = _times(shots), np.array([shutters.skew_s, shutters.readout_s]), shutters.jitter_s**2
+    observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
+    Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
+    moving = motions(t_s, Ts, covs)
+    stamped = np.array([shot.apart_s for shot in shots])
+    apart, variances = stamped.copy(), np.full(len(shots), jitter2)
+    for _ in range(2 if jitter2 == 0 else _STEPS):
+        for k, motion in enumerate(moving):
+            if motion is None or jitter2 == 0:
+                continue
+            exposed = _exposed(rig, observed[k], apart[k], theta)
+            score, H, _, _ = _linear(rig, body, observed[k], Ts[k], motion, exposed, 1, 1.0)
+            variances[k] = jitter2 / (1.0 + jitter2 * H[0, 0])
+            apart[k] = stamped[k] + variances[k] * (score[0] + H[0, 0] * (apart[k] - stamped[k]))
+        moved = [
+            _at_one_time(rig, body, o, T, motion, _exposed(rig, o, a, theta)[0])
+            for o, T, motion, a in zip(observed, Ts, moving, apart, strict=True)
+        ]
+        Ts, covs = _poses(rig, body, moved, Ts, moving)
+        moving = motions(t_s, Ts, covs)
+    return [Alignment(*each) for each in zip(Ts, moving, apart, variances, strict=True)]
+
+
+def at_one_time(
+    rig: StereoRig, body: Body, seen: Correspondences, alignment: Alignment, shutters: Shutters
+) -> Correspondences:
+    """Return a shot's correspondences moved to its time; unchanged where the motion is unknown."""
+    o = PixelObservations.of(seen, rig.sigma_px)
+    dt, _ = _exposed(rig, o, alignment.apart_s, np.array([shutters.skew_s, shutters.readout_s]))
+    uv = np.array(seen.uv)
+    uv[seen.seen] = _at_one_time(rig, body, o, alignment.T_left_body, alignment.motion, dt).uv
+    return replace(seen, uv=uv)
+
+
 def measure_moving(
     rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters
 ) -> list[tuple[PoseEstimate | Missed, bool]]:
@@ -298,7 +361,7 @@ def measure_moving(
         rig: the calibrated pair.
         body: what moves.
         shots: in the order of their time.
-        shutters: when the cameras look.
+        shutters: when the cameras expose.
 
     Returns:
         Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where
@@ -308,41 +371,30 @@ def measure_moving(
     Raises:
         InputError: the times do not rise.
     """
-    t_s = _times(shots)
-    theta = np.array([shutters.skew_s, shutters.readout_s])
-    observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
-    Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
-    moving = motions(t_s, Ts, covs)
-    apart, jitter2 = np.array([shot.apart_s for shot in shots]), shutters.jitter_s**2
-    stamped, variances = apart.copy(), np.zeros(len(shots))
-    exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
-    for _ in range(2 if jitter2 == 0 else _STEPS):
-        for k, motion in enumerate(moving):
-            if motion is None or jitter2 == 0:
-                continue
-            score, H, _, _ = _linear(rig, body, observed[k], Ts[k], motion, exposed[k], 1, 1.0)
-            variances[k] = jitter2 / (1.0 + jitter2 * H[0, 0])
-            apart[k] = stamped[k] + variances[k] * (score[0] + H[0, 0] * (apart[k] - stamped[k]))
-        exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
-        moved_uv = [
-            _at_one_time(rig, body, o, T, m, e[0]) for o, T, m, e in zip(observed, Ts, moving, exposed, strict=True)
-        ]
-        Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
-        moving = motions(t_s, Ts, covs)
     results: list[tuple[PoseEstimate | Missed, bool]] = []
-    for shot, o, T, motion, (dt, by), variance in zip(shots, observed, Ts, moving, exposed, variances, strict=True):
-        moved = _at_one_time(rig, body, o, T, motion, dt)
-        uv = np.array(shot.seen.uv)
-        uv[shot.seen.seen] = moved.uv
-        result = locate(rig, body, triangulate(rig, body, gate(rig, body, replace(shot.seen, uv=uv))))
-        if isinstance(result, PoseEstimate) and motion is not None:
-            _, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, result.T_left_body)
-            gain = np.linalg.pinv(A).reshape(6, len(dt), 2)
-            rates = A.reshape(len(dt), 2, 6)
-            by_twist = np.einsum("inj,njk,n->ik", gain, rates, dt)
-            by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, motion.twist, by)
-            cov = shutters.cov * [[jitter2 == 0, jitter2 == 0], [jitter2 == 0, 1.0]] + np.diag([variance, 0.0])
-            extra = by_theta @ cov @ by_theta.T + by_twist @ motion.cov @ by_twist.T
+    for shot, alignment in zip(shots, aligned(rig, body, shots, shutters), strict=True):
+        seen = at_one_time(rig, body, shot.seen, alignment, shutters)
+        result = locate(rig, body, triangulate(rig, body, gate(rig, body, seen)))
+        if isinstance(result, PoseEstimate) and alignment.motion is not None:
+            extra = _by_timing(rig, body, shot.seen, result.T_left_body, alignment, shutters)
             result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
-        results.append((result, motion is not None))
+        results.append((result, alignment.motion is not None))
     return results
+
+
+def _by_timing(
+    rig: StereoRig, body: Body, seen: Correspondences, T: Array, alignment: Alignment, shutters: Shutters
+) -> Array:
+    """Return the (6, 6) covariance of a pose that comes from what is not known of the exposures and of the motion."""
+    assert alignment.motion is not None
+    o = PixelObservations.of(seen, rig.sigma_px)
+    dt, by = _exposed(rig, o, alignment.apart_s, np.array([shutters.skew_s, shutters.readout_s]))
+    _, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, T)
+    gain, rates = np.linalg.pinv(A).reshape(6, len(dt), 2), A.reshape(len(dt), 2, 6)
+    by_twist = np.einsum("inj,njk,n->ik", gain, rates, dt)
+    by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, alignment.motion.twist, by)
+    cov = np.array(shutters.cov)
+    if shutters.jitter_s > 0:  # each shot's own skew is estimated, the mean is only its prior
+        cov[0, :] = cov[:, 0] = 0.0
+        cov[0, 0] = alignment.variance
+    return np.asarray(by_theta @ cov @ by_theta.T + by_twist @ alignment.motion.cov @ by_twist.T)
