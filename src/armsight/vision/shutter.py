@@ -5,11 +5,12 @@ long a rolling shutter takes from the first row to the last (readout), both with
 observation was moved to the shot's time by the body's own motion.
 
 A pixel of row v of camera c (0 left, 1 right) is exposed at t + c (apart + skew) + ((v + 1/2) / H - 1/2) readout. The
-motion of the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on both parameters
-through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual and the
-shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what the noise of the
-velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2); the covariance grows where the scores of the
-shots scatter more than their curvature predicts (Birge ratio).
+motion of the body is a cubic through the poses of up to five shots around each. The residuals of a shot depend on both
+parameters through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual
+and the shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what noise
+of the velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2); the covariance grows where the scores of
+the shots scatter more than their curvature predicts (Birge ratio). Where the skews of the shots differ by more than chance,
+the skew of each is a normal random effect.
 """
 
 from __future__ import annotations
