@@ -27,7 +27,7 @@ from armsight.geometry.matrix import (
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.markers.disc.fit import FitBuffers, factor, fit, shape_of, solve
+from armsight.vision.markers.disc.fit import FitBuffers, common_noise, factor, fit, shape_of, solve, widen
 from armsight.vision.markers.disc.search import Room, outline
 from armsight.vision.posefit import moved
 
@@ -433,6 +433,7 @@ def look(
     T = product(scene.T_right_left, found.T) if side == 1 else found.T
     P, n = np.empty(3), np.empty(3)
     theta, expected, J_P, J_n = np.empty(10), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
+    count = 0
     for m in range(len(scene.radii)):
         for i in range(3):
             P[i] = T[i, 3]
@@ -465,6 +466,14 @@ def look(
         if code == 0:
             found.uv[m, side, 0], found.uv[m, side, 1] = theta[0], theta[1]
             found.contrast[m, side] = abs(theta[6])
+            work.rims[count, :] = work.rim
+            count += 1
+    times, common = common_noise(count, work.rims)
+    count = 0
+    for m in range(len(scene.radii)):
+        if found.codes[m, side] == SEEN:
+            widen(found.cov_uv[m, side], work.rims[count], times, common)
+            count += 1
 
 
 @kernel(

@@ -24,6 +24,7 @@ from armsight.vision.markers.disc.fit import (
     SURROUND,
     UNKNOWNS,
     FitBuffers,
+    common_noise,
     factor,
     fit,
     gather,
@@ -31,6 +32,7 @@ from armsight.vision.markers.disc.fit import (
     normal_equations,
     of_centre,
     shape_of,
+    widen,
 )
 from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
 from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
@@ -246,7 +248,7 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         codes: (N,) filled with 0 or the reason why it is not a disc (``fit.REASONS``).
         work: buffers.
     """
-    noise = noise_of(image)
+    noise, count = noise_of(image), 0
     for i in range(len(theta)):
         codes[i] = fit(image, noise, theta[i], cov[i], work)
         if codes[i] in HARMLESS:
@@ -268,6 +270,15 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
                     cov[i, a, b] *= square / (n - UNKNOWNS)
         if codes[i] == 0 or codes[i] in HARMLESS:
             shape_of(theta[i], shape[i])
+        if codes[i] == 0:
+            work.rims[count, :] = work.rim
+            count += 1
+    times, common = common_noise(count, work.rims)
+    count = 0
+    for i in range(len(theta)):
+        if codes[i] == 0:
+            widen(cov[i], work.rims[count], times, common)
+            count += 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,8 @@ _GRIDS = 4
 _LOST_CONTRAST, _COMPLETED = 0.4, 2
 #: An outline, and a fit, may have so many times the area that the others let expect.
 _ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
+#: How far an outline may be from where its neighbours put it, in radii.
+_DISPLACED = 0.35
 #: Whether discs are light -> how the spec says so.
 POLARITIES = {False: "dark", True: "light"}
 
@@ -172,7 +174,9 @@ class CircleGrid(Record, Target):
     def _measured(self, image: Grey, blobs: Blobs, grid: Lattice, light: bool, least: int) -> Detections | str:
         """Number the discs of a grid and fit them; the reason where they do not make the board."""
         sign, size = (1 if light else -1), (image.shape[1], image.shape[0])
-        cells, starts, hollow = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size)
+        cells, starts, hollow = _completed(
+            image, grid.cells, blobs.theta[grid.blobs], sign, size, rings=bool(self.rings)
+        )
         placement = number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
             return placement
@@ -214,7 +218,7 @@ class CircleGrid(Record, Target):
 
 
 def _completed(
-    image: Grey, cells: Ids, theta: Array, sign: int, size_px: tuple[int, int]
+    image: Grey, cells: Ids, theta: Array, sign: int, size_px: tuple[int, int], *, rings: bool
 ) -> tuple[Ids, Array, NDArray[np.bool_]]:
     """Replace the odd outlines of a grid by what their neighbours let expect, and add discs that the search missed.
 
@@ -224,11 +228,14 @@ def _completed(
         theta: (N, 10) its outlines.
         sign: 1 for light discs, -1 for dark ones.
         size_px: width and height of the image.
+        rings: whether the board has rings, of which a part may have been taken for a disc.
 
     Returns:
         (M, 2) cells, (M, 10) outlines, (M,) whether a disc has a hole.
     """
     kept = ~odd_sized(theta, _ODD_OUTLINE)
+    if rings:
+        kept &= ~_displaced(cells, theta)
     cells, theta = cells[kept], theta[kept]
     contrast, hollow = contrasts(image, theta, sign)
     for _ in range(_COMPLETED):
@@ -241,6 +248,18 @@ def _completed(
         cells, theta = np.concatenate([cells, more[found]]), np.concatenate([theta, like[found]])
         contrast, hollow = np.concatenate([contrast, there[found]]), np.concatenate([hollow, ring[found]])
     return cells, theta, hollow
+
+
+def _displaced(cells: Ids, theta: Array) -> NDArray[np.bool_]:
+    """(N,) which outlines, theta (N, 10), are not where those around their cells (N, 2) put them: of a part of a ring."""
+    seen, out = positions(cells, theta[:, :2]), np.zeros(len(cells), bool)
+    radius = (theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25
+    for i, (x, y) in enumerate(cells.tolist()):
+        own = seen.pop((x, y))
+        guess = extrapolated((x, y), seen)
+        out[i] = guess is not None and abs(guess[0] - own) > _DISPLACED * radius[i]
+        seen[x, y] = own
+    return out
 
 
 def _from_fields(fields: Fields, staggered: bool) -> CircleGrid:

@@ -34,6 +34,8 @@ from armsight.vision.markers.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
 MOST_PIXELS = 3072
+#: Most discs of an image.
+MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
 #: Floats in a cache line.
@@ -54,7 +56,7 @@ Floats = NDArray[np.float32]
 
 @kernel_types(
     "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]"
 )
 class FitBuffers(NamedTuple):
     """The buffers of a fit; one set for each thread.
@@ -79,6 +81,8 @@ class FitBuffers(NamedTuple):
         start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
+        rim: (3,) what the rim of the last fit shows of the noise, see :func:`rim_noise`.
+        rims: (MOST_DISCS, 3) the same for each disc of an image.
     """
 
     px: Floats
@@ -100,6 +104,8 @@ class FitBuffers(NamedTuple):
     start: Array
     products: Array
     sums: Array
+    rim: Array
+    rims: Array
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -118,6 +124,7 @@ def workspace() -> FitBuffers:
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
         np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
+        np.empty(3), np.empty((MOST_DISCS, 3)),
     )  # fmt: skip
 
 
@@ -128,7 +135,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     Args:
         n: number of pixels.
         slope: kind of gradient: LIGHT, SURROUND, GLARE.
-        texture: variance of the surround over the noise's.
+        texture: variance of the surround beyond the noise's, over that; below zero: that of the disc, for shot noise.
         work: the pixels, and buffers.
 
     Returns:
@@ -138,7 +145,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     cx, cy, m11, m12, m22, blur, contrast, base, gx, gy = work.at
     i_blur = _ONE / blur
     square = _ZERO
-    v_texture = F(texture)
+    v_texture, v_disc = F(max(texture, 0.0)), F(max(-texture, 0.0))
     most = max(abs(base), abs(base + contrast), _ONE)
     k_out = base / most if slope == LIGHT else _ONE
     k_in = (base + contrast) / most if slope == LIGHT else (_ONE if slope == GLARE else _ZERO)
@@ -162,7 +169,7 @@ def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
         tail = density * b * (_B1 + b * (_B2 + b * (_B3 + b * (_B4 + b * _B5))))
         share = _HALF + np.copysign(_HALF - tail, z)
         rest = _ONE - share
-        w = _ONE / np.sqrt(_ONE + v_texture * rest * rest)
+        w = _ONE / np.sqrt(_ONE + v_texture * rest * rest + v_disc * share)
         k = k_in * share + k_out * rest
         inside[i] = share
         left = w * (level[i] - base - k * (gx * u + gy * v) - contrast * share)
@@ -353,6 +360,19 @@ def spread(n: int, work: FitBuffers, flat: Array) -> None:
     flat[2], flat[3] = count_in, count_out
 
 
+@kernel
+def inside_noise(n: int, work: FitBuffers) -> float:
+    """Return the variance of the noise inside the disc, from the differences of the residuals of neighbours in a row."""
+    px, py, residual, inside = work.px, work.py, work.residual, work.inside
+    square, count = 0.0, 0
+    for i in range(n - 1):
+        if inside[i] > F(0.995) and inside[i + 1] > F(0.995) and py[i + 1] == py[i] and px[i + 1] == px[i] + _ONE:
+            step = residual[i + 1] - residual[i]
+            square += step * step
+            count += 1
+    return 0.5 * square / max(count, 1)
+
+
 @kernel(fastmath=True)
 def clipped(n: int, work: FitBuffers) -> int:
     """Count the pixels that are black or white to the last level."""
@@ -391,6 +411,87 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: A
             sectors[1, k] += square
     for k in range(SECTORS):
         sectors[0, k] /= max(sectors[1, k], 1e-12)
+
+
+def _odd_harmonics() -> Array:
+    """Return cosines and sines (6, SECTORS) of 3, 5 and 7 times the angle of each sector of :func:`rim`."""
+    angles = np.empty(SECTORS)
+    for k in range(SECTORS):
+        within = np.radians((33.75 if k & 1 else 11.25) if k & 2 else (56.25 if k & 1 else 78.75))
+        right, below = bool(k & 8), bool(k & 4)
+        angles[k] = np.arctan2(np.sin(within) * (1 if below else -1), np.cos(within) * (1 if right else -1))
+    return np.array([f(h * angles) for h in (3, 5, 7) for f in (np.cos, np.sin)])
+
+
+_ODD = _odd_harmonics()
+#: Median of chi-square of six degrees, over six.
+_CHI6_MEDIAN = 0.8914
+#: From so many discs on, what their rims have in common is the image's noise.
+_LEAST_RIMS = 3
+
+
+@kernel
+def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
+    """Compare the deviations of the rim's sectors with white noise, and fill ``work.rim``.
+
+    The centre moves with the first harmonic of what noise does along the rim. The odd harmonics after it (3, 5, 7) show
+    how much of that there is, where noise is correlated between neighbours: by a demosaic, a filter, a compression. The
+    even ones do not count: the pixel grid has them, too, and they do not move the centre.
+
+    Args:
+        variance: of the noise, as the residuals have it.
+        work: buffers; ``sectors`` is filled by :func:`rim`. ``rim`` is filled: power of the odd harmonics over that of
+            white noise; mean square of the sectors' deviations beyond white noise, px^2; what chance makes of that.
+
+    Returns:
+        Sum of the squared deviations beyond white noise, px^2; its variance; number of sectors.
+    """
+    sectors, off, chance, count, power, white = work.sectors, 0.0, 0.0, 0, 0.0, 1e-30
+    for k in range(SECTORS):
+        if sectors[1, k] > 0.0:
+            expected = variance / sectors[1, k]
+            off += sectors[0, k] ** 2 - expected
+            chance += 2.0 * expected * expected
+            count += 1
+            white += 3.0 * expected
+    for h in range(len(_ODD)):
+        total = 0.0
+        for k in range(SECTORS):
+            if sectors[1, k] > 0.0:
+                total += _ODD[h, k] * sectors[0, k]
+        power += total * total
+    work.rim[0], work.rim[1], work.rim[2] = power / white, off / max(count, 1), np.sqrt(chance) / max(count, 1)
+    return off, chance, count
+
+
+@kernel
+def common_noise(n: int, rims: Array) -> tuple[float, float]:
+    """Return what the rims (N, 3) of an image's first n discs have in common, see :func:`rim_noise`.
+
+    Returns:
+        The factor of the variance of centres by correlated noise, one at least; the mean square of the sectors' deviations
+        beyond white noise, px^2. Both are medians, so that a few discs that are none do not count.
+    """
+    if n < _LEAST_RIMS:
+        return 1.0, 0.0
+    power, off = np.sort(rims[:n, 0].copy()), np.sort(rims[:n, 1].copy())
+    factor = 0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN
+    return max(factor, 1.0), max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
+
+
+@kernel
+def widen(cov: Array, rim_of_disc: Array, factor: float, common_px2: float) -> None:
+    """Enlarge a centre's covariance (2, 2) by the image's noise, and by how far its own rim (3,) deviates beyond that.
+
+    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
+    """
+    for a in range(2):
+        for b in range(2):
+            cov[a, b] *= factor
+    own = rim_of_disc[1] - common_px2
+    if own > _RIM_CHANCE * rim_of_disc[2] * factor:
+        cov[0, 0] += own
+        cov[1, 1] += own
 
 
 @kernel
@@ -495,6 +596,8 @@ def slope_outside(theta: Array, work: FitBuffers) -> float:
 
 
 _STEPS = 8
+#: Least variance of a surround, grey levels^2, and how many times more that of a disc may be, for the weights.
+_LEAST_VARIANCE, _MOST_SHOT_NOISE = 0.1, 10.0
 #: A step of the centre after which the next one is negligible (a tenth of it at the most): px, and standard deviations
 #: of the centre.
 _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
@@ -533,7 +636,7 @@ _RIM_CHANCE = 4.0
 #: Largest residuals beyond the image's noise, as a share of the contrast.
 _MOST_RESIDUAL = 0.1
 #: A centre that a textured surround makes less certain than this is rejected, px.
-_MOST_SIGMA_PX = 0.08
+_MOST_SIGMA_PX = 0.2
 #: Largest variation of the inside beyond the image's noise, as a share of the contrast.
 _UNEVEN = 0.12
 _LEAST_SNR = 3.0
@@ -575,14 +678,15 @@ def _step(
 
 @kernel
 def _minimise(
-    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, work: FitBuffers
-) -> tuple[float, float]:
+    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, texture: float,
+    work: FitBuffers,
+) -> tuple[float, float]:  # fmt: skip
     """Step until the centre converges; return the sum of squared residuals, -1 without a minimum, and the texture.
 
-    ``weigh``: where the surround varies more than the disc, reduce its weight.
+    ``weigh``: where surround or disc varies more than the other, reduce its weight; ``texture``: how it is reduced before.
     """
     flat, H = work.sectors[0], work.H
-    texture, weighed = 0.0, not weigh
+    weighed = not weigh
     for _ in range(_STEPS):
         shift, square = _step(n, theta, x0, y0, slope, texture, work)
         if shift < 0.0:
@@ -592,9 +696,16 @@ def _minimise(
             spread(n, work, flat)
             v_in = flat[0] if flat[2] >= 30.0 else noise_sigma * noise_sigma
             v_in = max(v_in, 0.05, 1e-4 * theta[6] * theta[6])
-            if flat[1] > (2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))) * v_in:
+            v_out = max(flat[1], _LEAST_VARIANCE)
+            chance = 2.0 + 6.0 * np.sqrt(2.0 / max(flat[2], 30.0) + 2.0 / max(flat[3], 4.0))
+            if flat[1] > chance * v_in:
                 texture = flat[1] / v_in - 1.0
                 continue
+            if flat[2] >= 30.0 and flat[0] > chance * v_out:
+                v_in = inside_noise(n, work)  # light that slopes over the disc is no noise
+                if v_in > chance * v_out:
+                    texture = -min(v_in / v_out - 1.0, _MOST_SHOT_NOISE)
+                    continue
         if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
             return square, texture
     return -1.0, 0.0
@@ -602,8 +713,9 @@ def _minimise(
 
 @kernel
 def _average(
-    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, cov: Array, work: FitBuffers
-) -> None:
+    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, texture: float, cov: Array,
+    work: FitBuffers,
+) -> None:  # fmt: skip
     """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood (model averaging).
 
     The result of SURROUND, its sum of squares included, is the input. A kind that is not distinguishable from another
@@ -616,7 +728,7 @@ def _average(
     results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
     for kind in (LIGHT, GLARE):
         trial[:] = start
-        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, work)
+        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, texture, work)
         results[kind, 0] = np.inf
         if square >= 0.0:
             of_centre(work, block)
@@ -667,7 +779,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
     if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
         return 2
-    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, work)
+    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
         return 2
     # Clipped pixels have no noise and do not count for it.
@@ -686,19 +798,15 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     rim(n, theta, x0, y0, work, sectors)
-    off, chance, count = 0.0, 0.0, 0
-    for k in range(SECTORS):
-        if sectors[1, k] > 0.0:
-            off += sectors[0, k] ** 2 - variance / sectors[1, k]
-            chance += 2.0 * (variance / sectors[1, k]) ** 2
-            count += 1
+    off, chance, count = rim_noise(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
         return 5
     spread(n, work, sectors[0])
-    if sectors[0, 2] > 10.0 and np.sqrt(max(sectors[0, 0] - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
+    v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
+    if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
-    uneven = texture == 0.0 and (
+    uneven = texture <= 0.0 and (
         slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
         or slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
     )
@@ -711,12 +819,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         for b in range(2):
             cov[a, b] *= variance
     if uneven:
-        _average(n, theta, x0, y0, noise_sigma, square, cov, work)
-    if off > _RIM_CHANCE * np.sqrt(chance):
-        # A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as
-        # much.
-        cov[0, 0] += off / count
-        cov[1, 1] += off / count
+        _average(n, theta, x0, y0, noise_sigma, square, texture, cov, work)
     return 0
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.kernels import kernel
-from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, factor, fit, shape_of, solve
+from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, common_noise, factor, fit, shape_of, solve, widen
 
 #: Longest half chord, px: half of the largest disc, blur and all.
 _REACH = 44
@@ -112,9 +112,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
             # The first pixel may have been noise beside the disc: is the level half-way between disc and surround?
             low = _beyond(image, x, y, left + right, up + down, sign)
             contrast = int(image[y, x]) - low
-            if sign * contrast <= 0:
-                return 2
-            if 8 * abs(2 * half - low - int(image[y, x])) < sign * contrast:
+            if 8 * abs(2 * half - low - int(image[y, x])) < sign * contrast or sign * contrast <= 0:  # or a ring's hole
                 break
     if left + right < 2 or up + down < 2 or left + right + up + down + 2 < 8:
         return 7
@@ -428,5 +426,9 @@ def find(
             codes[good] = FOUND_TWICE
         else:
             shape_of(starts[good], shape[good])
+            work.rims[good, :] = work.rim
             good += 1
+    times, common = common_noise(good, work.rims)
+    for i in range(good):
+        widen(cov[i], work.rims[i], times, common)
     return good, n

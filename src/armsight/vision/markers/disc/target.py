@@ -22,7 +22,7 @@ from armsight.vision.markers.disc import fit, search
 #: Most rejected candidates of an image that are reported.
 MOST_REPORTED = 100
 #: Most candidates examined in an image; sort key of one that has no closed rim.
-_MOST_CANDIDATES, _NEVER = 16384, 99
+_MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
 _KEPT = threading.local()
 
 
