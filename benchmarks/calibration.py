@@ -4,8 +4,8 @@
     python benchmarks/calibration.py 1 4        only these
 
 Metrics: 1 held-out errors on real sets, 2 half-subsets, 3 uncertainty, 4 the Motoman arm and its laser tracker,
-5 coverage of the pose's covariance, 6 time, 7 boards of discs. Real recordings are looked for at ARMSIGHT_DATA or
-../shared/data.
+5 coverage of the pose's covariance, 6 time, 7 boards of discs, 8 free-running web cameras. Real recordings are looked for
+at ARMSIGHT_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import cv2
 import motoman
 import real_discs
 import real_sets
+import real_shutters
 import rendered
 
 METRICS = {
@@ -27,6 +28,7 @@ METRICS = {
     "5": rendered.pose_coverage,
     "6": rendered.time_beside_opencv,
     "7": lambda: (real_discs.found_beside_opencv(), real_discs.heldout_beside_opencv(), real_discs.rendered_wide()),
+    "8": real_shutters.skews,
 }
 
 

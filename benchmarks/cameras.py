@@ -6,7 +6,8 @@
     python benchmarks/cameras.py --json found.json metrics as JSON, too
     python benchmarks/cameras.py --sheet sheet.png only this: the same body through every preset
 
-Sections: 0 each stage of a camera alone, 1 bodies of discs through each preset. ``camera_scene.scene`` renders the scenes.
+Sections: 0 each stage of a camera alone, 1 bodies of discs through each preset, 2 skew and readout of two web cameras.
+``camera_scene.scene`` renders the scenes.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ import cv2  # noqa: E402
 
 import camera_discs  # noqa: E402
 import camera_scene  # noqa: E402
+import camera_shutters  # noqa: E402
 import camera_stages  # noqa: E402
 from marker_report import Report  # noqa: E402
 
 SECTIONS = {
     "0": ("Each stage of a camera alone", camera_stages.section),
     "1": ("Bodies of discs through each preset, thresholded contours beside", camera_discs.section),
+    "2": ("Skew and readout of two web cameras, from a moving body", camera_shutters.section),
 }
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from armsight.errors import InputError
 from armsight.geometry.pose import log_se3
-from armsight.vision.rig import VERSION, StereoRig
+from armsight.vision.rig import VERSION, Shutters, StereoRig
 from asserts import assert_jacobian
 from strategies import CAMERAS, ordinary_rig
 
@@ -247,6 +247,19 @@ def test_other_files_are_reported(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"rig\.json"):
         StereoRig.load(path)
+
+
+def test_shutters_are_stored_and_files_without_them_are_read(tmp_path):
+    path, shutters = tmp_path / "rig.json", Shutters(-5e-3, 0.014, np.array([[1e-10, 2e-11], [2e-11, 4e-10]]))
+    replace(ordinary_rig(), shutters=shutters).save(path)
+    found = StereoRig.load(path).shutters
+    assert (found.skew_s, found.readout_s) == (-5e-3, 0.014)
+    assert np.array_equal(found.cov, shutters.cov)
+    assert str(found) == "skew 5.00 ± 0.01 ms (left later), readout 14.00 ± 0.02 ms"
+    assert StereoRig.load(saved(tmp_path)).shutters is None
+    for wrong in ({"skew_s": 1.0}, {"skew_s": 0.0, "readout_s": -1.0, "covariance_s2": [[0, 0], [0, 0]]}, "late"):
+        with pytest.raises(InputError, match=r"rig\.json"):
+            StereoRig.load(saved(tmp_path, shutters=wrong))
 
 
 def test_missing_files_and_folders_are_reported(tmp_path):

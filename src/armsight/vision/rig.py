@@ -35,6 +35,58 @@ TANGENT = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 
 
 @dataclass(frozen=True, eq=False)
+class Shutters(Record):
+    """When the rows of two cameras are exposed.
+
+    Attributes:
+        skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
+        readout_s: of all rows, s, in both cameras: a row begins by its H-th part later than the one above; 0 is a global
+            shutter.
+        cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
+        jitter_s: standard deviation by which the skew of a shot differs from the mean, s, beyond the stamps.
+    """
+
+    skew_s: float
+    readout_s: float
+    cov: Array
+    jitter_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check that times are finite and the covariance is one."""
+        super().__post_init__()
+        times = self.skew_s, self.readout_s, self.jitter_s
+        if not (np.isfinite(times).all() and min(times[1:]) >= 0):
+            raise InputError(
+                "skew, readout and jitter must be finite times, readout and jitter not below zero, got "
+                + ", ".join(f"{t:g} s" for t in times)
+            )
+        checked(self.cov, (2, 2), "covariance of skew and readout")
+        _check_covariance(self.cov, ("skew_s", "readout_s"))
+
+    def __str__(self) -> str:
+        """Return both in ms with their sigmas, for people."""
+        skew, readout = (f" ± {1e3 * s:.2f}" if s > 0 else "" for s in self.sigmas)
+        late = "right" if self.skew_s >= 0 else "left"
+        rolling = f", readout {1e3 * self.readout_s:.2f}{readout} ms" if self.readout_s or readout else ""
+        jitter = f", {1e3 * self.jitter_s:.2f} ms RMS from shot to shot" if self.jitter_s else ""
+        return f"skew {1e3 * abs(self.skew_s):.2f}{skew} ms ({late} later){jitter}{rolling}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that rig files and ``measure --json`` have."""
+        return {
+            "skew_s": self.skew_s,
+            "readout_s": self.readout_s,
+            "covariance_s2": self.cov.tolist(),
+            "jitter_s": self.jitter_s,
+        }
+
+    @property
+    def sigmas(self) -> Array:
+        """(2,) standard deviations of skew and readout, s."""
+        return np.sqrt(np.diag(self.cov))
+
+
+@dataclass(frozen=True, eq=False)
 class StereoRig(Record):
     """Two cameras that see the same volume.
 
@@ -47,6 +99,7 @@ class StereoRig(Record):
             parameter was given and not estimated.
         sigma_px: standard deviation of a detection beyond the image's own covariance, px: from the calibration.
         provenance: where the rig comes from: command, data, versions.
+        shutters: when the rows of both cameras are exposed; None where it is unknown.
     """
 
     left: Camera
@@ -55,6 +108,7 @@ class StereoRig(Record):
     cov: Array
     sigma_px: float
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    shutters: Shutters | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and the rotation."""
@@ -118,6 +172,7 @@ class StereoRig(Record):
             self.cov,
             self.sigma_px,
             self.provenance,
+            self.shutters,
         )
 
     def rectify(self) -> Rectification:
@@ -141,7 +196,7 @@ class StereoRig(Record):
             }
             for side, camera in zip(("left", "right"), self.cameras, strict=True)
         }
-        document = {
+        document: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,
             **cameras,
@@ -151,6 +206,8 @@ class StereoRig(Record):
             "covariance": self.cov.tolist(),
             "provenance": dict(self.provenance),
         }
+        if self.shutters is not None:
+            document["shutters"] = self.shutters.to_json()
         write_text(path, json.dumps(document, indent=1) + "\n")
 
     @staticmethod
@@ -171,6 +228,7 @@ class StereoRig(Record):
                 checked(document["covariance"], (count, count), "covariance"),
                 float(document["sigma_px"]),
                 _provenance(document),
+                _shutters(document.get("shutters")),
             )
         except KeyError as error:
             raise InputError(f"{path}: the rig file has no {error.args[0]!r}") from None
@@ -225,6 +283,14 @@ def _provenance(document: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(provenance, dict):
         raise InputError(f"provenance must be an object of names and values, got {json.dumps(provenance)[:40]}")
     return provenance
+
+
+def _shutters(entry: dict[str, Any] | None) -> Shutters | None:
+    """Build what a rig file says of its shutters, if it does."""
+    if entry is None:
+        return None
+    cov = checked(entry["covariance_s2"], (2, 2), "covariance_s2 of shutters")
+    return Shutters(float(entry["skew_s"]), float(entry["readout_s"]), cov, float(entry.get("jitter_s", 0.0)))
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

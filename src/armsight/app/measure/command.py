@@ -22,6 +22,12 @@ from armsight.errors import InputError
 @click.option("--right", metavar="GLOB", help="Right images.")
 @click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
 @click.option("--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections instead of images.")
+@click.option(
+    "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
+)
+@click.option(
+    "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
+)
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
@@ -32,6 +38,8 @@ def command(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    skew: str | None,
+    readout: str | None,
     output: Path | None,
     view_dir: Path | None,
     as_json: bool,
@@ -42,6 +50,9 @@ def command(
     be read or does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles
     about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict
     the rig or the body file, and the poses must not be trusted.
+
+    With --skew or --readout, or where the rig file has them, a moving body's detections are moved to the time of the shot
+    by its own motion, which the recording's other shots show.
     """
     given = [left is not None or right is not None, source is not None, detections is not None]
     if sum(given) != 1 or (left is None) != (right is None):
@@ -56,6 +67,8 @@ def command(
         right=right,
         source=source,
         detections=detections,
+        skew=skew,
+        readout=readout,
         output=output,
         view_dir=view_dir,
         as_json=as_json,

@@ -22,6 +22,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, Record
 from armsight.geometry.rotation import euler_zyx, quaternion_wxyz
+from armsight.vision.rig import Shutters
 
 #: Elements of a 6x6 covariance that are written.
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
@@ -44,6 +45,8 @@ CSV_COLUMNS = (
     "dropped",
     *(f"cov_{i}{j}" for i, j in UPPER),
 )
+
+SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,7 @@ class ShotPose(Record):
         way: how the follower found the body; None where it was not followed.
         jump: what was noticed about a jump of the pose; None without.
         took_ms: duration of the measurement, ms; None where it was not followed.
+        shutters: by which all observations were moved to the shot's time; None where they were taken as simultaneous.
     """
 
     shot: str
@@ -88,6 +92,7 @@ class ShotPose(Record):
     way: str | None = None
     jump: str | None = None
     took_ms: float | None = None
+    shutters: Shutters | None = None
 
     @property
     def ok(self) -> bool:
@@ -118,6 +123,8 @@ class ShotPose(Record):
             }
         if self.way is not None:
             found |= {"way": self.way, "jump": self.jump, "took_ms": self.took_ms}
+        if self.shutters is not None:
+            found["shutters"] = self.shutters.to_json()
         return found
 
 
@@ -161,10 +168,15 @@ def left_axes(T_left_body: Array, cov: Array) -> Array:
 
 
 def csv_text(poses: Sequence[ShotPose]) -> str:
-    """Return the CSV of many shots; ``cov_ij`` is the upper triangle of ``covariance``."""
+    """Return the CSV of many shots; ``cov_ij`` is the upper triangle of ``covariance``.
+
+    Where shots were moved to one time, the columns of SHUTTER_COLUMNS follow.
+    """
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
+    moved = any(p.shutters is not None for p in poses)
+    columns = CSV_COLUMNS + (SHUTTER_COLUMNS if moved else ())
+    writer.writerow(columns)
     for p in poses:
         row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
         if p.ok:
@@ -172,5 +184,8 @@ def csv_text(poses: Sequence[ShotPose]) -> str:
             row += np.sqrt(np.diag(p.cov)).tolist()
             row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
             row += [float(p.cov[i, j]) for i, j in UPPER]
-        writer.writerow(["" if value is None else value for value in row] + [""] * (len(CSV_COLUMNS) - len(row)))
+        if p.shutters is not None:
+            row += [""] * (len(CSV_COLUMNS) - len(row))
+            row += [p.shutters.skew_s, p.shutters.readout_s, *p.shutters.sigmas.tolist()]
+        writer.writerow(["" if value is None else value for value in row] + [""] * (len(columns) - len(row)))
     return output.getvalue()

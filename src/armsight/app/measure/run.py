@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, note_skew, requested_shutters
 from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
@@ -28,9 +29,11 @@ from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
+from armsight.vision.shutter import LOOSE_PX
 from armsight.vision.sources import PairsSource, Source, open_source
 from armsight.vision.sources.pairs import StoredSource
+from armsight.vision.sources.video import VideoSource
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
@@ -45,8 +48,8 @@ class _Followed:
     took_ms: float
 
 
-#: Shot, result, and how a followed body was found; None where the body was not followed.
-Result = tuple[Shot, PoseEstimate | Missed, _Followed | None]
+#: Shot, result, how a followed body was found, and the shutters by which it was moved to one time; None where not.
+Result = tuple[Shot, PoseEstimate | Missed, _Followed | None, Shutters | None]
 
 
 def measure_shots(
@@ -57,6 +60,8 @@ def measure_shots(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    skew: str | None,
+    readout: str | None,
     output: Path | None,
     view_dir: Path | None,
     as_json: bool,
@@ -70,6 +75,8 @@ def measure_shots(
         right: glob of the right images.
         source: a source's spec, where the images are not given by globs.
         detections: a file of detections, where there are no images.
+        skew: time by which the right camera is later, with its unit, or ``find``.
+        readout: time from the first row to the last, with its unit, or ``find``.
         output: CSV file of the poses.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
@@ -80,6 +87,9 @@ def measure_shots(
     Raises:
         ArmsightError: the input is wrong, or no shot could be measured.
     """
+    requested: Requested | Shutters | None = requested_shutters(skew, readout)
+    if requested is not None and detections is not None:
+        raise InputError("--skew and --readout need images with times: detections have none")
     stereo = StereoRig.load(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
@@ -95,19 +105,30 @@ def measure_shots(
         if detections is not None:
             body = open_body(target)
             shots = read_detections(detections, body)
-            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None) for s in shots)
+            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
-            opened = (
-                PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
-            )
-            stack.enter_context(contextlib.closing(opened))
+            opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
-            results = _measured(stereo, found, _shots(opened, stereo, rig))
-            total = opened.count
+            total, timed = opened.count, _timed(opened)
+            if requested is not None and not timed:
+                raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
+            if requested is None and stereo.shutters is not None:
+                if timed:
+                    requested = stereo.shutters
+                else:
+                    click.echo(f"note: {rig} has {stereo.shutters}, not used: no recording with times", err=True)
+            if requested is None:
+                results = _measured(stereo, found, _shots(opened, stereo, rig))
+                results = _noted(stereo, body, results) if timed else results
+            else:
+                again = _opened(left, right, source) if folder is not None else None
+                if again is not None:
+                    stack.enter_context(contextlib.closing(again))
+                results = _moved(stereo, found, _shots(opened, stereo, rig), requested, again)
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
@@ -130,6 +151,41 @@ def measure_shots(
     return health
 
 
+def _opened(left: str | None, right: str | None, source: str | None) -> Source:
+    """Open what the user named."""
+    return PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
+
+
+def _timed(source: Source) -> bool:
+    """Whether a source is a recording whose shots have times."""
+    if isinstance(source, StoredSource):
+        return any(pair.t_s is not None for pair in source.pairs)
+    return isinstance(source, VideoSource)
+
+
+def _noted(rig: StereoRig, body: Body, results: Iterator[Result]) -> Iterator[Result]:
+    """Yield the results, and say at the end where they show that the cameras do not expose at one time."""
+    first: list[tuple[float | None, PoseEstimate | Missed]] = []
+    for result in results:
+        if len(first) < NOTED_SHOTS:
+            first.append((result[0].t_s, result[1]))
+        yield result
+    note_skew(rig, body, first)
+
+
+def _moved(
+    rig: StereoRig, target: Target, shots: Iterator[Shot], requested: Requested | Shutters, again: Source | None
+) -> Iterator[Result]:
+    """Measure all shots, then move their detections to one time and measure again; ``again`` has the images to draw."""
+    measured = _measured(replace(rig, sigma_px=max(rig.sigma_px, LOOSE_PX)), target, shots)
+    first = [(replace(shot, left=None, right=None), result, followed) for shot, result, followed, _ in measured]
+    moved, shutters = moved_results(rig, target.body, [(shot.t_s, result) for shot, result, _ in first], requested)
+    click.echo(f"note: {shutters}", err=True)
+    for (shot, _, followed), (result, is_moved) in zip(first, moved, strict=True):
+        drawn = again.read() if again is not None else None
+        yield drawn or shot, result, followed, shutters if is_moved else None
+
+
 def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
     """Yield a source's shots; the first image that can be read must have the rig's size."""
     checked = False
@@ -145,13 +201,13 @@ def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
 def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator[Result]:
     """Measure shot after shot; a body of discs is followed from one to the next."""
     if not follows(target):
-        yield from ((shot, measure(rig, target, shot), None) for shot in shots)
+        yield from ((shot, measure(rig, target, shot), None, None) for shot in shots)
         return
     follower = Follower(rig, target)
     for shot in shots:
         begun = time.perf_counter()
         result = follower.measure(shot)
-        yield shot, result, _Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun))
+        yield shot, result, _Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun)), None
 
 
 def _run(
@@ -165,9 +221,9 @@ def _run(
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
-        for shot, measured, followed in results:
+        for shot, measured, followed, shutters in results:
             result = monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
-            record = shot_pose(shot.name, shot.t_s, body, result)
+            record = replace(shot_pose(shot.name, shot.t_s, body, result), shutters=shutters)
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
             records.append(record)

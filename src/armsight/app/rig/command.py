@@ -141,6 +141,7 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
         "convergence_deg": rig.convergence_deg,
         "sigma_px": rig.sigma_px,
         "sigmas": {name: sigma or None for name, sigma in _sigmas(rig).items()},
+        "shutters": None if rig.shutters is None else rig.shutters.to_json(),
         "provenance": dict(rig.provenance),
     }
 
@@ -162,6 +163,8 @@ def _lines(rig: StereoRig) -> list[str]:
         f"convergence: {rig.convergence_deg:.3f} deg",
         f"detection sigma: {rig.sigma_px:.3g} px",
     ]
+    if rig.shutters is not None:
+        lines.append(f"shutters: {rig.shutters}")
     if not rig.cov.any():
         lines.append("uncertainty: unknown (no covariance in this rig file)")
     return [*lines, *(f"{key}: {value}" for key, value in rig.provenance.items())]

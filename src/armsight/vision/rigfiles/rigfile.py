@@ -222,4 +222,6 @@ def not_held(rig: StereoRig) -> tuple[str, ...]:
     lost = []
     if rig.cov.any():
         lost.append("the covariance of the rig's parameters")
+    if rig.shutters is not None:
+        lost.append(f"the shutters: {rig.shutters}")
     return (*lost, f"the detection noise sigma_px ({rig.sigma_px:g} px)", "the provenance")

@@ -1,0 +1,125 @@
+"""Measure a recording of a moving body with cameras that do not expose at one time: two passes.
+
+In: the shots of a recording with their times. Out: what :func:`~armsight.app.measure.run.measure_shots` prints of each. The
+first pass detects and measures as if all were simultaneous, with a wide gate; from it the skew and the readout time are
+found where they are not given; the second moves every detection to its shot's time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import click
+import numpy as np
+
+from armsight.data import Body, Missed, PoseEstimate
+from armsight.errors import InputError
+from armsight.vision.rig import Shutters, StereoRig
+from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
+
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+#: A skew beyond so many sigmas, and so many seconds, is worth a note; from the first so many shots.
+_NOTED_SIGMAS, _NOTED_S, NOTED_SHOTS = 5.0, 1e-4, 200
+
+
+@dataclass(frozen=True)
+class Requested:
+    """What a user requests of the shutters; None is to be found."""
+
+    skew_s: float | None
+    readout_s: float | None
+
+
+def requested_shutters(skew: str | None, readout: str | None) -> Requested | None:
+    """Read ``--skew`` and ``--readout``; None where neither is given. Where only one is, the skew is found, no readout.
+
+    Raises:
+        InputError: not a time.
+    """
+    if skew is None and readout is None:
+        return None
+    found = Requested(_seconds("--skew", skew or "find"), _seconds("--readout", readout or "0ms"))
+    if found.readout_s is not None and found.readout_s < 0:
+        raise InputError(f"--readout {readout}: must not be below zero")
+    if found.readout_s is None and found.skew_s is not None:
+        raise InputError("--readout find needs --skew find: both are found together")
+    return found
+
+
+def _seconds(option: str, text: str) -> float | None:
+    """Return a time with its unit in s; None for ``find``."""
+    if text.strip() == "find":
+        return None
+    match = re.fullmatch(r"([+-]?\d*\.?\d+)\s*(s|ms|us)", text.strip())
+    if match is None:
+        raise InputError(f"{option} {text!r}: expected a time with its unit, such as 5ms, or find")
+    return float(match[1]) * _UNITS[match[2]]
+
+
+def moved_results(
+    rig: StereoRig,
+    body: Body,
+    first: Sequence[tuple[float | None, PoseEstimate | Missed]],
+    requested: Requested | Shutters,
+) -> tuple[list[tuple[PoseEstimate | Missed, bool]], Shutters]:
+    """Measure again with every detection moved to its shot's time.
+
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        first: time, s, and result of every shot as measured at first.
+        requested: the shutters, or which of them are to be found.
+
+    Returns:
+        Of every shot the result and whether it was moved; the shutters.
+
+    Raises:
+        InputError: a shot has no time, times do not rise, or what was to be found cannot be.
+    """
+    if any(t_s is None and isinstance(result, PoseEstimate) for t_s, result in first):
+        raise InputError(
+            "these shots have no times, so nothing is known of the body's motion between two exposures: record them with "
+            "`armsight record`, or give a video"
+        )
+    rows = [k for k, (_, result) in enumerate(first) if isinstance(result, PoseEstimate)]
+    shots = [_timed(*first[k]) for k in rows]
+    shutters = requested if isinstance(requested, Shutters) else _shutters(rig, body, shots, requested)
+    results: list[tuple[PoseEstimate | Missed, bool]] = [(result, False) for _, result in first]
+    for k, moved in zip(rows, measure_moving(rig, body, shots, shutters), strict=True):
+        results[k] = moved
+    return results, shutters
+
+
+def _timed(t_s: float | None, result: PoseEstimate | Missed) -> TimedShot:
+    """Return a measured shot with a time."""
+    assert t_s is not None
+    assert isinstance(result, PoseEstimate)
+    return TimedShot(t_s, result.points.seen, result.T_left_body)
+
+
+def _shutters(rig: StereoRig, body: Body, shots: Sequence[TimedShot], requested: Requested) -> Shutters:
+    """Return the shutters that a user requests, found where they are not given."""
+    given = Shutters(requested.skew_s or 0.0, requested.readout_s or 0.0, np.zeros((2, 2)))
+    if requested.skew_s is not None:
+        return given
+    found = estimate_shutters(rig, body, shots, known=given, readout=requested.readout_s is None)
+    if isinstance(found, Missed):
+        raise InputError(f"the skew of the cameras cannot be found: {found.reason}; or give it: --skew 5ms")
+    return found
+
+
+def note_skew(rig: StereoRig, body: Body, first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> None:
+    """Print a note where shots that were measured as simultaneous show that they are not."""
+    measured = [(t, r) for t, r in first if t is not None and isinstance(r, PoseEstimate)]
+    times = [t for t, _ in measured]
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        return
+    found = estimate_shutters(rig, body, [_timed(*each) for each in measured]) if measured else Missed("")
+    if isinstance(found, Shutters) and abs(found.skew_s) > max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
+        click.echo(
+            f"note: the cameras do not expose at one time: {found}; --skew find moves the detections to one time",
+            err=True,
+        )

@@ -1,0 +1,144 @@
+"""Skew and readout of two cameras from a moving body: found with an honest sigma, rejected of a slow one, corrected."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armsight.data import Body, Correspondences, Missed, PoseEstimate
+from armsight.geometry.pose import inverse, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.sim.example_rig import example_rig
+from armsight.vision.shutter import Shutters, TimedShot, estimate_shutters, measure_moving
+
+SKEW_S, READOUT_S, SIGMA_PX, RATE_HZ = 5e-3, 14e-3, 0.1, 30.0
+RIG = replace(example_rig((1280, 720), 900.0), sigma_px=0.0)
+POINTS = np.column_stack([np.mgrid[:5, :4].reshape(2, -1).T * 0.04 - [0.08, 0.06], np.zeros(20)])
+BODY = Body("plate", tuple(map(str, range(20))), POINTS)
+NOTHING = Shutters(0.0, 0.0, np.zeros((2, 2)))
+
+
+def at(t, speed, phase):
+    """Poses (N, 4, 4) at times (N,) of a body that moves and rotates at about a speed, m/s and rad/s."""
+    f = 2 * np.pi * np.array([0.5, 0.7, 0.4, 0.6, 0.3, 0.5])
+    x = speed * np.sqrt(2 / 3) * np.repeat([1.0, 2.0], 3) / f * np.sin(f * np.atleast_1d(t)[:, None] + phase)
+    T = np.tile(pose(exp_so3(np.array([0.2, -0.3, 0.4])), np.array([0.1, 0.0, 0.8])), (len(x), 1, 1))
+    T[:, :3, :3] = T[:, :3, :3] @ exp_so3(x[:, 3:])
+    T[:, :3, 3] += x[:, :3]
+    return T
+
+
+def recorded(seed, speed, skew_s=SKEW_S, readout_s=READOUT_S, *, count=24, stamped_s=0.0):
+    """Shots of a moving body with their noise, and its true poses; the stamps of the right camera vary by ``stamped_s``."""
+    rng = np.random.default_rng(seed)
+    phase, shots = rng.uniform(0, 2 * np.pi, 6), []
+    t_s = np.arange(count) / RATE_HZ
+    for t in t_s:
+        apart_s, uv = stamped_s * rng.normal(), np.empty((20, 2, 2))
+        for c, camera in enumerate(RIG.cameras):
+            late = np.zeros(20)
+            for _ in range(4):  # the row that sees a point depends on when it looks
+                T = at(t + c * (skew_s + apart_s) + late, speed, phase)
+                p = np.einsum("nij,nj->ni", T[:, :3, :3], POINTS) + T[:, :3, 3]
+                uv[:, c] = camera.project(transform(inverse(RIG.T_left_right), p) if c else p)
+                late = ((uv[:, c, 1] + 0.5) / 720 - 0.5) * readout_s
+        uv += SIGMA_PX * rng.standard_normal(uv.shape)
+        seen = Correspondences(np.arange(20), uv, np.tile(SIGMA_PX**2 * np.eye(2), (20, 2, 1, 1)))
+        shots.append(TimedShot(float(t), seen, at(t + 1e-3, speed, phase)[0], apart_s))
+    return shots, at(t_s, speed, phase)
+
+
+def test_skew_and_readout_are_found_and_their_sigma_is_honest():
+    z = []
+    for seed in range(12):
+        found = estimate_shutters(RIG, BODY, recorded(seed, 0.3)[0], readout=True)
+        assert isinstance(found, Shutters)
+        assert abs(found.skew_s - SKEW_S) < 2e-4
+        z.append((np.array([found.skew_s, found.readout_s]) - [SKEW_S, READOUT_S]) / found.sigmas)
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert ((rms > 0.5) & (rms < 1.5)).all(), rms
+
+
+@pytest.mark.parametrize("skew_s", [-8e-3, 0.0, 15e-3])
+def test_skew_of_global_shutters_is_found_whatever_its_sign(skew_s):
+    found = estimate_shutters(RIG, BODY, recorded(1, 0.3, skew_s, 0.0)[0])
+    assert isinstance(found, Shutters)
+    assert abs(found.skew_s - skew_s) < 4 * found.sigmas[0] < 4e-4
+
+
+def test_known_readout_is_held_and_stamps_that_differ_are_taken_into_account():
+    shots = recorded(2, 0.3, stamped_s=3e-3)[0]
+    known = Shutters(0.0, READOUT_S, np.zeros((2, 2)))
+    found = estimate_shutters(RIG, BODY, shots, known=known)
+    assert isinstance(found, Shutters)
+    assert found.readout_s == READOUT_S
+    assert abs(found.skew_s - SKEW_S) < 4 * found.sigmas[0]
+    blind = estimate_shutters(RIG, BODY, [replace(shot, apart_s=0.0) for shot in shots], known=known)
+    assert isinstance(blind, Missed) or blind.sigmas[0] > 3 * found.sigmas[0]
+
+
+def test_wrong_detections_do_not_move_the_skew():
+    shots = recorded(3, 0.3, readout_s=0.0)[0]
+    for shot in shots[::3]:
+        uv = np.array(shot.seen.uv)
+        uv[4, 1] += 8.0
+        shots[shots.index(shot)] = replace(shot, seen=replace(shot.seen, uv=uv))
+    found = estimate_shutters(RIG, BODY, shots)
+    assert isinstance(found, Shutters)
+    assert abs(found.skew_s - SKEW_S) < 2e-4
+
+
+def test_slow_and_short_motions_are_rejected_with_a_reason():
+    still = estimate_shutters(RIG, BODY, recorded(4, 0.0)[0])
+    slow = estimate_shutters(RIG, BODY, recorded(4, 0.01)[0], readout=True)
+    short = estimate_shutters(RIG, BODY, recorded(4, 0.3, count=5)[0])
+    assert isinstance(still, Missed)
+    assert "slow" in still.reason
+    assert isinstance(slow, Missed)
+    assert "slow" in slow.reason
+    assert isinstance(short, Missed)
+    assert "3 shots" in short.reason
+
+
+def test_moved_to_one_time_a_moving_body_is_measured_as_by_synchronised_cameras():
+    def rms_and_nees(shots, truth, shutters):
+        results = [r for r, _ in measure_moving(RIG, BODY, shots, shutters)]
+        assert all(isinstance(r, PoseEstimate) for r in results)
+        gaps = [
+            r.T_left_body[:3, :3].T @ (T[:3, 3] - r.T_left_body[:3, 3]) for r, T in zip(results, truth, strict=True)
+        ]
+        nees = [g @ np.linalg.solve(r.cov[:3, :3], g) / 3 for g, r in zip(gaps, results, strict=True)]
+        return np.sqrt(np.mean(np.square(gaps))), np.mean(nees)
+
+    apart, together = recorded(5, 0.3), recorded(5, 0.3, 0.0, 0.0)
+    found = estimate_shutters(RIG, BODY, apart[0], readout=True)
+    as_it_is, _ = rms_and_nees(*apart, NOTHING)
+    corrected, nees = rms_and_nees(*apart, found)
+    reference, _ = rms_and_nees(*together, NOTHING)
+    assert as_it_is > 10 * reference
+    assert corrected < 1.5 * reference
+    assert 0.5 < nees < 1.6
+    unsure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.diag([1e-6, 0.0])))
+    sure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.zeros((2, 2))))
+    assert all(np.trace(a.cov[:3, :3]) > np.trace(b.cov[:3, :3]) for (a, _), (b, _) in zip(unsure, sure, strict=True))
+
+
+def test_skew_that_varies_is_followed_from_shot_to_shot():
+    jitter_s = 4e-3
+    shots, truth = recorded(6, 0.3, readout_s=0.0, stamped_s=jitter_s, count=40)
+    shots = [replace(shot, apart_s=0.0) for shot in shots]
+    found = estimate_shutters(RIG, BODY, shots)
+    assert isinstance(found, Shutters)
+    assert abs(found.skew_s - SKEW_S) < 4 * found.sigmas[0]
+    assert 0.6 * jitter_s < found.jitter_s < 1.5 * jitter_s
+    results = [r for r, _ in measure_moving(RIG, BODY, shots, found)]
+    blind = [r for r, _ in measure_moving(RIG, BODY, shots, replace(found, jitter_s=0.0))]
+
+    def gaps(estimates):
+        pairs = [(r.T_left_body, T) for r, T in zip(estimates, truth, strict=True) if isinstance(r, PoseEstimate)]
+        return [T[:3, :3].T @ (T_true[:3, 3] - T[:3, 3]) for T, T_true in pairs]
+
+    assert all(isinstance(r, PoseEstimate) for r in results)
+    assert np.sqrt(np.mean(np.square(gaps(results)))) < np.sqrt(np.mean(np.square(gaps(blind)))) / 5
+    nees = [g @ np.linalg.solve(r.cov[:3, :3], g) / 3 for g, r in zip(gaps(results), results, strict=True)]
+    assert 0.5 < np.mean(nees) < 1.8
