@@ -65,7 +65,7 @@ class Shutters(Record):
 
     def __str__(self) -> str:
         """Return both in ms with their sigmas, for people."""
-        skew, readout = (f" ± {1e3 * s:.2f}" if s > 0 else "" for s in self.sigmas)
+        skew, readout = (f" ± {1e3 * s:.2g}" if s > 0 else "" for s in self.sigmas)
         late = "right" if self.skew_s >= 0 else "left"
         rolling = f", readout {1e3 * self.readout_s:.2f}{readout} ms" if self.readout_s or readout else ""
         jitter = f", {1e3 * self.jitter_s:.2f} ms RMS from shot to shot" if self.jitter_s else ""
