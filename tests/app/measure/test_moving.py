@@ -38,9 +38,11 @@ def late(tmp_path_factory):
     return folder, rig, at(t_s)
 
 
-def rms_mm(said, truth):
-    assert said.code == 0, said.err
-    gaps = [np.array(r["position_m"]) - T[:3, 3] for r, T in zip(said.lines, truth, strict=True) if r["status"] == "ok"]
+def rms_mm(said, truth, code=0):
+    assert said.code == code, said.err
+    gaps = [
+        np.array(r["position_m"]) - T[:3, 3] for r, T in zip(said.lines, truth, strict=False) if r["status"] == "ok"
+    ]
     return 1e3 * np.sqrt(np.mean(np.square(gaps)))
 
 
@@ -51,8 +53,8 @@ def test_the_skew_is_noted_found_and_used(late, armsight, tmp_path):
     assert "do not expose at one time: skew 5." in as_it_is.err or "do not expose at one time: skew 4.9" in as_it_is.err
     found = armsight(*start, "--skew", "find", "-o", tmp_path / "poses.csv", "--view", tmp_path / "view")
     given = armsight(*start, "--skew", "5ms")
-    assert rms_mm(found, truth) < rms_mm(as_it_is, truth) / 5
-    assert rms_mm(given, truth) < rms_mm(as_it_is, truth) / 5
+    assert rms_mm(found, truth) < rms_mm(as_it_is, truth, code=3) / 5
+    assert rms_mm(given, truth) < rms_mm(as_it_is, truth, code=3) / 5
     assert "(right later)" in found.err
     assert all(abs(r["shutters"]["skew_s"] - SKEW_S) < 2e-4 for r in found.lines)
     assert all(r["shutters"]["covariance_s2"][0][0] == 0 for r in given.lines)

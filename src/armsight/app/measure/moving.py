@@ -12,11 +12,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import click
 import numpy as np
 
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.errors import InputError
+from armsight.loop.health.record import HealthFinding
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
 
@@ -111,15 +111,23 @@ def _shutters(rig: StereoRig, body: Body, shots: Sequence[TimedShot], requested:
     return found
 
 
-def note_skew(rig: StereoRig, body: Body, first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> None:
-    """Print a note where shots that were measured as simultaneous show that they are not."""
+def skew_finding(
+    rig: StereoRig, body: Body, first: Sequence[tuple[float | None, PoseEstimate | Missed]]
+) -> HealthFinding | None:
+    """Return what is wrong where shots that were measured as simultaneous show that they are not, or None."""
     measured = [(t, r) for t, r in first if t is not None and isinstance(r, PoseEstimate)]
     times = [t for t, _ in measured]
     if any(b <= a for a, b in itertools.pairwise(times)):
-        return
+        return None
     found = estimate_shutters(rig, body, [_timed(*each) for each in measured]) if measured else Missed("")
-    if isinstance(found, Shutters) and abs(found.skew_s) > max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
-        click.echo(
-            f"note: the cameras do not expose at one time: {found}; --skew find moves the detections to one time",
-            err=True,
-        )
+    if not isinstance(found, Shutters) or abs(found.skew_s) <= max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
+        return None
+    return HealthFinding(
+        "time",
+        f"the cameras do not expose at one time: {found}",
+        times[0],
+        1e3 * found.skew_s,
+        1e3 * float(found.sigmas[0]),
+        "ms",
+        "--skew find moves the detections to one time",
+    )

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, note_skew, requested_shutters
+from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, requested_shutters, skew_finding
 from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
@@ -101,6 +101,7 @@ def measure_shots(
     results: Iterator[Result]
     total: int | None
     discs: DiscTarget | None = None
+    skewed: list[HealthFinding] = []
     with contextlib.ExitStack() as stack:
         if detections is not None:
             body = open_body(target)
@@ -123,7 +124,7 @@ def measure_shots(
                     click.echo(f"note: {rig} has {stereo.shutters}, not used: no recording with times", err=True)
             if requested is None:
                 results = _measured(stereo, found, _shots(opened, stereo, rig))
-                results = _noted(stereo, body, results) if timed else results
+                results = _noted(stereo, body, results, skewed) if timed else results
             else:
                 again = _opened(left, right, source) if folder is not None else None
                 if again is not None:
@@ -143,7 +144,8 @@ def measure_shots(
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
-    health = monitor.findings()
+    # Of a moving body a skew looks like cameras that moved against each other.
+    health = (*skewed, *(found for found in monitor.findings() if not skewed or found.cause != "rig"))
     for line in health_lines(health):
         click.echo(weak(line), err=True, color=colour())
     if as_json and health:
@@ -163,14 +165,16 @@ def _timed(source: Source) -> bool:
     return isinstance(source, VideoSource)
 
 
-def _noted(rig: StereoRig, body: Body, results: Iterator[Result]) -> Iterator[Result]:
-    """Yield the results, and say at the end where they show that the cameras do not expose at one time."""
+def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
+    """Yield the results, and add to ``skewed`` at the end where they show that the cameras do not expose at one time."""
     first: list[tuple[float | None, PoseEstimate | Missed]] = []
     for result in results:
         if len(first) < NOTED_SHOTS:
             first.append((result[0].t_s, result[1]))
         yield result
-    note_skew(rig, body, first)
+    found = skew_finding(rig, body, first)
+    if found is not None:
+        skewed.append(found)
 
 
 def _moved(
