@@ -288,6 +288,8 @@ class RunData(Record):
         modes: (M,) basis of each command.
         missed: number of shots that gave no pose.
         rejected: number of pose measurements that the estimator rejected.
+        reopened: how many times measurements contradicted what the estimator had learned, so that it opened it again.
+        misfit_max: the largest misfit of a measured pose; 1 without one.
     """
 
     t_s: Array
@@ -304,6 +306,8 @@ class RunData(Record):
     modes: NDArray[np.str_]
     missed: int
     rejected: int
+    reopened: int
+    misfit_max: float
 
 
 def assembled(
@@ -359,6 +363,8 @@ def assembled(
         np.array(log.modes),
         len(log.poses) - len(seen),
         sum(outcome in (Outcome.OUTLIER, Outcome.TOO_LATE) for outcome in log.outcomes),
+        log.outcomes.count(Outcome.REOPENED),
+        max((pose.misfit for _, _, pose in log.poses if isinstance(pose, PoseEstimate)), default=1.0),
     )
 
 

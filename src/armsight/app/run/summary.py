@@ -85,11 +85,18 @@ class HandEyeSummary:
 
 @dataclass(frozen=True)
 class ShotCounts:
-    """Numbers of shots: measured, missed (no pose), rejected by the estimator."""
+    """Numbers of shots: measured, missed (no pose), rejected by the estimator.
+
+    Attributes:
+        reopened: how many times measurements contradicted what the estimator had learned, so that it opened it again.
+        misfit_max: the largest misfit of a measured pose, 1 where the residuals are within chance.
+    """
 
     measured: int
     missed: int
     rejected: int
+    reopened: int
+    misfit_max: float
 
 
 @dataclass(frozen=True)
@@ -235,7 +242,7 @@ def summary_of(
         spread(run.latency_s) if len(run.latency_s) else None,
         HandEyeSummary(*result.handeye.found.held_out.rms(), len(result.handeye.q)),
         (result.delay.delay_s, result.delay.sigma_s),
-        ShotCounts(len(run.vision), run.missed, run.rejected),
+        ShotCounts(len(run.vision), run.missed, run.rejected, run.reopened, run.misfit_max),
         studies,
         result.health,
     )

@@ -230,11 +230,15 @@ class RigWatch:
         self._window.add(self._test, 1.0)
         self._test = _Sums(self._size, 0.0)
         change = self._estimated(self._window)
-        by_fault, variance = self._effect
-        shift = by_fault @ change.f
-        alarm = change.chi_square > _ALARM and float(shift @ shift) > variance
+        alarm = change.chi_square > _ALARM and self._matters(change, slice(0, 6))
         self.suspected = change if alarm else None
         self._alarmed = self._alarmed or alarm
+
+    def _matters(self, change: RigChange, part: slice) -> bool:
+        """Return whether a part of the six numbers moves the newest pose by more than the claimed sigma of its position."""
+        by_fault, variance = self._effect
+        shift = by_fault[:, part] @ change.f[part]
+        return float(shift @ shift) > variance
 
     def _estimated(self, sums: _Sums) -> RigChange:
         """Return the six numbers from sums, everything else eliminated."""
@@ -281,8 +285,9 @@ class RigWatch:
             return ()
         began_s, change = self._since()
         since_s = began_s if self._timed else None
-        rig_needed = change.chi_square - change.scale_alone > chdtri(5, _NECESSARY)
-        scale_needed = change.chi_square - change.rig_alone > chdtri(1, _NECESSARY)
+        rig_more, scale_more = change.chi_square - change.scale_alone, change.chi_square - change.rig_alone
+        rig_needed = rig_more > chdtri(5, _NECESSARY) and self._matters(change, slice(0, 5))
+        scale_needed = scale_more > chdtri(1, _NECESSARY) and self._matters(change, slice(5, 6))
         found = []
         if rig_needed or (not scale_needed and change.rig_alone >= change.scale_alone):
             found.append(_rig_finding(change, since_s, alone=not rig_needed))
