@@ -29,6 +29,8 @@ from armsight.robot.boards.codes import BoardState
 from armsight.robot.trajectories import point_to_point
 
 ARM = open_arm("six_r")
+#: A rig of which nothing is known, so that nothing can be tested.
+UNKNOWN = SimpleNamespace(cov=np.zeros((30, 30)))
 
 
 class Standing:
@@ -55,7 +57,7 @@ class Standing:
 class Blind:
     """A follower that never finds the body."""
 
-    rig, way = None, "followed"
+    rig, way = UNKNOWN, "followed"
 
     def measure(self, shot, expected=None):
         return Missed("nothing is seen")
@@ -194,7 +196,7 @@ def test_a_board_that_faults_while_something_is_computed_is_reported_at_once():
 
 def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     board = Standing()
-    slow = SimpleNamespace(rig=None, way="followed")
+    slow = SimpleNamespace(rig=UNKNOWN, way="followed")
 
     def measure(shot, expected=None):
         sent = len(board.sent)
