@@ -21,7 +21,7 @@ from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
 
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-#: A skew beyond so many sigmas, and so many seconds, is worth a note; from the first so many shots.
+#: A skew beyond so many sigmas, and so many seconds, is said; from the first so many shots.
 _NOTED_SIGMAS, _NOTED_S, NOTED_SHOTS = 5.0, 1e-4, 200
 
 

@@ -144,8 +144,13 @@ def measure_shots(
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
-    # Of a moving body a skew looks like cameras that moved against each other.
-    health = (*skewed, *(found for found in monitor.findings() if not skewed or found.cause != "rig"))
+    health = monitor.findings()
+    if skewed and any(found.cause == "rig" for found in health):
+        # Of a moving body a skew looks like cameras that moved against each other.
+        health = (*skewed, *(found for found in health if found.cause != "rig"))
+    else:  # a skew that changes no pose by more than its sigma
+        for found in skewed:
+            click.echo(f"note: {found.what}; {found.advice}", err=True)
     for line in health_lines(health):
         click.echo(weak(line), err=True, color=colour())
     if as_json and health:

@@ -181,9 +181,8 @@ class RigWatch:
         late = A @ self._skew(estimate.T_left_body, now_s)
         late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
         along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
-        whole = rest.T @ rest - np.outer(along, along) / (
-            1.0 + k2
-        )  # Sherman and Morrison: the skew has a variance of 1
+        # The skew, of variance 1, is eliminated (Sherman and Morrison).
+        whole = rest.T @ rest - np.outer(along, along) / (1.0 + k2)
         sums = _Sums(self._size, now_s)
         sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
         return sums, -gain[:, :-1] @ self._by_fault
