@@ -145,12 +145,12 @@ def measure_shots(
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     health = monitor.findings()
-    if skewed and any(found.cause == "rig" for found in health):
+    if skewed and any(each.cause == "rig" for each in health):
         # Of a moving body a skew looks like cameras that moved against each other.
-        health = (*skewed, *(found for found in health if found.cause != "rig"))
+        health = (*skewed, *(each for each in health if each.cause != "rig"))
     else:  # a skew that changes no pose by more than its sigma
-        for found in skewed:
-            click.echo(f"note: {found.what}; {found.advice}", err=True)
+        for skew in skewed:
+            click.echo(f"note: {skew.what}; {skew.advice}", err=True)
     for line in health_lines(health):
         click.echo(weak(line), err=True, color=colour())
     if as_json and health:
