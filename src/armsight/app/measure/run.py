@@ -149,8 +149,8 @@ def measure_shots(
         # Of a moving body a skew looks like cameras that moved against each other.
         health = (*skewed, *(each for each in health if each.cause != "rig"))
     else:  # a skew that changes no pose by more than its sigma
-        for skew in skewed:
-            click.echo(f"note: {skew.what}; {skew.advice}", err=True)
+        for late in skewed:
+            click.echo(f"note: {late.what}; {late.advice}", err=True)
     for line in health_lines(health):
         click.echo(weak(line), err=True, color=colour())
     if as_json and health:
