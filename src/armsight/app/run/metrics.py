@@ -93,10 +93,11 @@ class TrackMetrics:
 
 @dataclass(frozen=True)
 class Spread:
-    """Percentiles of values: median, 99th, maximum; in their unit."""
+    """Percentiles of values: median, 99th, 99.9th, maximum; in their unit."""
 
     p50: float
     p99: float
+    p999: float
     max: float
 
 
@@ -179,6 +180,6 @@ def rms(values: Array) -> float:
 
 
 def spread(values: Array) -> Spread:
-    """Return median, 99th percentile and maximum."""
-    p50, p99 = np.percentile(values, [50, 99])
-    return Spread(float(p50), float(p99), float(np.max(values)))
+    """Return median, 99th and 99.9th percentile and maximum."""
+    p50, p99, p999 = np.percentile(values, [50, 99, 99.9])
+    return Spread(float(p50), float(p99), float(p999), float(np.max(values)))
