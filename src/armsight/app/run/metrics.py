@@ -124,11 +124,12 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
 
 
 def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
-    """Return the RMS distance of the tool from its reference in the last fifth of a second of each rest, m."""
+    """Return the RMS distance of the tool from its reference in the last fifth of a second of each rest that is as long, m."""
     found = {}
     for segment in run.segments:
         rows = (run.reference.t_s > segment.end_s - _SETTLED_S) & (run.reference.t_s <= segment.end_s)
-        if segment.phase == "rest" and segment.motion and rows.any():
+        long = segment.end_s - segment.begin_s >= _SETTLED_S - 1e-6
+        if segment.phase == "rest" and segment.motion and long and rows.any():
             off = truth.at(run.reference.t_s[rows])[:, :3, 3] - run.reference.Ts_base_tool[rows, :3, 3]
             found[segment.motion] = float(np.sqrt((off**2).sum(axis=1).mean()))
     return found
