@@ -262,7 +262,7 @@ def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult
     log = Log()
     loop = Loop.open(
         setup,
-        Follower(rig, setup.target),
+        Follower(rig, setup.target, setup.sync_s),
         log,
         KalmanEstimator(setup.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
     )

@@ -31,7 +31,7 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
 
 #: Largest difference of the joints from the start of the motion before anything moves, rad.
 START_RAD = float(np.radians(2.0))
@@ -131,6 +131,7 @@ class RunResult:
         log: everything that was measured and commanded.
         handeye: the hand-eye calibration; None before it was made.
         delay: delay of the cameras' time stamps.
+        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
         open_s: begin and end of the pass with potentiometers alone, board's clock, s; None before.
         closed_s: begin and end of the pass with the loop closed.
         covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
@@ -146,6 +147,7 @@ class RunResult:
     log: Log = field(default_factory=Log)
     handeye: HandEyeRun | None = None
     delay: Delay = _UNKNOWN_DELAY
+    shutters: Shutters | None = None
     open_s: tuple[float, float] | None = None
     closed_s: tuple[float, float] | None = None
     covered_s: tuple[float, float] | None = None
@@ -211,7 +213,7 @@ def _run(
     loop: Loop | None = None
     try:
         progress("preparing to follow the body")
-        follower = Follower(rig, setup.target)
+        follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
         loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
@@ -267,6 +269,7 @@ def _prepare(
     progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
+    outcome.shutters = loop.shutters
     back = point_to_point(arm, middle, plan.start)
     there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
     loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))

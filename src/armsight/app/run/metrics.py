@@ -124,7 +124,7 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
 
 
 def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
-    """Return the RMS distance of the tool from its reference in the last fifth of a second of each rest that is as long, m."""
+    """Return the RMS distance of the tool from its reference over the last fifth of a second of each rest as long, m."""
     found = {}
     for segment in run.segments:
         rows = (run.reference.t_s > segment.end_s - _SETTLED_S) & (run.reference.t_s <= segment.end_s)
