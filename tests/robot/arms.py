@@ -32,9 +32,9 @@ def plain(name, a, d, alpha, **more):
         np.array(a),
         np.array(d),
         np.deg2rad(alpha),
-        np.full(6, -2 * np.pi),
-        np.full(6, 2 * np.pi),
-        *np.full((3, 6), 1.0),
+        np.full(len(a), -2 * np.pi),
+        np.full(len(a), 2 * np.pi),
+        *np.full((3, len(a)), 1.0),
         **more,
     )
 
@@ -71,13 +71,18 @@ IDENTIFIED = [
 ]
 
 #: Arms whose inverse is a closed form.
+CLOSED = {name: arm for name, arm in MODELS.items() if arm.joints == 6 and arm.table[KIND]}
 EXACT = [
-    *(arm for arm in MODELS.values() if arm.joints == 6 and arm.table[KIND]),
+    *CLOSED.values(),
     CRAIG,
     TO_AND_FRO,
     *(odd(MODELS[name], f"odd_{name}", i) for i, name in enumerate(("six_r", "ur10", "puma560"))),
 ]
 ALL = [*EXACT, *IDENTIFIED, GENERAL]
+#: Four joints: turning base, two parallel axes, a wrist across them.
+FOUR = plain("four", [0.02, 0.3, 0.25, 0.0], [0.2, 0.03, 0.0, 0.1], [90, 0, 90, 0])
+#: A PUMA 560 whose third motor turns its forearm against the ground: J3' = J3 + J2.
+COUPLED = dataclasses.replace(MODELS["puma560"], name="coupled", coupling=np.eye(6) + np.eye(6)[2][:, None] * np.eye(6)[1])
 #: Arms of other than six joints.
 OTHERS = [arm for arm in MODELS.values() if arm.joints != 6]
 

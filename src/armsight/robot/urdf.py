@@ -39,7 +39,7 @@ FAR = 1e6
 PROBES = 16
 _MOVING = ("revolute", "continuous", "prismatic", "floating", "planar")
 #: A last joint of such a name is a gripper's.
-_GRIPPERS = ("gripper", "jaw", "finger")
+_GRIPPERS = ("grip", "jaw", "finger")
 
 
 class _Joint(NamedTuple):

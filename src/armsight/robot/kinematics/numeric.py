@@ -134,7 +134,7 @@ def _step(J: Array, e: Array, q: Array, low: Array, high: Array, damping: float,
 def _descend(table: Array, G: Frame, q: Array, low: Array, high: Array, work: Array) -> float:
     """Move joint angles (n,) in-place towards a frame, within bounds; return the weighted squared error that is left."""
     n = q.shape[0]
-    J, A, e, g, step, trial = work[0:6], work[6:13], work[13], work[14], work[15], work[16]
+    J, A, e, g, step, trial = work[0:6], work[6:13], work[13], work[14], work[15], work[16, :n]
     F = jacobian_base(table, q, J)
     pose_error(F, G, e)
     cost = _weigh(F, n, J, e)
