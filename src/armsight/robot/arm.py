@@ -12,6 +12,7 @@ import itertools
 import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from statistics import mode
 from typing import Literal
 
 import numpy as np
@@ -106,7 +107,7 @@ class Arm(Record):
         Raises:
             InputError: a wrong shape, a value that is not finite, or a limit that is not positive.
         """
-        joints = np.size(self.a)
+        joints = mode(np.size(getattr(self, name)) for name in ("a", "d", "alpha", "q_min", "q_max"))
         if not FEWEST_JOINTS <= joints <= MOST_JOINTS:
             raise InputError(f"{self.name}: {joints} joints; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}")
         given = {name: np.full(joints, value) for name, value in _DEFAULTS.items()} | {"coupling": np.eye(joints)}

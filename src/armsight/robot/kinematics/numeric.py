@@ -38,8 +38,11 @@ _SPREAD = 1.0969815577985598
 #: Steps along the free motion, the furthest of them, rad, the share of a joint's range from its middle from which on it is
 #: pushed back, and how strongly.
 _SLIDES, _SLIDE_RAD, _EDGE, _PUSH = 8, 0.3, 0.85, 100.0
-#: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the levels' damping.
-_LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM, _SOFT = 60, 0.3, 1e-13, 1e-14, 1e-6
+#: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the damping of the position.
+_LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
+#: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a radian
+#: the wrist would turn over.
+_WEAK = 1e-2
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -260,40 +263,69 @@ def _slide(table: Array, limits: Array, G: Frame, goal: Array, q: Array, work: A
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
-def _level(J: Array, e: Array, first: int, past: int, n: int, damping: float, step: Array, count: int, work: Array) -> int:
-    """Add to a step (n,) what rows ``first`` to ``past`` of J still need, in what the rows before leave free."""
-    A, rows, g, y, B = work[6:13], work[20:27, :n], work[14], work[18], work[28:31]
-    m = past - first
-    for k in range(m):
-        left = e[first + k]
-        for i in range(n):
-            B[k, i] = J[first + k, i]
-            left -= J[first + k, i] * step[i]
-        for j in range(count):
-            along = 0.0
-            for i in range(n):
-                along += rows[j, i] * B[k, i]
-            for i in range(n):
-                B[k, i] -= along * rows[j, i]
-        g[k] = left
-    for k in range(m):
-        for j in range(k, m):
+def _free_part(row: Array, rows: Array, count: int) -> None:
+    """Take out of a row (n,) what lies in orthonormal rows."""
+    for k in range(count):
+        along = 0.0
+        for i in range(row.shape[0]):
+            along += rows[k, i] * row[i]
+        for i in range(row.shape[0]):
+            row[i] -= along * rows[k, i]
+
+
+@kernel(nogil=True, fastmath={"contract", "nsz"})
+def _position_level(J: Array, e: Array, n: int, step: Array, work: Array) -> int:
+    """Write the least step (n,) that meets the position, and orthonormal rows of the motions used; return their number."""
+    A, rows, g, y, row = work[6:13], work[20:27, :n], work[14], work[18], work[28, :n]
+    for k in range(3):
+        g[k] = e[k]
+        for j in range(k, 3):
             total = 0.0
             for i in range(n):
-                total += B[k, i] * B[j, i]
+                total += J[k, i] * J[j, i]
             A[k, j] = total
-    if _solve(A, g, m, damping, y):
-        for i in range(n):
-            for k in range(m):
-                step[i] += g[k] * B[k, i]
-    for k in range(m):
-        row = B[k, :n]
-        size = 0.0
-        for i in range(n):
-            size += row[i] * row[i]
-        if size > 1e-9:
-            count = _added(row, rows, count)
+    good, count = _solve(A, g, 3, _FIRM, y), 0
+    for i in range(n):
+        step[i] = g[0] * J[0, i] + g[1] * J[1, i] + g[2] * J[2, i] if good else 0.0
+    for k in range(3):
+        row[:] = J[k, :n]
+        count = _added(row, rows, count)
     return count
+
+
+@kernel(nogil=True, fastmath={"contract", "nsz"})
+def _row_level(J: Array, e: Array, k: int, n: int, step: Array, count: int, work: Array) -> int:
+    """Add to a step (n,) what row k of J still needs of the motions left free; not where those hardly change it."""
+    rows, row = work[20:27, :n], work[28, :n]
+    left, size = e[k], 0.0
+    for i in range(n):
+        left -= J[k, i] * step[i]
+    row[:] = J[k, :n]
+    _free_part(row, rows, count)
+    for i in range(n):
+        size += row[i] * row[i]
+    if size < _WEAK:
+        return count
+    for i in range(n):
+        step[i] += left / size * row[i]
+    return _added(row, rows, count)
+
+
+@kernel(nogil=True, fastmath={"contract", "nsz"})
+def _part_axis_rows(J: Array, e: Array, n: int, count: int, work: Array) -> None:
+    """Rotate rows 3 and 4 of J, and their errors, so that what is left free of them is perpendicular: strong and weak."""
+    rows, one, two = work[20:27, :n], work[28, :n], work[29, :n]
+    one[:], two[:] = J[3, :n], J[4, :n]
+    _free_part(one, rows, count)
+    _free_part(two, rows, count)
+    a = b = m = 0.0
+    for i in range(n):
+        a, b, m = a + one[i] * one[i], b + two[i] * two[i], m + one[i] * two[i]
+    angle = 0.5 * math.atan2(2.0 * m, a - b)
+    c, s = math.cos(angle), math.sin(angle)
+    for i in range(n):
+        J[3, i], J[4, i] = c * J[3, i] + s * J[4, i], c * J[4, i] - s * J[3, i]
+    e[3], e[4] = c * e[3] + s * e[4], c * e[4] - s * e[3]
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -328,16 +360,15 @@ def _errors_by_level(F: Frame, G: Frame, J: Array, n: int, e: Array) -> None:
 def _by_priority(table: Array, G: Frame, q: Array, low: Array, high: Array, work: Array) -> None:
     """Move joint angles (n,) in-place: the position first, then the direction of the z axis, then the rotation about it."""
     n = q.shape[0]
-    J, e, step = work[0:6], work[13], work[15]
+    J, e, step = work[0:6], work[13], work[15, :n]
     for _ in range(_LEVEL_STEPS):
         F = jacobian_base(table, q, J)
         _errors_by_level(F, G, J, n, e)
         for _ in range(n):
-            for i in range(n):
-                step[i] = 0.0
-            count = _level(J, e, 0, 3, n, _FIRM, step, 0, work)
-            count = _level(J, e, 3, 5, n, _SOFT, step, count, work)
-            _level(J, e, 5, 6, n, _SOFT, step, count, work)
+            count = _position_level(J, e, n, step, work)
+            _part_axis_rows(J, e, n, count, work)
+            for k in range(3, 6):
+                count = _row_level(J, e, k, n, step, count, work)
             again = False
             for i in range(n):
                 if (q[i] <= low[i] and step[i] < 0.0) or (q[i] >= high[i] and step[i] > 0.0):
@@ -404,7 +435,7 @@ def inverse(
         if cost < _NONE:
             exact = True
             break
-        if n < 6 and k >= _STARTS // 4:
+        if n < 6 and k >= _STARTS // 2:
             break
     if exact and n > 6:
         _slide(table, limits, G, goal, q, work)
