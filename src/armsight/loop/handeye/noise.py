@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
-from scipy.special import gammaln
 
 from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse
@@ -52,8 +51,8 @@ SHARED = ("robot drifting over its poses", "robot drifting over time", "camera w
 OF_THE_ARM = ("flange_m", "flange_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
-#: Variances are looked for between the squares of these (m, rad, s, or a factor).
-LOW, HIGH = 1e-7, 0.3
+#: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
+LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +129,9 @@ def walk_gathered(poses: Poses) -> dict[str, Array]:
 def pose_kernel(A: Array) -> Array:
     """Return the correlation (N, N) of a smooth error between poses (N, 4, 4)."""
     way = np.sum((A[:, None, :3, 3] - A[None, :, :3, 3]) ** 2, axis=-1)
-    cosine = (np.einsum("iab,jab->ij", A[:, :3, :3], A[:, :3, :3]) - 1) / 2
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    return np.asarray(np.exp(-0.5 * (way / FORGETS_M**2 + (angle / FORGETS_RAD) ** 2)))
+    # Chords, not angles: an exponential of squared angles is no covariance (Feragen et al., CVPR 2015).
+    chords = 3 - np.einsum("iab,jab->ij", A[:, :3, :3], A[:, :3, :3])
+    return np.asarray(np.exp(-0.5 * (way / FORGETS_M**2 + chords / FORGETS_RAD**2)))
 
 
 def time_kernel(t_s: Array) -> Array:
@@ -150,12 +149,14 @@ class Blocks(Record):
         J: (n, m, P) their derivative.
         given: (n, m, m) what is given.
         parts: (K, n, m, m) what unit variances of the sources cause.
+        sources: their K names.
     """
 
     e: Array
     J: Array
     given: Array
     parts: Array
+    sources: tuple[str, ...]
 
     def covariance(self, variances: Array) -> Array:
         """Return the covariance (n, m, m)."""
@@ -174,7 +175,7 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     if "image" in sources:
         own["image"] = linear.given
     if structure not in SHARED:
-        return Blocks(linear.e, linear.J, given, np.array([own[name] for name in sources]))
+        return Blocks(linear.e, linear.J, given, np.array([own[name] for name in sources]), sources)
     parts = []
     for name in sources:
         if name in own:
@@ -191,6 +192,7 @@ def blocks(linear: Linear, structure: str) -> Blocks:
         linear.J.reshape(1, 6 * n, -1),
         _spread(given)[None],
         np.array(parts)[:, None],
+        sources,
     )
 
 
@@ -208,26 +210,47 @@ def _spread(own: Array) -> Array:
     return M.reshape(6 * n, 6 * n)
 
 
-def solve(b: Blocks, variances: Array) -> tuple[Array, Array, Array, Array, float]:
-    """Solve the weighted least squares.
+@dataclass(frozen=True, eq=False)
+class Solved(Record):
+    """The weighted least squares at given variances.
 
-    Returns:
-        (P,) the step x that minimises the squares of e + J x, (P, P) its covariance, (n, m, m) the inverse covariance of
-        the residuals, (n, m) the inverse covariance times what is left, and minus the restricted log-likelihood.
+    Attributes:
+        x: (P,) the step that minimises the squares of e + J x.
+        root: (P, P) root @ root.T is its covariance.
+        inverse: (n, m, m) inverse covariance of the residuals.
+        weighted: (n, m) inverse covariance times what is left.
+        cost: minus the restricted log-likelihood.
     """
+
+    x: Array
+    root: Array
+    inverse: Array
+    weighted: Array
+    cost: float
+
+    @property
+    def cov(self) -> Array:
+        """(P, P) covariance of the step."""
+        return np.asarray(self.root @ self.root.T)
+
+
+def solve(b: Blocks, variances: Array) -> Solved:
+    """Solve the weighted least squares."""
     C = b.covariance(variances)
     L = np.linalg.cholesky(C)
     Ci = np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None]
     CiJ = Ci @ b.J
     H = np.einsum("nki,nkj->ij", b.J, CiJ)
-    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    cov = np.linalg.pinv(unit[:, None] * H * unit, hermitian=True, rcond=1e-14) * np.outer(unit, unit)
-    x = -cov @ np.einsum("nki,nk->i", CiJ, b.e)
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
+    values, vectors = np.linalg.eigh(unit[:, None] * H * unit)
+    values = np.maximum(values, 1e-14 * values[-1])
+    root = unit[:, None] * vectors / np.sqrt(values)
+    x = -root @ (root.T @ np.einsum("nki,nk->i", CiJ, b.e))
     left = b.e + b.J @ x
-    Pe = (Ci @ left[..., None])[..., 0]
+    weighted = (Ci @ left[..., None])[..., 0]
     logdet = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    value = 0.5 * (logdet + float(np.linalg.slogdet(H)[1]) + float((left * Pe).sum()))
-    return x, cov, Ci, Pe, value
+    logdet_H = float(np.log(values).sum() - 2 * np.log(unit).sum())
+    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + float((left * weighted).sum())))
 
 
 def _inverse(L: Array) -> Array:
@@ -236,18 +259,28 @@ def _inverse(L: Array) -> Array:
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
 
 
+def left_out_squares(b: Blocks, s: Solved) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's residual, predicted from all others; one block only."""
+    CiJ = s.inverse[0] @ b.J[0] @ s.root
+    n = b.e.size // 6
+    out = np.empty(n)
+    for k in range(n):
+        rows = slice(6 * k, 6 * k + 6)
+        own = s.inverse[0][rows, rows] - CiJ[rows] @ CiJ[rows].T
+        out[k] = float(s.weighted[0][rows] @ np.linalg.lstsq(own, s.weighted[0][rows], rcond=1e-12)[0])
+    return out
+
+
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     """Return minus the restricted log-likelihood, and its gradient by the logarithms of the variances."""
     variances = np.exp(logs)
-    _, cov, Ci, Pe, value = solve(b, variances)
-    CiJ = Ci @ b.J
+    s = solve(b, variances)
     n, m = b.e.shape
-    flat = b.parts.reshape(len(b.parts), n * m * m)
-    trace = flat @ Ci.reshape(-1)
-    root = CiJ @ np.linalg.cholesky(cov + 1e-14 * np.diag(np.diag(cov)))  # P = Ci - root root^T
-    projected = flat @ (root @ np.swapaxes(root, 1, 2)).reshape(-1)
-    squares = flat @ (Pe[:, :, None] * Pe[:, None, :]).reshape(-1)
-    return value, 0.5 * variances * (trace - projected - squares)
+    flat = b.parts.reshape(len(b.sources), n * m * m)
+    root = s.inverse @ b.J @ s.root  # the inverse covariance, projected: s.inverse - root root^T
+    projected = s.inverse - root @ np.swapaxes(root, 1, 2)
+    traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
+    return s.cost, 0.5 * variances * traces
 
 
 def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
@@ -258,21 +291,22 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
         start: (K,) variances to begin at.
         steps: iterations at most.
     """
-    low, high = 2 * np.log(LOW), 2 * np.log(HIGH * 100)
+    low = 2 * np.log(LOW)
+    bounds = [(low, 2 * np.log(HIGH_IMAGE if name == "image" else HIGH)) for name in b.sources]
     found = minimize(
         _value_and_gradient,
-        np.clip(np.log(start), low, high),
+        np.clip(np.log(start), *np.transpose(bounds)),
         args=(b,),
         jac=True,
         method="L-BFGS-B",
-        bounds=[(low, high)] * len(start),
+        bounds=bounds,
         options={"maxiter": steps, "ftol": 1e-7},
     )
     return np.asarray(np.exp(found.x))
 
 
 def held_out(
-    linear: Linear, structure: str, variances: Array, parts: list[NDArray[np.int64]], steps: int = 15
+    linear: Linear, structure: str, variances: Array, parts: list[NDArray[np.int64]], steps: int = 8
 ) -> tuple[Array, Array]:
     """Predict poses left out, part after part; the variances are estimated anew without them.
 
@@ -287,19 +321,19 @@ def held_out(
         others = np.setdiff1d(everything, part)
         rest = blocks(linear.rows(others), structure)
         again = reml(rest, variances, steps)
-        x, cov, Ci, Pe, _ = solve(rest, again)
-        mean, J = linear.e[part] + linear.J[part] @ x, linear.J[part]
+        fitted = solve(rest, again)
+        mean, J = linear.e[part] + linear.J[part] @ fitted.x, linear.J[part]
         residual[part] = mean
         if whole is None:
-            S = blocks(linear.rows(part), structure).covariance(again) + J @ cov @ np.swapaxes(J, 1, 2)
+            S = blocks(linear.rows(part), structure).covariance(again) + J @ fitted.cov @ np.swapaxes(J, 1, 2)
         else:
             C = whole.covariance(again)[0]
             of, frm = _lines(part), _lines(others)
-            gain = C[np.ix_(of, frm)] @ Ci[0]
+            gain = C[np.ix_(of, frm)] @ fitted.inverse[0]
             JJ = J.reshape(len(of), -1) - gain @ rest.J[0]
-            full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ cov @ JJ.T
+            full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ fitted.cov @ JJ.T
             S = np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(part))])
-            mean = mean - (C[np.ix_(of, frm)] @ Pe[0]).reshape(-1, 6)
+            mean = mean - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
         density[part] = _log_normal(mean, S)
     return density, residual
 
@@ -313,9 +347,3 @@ def _log_normal(e: Array, S: Array) -> Array:
     squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
     return np.asarray(-0.5 * (squares + np.linalg.slogdet(S)[1] + 6 * np.log(2 * np.pi)))
 
-
-def log_student(e: Array, S: Array, freedom: float) -> Array:
-    """Return the logarithm of Student's density of residuals (N, 6) with scale matrices (N, 6, 6)."""
-    squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
-    constant = gammaln((freedom + 6) / 2) - gammaln(freedom / 2) - 3 * np.log(freedom * np.pi)
-    return np.asarray(constant - 0.5 * np.linalg.slogdet(S)[1] - 0.5 * (freedom + 6) * np.log1p(squares / freedom))

@@ -36,6 +36,7 @@ from armsight.loop.handeye.noise import (
     blocks,
     error_maps,
     held_out,
+    left_out_squares,
     pose_kernel,
     reml,
     solve,
@@ -44,9 +45,9 @@ from armsight.loop.handeye.noise import (
 )
 
 #: Poses that variances and held-out likelihoods come from at most, evenly spread, and those of a shared error.
-MAX_VARIANCE, MAX_SHARED = 150, 50
+MAX_VARIANCE, MAX_SHARED = 150, 40
 #: Poses that the transforms come from at most, and those with a shared error.
-MAX_FIT, MAX_SHARED_FIT = 1000, 200
+MAX_FIT, MAX_SHARED_FIT = 1000, 120
 #: Fewest poses for a structure with shared errors.
 MIN_SHARED = 12
 #: Parts that are left out, one after the other.
@@ -59,6 +60,8 @@ OPEN_M, OPEN_RAD = 0.1, 0.1
 FREEDOM = 4.0
 #: A scale must be off by this many sigmas to be believed.
 SURELY = 5.0
+#: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
+HANGING = 1.0
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -111,19 +114,23 @@ class StructuredHandEye(Record):
 
 @dataclass(frozen=True, eq=False)
 class _Guess(Record):
-    """Transforms, scale and what is left of the time offset."""
+    """Transforms, scale and what is left of the time offset.
+
+    Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
+    body's noise: ``per_m`` of them make one metre.
+    """
 
     Z: Array
     X: Array
-    scale: float = 1.0
+    per_m: float = 1.0
     step_s: float = 0.0
 
     def moved(self, x: Array, free: tuple[bool, bool]) -> _Guess:
         """Return the guess after a step (P,) of Z, X and what is free of scale and time."""
         rest = list(x[12:])
-        scale = self.scale * float(np.exp(np.clip(rest.pop(0), -1, 1))) if free[0] else self.scale
+        per_m = self.per_m * float(np.exp(np.clip(rest.pop(0), -1, 1))) if free[0] else self.per_m
         step_s = self.step_s + float(np.clip(rest.pop(0), -0.05, 0.05)) if free[1] else self.step_s
-        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), scale, step_s)
+        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), per_m, step_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,24 +147,37 @@ class _Problem(Record):
         return _Problem(self.poses.rows(rows), t_s, None if self.speed is None else self.speed[rows], self.free)
 
     def scaled(self, guess: _Guess) -> Poses:
-        """Return the poses with the guess's scale and time."""
-        p, B = self.poses, self.poses.B.copy()
-        B[:, :3, 3] *= guess.scale
-        A = p.A if self.speed is None or guess.step_s == 0 else p.A @ exp_se3(guess.step_s * self.speed)
-        return Poses(A, B, p.cov, p.in_hand, p.centre * guess.scale)
+        """Return the poses with the guess's time, the flange's lengths in the body's unit."""
+        p = self.poses
+        A = p.A.copy() if self.speed is None or guess.step_s == 0 else p.A @ exp_se3(guess.step_s * self.speed)
+        A[:, :3, 3] *= guess.per_m
+        return Poses(A, p.B, p.cov, p.in_hand, p.centre)
 
     def linear(self, guess: _Guess) -> Linear:
         """Return the residuals at a guess, with what noise does to them; no shared sources."""
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
+        unit = np.repeat([guess.per_m, 1.0], 3)  # an error of the flange of 1 m, and of 1 rad
         if self.free[0]:
-            by_scale = np.zeros((len(e), 6, 1))
-            toward = np.swapaxes(poses.B[:, :3, :3], 1, 2) @ poses.B[:, :3, 3:]
-            by_scale[:, :3] = toward if poses.in_hand else -toward
-            J = np.concatenate([J, by_scale], axis=2)
+            way = np.zeros((len(e), 6, 1))
+            way[:, :3] = np.swapaxes(poses.A[:, :3, :3], 1, 2) @ poses.A[:, :3, 3:]
+            J = np.concatenate([J, carry @ way], axis=2)
+        carry = carry * unit
         if self.free[1] and self.speed is not None:
             J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
         return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed), {}, {})
+
+    def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
+        """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
+        change = np.eye(len(cov))
+        change[:3, :3] = change[6:9, 6:9] = np.eye(3) / guess.per_m
+        Z, X = guess.Z.copy(), guess.X.copy()
+        Z[:3, 3] /= guess.per_m
+        X[:3, 3] /= guess.per_m
+        if self.free[0]:
+            change[:3, 12] = -Z[:3, :3].T @ Z[:3, 3]
+            change[6:9, 12] = -X[:3, :3].T @ X[:3, 3]
+        return replace(guess, Z=Z, X=X), change @ cov @ change.T
 
     def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
         """Add the correlations of shared sources to residuals of the same rows."""
@@ -271,19 +291,20 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
     known, used_known = _robust(problem, _first(problem))
     free = replace(problem, free=(True, problem.free[1]))
-    factor = _first_scale(problem)
-    B = problem.poses.B.copy()
-    B[:, :3, 3] *= factor
-    p = problem.poses
-    scaled = replace(problem, poses=Poses(p.A, B, p.cov, p.in_hand, p.centre * factor))
-    guesses = [replace(guess, scale=factor) for guess in _first(scaled)]
+    per_m = 1 / _first_scale(problem)
+    scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
+    guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
     rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
     linear = free.rows(rows).linear(found)
     b = blocks(linear, "robot and camera")
-    x, cov, _, _, _ = solve(b, reml(b, _start_variances(linear, "robot and camera")))
-    sure = abs(np.log(found.scale) + x[12]) > SURELY * np.sqrt(cov[12, 12])
-    if sure and 1e-4 < found.scale < 1e4:
+    solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
+    sure = abs(np.log(found.per_m) + solved.x[12]) > SURELY * np.sqrt(solved.cov[12, 12])
+    (before_m, before_rad), (after_m, after_rad) = (
+        _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
+    )
+    gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
+    if (sure or gained > 1) and 1e-4 < found.per_m < 1e4:
         return free, found, used
     return problem, known, used_known
 
@@ -409,9 +430,12 @@ def _chosen(
         raise InputError(f"none of the structures {', '.join(structures)} can be told from these poses")
     gathered = walk_gathered(whole.scaled(guess)) if whole.t_s is not None and whole.poses.in_hand else {}
     simple = "robot and camera" if "robot and camera" in names else names[0]
-    guess, used, _ = _settled(whole, guess, used, simple, gathered)
+    guess, used, variances = _settled(whole, guess, used, simple, gathered)
+    hanging = _hanging(whole, guess, used, simple, variances, gathered)
     trials = {}
     for name in names:
+        if name in SHARED and name not in hanging:
+            continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
     best = max(trials, key=lambda name: trials[name][0])
@@ -419,24 +443,26 @@ def _chosen(
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, best, gathered)
-    x, cov, _, _, _ = solve(blocks(linear, best), variances)
+    solved = solve(blocks(linear, best), variances)
+    x, cov = solved.x, solved.cov
     guess = guess.moved(x, whole.free)
     freedom = max(linear.e.size - len(x) - len(variances), 6)
     # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
     cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
-    require_known(whole.poses, guess.Z, guess.X, cov)
+    metric, cov = whole.metric(guess, cov)
+    require_known(whole.poses, metric.Z, metric.X, cov)
     sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
-    arm, camera = _displacements(whole, linear, best, variances, rows, guess)
+    arm, camera = _displacements(whole, linear, best, variances, guess)
     rest = np.sqrt(np.diag(cov)[12:]).tolist()
     sigma_scale = rest.pop(0) if whole.free[0] else 0.0
     distance = _distances(whole, guess, best, variances, gathered)
     found = StructuredHandEye(
         eye="in_hand" if whole.poses.in_hand else "to_hand",
-        T_base_still=guess.Z,
-        T_flange_held=guess.X,
+        T_base_still=metric.Z,
+        T_flange_held=metric.X,
         cov=cov[:12, :12],
-        scale=guess.scale,
-        sigma_scale=guess.scale * sigma_scale,
+        scale=1 / guess.per_m,
+        sigma_scale=sigma_scale / guess.per_m,
         step_s=guess.step_s,
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
         structure=best,
@@ -444,11 +470,40 @@ def _chosen(
         likelihoods={name: trial[0] for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, trials[best][1], trials[best][2], used),
+        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][2]),
         used=used,
         distance=distance,
     )
     return found, used
+
+
+def _hanging(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
+) -> set[str]:
+    """Return the structures with shared errors that the residuals of neighbours speak for (Moran's test)."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT)
+    if structure in SHARED or len(rows) < MIN_SHARED:
+        return set(SHARED)
+    part = whole.rows(rows)
+    linear = part.shared(part.linear(guess), guess, {})
+    C = blocks(linear, structure).covariance(variances)
+    white = np.linalg.solve(np.linalg.cholesky(C), linear.e[..., None])[..., 0]
+    kernels = dict(linear.kernel)
+    if gathered:
+        n = len(rows)
+        kernels["camera walking"] = np.asarray(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) == 1, dtype=float)
+    found = set()
+    for name, K in kernels.items():
+        others = K - np.diag(np.diag(K))
+        moran = float(np.einsum("ik,ij,jk->", white, others, white)) / np.sqrt(2 * 6 * float((others**2).sum()))
+        if moran > HANGING:
+            found.add(name)
+    return found
 
 
 def _linear(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]) -> Linear:
@@ -468,15 +523,22 @@ def _settled(
     for _ in range(ROUNDS):
         few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
         linear = _linear(whole, guess, few, structure, gathered)
-        variances = reml(
-            blocks(linear, structure), _start_variances(linear, structure) if variances is None else variances
-        )
+        if variances is None:
+            variances = reml(blocks(linear, structure), _start_variances(linear, structure))
+        else:
+            variances = reml(blocks(linear, structure), variances, 10)
         rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
         linear = _linear(whole, guess, rows, structure, gathered)
-        x = solve(blocks(linear, structure), variances)[0]
+        b = blocks(linear, structure)
+        solved = solve(b, variances)
+        x = solved.x
         guess = guess.moved(x, whole.free)
-        far = _distances(whole, guess, structure, variances, gathered)
-        keep = far * 6 < chdtri(6, CHANCE)
+        if structure in SHARED:
+            far = left_out_squares(b, solved)
+            keep = used.copy()
+            keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
+        else:
+            keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
         if keep.sum() < max(MIN_POSES, len(keep) // 3):
             keep = used
         settled = bool((keep == used).all()) and float(np.abs(x).max()) < 1e-5
@@ -520,19 +582,20 @@ def _trial(
     return float(density.mean()), residual, rows
 
 
-def _held_out_errors(whole: _Problem, residual: Array, rows: NDArray[np.int64], used: NDArray[np.bool_]) -> HeldOut:
+def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
     """Return the distances of the body's middle and the angles, of the rows that were left out in turn."""
-    position, angle = np.full(len(used), np.nan), np.full(len(used), np.nan)
-    moved = residual[:, :3] - np.cross(whole.poses.centre, residual[:, 3:])
+    n = len(whole.poses.A)
+    position, angle = np.full(n, np.nan), np.full(n, np.nan)
+    moved = (residual[:, :3] - np.cross(whole.poses.centre, residual[:, 3:])) / guess.per_m
     position[rows], angle[rows] = np.linalg.norm(moved, axis=1), np.linalg.norm(residual[:, 3:], axis=1)
     return HeldOut(position, angle)
 
 
 def _displacements(
-    whole: _Problem, linear: Linear, structure: str, variances: Array, rows: NDArray[np.int64], guess: _Guess
+    whole: _Problem, linear: Linear, structure: str, variances: Array, guess: _Guess
 ) -> tuple[float, float]:
     """Return the RMS distances by which the arm's and vision's errors move the body's middle, m."""
-    middle = np.concatenate([np.eye(3), -skew(whole.poses.centre * guess.scale)], axis=1)
+    middle = np.concatenate([np.eye(3), -skew(whole.poses.centre)], axis=1) / guess.per_m
     arm = camera = 0.0
     for name, variance in zip(STRUCTURES[structure], variances, strict=True):
         if name == "image":
