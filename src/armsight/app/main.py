@@ -26,6 +26,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     },
     "Measure": {
         "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
+        "handeye": "Calibrate hand and eye from your own data: robot poses, and images or poses of a target.",
         "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
