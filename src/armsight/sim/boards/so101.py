@@ -283,14 +283,15 @@ class So101Bus:
         return bytes(self.tables[servo][address : address + count])
 
     def _answer(self, answers: list[tuple[int, bytes]]) -> None:
-        """Send answers that begin at the same time: where two servos answer, their bytes are pulled low together."""
+        """Send answers: where two servos answer to one id, the line is low where either pulls it low."""
         texts = []
         for servo, data in answers:
             body = bytes((self.ids[servo], len(data) + 2, 0)) + data
             texts.append(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)))
         if texts:
             text = texts[0]
-            for other in texts[1:]:
+            for late, begun in enumerate(texts[1:], 1):  # no two servos begin within a byte's time of 10 us
+                other = b"\xff" * late + begun
                 length = max(len(text), len(other))
                 pairs = zip(text.ljust(length, b"\xff"), other.ljust(length, b"\xff"), strict=True)
                 text = bytes(one & two for one, two in pairs)

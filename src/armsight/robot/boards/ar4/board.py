@@ -35,7 +35,7 @@ LATENCY_S = 0.05
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
-_POLL_S = 0.001
+_POLL_S, _DRAIN_S = 0.001, 0.05
 #: Homing of a group of joints: to the switches, away from them, to the rest position.
 _HOMING_S = 60.0
 _STOPS = 3
@@ -164,6 +164,8 @@ class Ar4Board:
         if command in (Command.ENABLE, Command.ENABLE_INWARD):
             self._take_over()
         elif command is Command.CLEAR_STOP:
+            self._enabled = False
+            self._listen(_DRAIN_S)  # answers to goals say what was before
             self._ask(lines.reset_stop(), Ar4Stopped)
             if self._stopped:
                 raise DeviceError(f"{self.name}: the emergency stop is still pressed")
@@ -361,6 +363,7 @@ class Ar4Board:
             elif not isinstance(answer, Ar4Text):
                 if isinstance(answer, Ar4Stopped):
                     self._stopped = answer.pressed
+                    self._enabled = self._enabled and not answer.pressed
                 found.append(answer)
             elif answer.heading is Heading.ERROR:
                 raise DeviceError(f"{self.name}: the Teensy reports: {answer.text}")

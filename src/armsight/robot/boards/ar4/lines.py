@@ -160,7 +160,7 @@ class LineReader:
         """Return the lines that are complete with these bytes."""
         self._data += data
         *lines, rest = self._data.split(b"\n")
-        self._data = bytearray(rest[-LONGEST:])
+        self._data = bytearray(rest[-LONGEST - 1 :])  # one more than a line has: broken, whatever follows
         found = []
         for line in lines:
             if len(line) <= LONGEST and line.isascii():

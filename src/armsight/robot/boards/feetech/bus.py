@@ -59,7 +59,7 @@ class ServoBus:
         self.name, self.baud, self.now = name, baud, now
         self._link = link
         self._reader = PacketReader()
-        self.lost = 0
+        self.lost = self._bytes = 0
 
     @property
     def broken(self) -> int:
@@ -160,7 +160,9 @@ class ServoBus:
         answers: dict[int, StatusPacket] = {}
         until = self.now() + ANSWER_S
         while len(answers) < len(ids) and self.now() < until:
-            for answer in self._reader.take(self._link.read(_POLL_S)):
+            data = self._link.read(_POLL_S)
+            self._bytes += len(data)
+            for answer in self._reader.take(data):
                 if answer.id in ids and len(answer.parameters) == count:
                     answers[answer.id] = answer
         self.lost += len(ids) - len(answers)
@@ -173,15 +175,15 @@ class ServoBus:
         data, until = b"", self.now() + ANSWER_S
         while not data and self.now() < until:
             data = self._link.read(_POLL_S)
+        self._bytes += len(data)
         return data + self._link.read(2 * _POLL_S) if data else data
 
     def _explain(self, silent: Sequence[int]) -> NoReturn:
         """Raise what is wrong where these ids did not answer whole."""
-        noisy = bool(self._link.read(5 * _POLL_S))  # the bus is silent without a question
         found = {id: self._quality(id) for id in LOOKED_FOR}
         answering = [id for id, whole in found.items() if whole]
         broken = [id for id, whole in found.items() if whole is False]
-        if noisy or (broken and not answering):
+        if not answering and self._bytes:
             raise DeviceError(
                 f"{self.name}: bytes come, but no whole answer: is {self.baud} the servos' baud rate, is the wire sound,"
                 " and is this a bus of STS3215 servos?"
