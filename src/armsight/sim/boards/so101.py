@@ -52,7 +52,7 @@ class So101Mechanics:
 
 
 def arm_load(q: Array) -> Array:
-    """Return the gravity torques (6,), N m, of a stretched SO-101 with 0.2 kg in its gripper, at joint angles (6,), rad."""
+    """Return the gravity torques (6,), N m, of an SO-101 with 0.2 kg in its gripper, at joint angles (6,), rad."""
     upper, fore, hand = np.cos(q[1]), np.cos(q[1] + q[2]), np.cos(q[1] + q[2] + q[3])
     return np.array([0.0, 0.55 * upper + 0.45 * fore + 0.25 * hand, 0.45 * fore + 0.25 * hand, 0.25 * hand, 0.0, 0.0])
 

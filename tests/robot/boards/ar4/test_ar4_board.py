@@ -39,6 +39,12 @@ def follow(board, q, wait_s):
     return board.receive(wait_s).q[-1]
 
 
+def off(board, device, q):
+    """Return true less reported angles, degrees, after a motion."""
+    reported = np.degrees(follow(board, q, 1.0))
+    return device.true_deg - reported
+
+
 def test_it_says_who_it_is_and_what_it_cannot_do():
     board, _ = opened(Ar4Teensy())
     assert board.welcome.board == "ar4 mk3"
@@ -84,14 +90,14 @@ def test_a_motion_follows_the_ramps(homed):
 def test_steps_that_a_motor_loses_are_made_up_for_and_a_slipped_belt_is_not(homed):
     board, device = homed
     q = np.radians([10.0, 0, 0, 0, 0, 0])
-    begin = device.true_deg - np.degrees(follow(board, q, 1.0))
+    begin = off(board, device, q)
     device.lose_steps(0, -20)
     assert np.degrees(board.receive(0.02).q[-1][0]) == pytest.approx(10.0 - 20 / 44.44, abs=0.1)
     board.receive(1.0)
-    after = device.true_deg - np.degrees(follow(board, q, 1.0))
+    after = off(board, device, q)
     assert after == pytest.approx(begin, abs=0.2)
     device.lose(1, -0.7)
-    after = device.true_deg - np.degrees(follow(board, q, 1.0))
+    after = off(board, device, q)
     assert after[1] - begin[1] == pytest.approx(-0.7, abs=0.1)
 
 

@@ -32,7 +32,7 @@ class Ar4Model(Record):
     """A model of the AR4.
 
     Attributes:
-        name: as the firmware is told.
+        name: as the firmware knows it.
         steps_per_deg: (6,) motor steps of a degree.
         low_deg: (6,) lower limits.
         high_deg: (6,) upper limits.
