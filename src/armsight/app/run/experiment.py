@@ -27,8 +27,8 @@ from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
 from armsight.loop.health.fixed import BaseMotion
 from armsight.loop.servo import LoopTiming, PoseServo
-from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
+from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
 from armsight.vision.rig import Shutters, StereoRig
@@ -41,7 +41,7 @@ _STEP_S = 0.05
 _CHECKED = 200  # joint angles along a motion that are checked
 
 
-def enable(board: Board) -> None:
+def enable(board: MotionBoard) -> None:
     """Switch the drives on; an arm that is held since an earlier host went silent is taken over in its position.
 
     Raises:
@@ -97,8 +97,7 @@ def passed(way: Trajectory) -> Array:
 
 def _require_range(setup: Setup, q: Array) -> None:
     """Reject joint angles (N, 6), rad, beyond the board's own limits: it would stop the joint on the way."""
-    config = setup.board.configuration()["joint"]
-    low, high = config["soft_min_rad"].astype(float), config["soft_max_rad"].astype(float)
+    low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
     if beyond.max() > 1e-3:
         joint = int(beyond.argmax())
