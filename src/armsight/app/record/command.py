@@ -31,6 +31,7 @@ def command(
       url:URL_LEFT,URL_RIGHT              MJPEG over HTTP, or RTSP
       video:LEFT.mp4,RIGHT.mp4            or one side-by-side file
       folder:DIR                          or just DIR
+      bag:FILE[,left=TOPIC,right=TOPIC]   a ROS or Foxglove recording
 
     Ctrl-C stops the recording; what was stored until then is complete and readable.
     """  # noqa: D301 - click reads the backspace character
