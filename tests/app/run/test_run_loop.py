@@ -17,7 +17,7 @@ from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import experiment
 from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import run_experiment
-from armsight.app.run.loop import PERIOD_S, Loop, beside, steady
+from armsight.app.run.loop import PERIOD_S, SIMULATED_SEARCH_S, Loop, beside, steady
 from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
@@ -217,6 +217,22 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     (name,) = [name for name, _, _ in loop.log.poses[len(names) :]]
     assert int(name) >= 60
     assert board.t_s > 1.02
+
+
+def test_a_search_takes_its_time_in_a_simulation_too_and_commands_continue():
+    board = Standing()
+    searching = SimpleNamespace(rig=UNKNOWN, way="lost", measure=lambda shot, expected=None: Missed("searched in vain"))
+    loop = Loop.open(setup(board), searching, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    stand(loop, 0.5)
+    assert len(board.sent) == pytest.approx(0.5 / PERIOD_S, abs=2)
+    taken = np.array([t_s for _, t_s, _ in loop.log.poses])
+    assert np.diff(taken).min() >= SIMULATED_SEARCH_S  # the next shot is the newest after the search
+    assert 5 <= len(taken) <= 8
+    searching.way = "followed"
+    before = len(taken)
+    stand(loop, 0.5)
+    assert len(loop.log.poses) - before == pytest.approx(30, abs=2)
 
 
 def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatch):

@@ -284,8 +284,10 @@ def _line(record: ShotPose) -> str:
     note += f", misfit {record.misfit:.1f}" if record.misfit > 1 else ""
     note += f", {record.jump}" if record.jump else ""
     singular = SINGULAR if record.pitch_singular else ""
+    _, precision, calibration = (1e3 * sigma for sigma in record.position_sigmas_m)
     return (
-        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}, {len(record.points_m)} points{note}"
+        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}; precision {precision:.3f} mm, "
+        f"calibration {calibration:.3f} mm; {len(record.points_m)} points{note}"
     )
 
 

@@ -111,7 +111,8 @@ class RunSummary:
         occlusion: errors while the body was hidden; None where it was not, or without a truth.
         passes: errors with potentiometers alone and with the loop closed; None where not both were made.
         singular_rests: names of the rests at which the servo corrects only in part.
-        latency: computing time from image to command, s; None without images.
+        latency: computing time from image to command while the body is followed, s; None without images.
+        search: the same where the body was searched, and commands continued meanwhile, s; None without a search.
         handeye: the hand-eye calibration; None where the run ended before it.
         delay_s: delay of the cameras' time stamps, s, and its sigma, s.
         shots: numbers of shots.
@@ -127,6 +128,7 @@ class RunSummary:
     passes: tuple[PassErrors, PassErrors] | None = None
     singular_rests: tuple[str, ...] = ()
     latency: Spread | None = None
+    search: Spread | None = None
     handeye: HandEyeSummary | None = None
     delay_s: tuple[float, float] | None = None
     shots: ShotCounts | None = None
@@ -146,6 +148,8 @@ class RunSummary:
             found["closed_loop"] = _passes_json(self.passes, self.singular_rests)
         if self.latency is not None:
             found["latency_s"] = asdict(self.latency)
+        if self.search is not None:
+            found["search_s"] = asdict(self.search)
         if self.handeye is not None:
             found["handeye"] = asdict(self.handeye)
         if self.delay_s is not None:
@@ -240,6 +244,7 @@ def summary_of(
         passes,
         singular_rests,
         spread(run.latency_s) if len(run.latency_s) else None,
+        spread(run.search_s) if len(run.search_s) else None,
         HandEyeSummary(*result.handeye.found.held_out.rms(), len(result.handeye.q)),
         (result.delay.delay_s, result.delay.sigma_s),
         ShotCounts(len(run.vision), run.missed, run.rejected, run.reopened, run.misfit_max),
@@ -362,7 +367,12 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
         )
     if (t := summary.latency) is not None:
         lines.append(
-            f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, longest {1e3 * t.max:.1f} ms"
+            f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, p99.9 {1e3 * t.p999:.2f} ms, "
+            f"longest {1e3 * t.max:.1f} ms while the body is followed"
+        )
+    if (t := summary.search) is not None:
+        lines.append(
+            f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms; commands continue meanwhile"
         )
     if (shots := summary.shots) is not None:
         lines.append(
