@@ -21,7 +21,12 @@ from armsight.errors import InputError
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images.")
 @click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
-@click.option("--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections instead of images.")
+@click.option(
+    "--detections",
+    metavar="D.csv",
+    type=click.Path(path_type=Path),
+    help="Detections instead of images; bag:FILE for tags in a bag.",
+)
 @click.option(
     "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
 )
@@ -46,10 +51,11 @@ def command(
 ) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.
 
-    Give the images as --left and --right, as --source, or what was detected in them as --detections. A shot that cannot
-    be read or does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles
-    about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict
-    the rig or the body file, and the poses must not be trusted.
+    Give the images as --left and --right, as --source, or what was detected in them as --detections. RIG.json may also be
+    bag:FILE, a recording that holds the camera_info of a stereo pair. A shot that cannot be read or does not show the
+    target gives a line with the reason, and the run continues. rz, ry, rx are the angles about z, y and x, in this order
+    (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict the rig or the body file, and
+    the poses must not be trusted.
 
     With --skew or --readout, or where the rig file has them, a moving body's detections are moved to the time of the shot
     by its own motion, which the recording's other shots show.

@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
-from armsight.vision.detections import read_detections
+from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -31,7 +31,10 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
-from armsight.vision.sources import PairsSource, Source, open_source
+from armsight.vision.sources import PairsSource, Source, notes_of, open_source
+from armsight.vision.sources.bag import BagSource
+from armsight.vision.sources.bag.camera_info import open_rig
+from armsight.vision.sources.bag.tags import read_tags
 from armsight.vision.sources.pairs import StoredSource
 from armsight.vision.sources.video import VideoSource
 
@@ -90,7 +93,7 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
-    stereo = StereoRig.load(rig)
+    stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
         check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
@@ -104,14 +107,14 @@ def measure_shots(
     skewed: list[HealthFinding] = []
     with contextlib.ExitStack() as stack:
         if detections is not None:
-            body = open_body(target)
-            shots = read_detections(detections, body)
-            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None, None) for s in shots)
+            body, shots = _detected(detections, target)
+            results = ((Shot(s.name, None, None, s.t_s), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
             opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
+            _say(notes_of(opened))
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
@@ -163,11 +166,28 @@ def _opened(left: str | None, right: str | None, source: str | None) -> Source:
     return PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
 
 
+def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot]]:
+    """Return the body, and what was detected of it: from a table, or from a recording of tags, bag:FILE."""
+    if not str(detections).startswith("bag:"):
+        body = open_body(target)
+        return body, read_detections(detections, body)
+    tagged = open_body(target) if target.lower().endswith(".csv") else open_target(target)
+    shots, notes = read_tags(str(detections), tagged)
+    _say(notes)
+    return tagged if isinstance(tagged, Body) else tagged.body, shots
+
+
+def _say(notes: Iterable[str]) -> None:
+    """Print notes on stderr."""
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+
+
 def _timed(source: Source) -> bool:
     """Whether a source is a recording whose shots have times."""
     if isinstance(source, StoredSource):
         return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource)
+    return isinstance(source, VideoSource | BagSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
