@@ -94,6 +94,7 @@ class Moved:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
         outcome = self.estimator.vision(measurement)
+        self.monitor.work()
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s
         return outcome

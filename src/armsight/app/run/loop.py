@@ -318,7 +318,7 @@ class Loop:
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
-            result = self._skew.widened(self.health.measured(result, shot.t_s), shot.t_s)
+            result = self._skew.widened(self.health.received(result, shot.t_s), shot.t_s)
             if self.mounting is not None:
                 measurement = self.health.widened(self.mounting.pose_measurement(result, shot.t_s))
                 self.log.outcomes.append(self.estimator.vision(measurement))
@@ -384,6 +384,7 @@ class Loop:
                     if self.mounting is not None:  # before, no command depended on images
                         self.log.latency_s.append(time.perf_counter() - began)
                     self.on_shot(shot, result)
+                    self.health.work()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
