@@ -182,6 +182,8 @@ class Loop:
         mounting: poses of cameras and body on the arm; None before they are known: then the estimator has the joints alone.
         health: watches whether the calibrations still hold.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
+        on_period: called in every period before its command; what it raises ends the motion.
+        segment: the entry of the log of what is running, with its begin; None before the first.
         t_s: time of the newest reading, board's clock, s.
     """
 
@@ -190,6 +192,8 @@ class Loop:
         self.estimator, self.log = estimator, log
         self.mounting: Mounting | None = None
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
+        self.on_period: Callable[[], None] = lambda: None
+        self.segment: RunSegment | None = None
         self.t_s = 0.0
         self._shot_s = -np.inf
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
@@ -366,10 +370,12 @@ class Loop:
     def _iterate(self, controller: Controller, over: Callable[[], bool], segment: RunSegment, *, watch: bool) -> None:
         """Let a controller command the joints, period by period, until ``over`` returns True."""
         begin_s = self.t_s
+        self.segment = replace(segment, begin_s=begin_s)
         self._watch.forget()
         try:
             while not over():
                 self.pass_time(self._rest_of_period())
+                self.on_period()
                 self._check_board()
                 controller.prepare(self.t_s)  # before the image is measured, so that its command need not wait for it
                 measured = self.look() if watch else None
