@@ -177,6 +177,7 @@ def run_experiment(
     progress: Progress,
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
+    begun: Callable[[Loop], None] = lambda loop: None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -188,13 +189,14 @@ def run_experiment(
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
+        begun: called with the loop before the drives are switched on.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun)
     return outcome
 
 
@@ -207,6 +209,7 @@ def _run(
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
+    begun: Callable[[Loop], None],
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
@@ -216,6 +219,7 @@ def _run(
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
         loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        begun(loop)
         enable(setup.board)
         _require_seen(loop, setup, plan)
         _prepare(loop, setup, plan, targets, outcome, progress)

@@ -194,6 +194,8 @@ class Loop:
             delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
+        on_period: called in every period before its command; what it raises ends the motion.
+        segment: the entry of the log of what is running, with its begin; None before the first.
         t_s: time of the newest reading, board's clock, s.
     """
 
@@ -204,6 +206,8 @@ class Loop:
         self.delay_s: float | None = None
         self.shutters: Shutters | None = follower.rig.shutters
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
+        self.on_period: Callable[[], None] = lambda: None
+        self.segment: RunSegment | None = None
         self.t_s = 0.0
         self._shot_s = -np.inf
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
@@ -426,11 +430,13 @@ class Loop:
     def _iterate(self, controller: Controller, over: Callable[[], bool], segment: RunSegment, *, watch: bool) -> None:
         """Let a controller command the joints, period by period, until ``over`` returns True."""
         begin_s = self.t_s
+        self.segment = replace(segment, begin_s=begin_s)
         self._watch.forget()
         self._search = None
         try:
             while not over():
                 self.pass_time(self._rest_of_period())
+                self.on_period()
                 self._check_board()
                 controller.prepare(self.t_s)  # before the image is measured, so that its command need not wait for it
                 measured = self.look() if watch else None
