@@ -141,17 +141,15 @@ class ShotFolder:
         self.shots = 0
         self.problems = 0
 
-<<<<<<< HEAD
     def add(self, shot: Shot) -> Shot:
-        """Store one shot, completely or not at all; return it with its files' bytes, unless it has those of the cameras."""
-=======
-    def add(self, shot: Shot) -> None:
         """Store one shot, completely or not at all.
+
+        Returns:
+            The shot with its files' bytes, unless it has those of the cameras.
 
         Raises:
             InputError: it cannot be written, the disk is full.
         """
->>>>>>> 7883e632ad8f006c5f222192ddd520c04f46b34f
         index = self._opened()
         files: list[Path] = []
         encoded: list[bytes] = []
