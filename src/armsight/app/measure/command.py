@@ -33,6 +33,12 @@ from armsight.errors import InputError
 @click.option(
     "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
 )
+@click.option(
+    "--save-rig",
+    metavar="RIG2.json",
+    type=click.Path(path_type=Path),
+    help="Write the rig with the skew and readout found.",
+)
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
@@ -45,6 +51,7 @@ def command(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
     view_dir: Path | None,
     as_json: bool,
@@ -75,6 +82,7 @@ def command(
         detections=detections,
         skew=skew,
         readout=readout,
+        save_rig=save_rig,
         output=output,
         view_dir=view_dir,
         as_json=as_json,
