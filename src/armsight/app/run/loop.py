@@ -29,6 +29,7 @@ from armsight.errors import DeviceError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower
@@ -210,6 +211,7 @@ class Loop:
         self.segment: RunSegment | None = None
         self.t_s = 0.0
         self._shot_s = -np.inf
+        self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
@@ -395,6 +397,8 @@ class Loop:
         self._taken_s = time.perf_counter()
         self._expected = self._twist = None
         shot = shot if shot is None or clock is None else clock.on_board(shot)
+        if shot is not None and shot.t_s is not None:
+            shot = replace(shot, t_s=self._frames.time(shot.t_s))
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
             motion = None if shot.t_s is None else self._motion(shot.t_s)
