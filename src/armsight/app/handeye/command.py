@@ -49,15 +49,22 @@ class Options:
 @click.command("handeye")
 @click.option("--robot", required=True, metavar="POSES.csv", type=click.Path(path_type=Path), help="Poses or joints.")
 @click.option(
-    "--eye", required=True, type=click.Choice(["in-hand", "to-hand"]), help="Does the arm carry the camera, or the target?"
+    "--eye",
+    required=True,
+    type=click.Choice(["in-hand", "to-hand"]),
+    help="Does the arm carry the camera, or the target?",
 )
 @click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
 @click.option(
-    "--rotation", metavar="CONVENTION", help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ..."
+    "--rotation",
+    metavar="CONVENTION",
+    help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ...",
 )
 @click.option("--units", type=click.Choice(["m", "mm"]), help="Of lengths whose columns do not name a unit.")
 @click.option("--columns", metavar="NAME=COLUMN,...", help="Names of columns in your table, such as x_mm=X,rx_deg=A.")
-@click.option("--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera.")
+@click.option(
+    "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
+)
 @click.option("--seen-rotation", metavar="CONVENTION", help="The same for the target's table.")
 @click.option("--seen-units", type=click.Choice(["m", "mm"]), help="The same for the target's table.")
 @click.option("--images", metavar="GLOB", help="Images of one camera; quote the glob.")
@@ -70,7 +77,9 @@ class Options:
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
 @click.option("--detect-units", is_flag=True, help="Take lengths that cannot be metres for millimetres, and say so.")
 @click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files.")
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def command(**given: object) -> None:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
@@ -115,7 +124,9 @@ def _require_one_way(options: Options) -> None:
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
-        "--rig with --left and --right": options.rig is not None or options.left is not None or options.right is not None,
+        "--rig with --left and --right": options.rig is not None
+        or options.left is not None
+        or options.right is not None,
     }
     if sum(ways.values()) != 1:
         raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")

@@ -124,7 +124,9 @@ def read_camera(path: Path) -> Camera:
         except json.JSONDecodeError as error:
             raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
         if not isinstance(document, dict) or "K" not in document:
-            raise InputError(f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera')
+            raise InputError(
+                f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera'
+            )
         return camera_of(path, document)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{path}: a camera is a .json, .yaml or .yml file, or fit (from the images themselves)")

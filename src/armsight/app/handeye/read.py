@@ -166,7 +166,9 @@ def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tup
     """Return the rows if all have as many fields as there are columns."""
     for line, row in rows:
         if len(row) != count:
-            raise InputError(f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line")
+            raise InputError(
+                f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line"
+            )
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     return rows
@@ -276,7 +278,9 @@ class _Columns:
                     "camera poses are right-handed: exchange no axes without a sign"
                 )
             if off >= LOOSE:
-                raise InputError(f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})")
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})"
+                )
         return np.asarray([nearest_rotation(one) for one in R])
 
 
@@ -326,5 +330,9 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
                 f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
                 "give --units m, or --detect-units"
             )
-        return p, 1.0, (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",)
+        return (
+            p,
+            1.0,
+            (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
+        )
     return unit_m * p, unit_m, ()

@@ -95,7 +95,11 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
         "Errors on poses left out",
         "Each pose was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
     ),
-    "sigma": (sigma_figure, "How well the transforms are known", "A bar that stands out is the direction to rotate more in."),
+    "sigma": (
+        sigma_figure,
+        "How well the transforms are known",
+        "A bar that stands out is the direction to rotate more in.",
+    ),
     "structure": (
         structure_figure,
         "Whose error it is",
