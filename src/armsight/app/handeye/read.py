@@ -157,7 +157,7 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     if len(head) not in forms:
         raise InputError(
             f"{path}: line {rows[0][0]}: {len(head)} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
-            "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name the columns"
+            "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
     return forms[len(head)], _even(path, rows, len(head))
 
@@ -212,7 +212,7 @@ class _Columns:
         """Return joint angles (N, J), rad."""
         if arm is not None and len(names) != len(arm.joint_names):
             raise InputError(
-                f"{self.path}: line 1: {len(names)} joints ({names[0]} .. {names[-1]}); {arm.name} has {len(arm.joint_names)}"
+                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has {len(arm.joint_names)}"
             )
         q = self.numbers(names)
         return np.radians(q) if names[0].endswith("_deg") else q
@@ -274,8 +274,8 @@ class _Columns:
             off, turn = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
             if off < LOOSE and turn < 0:
                 raise InputError(
-                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot and "
-                    "camera poses are right-handed: exchange no axes without a sign"
+                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
+                    "and camera poses are right-handed: exchange no axes without a sign"
                 )
             if off >= LOOSE:
                 raise InputError(

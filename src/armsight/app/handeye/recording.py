@@ -106,7 +106,7 @@ def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[n
         return rows, matched
     if len(robot.Ts) != len(seen.Ts):
         raise InputError(
-            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give the table a column "
+            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give it a column "
             "image (or name), or t_s on both sides and --streams, so that they can be told apart"
         )
     return np.arange(len(robot.Ts)), np.arange(len(seen.Ts))
@@ -131,14 +131,23 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     if np.linalg.norm(p) < 1.0 and turn < 0.5:
         return []
     return [
-        f"{robot.path}: its poses are those of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
+        f"{robot.path}: its poses are of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
         f"of {arm.name}: the transform found is from this TCP, not from the flange"
     ]
 
 
+def links_of(recording: Recording, arm: Arm) -> Array | None:
+    """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
+    if recording.robot.q is None:
+        return None
+    frames = np.array([arm.links(q) for q in recording.robot.q[recording.rows]])
+    return np.asarray(inverse(frames) @ frames[:, -1:])
+
+
 def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> Recording:
     """Return the rows of two streams that were calibrated; the flange's poses are interpolated."""
-    assert robot.t_s is not None and seen.t_s is not None
+    assert robot.t_s is not None
+    assert seen.t_s is not None
     rows = np.clip(np.searchsorted(robot.t_s, found.t_s + found.offset_s), 0, len(robot.t_s) - 1)
     matched = np.searchsorted(seen.t_s, found.t_s)
     poses = Poses(found.A, found.B, np.zeros((len(found.A), 6, 6)), found.handeye.eye == "in_hand", seen.centre)

@@ -93,7 +93,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
     "errors": (
         errors_figure,
         "Errors on poses left out",
-        "Each pose was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
+        "Each was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
     ),
     "sigma": (
         sigma_figure,
@@ -109,7 +109,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
     "coverage": (
         coverage_figure,
         "Motion and views",
-        "Good: the rotations spread in both colours, by 20 degrees and more; points on a line are rotations about one axis.",
+        "Good: rotations spread in both colours, by 20 degrees and more; points on a line are rotations about one axis.",
     ),
 }
 

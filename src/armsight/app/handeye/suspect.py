@@ -21,7 +21,7 @@ from armsight.app.handeye.read import CONVENTIONS, rotations_by, stacked
 from armsight.app.handeye.recording import Recording
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.geometry.pose import log_se3
+from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
 from armsight.robot.arm import Arm
 
@@ -53,7 +53,7 @@ def misfit(poses: Poses) -> float:
 
 def _angles(Ts: Array) -> Array:
     """Return the angles between neighbouring poses, rad."""
-    return np.asarray(np.linalg.norm(log_se3(np.linalg.inv(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
+    return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
 
 
 def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
@@ -159,7 +159,7 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
     n = q.shape[1]
     rows = np.linspace(0, len(q) - 1, min(JUDGED, len(q))).round().astype(np.int64)
-    seen = _angles(p.B[rows] if not p.in_hand else np.linalg.inv(p.B[rows]))
+    seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
     orders: list[tuple[int, ...]] = [
         tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
     ]
@@ -170,9 +170,9 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     for order in orders:
         turned = _angles(np.asarray(arm.forward(q[rows][:, order])))
         scored.append((float(np.median(np.abs(turned - seen))), np.array(order)))
-    for _, order in sorted(scored, key=lambda one: one[0])[:3]:
-        named = ", ".join(f"q{k + 1}" for k in order)
+    for _, at in sorted(scored, key=lambda one: one[0])[:3]:
+        named = ", ".join(f"q{k + 1}" for k in at)
         yield (
-            replace(p, A=np.asarray(arm.forward(q[:, order]))),
+            replace(p, A=np.asarray(arm.forward(q[:, at]))),
             f"the joints are in another order: {arm.name}'s are {named} here",
         )

@@ -260,7 +260,7 @@ def solve(b: Blocks, variances: Array) -> Solved:
     """Solve the weighted least squares."""
     C = b.covariance(variances)
     L = np.linalg.cholesky(C)
-    Ci = np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None]
+    Ci = np.asarray(np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None])
     CiJ = Ci @ b.J
     H = np.einsum("nki,nkj->ij", b.J, CiJ)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side

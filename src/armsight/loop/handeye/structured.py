@@ -375,8 +375,8 @@ def require_rotations(poses: Poses, e: Array) -> None:
         axis = axes[:, 2] * np.sign(axes[np.argmax(np.abs(axes[:, 2])), 2])
         named = " ".join(f"{value:.2f}" for value in axis)
         raise CalibrationError(
-            f"the flange rotates about one axis only, [{named}] in the flange (RMS {np.degrees(spread[0]):.1f} deg; across "
-            f"it {np.degrees(spread[1]):.2f} deg, where the noise is {np.degrees(noise):.2f} deg): the translation of {held} "
+            f"the flange rotates about one axis only, [{named}] in the flange ({np.degrees(spread[0]):.1f} deg RMS; across "
+            f"it {np.degrees(spread[1]):.2f} deg, the noise {np.degrees(noise):.2f} deg): the translation of {held} "
             "along this axis stays open; rotate about a second axis, by 20 degrees and more"
         )
 
@@ -420,7 +420,7 @@ def _start_variances(linear: Linear, structure: str) -> Array:
     sources = STRUCTURES[structure]
     small = {"time_s": 1e-6, "image": 1.0, "walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
     even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
-    return np.maximum(np.array([small.get(name, even[name]) for name in sources]), 1e-13)
+    return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
 
 
 def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
