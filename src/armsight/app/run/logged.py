@@ -107,7 +107,9 @@ def run_logged(
         InputError: rows and shots do not belong together.
         CalibrationError: too few shots show the body, or the motions leave a direction open.
     """
-    names, times, seen = [], [], []
+    names: list[str] = []
+    times: list[float | None] = []
+    seen: list[PoseEstimate | Missed] = []
     while (shot := source.read()) is not None:
         progress(f"measuring shot {len(names) + 1}")
         names.append(shot.name)
