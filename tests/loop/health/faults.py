@@ -75,8 +75,9 @@ LEARNED_S, AT_S = 5.0, 6.5
 class Moved:
     """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
 
-    def __init__(self, estimator, T_base_rig, motion):
+    def __init__(self, estimator, T_base_rig, motion, slip=None):
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
+        self.slip = slip  # of the body on the tool (6,), [m; rad]
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
         self.found_s = None
 
@@ -93,16 +94,41 @@ class Moved:
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
+            if self.slip is not None:
+                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
         outcome = self.estimator.vision(measurement)
+        self.monitor.work()
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s
         return outcome
 
 
-def watched_arm(seed, motion, seconds=9.0):
-    """Run an arm with errors; return the estimator with its monitor."""
+class SlippingArm:
+    """An arm of which one potentiometer slips on its shaft, by so much, or whose backlash grows, at AT_S."""
+
+    def __init__(self, arm, joint, slip_rad, more_rad):
+        self.arm, self.joint, self.slip_rad, self.more_rad = arm, joint, slip_rad, more_rad
+
+    def tool(self, shaft):
+        at = round(AT_S / 1e-3)
+        before = self.arm.tool(shaft[:at])
+        self.arm.backlash = self.arm.backlash + np.eye(6)[self.joint] * self.more_rad
+        beyond = self.slip_rad * np.eye(6)[self.joint]
+        zeros, self.arm.linearity = self.arm.linearity, lambda q: zeros(q) + beyond
+        return np.concatenate([before, self.arm.tool(shaft[at:])])
+
+
+def watched_arm(seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0):
+    """Run an arm with errors; return the estimator with its monitor.
+
+    The faults, at AT_S: a motion of the rig, a slip of the body on the tool (6,), [m; rad], a slip of a joint's
+    potentiometer or more backlash of it, rad.
+    """
     rng = np.random.default_rng(seed)
     mount = mounts(rng)
-    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion)
-    run(rng, moved, worn(rng), legs(rng, seconds), mount=mount)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion, slip)
+    arm = worn(rng)
+    if slip_rad or more_rad:
+        arm = SlippingArm(arm, joint, slip_rad, more_rad)
+    run(rng, moved, arm, legs(rng, seconds), mount=mount)
     return moved

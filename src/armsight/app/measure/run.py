@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
-from armsight.vision.detections import read_detections
+from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -31,7 +31,10 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
-from armsight.vision.sources import PairsSource, Source, open_source
+from armsight.vision.sources import PairsSource, Source, notes_of, open_source
+from armsight.vision.sources.bag import BagSource
+from armsight.vision.sources.bag.camera_info import open_rig
+from armsight.vision.sources.bag.tags import read_tags
 from armsight.vision.sources.pairs import StoredSource
 from armsight.vision.sources.video import VideoSource
 
@@ -62,6 +65,7 @@ def measure_shots(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
     view_dir: Path | None,
     as_json: bool,
@@ -77,6 +81,7 @@ def measure_shots(
         detections: a file of detections, where there are no images.
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
+        save_rig: file for the rig with the skew and readout that were found or given.
         output: CSV file of the poses.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
@@ -90,7 +95,11 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
-    stereo = StereoRig.load(rig)
+    if save_rig is not None:
+        if requested is None:
+            raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
+        check_writable(save_rig, apart_from=(rig, target, output))
+    stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
         check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
@@ -104,14 +113,14 @@ def measure_shots(
     skewed: list[HealthFinding] = []
     with contextlib.ExitStack() as stack:
         if detections is not None:
-            body = open_body(target)
-            shots = read_detections(detections, body)
-            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None, None) for s in shots)
+            body, shots = _detected(detections, target)
+            results = ((Shot(s.name, None, None, s.t_s), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
             opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
+            _say(notes_of(opened))
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
@@ -144,6 +153,9 @@ def measure_shots(
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
+    moved = next((r.shutters for r in records if r.shutters is not None), None)
+    if save_rig is not None and moved is not None:
+        replace(stereo, shutters=moved).save(save_rig)
     health = monitor.findings()
     if skewed and any(each.cause == "rig" for each in health):
         # Of a moving body a skew looks like cameras that moved against each other.
@@ -163,11 +175,28 @@ def _opened(left: str | None, right: str | None, source: str | None) -> Source:
     return PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
 
 
+def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot]]:
+    """Return the body, and what was detected of it: from a table, or from a recording of tags, bag:FILE."""
+    if not str(detections).startswith("bag:"):
+        body = open_body(target)
+        return body, read_detections(detections, body)
+    tagged = open_body(target) if target.lower().endswith(".csv") else open_target(target)
+    shots, notes = read_tags(str(detections), tagged)
+    _say(notes)
+    return tagged if isinstance(tagged, Body) else tagged.body, shots
+
+
+def _say(notes: Iterable[str]) -> None:
+    """Print notes on stderr."""
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+
+
 def _timed(source: Source) -> bool:
     """Whether a source is a recording whose shots have times."""
     if isinstance(source, StoredSource):
         return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource)
+    return isinstance(source, VideoSource | BagSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
@@ -264,8 +293,10 @@ def _line(record: ShotPose) -> str:
     note += f", misfit {record.misfit:.1f}" if record.misfit > 1 else ""
     note += f", {record.jump}" if record.jump else ""
     singular = SINGULAR if record.pitch_singular else ""
+    _, precision, calibration = (1e3 * sigma for sigma in record.position_sigmas_m)
     return (
-        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}, {len(record.points_m)} points{note}"
+        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}; precision {precision:.3f} mm, "
+        f"calibration {calibration:.3f} mm; {len(record.points_m)} points{note}"
     )
 
 

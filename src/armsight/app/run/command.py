@@ -92,7 +92,7 @@ class RunPlan:
     type=click.FloatRange(min=0.0, max=1_000.0),
     default=0.1,
     show_default=True,
-    help="Sigma of the time between the two exposures of a shot, ms; sim: knows its own.",
+    help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
 )
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(

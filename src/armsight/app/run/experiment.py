@@ -31,7 +31,7 @@ from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
 
 #: Largest difference of the joints from the start of the motion before anything moves, rad.
 START_RAD = float(np.radians(2.0))
@@ -130,6 +130,7 @@ class RunResult:
         log: everything that was measured and commanded.
         handeye: the hand-eye calibration; None before it was made.
         delay: delay of the cameras' time stamps.
+        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
         open_s: begin and end of the pass with potentiometers alone, board's clock, s; None before.
         closed_s: begin and end of the pass with the loop closed.
         covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
@@ -145,6 +146,7 @@ class RunResult:
     log: Log = field(default_factory=Log)
     handeye: HandEyeRun | None = None
     delay: Delay = _UNKNOWN_DELAY
+    shutters: Shutters | None = None
     open_s: tuple[float, float] | None = None
     closed_s: tuple[float, float] | None = None
     covered_s: tuple[float, float] | None = None
@@ -175,6 +177,7 @@ def run_experiment(
     progress: Progress,
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
+    begun: Callable[[Loop], None] = lambda loop: None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -186,13 +189,14 @@ def run_experiment(
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
+        begun: called with the loop before the drives are switched on.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun)
     return outcome
 
 
@@ -205,15 +209,17 @@ def _run(
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
+    begun: Callable[[Loop], None],
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
     try:
         progress("preparing to follow the body")
-        follower = Follower(rig, setup.target)
+        follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
         loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        begun(loop)
         enable(setup.board)
         _require_seen(loop, setup, plan)
         _prepare(loop, setup, plan, targets, outcome, progress)
@@ -266,6 +272,7 @@ def _prepare(
     progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
+    outcome.shutters = loop.shutters
     back = point_to_point(arm, middle, plan.start)
     there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
     loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))

@@ -216,6 +216,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
+        if outcome.shutters is not None:
+            keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.moved)
         keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
@@ -316,6 +318,11 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         f"delay of the images, by a sweep: {1e3 * outcome.delay.delay_s:.2f} ms, sigma {1e3 * outcome.delay.sigma_s:.2f} ms"
         if outcome.delay_found
         else f"the delay of the images was not measured: {1e3 * outcome.delay.delay_s:g} ms assumed",
+        *(
+            []
+            if outcome.shutters is None
+            else [f"exposures: {outcome.shutters}; detections were moved to one time by the motion of the arm"]
+        ),
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.rejected} rejected by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} {_BASED.get(mode, f'on {mode}')}" for mode, count in modes.most_common()),

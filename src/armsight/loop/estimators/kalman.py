@@ -88,6 +88,11 @@ class KalmanEstimator:
         self._newest: ArmEstimate | None = None
 
     @property
+    def sigmas(self) -> Array:
+        """(K,) standard deviations of the state before anything was measured."""
+        return self._model.sigmas
+
+    @property
     def span_s(self) -> tuple[float, float]:
         """The oldest and the newest time that can be estimated, s."""
         return self._readings.span_s
