@@ -244,6 +244,89 @@ def clear(name: str, baud: int | None, as_json: bool) -> None:
 
 
 @command.command()
+@_board
+@_JSON
+def release(name: str, baud: int | None, as_json: bool) -> None:
+    """Switch the drives off: the arm sinks, support it."""
+    from armsight.robot.boards.codes import Command
+
+    with _open_any(name, baud) as board:
+        board.confirm(board.command(Command.DISABLE))
+        board.receive(0.05)
+        state = board.status.state.name
+    click.echo(json.dumps({"state": state}) if as_json else state)
+
+
+@command.command()
+@_board
+@_calibration
+@click.option(
+    "--identified", metavar="ARM", help="Correct by what `armsight identify` found; with --arm, the arm it began with."
+)
+@click.option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
+@click.option(
+    "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
+)
+@click.option("--restore", metavar="FILE", type=click.Path(path_type=Path), help="Write back what --keep has kept.")
+@click.option(
+    "--keep",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    default=Path("old_offsets.json"),
+    show_default=True,
+    help="New file for the offsets as they were.",
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@_JSON
+def offsets(
+    name: str,
+    baud: int | None,
+    calibration: Path | None,
+    identified: str | None,
+    nominal: str | None,
+    further: str | None,
+    restore: Path | None,
+    keep: Path,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Print the homing offsets of a servo bus (register 31), or correct them, after asking.
+
+    The old offsets are kept in a file first. LeRobot's calibration, where given, gets the same new offsets. The torque must
+    be off (`armsight board release`).
+    """
+    import numpy as np
+
+    from armsight.app.board import offsets as changed
+    from armsight.robot.arm_file import open_arm
+    from armsight.robot.boards.feetech.board import FeetechBoard
+
+    given = [each for each in (identified, further, restore) if each is not None]
+    if len(given) > 1 or (identified is None) != (nominal is None):
+        raise InputError("give one of --identified ARM with --arm ARM, --further DEG,... and --restore FILE")
+    angles = None if further is None else changed.parsed_degrees(further)
+    if identified is not None and nominal is not None:
+        angles = changed.further_of(open_arm(identified), open_arm(nominal))
+    if not name.startswith("feetech:"):
+        raise InputError(f"{name} has no homing offsets in its servos; feetech:PORT has")
+    with _open_any(name, baud, calibration) as board:
+        assert isinstance(board, FeetechBoard)
+        if restore is not None:
+            changes = changed.restored_changes(board, restore)
+        else:
+            none = np.zeros(board.abilities.joints)
+            changes = changed.planned_changes(board, none if angles is None else angles)
+        if given:
+            if not yes:
+                click.echo(changed.changes_text(changes), err=True)
+                click.confirm("write the new offsets to the servos?", abort=True, err=True)
+            changed.apply(board, changes, keep, calibration)
+    click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
+    if given:
+        click.echo(f"written; the old offsets are in {keep}", err=True)
+
+
+@command.command()
 @click.argument("arm", type=click.Choice(["so101", "ar4"]))
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
 @_JSON

@@ -19,6 +19,7 @@ from armsight.robot.boards.ar4.models import (
     MODELS,
     MOST_ACCELERATION_DEG_S2,
     MOST_SPEED_DEG_S,
+    SENSE,
     SWITCH_AT,
     Ar4Model,
 )
@@ -77,7 +78,7 @@ class Ar4Teensy:
     def __post_init__(self) -> None:
         """Switch it on: the encoders read 0 wherever the arm is."""
         self._rng = np.random.default_rng(self.seed)
-        self._motor = np.array(self.q_deg, float)  # degrees of the joint at the motor
+        self._motor = SENSE * np.array(self.q_deg, float)  # degrees of the driver's joint at the motor
         self._joint = self._motor.copy()
         self._speed = np.zeros(_JOINTS)
         self._target = self._motor.copy()
@@ -88,10 +89,11 @@ class Ar4Teensy:
     @property
     def true_deg(self) -> Array:
         """(6,) true joint angles."""
-        return self._joint.copy()
+        return np.asarray(SENSE * self._joint)
 
     def lose(self, joint: int, degrees: float) -> None:
         """Let a joint slip against its motor, as a belt does: the encoder does not see it."""
+        degrees *= float(SENSE[joint])
         self._encoder_zero[joint] += degrees
         self._motor[joint] += degrees
         self._target[joint] += degrees
@@ -99,7 +101,7 @@ class Ar4Teensy:
 
     def lose_steps(self, joint: int, steps: float) -> None:
         """Let a motor miss steps: its encoder sees it, and the next goal makes up for it."""
-        degrees = steps / self.model.steps_per_deg[joint]
+        degrees = SENSE[joint] * steps / self.model.steps_per_deg[joint]
         self._motor[joint] += degrees
         self._target[joint] += degrees
 
@@ -231,7 +233,7 @@ class Ar4Teensy:
         joints = sorted({int(each) for each in sequence[1:]})
         for k in joints:
             # At the switch the encoder is set to the limit; the joint really is beside it.
-            beside = self.mechanics.homing_deg[k] + self.mechanics.scatter_deg * self._rng.standard_normal()
+            beside = SENSE[k] * self.mechanics.homing_deg[k] + self.mechanics.scatter_deg * self._rng.standard_normal()
             self._encoder_zero[k] = beside + model.offset_deg[k]
             self._motor[k] = self._target[k] = beside
             self._joint[k] = beside + SWITCH_AT[k] * self.mechanics.backlash_deg[k] / 2

@@ -1,12 +1,16 @@
 """The lines of the AR4's Teensy: worked examples of its firmware, both ways, and lines with anything in them."""
 
 import hypothesis.strategies as st
+import numpy as np
 import pytest
 from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
 
+from armsight.geometry.pose import inverse
+from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.ar4 import lines
 from armsight.robot.boards.ar4.lines import Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader, read_line
-from armsight.robot.boards.ar4.models import MODELS
+from armsight.robot.boards.ar4.models import MODELS, SENSE
 
 
 @pytest.mark.parametrize(
@@ -94,3 +98,35 @@ def test_the_models_limits_and_steps():
     assert reported + mk3.offset_deg == pytest.approx(0.0, abs=0.05)
     # joint_offsets/mk2.yaml of the driver.
     assert MODELS["mk2"].offset_deg.tolist() == [170, -42, -89, -165, -105, -155]
+
+
+def test_joint_angles_are_those_of_our_ar4_and_joint_1_has_the_other_sense_in_the_drivers_urdf():
+    # annin_ar4_description/urdf/ar_macro.xacro: origin (xyz, rpy) and axis; without its 7 mm sideways at joint 3.
+    half = np.pi / 2
+    chain = [
+        ((0, 0, 0), (np.pi, 0, 0), (0, 0, 1)),
+        ((0, 0.0642, -0.16977), (half, 0, -half), (0, 0, -1)),
+        ((0, -0.305, 0), (0, 0, np.pi), (0, 0, -1)),
+        ((0, 0, 0), (half, 0, -half), (0, 0, -1)),
+        ((0, 0, -0.22263), (np.pi, 0, -half), (1, 0, 0)),
+        ((0, 0, 0.041), (0, 0, np.pi), (0, 0, 1)),
+    ]
+
+    def driver(q):
+        T = np.eye(4)
+        for (xyz, rpy, axis), angle in zip(chain, q, strict=True):
+            step = np.eye(4)
+            step[:3, 3] = xyz
+            step[:3, :3] = (Rotation.from_euler("xyz", rpy) * Rotation.from_rotvec(angle * np.array(axis))).as_matrix()
+            T = T @ step
+        return T
+
+    arm, rng = open_arm("ar4"), np.random.default_rng(1)
+    q = rng.uniform(-0.6, 0.6, (5, 6))
+    ours, theirs = arm.forward(SENSE * q), np.array([driver(each) for each in q])
+    # The bases differ by a rotation about z, the flanges by a constant transform.
+    base = np.eye(4)
+    base[:2, :2] = [[0, 1], [-1, 0]]
+    flange = inverse(base @ ours[0]) @ theirs[0]
+    assert base @ ours @ flange == pytest.approx(theirs, abs=1e-9)
+    assert base @ arm.forward(q) @ flange != pytest.approx(theirs, abs=1e-2)

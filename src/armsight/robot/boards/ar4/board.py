@@ -20,7 +20,7 @@ from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.ar4 import lines
 from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
-from armsight.robot.boards.ar4.models import HOMING_GROUPS, MODELS, MOST_SPEED_DEG_S, Ar4Model
+from armsight.robot.boards.ar4.models import HOMING_GROUPS, MODELS, MOST_SPEED_DEG_S, SENSE, Ar4Model
 from armsight.robot.boards.codes import Alarm, BoardState, Command, Limited
 from armsight.robot.boards.contract import Abilities, checked_goals
 from armsight.robot.boards.link import Link
@@ -247,7 +247,7 @@ class Ar4Board:
 
     def _q(self) -> Array:
         """Return the newest joint angles (6,), rad."""
-        return np.radians(self._reported + self.model.offset_deg)
+        return np.radians(self.model.angles_deg(self._reported))
 
     def _start(self, version: str) -> None:
         """Name version and model; a firmware of another version of the same kind is asked again in its own."""
@@ -281,7 +281,7 @@ class Ar4Board:
         self._enabled = True
 
     def _write_goal(self) -> None:
-        self._link.write(lines.move_to((np.degrees(self._goal) - self.model.offset_deg).tolist()))
+        self._link.write(lines.move_to(self.model.reported_deg(np.degrees(self._goal)).tolist()))
         self._written_s = self._now()
 
     def _read(self) -> None:
@@ -294,7 +294,7 @@ class Ar4Board:
             if self._possible(reported, t_s):
                 passed = t_s - self._t_s
                 if 0 < passed < 1.0:
-                    self._speed_rad_s = np.radians((reported - self._reported) / passed)
+                    self._speed_rad_s = np.radians(SENSE * (reported - self._reported) / passed)
                 self._t_s, self._reported = t_s, reported
                 return
             self._broken += 1

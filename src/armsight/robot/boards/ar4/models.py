@@ -2,7 +2,10 @@
 
 Numbers of firmware 2.1.0 and of the driver's ``joint_offsets`` (source: see ``lines``). The encoder of a joint is set at
 its limit switch; its zero lies at the joint's lower limit, that of joint 1, whose encoder counts backwards, at the upper
-one. So the joint angle is the position that the Teensy reports plus the lower limit (joint 1: the upper one).
+one. So the driver's joint angle is the position that the Teensy reports plus the lower limit (joint 1: the upper one).
+
+Joint angles here are those of armsight's ``ar4``, the maker's table: joint 1 has the opposite sense of the driver's, whose
+URDF has its axis downwards.
 """
 
 from __future__ import annotations
@@ -15,6 +18,8 @@ from armsight.data import Array, Record
 
 #: Sense of the encoders.
 ENCODER_DIRECTION = np.array([-1, 1, 1, 1, 1, 1])
+#: Sense of the driver's joints in armsight's ``ar4``.
+SENSE = np.array([-1, 1, 1, 1, 1, 1])
 #: Where a joint's limit switch is: -1 at its lower limit, +1 at its upper one.
 SWITCH_AT = np.array([-1, -1, 1, -1, -1, 1])
 #: Encoder counts of a motor step.
@@ -34,7 +39,7 @@ class Ar4Model(Record):
     Attributes:
         name: as the firmware knows it.
         steps_per_deg: (6,) motor steps of a degree.
-        low_deg: (6,) lower limits.
+        low_deg: (6,) lower limits; joint 1 has the same to either side.
         high_deg: (6,) upper limits.
     """
 
@@ -45,8 +50,16 @@ class Ar4Model(Record):
 
     @property
     def offset_deg(self) -> Array:
-        """(6,) what is added to a reported position to have the joint angle."""
+        """(6,) what is added to a reported position to have the driver's joint angle."""
         return np.where(ENCODER_DIRECTION > 0, self.low_deg, self.high_deg)
+
+    def angles_deg(self, reported: Array) -> Array:
+        """Return the joint angles (6,) at positions (6,) that the Teensy reports."""
+        return SENSE * (reported + self.offset_deg)
+
+    def reported_deg(self, angles: Array) -> Array:
+        """Return the positions (6,) that the Teensy reports at joint angles (6,)."""
+        return SENSE * angles - self.offset_deg
 
 
 def _model(name: str, fourth: float, low: tuple[float, ...], high: tuple[float, ...]) -> Ar4Model:

@@ -67,6 +67,11 @@ class FeetechBoard:
         self._goal = self._q()
         self._goal_speed = np.zeros(count)
 
+    @property
+    def bus(self) -> ServoBus:
+        """The bus, for registers."""
+        return self._bus
+
     @classmethod
     def connect(cls, bus: ServoBus, calibration: ServoCalibration | None = None) -> Self:
         """Meet the servos of an arm; nothing is written.
