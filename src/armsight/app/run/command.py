@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import dataclass
@@ -155,7 +156,7 @@ def command(
                 write_text(output / name, text)
             rig.save(output / "rig.json")
             try:
-                summary = _run(setup, plan, output, progress)
+                summary = _run(setup, plan, output, files["body.toml"], progress)
             except KeyboardInterrupt:
                 click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
                 raise
@@ -183,12 +184,25 @@ def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
         ) from None
 
 
-def _run(setup: Setup, plan: RunPlan, output: Path, progress: Progress) -> RunSummary:
+def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Progress) -> RunSummary:
     """Run and write; raises what ended the run early after everything is written."""
     from armsight.app.run.experiment import run_experiment
     from armsight.app.run.folder import Finished, finish
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.mcap_file import LazyMcap, properties
 
-    outcome = run_experiment(setup, plan.rig, plan.motions, plan.targets, progress=progress, close_loop=plan.close_loop)
+    texts = properties(plan.rig, body_text, setup.arm, command="run")
+    published = Published(plan.rig, setup.target.body, setup.arm, texts)
+    with contextlib.closing(LazyMcap(output, published, lambda line: click.echo(line, err=True))) as file:
+        outcome = run_experiment(
+            setup,
+            plan.rig,
+            plan.motions,
+            plan.targets,
+            progress=progress,
+            close_loop=plan.close_loop,
+            publisher=file,
+        )
     progress("writing and plotting")
-    properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, properties, plan.began, [], None), output)
+    of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, of_run, plan.began, [], None), output)

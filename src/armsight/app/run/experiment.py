@@ -21,6 +21,8 @@ from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, estimator_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
@@ -176,6 +178,7 @@ def run_experiment(
     progress: Progress,
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
+    publisher: Publisher | None = None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -187,13 +190,14 @@ def run_experiment(
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
+        publisher: is given everything that is measured; it returns at once.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, publisher or Fanout())
     return outcome
 
 
@@ -206,6 +210,7 @@ def _run(
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
+    publisher: Publisher,
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
@@ -214,7 +219,9 @@ def _run(
         follower = Follower(rig, setup.target)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        first = KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY)
+        publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
+        loop = Loop.open(setup, follower, outcome.log, first, publisher)
         enable(setup.board)
         _require_seen(loop, setup, plan)
         _prepare(loop, setup, plan, targets, outcome, progress)
