@@ -23,6 +23,8 @@ from armsight.vision.rigfiles.rigfile import rectification
 Message: TypeAlias = Any
 #: Images that cameras deliver as pixels are compressed here, at most one pair in this time, s: it takes long.
 _COMPRESS_EVERY_S, _QUALITY = 1.0, 85
+#: Joints and the tool are shown at most once in this time, s; as JSON all are published.
+_JOINTS_EVERY_S = 0.02
 #: The ellipsoid has this many sigmas, and at least this radius, m, to be seen.
 _SIGMAS, _LEAST_M = 3.0, 2e-4
 _NS = 1_000_000_000
@@ -76,6 +78,7 @@ class Messages:
         self._Timestamp: Message = Timestamp
         self._calibrated = False
         self._compressed_s = -np.inf
+        self._joints_s = -np.inf
         self._T_base_rig: Array | None = None
 
     def of(self, datum: ShotDatum | JointsDatum | NoteDatum | EventDatum) -> Iterator[tuple[str, Message]]:
@@ -218,6 +221,9 @@ class Messages:
             yield found
 
     def _of_joints(self, datum: JointsDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
+        if 0.0 <= datum.time_s - self._joints_s < _JOINTS_EVERY_S:
+            return
+        self._joints_s = datum.time_s
         q = datum.states.q[-1]
         joints = self._Joints(timestamp=stamp)
         for k, angle in enumerate(q.tolist(), start=1):

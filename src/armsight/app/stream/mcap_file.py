@@ -67,8 +67,8 @@ class McapSink(Sink):
             self._file: IO[bytes] = path.open("xb")
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-        # Images are compressed already, and the rest is small: compressing again costs more than it saves.
-        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.NONE)
+        # Images are compressed already: LZ4 passes over them fastest.
+        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.LZ4)
         self._writer.start(profile="", library="armsight")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
