@@ -35,6 +35,7 @@ from armsight.vision.sources import PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.bag import BagSource
 from armsight.vision.sources.bag.camera_info import open_rig
 from armsight.vision.sources.bag.tags import read_tags
+from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource
 from armsight.vision.sources.video import VideoSource
 
@@ -187,7 +188,7 @@ def _timed(source: Source) -> bool:
     """Whether a source is a recording whose shots have times."""
     if isinstance(source, StoredSource):
         return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource | BagSource)
+    return isinstance(source, VideoSource | BagSource | LeRobotSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:

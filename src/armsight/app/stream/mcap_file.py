@@ -196,6 +196,9 @@ def properties(rig: StereoRig | None, body_text: str | None, arm: Arm | None = N
 
 def arm_of(text: str) -> Arm:
     """Return the arm of a run's metadata."""
-    values = json.loads(text)
-    arrays = {name: np.array(value, float) for name, value in values.items() if isinstance(value, list)}
-    return Arm(**(values | arrays | {"joint_names": tuple(values["joint_names"])}))
+    values: dict[str, Any] = json.loads(text)
+    names = tuple(values.pop("joint_names"))
+    arrays: dict[str, Any] = {
+        name: np.array(value, float) if isinstance(value, list) else value for name, value in values.items()
+    }
+    return Arm(joint_names=names, **arrays)
