@@ -192,15 +192,14 @@ def test_a_file_that_was_cut_short_is_one_line_or_is_read_as_far_as_it_goes(tmp_
     file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix in (".mcap", ".db3"))
     data = file.read_bytes()
     file.write_bytes(data[: int(0.6 * len(data))])
-    try:
-        found, notes = shots(f"bag:{path}")
-    except InputError as error:
-        assert str(path) in str(error)
-        assert "\n" not in str(error)
-        assert any(word in str(error) for word in ("index", "damaged", "image"))
+    if container != "foxglove":  # rosbags writes MCAP as one chunk
+        with pytest.raises(InputError, match=r"index|damaged|cut short") as error:
+            shots(f"bag:{path}")
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
         return
-    assert container in ("mcap", "foxglove")
-    assert len(found) >= 0
+    found, notes = shots(f"bag:{path}")
+    assert 10 < sum(shot.problem is None for shot in found) < 30
     assert any("cut short or damaged" in note for note in notes)
 
 

@@ -34,6 +34,12 @@ from armsight.errors import InputError
     "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
 )
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+)
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(
@@ -46,6 +52,7 @@ def command(
     skew: str | None,
     readout: str | None,
     output: Path | None,
+    stream: tuple[str, ...],
     view_dir: Path | None,
     as_json: bool,
 ) -> None:
@@ -76,6 +83,7 @@ def command(
         skew=skew,
         readout=readout,
         output=output,
+        streams=stream,
         view_dir=view_dir,
         as_json=as_json,
     )

@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,8 @@ from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
+from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
@@ -41,6 +43,8 @@ from armsight.vision.sources.video import VideoSource
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
+#: A shot that is younger by its own stamp was stamped by a live camera, s.
+_LIVE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,7 @@ def measure_shots(
     skew: str | None,
     readout: str | None,
     output: Path | None,
+    streams: Sequence[str],
     view_dir: Path | None,
     as_json: bool,
 ) -> tuple[HealthFinding, ...]:
@@ -82,6 +87,7 @@ def measure_shots(
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
         output: CSV file of the poses.
+        streams: what to publish each pose to.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
 
@@ -141,8 +147,9 @@ def measure_shots(
         if output is not None:
             stack.callback(_write, output, records)
         monitor = HealthMonitor(stereo, body, _SYNC_S)
+        publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(results, total, body, records, as_json, view, monitor)
+            _run(results, total, body, records, as_json, view, monitor, publisher)
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
@@ -182,6 +189,21 @@ def _say(notes: Iterable[str]) -> None:
     """Print notes on stderr."""
     for note in notes:
         click.echo(f"note: {note}", err=True)
+
+
+def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
+    """Open the streams of the command line."""
+    if not specs:
+        return Fanout()
+    from armsight.app.stream.streams import open_streams
+
+    return open_streams(specs, Published(rig, body), lambda line: click.echo(line, err=True))
+
+
+def _arrival_s(shot: Shot) -> float | None:
+    """Return the time by the clock of live cameras, s; None where the shot is of a recording."""
+    now = time.monotonic()
+    return now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
 
 
 def _timed(source: Source) -> bool:
@@ -248,6 +270,7 @@ def _run(
     as_json: bool,
     view: PictureFolder | None,
     monitor: HealthMonitor,
+    publisher: Publisher,
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
@@ -257,6 +280,7 @@ def _run(
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
             records.append(record)
+            publisher.put(ShotDatum(shot, result, _arrival_s(shot)))
             click.echo(json.dumps(record.to_json()) if as_json else _line(record))
             if view is not None:
                 view.add(shot, result, record)

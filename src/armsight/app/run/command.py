@@ -36,6 +36,7 @@ class RunPlan:
         motions: the motions.
         targets: (N, 6) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
+        streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.
     """
 
@@ -43,6 +44,7 @@ class RunPlan:
     motions: MotionPlan
     targets: Array
     close_loop: bool
+    streams: tuple[str, ...]
     began: float
 
 
@@ -87,6 +89,12 @@ class RunPlan:
     show_default=True,
     help="Sigma of the time between the two exposures of a shot, ms; sim: knows its own.",
 )
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+)
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
     "-o",
@@ -107,6 +115,7 @@ def command(
     motion: Path | None,
     rate: float,
     sync_ms: float,
+    stream: tuple[str, ...],
     open_loop: bool,
     output: Path,
     as_json: bool,
@@ -145,7 +154,7 @@ def command(
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
-    plan = RunPlan(rig, motions, targets, not open_loop, time.perf_counter())
+    plan = RunPlan(rig, motions, targets, not open_loop, stream, time.perf_counter())
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
     with steps() as progress:
         progress("opening the devices")
@@ -190,10 +199,17 @@ def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Pr
     from armsight.app.run.folder import Finished, finish
     from armsight.app.stream.datum import Published
     from armsight.app.stream.mcap_file import LazyMcap, properties
+    from armsight.app.stream.sink import Fanout
+    from armsight.app.stream.streams import open_streams
+
+    def say(line: str) -> None:
+        click.echo(line, err=True)
 
     texts = properties(plan.rig, body_text, setup.arm, command="run")
     published = Published(plan.rig, setup.target.body, setup.arm, texts)
-    with contextlib.closing(LazyMcap(output, published, lambda line: click.echo(line, err=True))) as file:
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(contextlib.closing(LazyMcap(output, published, say)))
+        streams = stack.enter_context(contextlib.closing(open_streams(plan.streams, published, say)))
         outcome = run_experiment(
             setup,
             plan.rig,
@@ -201,7 +217,7 @@ def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Pr
             plan.targets,
             progress=progress,
             close_loop=plan.close_loop,
-            publisher=file,
+            publisher=Fanout((file, streams)),
         )
     progress("writing and plotting")
     of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}

@@ -18,8 +18,6 @@ STREAMS: dict[str, Callable[[str, Published], Sink]] = {
     "json+udp": open_json_udp,
     "igtl": open_igtl,
 }
-#: The help of the option.
-HELP = "Publish while it runs: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated."
 
 
 class Streams:

@@ -1,8 +1,8 @@
 """A LeRobot dataset: two of its cameras as shots, and its joints.
 
 In: the folder of a dataset of format 2 or 3 (meta/info.json, Parquet tables, one MP4 an episode or a file, usually AV1).
-Out: one shot a frame of the table, with the table's time stamp. Read are the features of dtype ``video``; which two are left
-and right their names say, or the user does: ``lerobot:DIR,left=KEY,right=KEY``; ``episode=N`` reads one episode alone.
+Out: one shot a frame of the table, with the table's time stamp. Read are the features of dtype ``video``; which two are
+left and right their names say, or the user does: ``lerobot:DIR,left=KEY,right=KEY``; ``episode=N`` reads one episode alone.
 """
 
 from __future__ import annotations
