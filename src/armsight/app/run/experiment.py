@@ -21,6 +21,8 @@ from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, estimator_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
@@ -178,6 +180,7 @@ def run_experiment(
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
     begun: Callable[[Loop], None] = lambda loop: None,
+    publisher: Publisher | None = None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -190,13 +193,14 @@ def run_experiment(
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
         begun: called with the loop before the drives are switched on.
+        publisher: is given everything that is measured; it returns at once.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun, publisher or Fanout())
     return outcome
 
 
@@ -210,6 +214,7 @@ def _run(
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
     begun: Callable[[Loop], None],
+    publisher: Publisher,
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
@@ -218,7 +223,9 @@ def _run(
         follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        first = KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY)
+        publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
+        loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
         enable(setup.board)
         _require_seen(loop, setup, plan)

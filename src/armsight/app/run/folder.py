@@ -36,6 +36,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, RunReport, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
+from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
@@ -272,7 +273,7 @@ def make_room(folder: Path) -> None:
     writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*NAMES, "pose", "workcell", *_OLD_FIGURES)]
     names += [f"{name}.{kind}" for name in (*_TRACKS, *_OLD_TRACKS, "joints") for kind in ("csv", "parquet")]
-    names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"]
+    names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv", RUN_MCAP]
     try:
         if (folder / _SHOTS).is_dir():
             shutil.rmtree(folder / _SHOTS)

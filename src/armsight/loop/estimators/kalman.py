@@ -93,6 +93,11 @@ class KalmanEstimator:
         return self._model.sigmas
 
     @property
+    def settings(self) -> tuple[Prior, Delay, bool]:
+        """Prior, delay and whether the delay is corrected: what it was made with."""
+        return self._prior, self._delay, self._learns_delay
+
+    @property
     def span_s(self) -> tuple[float, float]:
         """The oldest and the newest time that can be estimated, s."""
         return self._readings.span_s
