@@ -127,7 +127,14 @@ _TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "reference")
 _OLD_TRACKS, _OLD_FIGURES = ("wanted",), ("cell",)
 _SHOTS = "shots"
 #: Basis of a command -> its text in run.log.
-_BASED = {"planned": "as planned", "vision": "on vision", "bridged": "on the model while vision was missing"}
+_BASED = {
+    "planned": "as planned",
+    "vision": "on vision",
+    "bridged": "on the model while vision was missing",
+    "potentiometers": "with the last correction, vision lost",
+    "held": "with the correction held, as vision contradicted what was learned",
+    "distrusted": "on the potentiometers alone, as vision was wrong",
+}
 
 
 @dataclass(frozen=True)
