@@ -1,5 +1,6 @@
 """Changes of rig, body and joints that a filter would follow: found by closure, named, sized; none where none is."""
 
+import faults
 import numpy as np
 import pytest
 from arm_rig import ARM
@@ -8,6 +9,7 @@ from armsight.loop.estimators import Innovation, Outcome, Prior
 from armsight.loop.estimators.armerror import BACKLASH, FLOAT, POSE, SIZE, ZEROS
 from armsight.loop.estimators.errormodel import ErrorModel
 from armsight.loop.health.closure import ClosureWatch
+from armsight.loop.servo import Mode
 
 SHOT_S, AT_S, PRIOR = 0.1, 18.0, Prior()
 SHOT = np.repeat([1.5e-4, np.radians(0.02)], 3)
@@ -97,3 +99,13 @@ def test_sizes_scatter_as_their_covariance_says():
         off = change.size - SHIFT
         squares.append(off @ np.linalg.solve(change.cov, off))
     assert np.mean(squares) < 12.0
+
+
+def test_a_loop_on_a_rig_that_moved_is_no_worse_than_the_potentiometers(monkeypatch):
+    monkeypatch.setattr(faults, "LEARNED_S", 3.0)
+    monkeypatch.setattr(faults, "AT_S", 4.0)
+    alone = max(row[1] for row in faults.closed_loop(40, closes=False, seconds=9.0))
+    rows = faults.closed_loop(40, lambda t_s: np.array([0.01, 0.0, 0.0, 0.0, np.radians(0.8), 0.0]), seconds=9.0)
+    assert max(distance for t_s, distance, *_ in rows if t_s > 4.0) < 1.2 * alone
+    assert rows[-1][3] is Mode.DISTRUSTED
+    assert any(mode is Mode.VISION for *_, mode in rows)

@@ -42,13 +42,13 @@ _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 #: Beginnings that are tried; the newer, the closer.
 _BEGINS = 12
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
-_BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
+_BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 4.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), and of an angle, rad.
 _WIDE, _WIDE_RAD = np.repeat([0.05, 0.1], 3), np.array([0.1])
 #: A motion of rig or body that displaces the tool by less than this, m, is not reported, nor a smaller angle, rad.
 _LEAST_M, _LEAST_RAD = 1e-4, float(np.radians(0.1))
 #: By so much the chi-square of a drift must exceed that of a jump.
-_RARER = 10.0
+_RARER = 5.0
 #: Two changes whose chi-squares, less their limits, differ by less than this cannot be distinguished.
 _ALIKE = 12.0
 #: The parameters that may change, of the state: tangents of base and tool, zeros of the joints after the first (its own is

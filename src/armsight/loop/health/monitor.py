@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from armsight.data import Body, PoseEstimate
-from armsight.loop.estimators import Innovation, KalmanEstimator, PoseMeasurement
+from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
 from armsight.loop.estimators.armerror import SIZE
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import RigWatch
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
+
+#: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
+DOUBT_S = 2.0
 
 
 class HealthMonitor:
@@ -31,6 +34,7 @@ class HealthMonitor:
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
         self._suspected = np.zeros((6, 6))  # what the newest tested shot adds to the covariance of a pose
+        self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
 
@@ -73,7 +77,21 @@ class HealthMonitor:
         self._fixed = FixedWatch(arm.T_base_0, SIZE)
         self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
         self._innovations = []
-        estimator.on_innovation = self._innovations.append
+        estimator.on_innovation = self._note
+
+    def _note(self, innovation: Innovation) -> None:
+        """Keep what became of a measurement for the tests; a contradiction counts at once."""
+        self._innovations.append(innovation)
+        self._newest_s = innovation.t_s
+        if innovation.outcome is Outcome.REOPENED:
+            self._doubted_s = innovation.t_s
+
+    @property
+    def trust(self) -> Trust:
+        """How far a loop may rely on the measured poses now."""
+        if self.moved is not None or (self._rig is not None and self._rig.suspected is not None):
+            return Trust.NONE
+        return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
 
     @property
     def moved(self) -> BaseMotion | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from enum import Enum
 from typing import Any, Literal
 
 from scipy.special import chdtri
@@ -14,6 +15,14 @@ from scipy.special import chdtri
 Cause = Literal["rig", "body", "fixed", "time", "joint", "estimator"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
+
+
+class Trust(Enum):
+    """How far a loop may rely on the poses that vision measures."""
+
+    FULL = "nothing is suspected"
+    DOUBTED = "measured poses contradict what was learned, and the cause is not known yet"
+    NONE = "what vision measures is wrong: the cameras, the rig or the body moved"
 
 
 @dataclass(frozen=True)
