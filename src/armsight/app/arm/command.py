@@ -35,7 +35,7 @@ def _arm_argument(command: Callable[..., Any]) -> Callable[..., Any]:
 def command() -> None:
     """Print an arm's table and kinematics: mm and degrees here, m and rad in --json.
 
-    ARM is a name that `armsight arm list` prints, or a .toml or .urdf file of six revolute joints.
+    ARM is a name that `armsight arm list` prints, or a .toml or .urdf file of four to seven revolute joints.
     """
 
 

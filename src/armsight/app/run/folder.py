@@ -47,9 +47,9 @@ from armsight.vision.rig import StereoRig
 
 
 def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
-    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, 6), rad."""
+    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, n), rad."""
     named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
-    for joint in range(6):
+    for joint in range(q.shape[1]):
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
         named[f"q{joint + 1}_ref_rad"] = np.round(q_ref[:, joint], 9)
     return named
@@ -72,12 +72,12 @@ def write_handeye(folder: Path, run: HandEyeRun) -> None:
     write_text(folder / "handeye.json", json.dumps(calibration, indent=1) + "\n")
     T = run.Ts_left_body
     covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
-    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
+    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(run.q.shape[1])}
     named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
     quaternions = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
     named |= {f"q{axis}": quaternions[:, i] for i, axis in enumerate("wxyz")}
     named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
-    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
+    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(run.q.shape[1])}
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
     writer.writerow(named)

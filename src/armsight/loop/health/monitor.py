@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from armsight.data import Body, PoseEstimate
 from armsight.loop.estimators import KalmanEstimator, PoseMeasurement
-from armsight.loop.estimators.armerror import SIZE
+from armsight.loop.estimators.armerror import layout
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
 from armsight.loop.health.record import HealthFinding
 from armsight.loop.health.rig import RigWatch
@@ -41,7 +41,7 @@ class HealthMonitor:
 
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Watch from now on whether the rig stands still in the base of an arm, by what an estimator makes of the poses."""
-        self._fixed = FixedWatch(arm.T_base_0, SIZE)
+        self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
         estimator.on_innovation = self._fixed.take
 
     @property
