@@ -5,8 +5,8 @@ frame of the joint before; it turns about its z axis. UR's joints are called sho
 wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
 
 In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a little
-off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to the
-makers' as its axes allow; and how far the two arms put their tools apart.
+off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to those of
+the nominal table as its axes allow; and how far the two arms put their tools apart.
 """
 
 from __future__ import annotations
