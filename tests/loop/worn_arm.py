@@ -44,7 +44,9 @@ class Worn:
             for i in range(q.shape[1]):
                 z, at = T[i, :3, 2], T[i, :3, 3]
                 force = np.array([0, 0, -GRAVITY])
-                out[n, i] = sum(m * z @ np.cross(T[j + 1, :3, 3] - at, force) for j, m in enumerate(MASS_KG[: q.shape[1]]) if j >= i)
+                out[n, i] = sum(
+                    m * z @ np.cross(T[j + 1, :3, 3] - at, force) for j, m in enumerate(MASS_KG[: q.shape[1]]) if j >= i
+                )
         return out
 
     def T_rig_body(self, q, approach):

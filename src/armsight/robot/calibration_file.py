@@ -1,10 +1,11 @@
 """Calibrated tables of single arms, as their makers' ROS drivers keep them: Universal Robots' and UFACTORY's YAML.
 
-Both are one form: ``kinematics:`` with x, y, z, m, and roll, pitch, yaw, rad, for every joint: where its frame stands in the
-frame of the joint before; it turns about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1 to
+Both are one form: ``kinematics:`` with x, y, z, m, and roll, pitch, yaw, rad, for every joint: where its frame stands in
+the frame of the joint before; it turns about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1 to
 wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
 
-In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a little
+In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a
+little
 off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to those of
 the nominal table as its axes allow; and how far the two arms put their tools apart.
 """
@@ -44,7 +45,8 @@ class Difference(NamedTuple):
         most_m: greatest, m.
         mean_rad: mean angle between the tools, rad.
         most_rad: greatest, rad.
-        a_m: (n,) what the second arm's link lengths are more, m; NaN where a row's axes are no longer parallel or have become
+        a_m: (n,) what the second arm's link lengths are more, m; NaN where a row's axes are no longer parallel or have
+        become
             so, and lengths cannot be compared.
         d_m: (n,) link offsets likewise, m.
         alpha_rad: (n,) twists, rad.
@@ -91,8 +93,8 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
     check_same(f"{path}", arm, links)
     if (far := difference(nominal, arm).mean_m) > _FAR_M:
         raise InputError(
-            f"{path}: its tool is {1e3 * far:.0f} mm from that of {nominal.name} on the mean: is it the calibration of another "
-            "kind of arm, or in mm?"
+            f"{path}: its tool is {1e3 * far:.0f} mm from that of {nominal.name} on the mean: is it the calibration of "
+            "another kind of arm, or in mm?"
         )
     return arm
 
@@ -107,7 +109,9 @@ def _origins(path: str | Path, nominal: Arm) -> list[Array]:
     missing = [name for name in names if not isinstance(kinematics.get(name), Mapping)]
     if missing:
         there = ", ".join(str(name) for name in kinematics)
-        raise InputError(f"{path}: kinematics: {missing[0]} is missing; {nominal.name} has {', '.join(names)}, there are {there}")
+        raise InputError(
+            f"{path}: kinematics: {missing[0]} is missing; {nominal.name} has {', '.join(names)}, there are {there}"
+        )
     if f"joint{len(names) + 1}" in kinematics:
         raise InputError(f"{path}: kinematics: has joint{len(names) + 1}; {nominal.name} has {len(names)} joints")
     out = []
@@ -123,8 +127,10 @@ def _origins(path: str | Path, nominal: Arm) -> list[Array]:
 
 def _names(arm: Arm) -> tuple[str, ...]:
     """Return what a file calls an arm's joints."""
-    return UR_NAMES if arm.joint_names[0] == "shoulder_pan" and arm.joints == 6 else tuple(
-        f"joint{i + 1}" for i in range(arm.joints)
+    return (
+        UR_NAMES
+        if arm.joint_names[0] == "shoulder_pan" and arm.joints == 6
+        else tuple(f"joint{i + 1}" for i in range(arm.joints))
     )
 
 
@@ -150,16 +156,18 @@ def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:
         nominal: the maker's table of this kind of arm, whose frames the file follows.
 
     Returns:
-        The YAML text, and how far the file's flange is off the arm's, m and rad: zero where axis n goes through the origin of
-        the flange along its z, as in the makers' tables.
+        The YAML text, and how far the file's flange is off the arm's, m and rad: zero where axis n goes through the origin
+        of the flange along its z, as in the makers' tables.
 
     Raises:
         InputError: another number of joints, a joint that turns the other way, or coupled motors.
     """
     if arm.joints != nominal.joints:
         raise InputError(f"{arm.name} has {arm.joints} joints, {nominal.name} {nominal.joints}")
-    if (arm.direction < 0).any() and (nominal.direction > 0).all() or (arm.coupling != np.eye(arm.joints)).any():
-        raise InputError(f"{arm.name}: joints that turn the other way, and coupled motors, have no place in such a file")
+    if ((arm.direction < 0).any() and (nominal.direction > 0).all()) or (arm.coupling != np.eye(arm.joints)).any():
+        raise InputError(
+            f"{arm.name}: joints that turn the other way, and coupled motors, have no place in such a file"
+        )
     frames, before = _frames(arm, nominal), np.eye(4)
     lines = ["kinematics:"]
     for name, F in zip(_names(nominal), frames, strict=True):

@@ -13,7 +13,7 @@ from armsight.robot.urdf import read_urdf
 pytest.importorskip("yaml")
 UR5E = MODELS["ur5e"]
 #: One whose forearm is 0.4 mm longer.
-LONGER = dataclasses.replace(UR5E, a=UR5E.a + [0, 0, -4e-4, 0, 0, 0])
+LONGER = dataclasses.replace(UR5E, a=UR5E.a - 4e-4 * np.eye(6)[2])
 
 
 def test_the_difference_is_said_and_the_arm_converted(armsight, tmp_path):

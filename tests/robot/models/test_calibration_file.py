@@ -95,4 +95,3 @@ def test_what_a_file_cannot_hold_is_rejected():
         calibration_text(dataclasses.replace(ur5e, direction=-np.ones(6)), ur5e)
     with pytest.raises(InputError, match="7 joints, ur5e 6"):
         calibration_text(MODELS["xarm7"], ur5e)
-

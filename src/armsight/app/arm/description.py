@@ -218,8 +218,9 @@ def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
         for i in range(nominal.joints)
     ]
     lines = [
-        f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, {1e3 * found.most_m:.3f} mm at "
-        f"most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, {np.degrees(found.most_rad):.3f} deg at most",
+        f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, "
+        f"{1e3 * found.most_m:.3f} mm at most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, "
+        f"{np.degrees(found.most_rad):.3f} deg at most",
         "(the same joint angles and base; poses all over the joint limits)",
         *_table((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
     ]

@@ -451,7 +451,9 @@ def _together(rows: Array) -> list[tuple[float, tuple[int, ...]]]:
 
     ``rows``: (N, n + 1) times, s, and commanded joint angles, rad.
     """
-    each = sorted((t_s, joint) for joint in range(1, rows.shape[1]) for t_s in _reversal_times(rows[:, 0], rows[:, joint]))
+    each = sorted(
+        (t_s, joint) for joint in range(1, rows.shape[1]) for t_s in _reversal_times(rows[:, 0], rows[:, joint])
+    )
     near = _NEAR * float(np.ptp(rows[:, 0])) if len(rows) else 0.0
     found: list[tuple[float, tuple[int, ...]]] = []
     for t_s, joint in each:

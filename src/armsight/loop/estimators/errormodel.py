@@ -73,9 +73,7 @@ def smoothed_anew(state: ErrorState, then: Smoothed) -> ErrorState:
     return state._replace(x=x, joints=then)
 
 
-def bridged(
-    noise_at: slice, before: Array, after: Array, ahead: Propagation, back: Propagation
-) -> tuple[Array, Array]:
+def bridged(noise_at: slice, before: Array, after: Array, ahead: Propagation, back: Propagation) -> tuple[Array, Array]:
     """Return the readings' noise (N, n) between the states before and after (N, size), and what is added to variances.
 
     The noise is bounded by both ends, as a Gauss-Markov process is: its mean between them, and what is left of its
@@ -112,7 +110,11 @@ class ErrorModel:
 
     def poses(self, x: Array, q: Array, unseen: Array) -> tuple[Array, Array]:
         """Return the tool's poses (N, 4, 4) and their derivatives (N, 6, size); x may be one for all."""
-        Ts, Hs, xs = np.empty((len(q), 4, 4)), np.empty((len(q), 6, self.layout.size)), np.empty((len(q), self.layout.size))
+        Ts, Hs, xs = (
+            np.empty((len(q), 4, 4)),
+            np.empty((len(q), 6, self.layout.size)),
+            np.empty((len(q), self.layout.size)),
+        )
         xs[:] = x
         armerror.poses_and_derivatives(self._table, xs, q, unseen, Ts, Hs)
         return Ts, Hs

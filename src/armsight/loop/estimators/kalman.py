@@ -207,7 +207,11 @@ class KalmanEstimator:
             self._widths @ x,
             np.sqrt(np.diag(self._widths @ P @ self._widths.T)),
             now.unseen[0, 0],
-            replace(self._delay, delay_s=self._delay.delay_s + float(x[self._at.delay]), sigma_s=float(sigma[self._at.delay])),
+            replace(
+                self._delay,
+                delay_s=self._delay.delay_s + float(x[self._at.delay]),
+                sigma_s=float(sigma[self._at.delay]),
+            ),
         )
 
     def _backlash(self) -> Array:
@@ -247,7 +251,9 @@ class KalmanEstimator:
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 report(
-                    Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((self._at.size, 6)), outcome)
+                    Innovation(
+                        t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((self._at.size, 6)), outcome
+                    )
                 )
             return None, outcome
         if outcome is Outcome.REOPENED:

@@ -211,7 +211,11 @@ class Readings:
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
         self._gap, self._sigma, self._joints = np.full(arm.joints, GAP_RAD), sigma_rad, arm.joints
         # Beside each reading: travel, flips, side, position behind the dead zone; then what ``backlash_dynamics`` writes.
-        self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, arm.joints)), np.zeros((_ROWS, 8, arm.joints))
+        self._t, self._q, self._memory = (
+            np.empty(_ROWS),
+            np.empty((_ROWS, arm.joints)),
+            np.zeros((_ROWS, 8, arm.joints)),
+        )
         self._first = self._count = self._settled = 0
         self._gone_s = -np.inf
         # The variance that a parabola leaves of its slope at its end is 192/(N SPAN^2).

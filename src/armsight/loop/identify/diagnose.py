@@ -115,8 +115,8 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     """
     if measured.q.shape[1] != arm.joints:
         raise InputError(
-            f"these data have {measured.q.shape[1]} joint angles a row, {arm.name} has {arm.joints} joints: is it the right "
-            "model? a gripper's angle is none of the arm's: leave it out"
+            f"these data have {measured.q.shape[1]} joint angles a row, {arm.name} has {arm.joints} joints: is it the "
+            "right model? a gripper's angle is none of the arm's: leave it out"
         )
     if np.abs(measured.q).max() > chain.MOST_RADIANS:
         row, joint = divmod(int(np.argmax(np.abs(measured.q))), measured.q.shape[1])
@@ -193,7 +193,9 @@ def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str | None:
     if other is not None:
         text += f"; these data fit as well, and do not show which is true, if {other.text}"
     flipped = [tuple(-s if i == j else s for i, s in enumerate(best.signs)) for j in range(arm.joints)]
-    either = [str(j + 1) for j in range(arm.joints) if any(m[:3] == (best.joint_order, flipped[j], best.left) for m in alike)]
+    either = [
+        str(j + 1) for j in range(arm.joints) if any(m[:3] == (best.joint_order, flipped[j], best.left) for m in alike)
+    ]
     return text + (f"; they do not show whether the sign of joint {', '.join(either)} is right" if either else "")
 
 

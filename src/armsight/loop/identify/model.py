@@ -1,8 +1,8 @@
 """The model that identification fits: an arm with everything that can be off about it, as one vector of parameters.
 
 The vector x (P,) holds, in this order: the base in the rig (translation along the rig's axes; rotation about them, from a
-start), the tool's points or the body in the last frame, the 30 numbers of the table, and one coefficient per error source beyond
-the table.
+start), the tool's points or the body in the last frame, the 30 numbers of the table, and one coefficient per error source
+beyond the table.
 
 The file in order: forward kinematics of an arm that deviates from its table, with derivatives (:class:`TableMotion`); the
 error sources of single joints (:class:`Feature`); the vector and its predictions (:class:`Model`).
@@ -306,8 +306,8 @@ class Model(Record):
         full: whether full poses are measured.
         features: the error sources beyond the table.
         R_start: (3, 3) rotation of the base in the rig that the base's rotation parameters start from.
-        R_tool: (3, 3) rotation of the body in the last frame that the tool's rotation parameters start from, with full poses.
-        up_base: (3,) unit vector against gravity, base.
+        R_tool: (3, 3) rotation of the body in the last frame that the tool's rotation parameters start from, with full
+        poses. up_base: (3,) unit vector against gravity, base.
         q_seen: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves
             fade; None before the fit is done, and of an arm whose file does not say it.
         fade_rad: how far beyond them the curves have faded, rad.
@@ -388,7 +388,7 @@ class Model(Record):
         return x[self.tool_at : self.tool_at + 3 * self.points].reshape(-1, 3)
 
     def T_6_body(self, x: Array) -> Array:
-        """Return the body (4, 4) in the last frame; its rotation is that of the last frame where only points are measured."""
+        """Return the body (4, 4) in the last frame; its rotation is that frame's where only points are measured."""
         T = np.eye(4)
         T[:3, 3] = self.tool_points(x)[0]
         if self.full:

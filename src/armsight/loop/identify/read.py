@@ -117,7 +117,9 @@ def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) 
         if rotation is not None:
             requested += _alternative(path, columns, [["rx_deg", "ry_deg", "rz_deg"]], "angles")
     if "approach1" in columns:
-        requested += _alternative(path, columns, [[f"approach{i + 1}" for i in range(joints)]], "directions of approach")
+        requested += _alternative(
+            path, columns, [[f"approach{i + 1}" for i in range(joints)]], "directions of approach"
+        )
     missing = [name for name in requested if name not in columns]
     if missing:
         raise InputError(f"{path}: line 1: column {missing[0]} is missing")
