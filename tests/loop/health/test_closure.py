@@ -36,7 +36,7 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, gain=0.0):
         e = H @ x + SHOT * rng.normal(size=6)
         if kind is not None and t_s >= AT_S:
             if kind == "backlash":
-                column = H[:, [BACKLASH + joint]] + H[:, [FLOAT + joint]]
+                column = 0.5 * (H[:, [BACKLASH + joint]] + H[:, [FLOAT + joint]])
             else:
                 column = H[:, COLUMNS.get(kind, [ZEROS[joint]])]
             e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
@@ -64,9 +64,9 @@ SHIFT = np.array([6e-4, 0.0, 3e-4, 0.0, np.radians(0.03), 0.0])
         ("rig", SHIFT, 0, "fixed"),
         ("drift", SHIFT / 20.0, 0, "fixed"),
         ("body", 2.0 * SHIFT, 0, "body"),
-        ("joint", np.radians(0.3), 2, "joint"),
-        ("joint", np.radians(-0.3), 1, "joint"),
-        ("backlash", np.radians(0.25), 1, "joint"),
+        ("joint", np.radians(0.5), 2, "joint"),
+        ("joint", np.radians(-0.5), 1, "joint"),
+        ("backlash", np.radians(0.5), 1, "joint"),
     ],
 )
 @pytest.mark.parametrize("gain", [0.0, 0.1])
@@ -86,7 +86,7 @@ def test_a_change_is_named_sized_and_dated_though_a_filter_follows_it(kind, size
 
 
 def test_the_first_joint_looks_like_a_rotation_of_the_rig_about_its_axis():
-    (found,) = watched(12, "joint", np.radians(0.3), 0).findings()
+    (found,) = watched(12, "joint", np.radians(0.5), 0).findings()
     assert "or the rig rotated about the axis of this joint" in found.what
 
 

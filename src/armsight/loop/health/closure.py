@@ -42,11 +42,14 @@ _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 #: Beginnings that are tried; the newer, the closer.
 _BEGINS = 12
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
-_BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 4.0
+_BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), and of an angle, rad.
 _WIDE, _WIDE_RAD = np.repeat([0.05, 0.1], 3), np.array([0.1])
 #: A motion of rig or body that displaces the tool by less than this, m, is not reported, nor a smaller angle, rad.
-_LEAST_M, _LEAST_RAD = 1e-4, float(np.radians(0.1))
+#: What a link does within its backlash looks like a slip of a tenth of a degree.
+_LEAST_M, _LEAST_RAD = 2e-4, float(np.radians(0.3))
+#: The limits are higher than those of Gaussian errors by this factor: the errors of an arm have longer tails.
+_MARGIN = 1.4
 #: By so much the chi-square of a drift must exceed that of a jump.
 _RARER = 5.0
 #: Two changes whose chi-squares, less their limits, differ by less than this cannot be distinguished.
@@ -78,7 +81,7 @@ class Suspect:
 
 def _suspects() -> tuple[Suspect, ...]:
     """Return all; the probability of a false alarm is shared by them and the beginnings that are tried."""
-    six, one = (alarm_limit(freedom, 1.0 / BLOCK_S, 15 * _BEGINS) for freedom in (6, 1))
+    six, one = (_MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, 15 * _BEGINS) for freedom in (6, 1))
     return (
         Suspect("rig", -1, slice(0, 6), six),
         Suspect("drift", -1, slice(0, 6), six),
@@ -258,13 +261,16 @@ class ClosureWatch:
         self._sums.add(self._t[k], H_white @ changes, changes_white @ changes, changes_white @ e)
 
     def _estimate_noise(self) -> None:
-        """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew."""
+        """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it.
+
+        The second time the change that explains most is fitted as well: it must not be taken for errors.
+        """
         A, e = np.array(self._H)[:, :, :REST] * self._sigmas, np.array(self._e)
-        for _ in range(2):
+        for last in (False, True):
             whiten = np.linalg.cholesky(np.linalg.inv(self._cov)).T
-            flat = (whiten @ A).reshape(-1, REST)
+            flat = (whiten @ A).reshape(len(A) * 6, -1)
             whole = flat.T @ flat
-            N = whole + np.eye(REST)
+            N = whole + np.eye(len(whole))
             x = np.linalg.solve(N, flat.T @ (e @ whiten.T).ravel())
             freedom = max(e.size - float(np.trace(np.linalg.solve(N, whole))), 0.0)
             left = e - A @ x
@@ -273,9 +279,23 @@ class ClosureWatch:
             # Neighbours of like errors count as fewer (first-order autoregression).
             rho = float(np.vdot(along[1:], along[:-1]) / np.vdot(along, along))
             self._cov = own * max((1.0 + rho) / (1.0 - rho), 1.0)
-        self._clear()
-        for k in range(len(e)):
-            self._sum(k)
+            self._clear()
+            for k in range(len(e)):
+                self._sum(k)
+            if not last:
+                best = max(self._tested(_begins(len(e)), SUSPECTS), key=lambda each: each.above)
+                A = np.concatenate([A, self._by_change(best)], axis=2)
+
+    def _by_change(self, found: _Tested) -> Array:
+        """Return the derivative (N, 6, D) of the blocks by a change, over the width of its prior."""
+        t = np.array(self._t)
+        begin_s = t[found.begin - 1]
+        after = (t > begin_s).astype(float)
+        if found.suspect.kind == "drift":
+            after *= (t - begin_s) / (t[-1] - begin_s)
+        columns = np.array([_changes(H)[:, found.suspect.columns] for H in self._H])
+        wide = _WIDE if columns.shape[2] == 6 else _WIDE_RAD
+        return np.asarray(columns * wide * after[:, None, None])
 
     def _decide(self) -> None:
         """Test all hypotheses at some beginnings, and the best of them at those between."""
@@ -332,7 +352,8 @@ class ClosureWatch:
 
 def _changes(H: Array) -> Array:
     """Return the columns (6, 23) of what may change, of the derivative (6, K) of the tool's pose by the state."""
-    widths = H[:, BACKLASH : BACKLASH + 6] + H[:, FLOAT : FLOAT + 6]
+    # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
+    widths = 0.5 * (H[:, BACKLASH : BACKLASH + 6] + H[:, FLOAT : FLOAT + 6])
     return np.concatenate([H[:, :6], H[:, _TOOL], H[:, ZEROS[1:]], widths], axis=1)
 
 
