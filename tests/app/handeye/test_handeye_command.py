@@ -100,7 +100,9 @@ def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsig
     _, A, B = motion(20)
     B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--plan", 2, "-o", tmp_path / "out")
+    said = armsight(
+        "handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--plan", 2, "-o", tmp_path / "out"
+    )
     assert said.code == 0, said.err
     assert "T_flange_rig" in said.out
     assert " ± " in said.out
@@ -154,7 +156,11 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
         speeds = np.array([0.31, 0.47, 0.59, 0.71, 0.83, 1.03]) * 0.6 * np.pi
         return exp_se3(np.array([0.2, 0.2, 0.15, 0.5, 0.4, 0.5]) * np.sin(speeds * t[:, None] + np.arange(6)))
 
-    B = inverse(motion_at(t_eye) @ X) @ Z @ exp_se3(np.random.default_rng(0).normal(0, [2e-4] * 3 + [5e-4] * 3, (140, 6)))
+    B = (
+        inverse(motion_at(t_eye) @ X)
+        @ Z
+        @ exp_se3(np.random.default_rng(0).normal(0, [2e-4] * 3 + [5e-4] * 3, (140, 6)))
+    )
     head = "t_s,x_m,y_m,z_m,qw,qx,qy,qz"
     A = motion_at(t_hand)
     robot = named(tmp_path / "a.csv", head, np.hstack([t_hand[:, None], A[:, :3, 3], quaternions(A)]))
@@ -169,7 +175,9 @@ def test_millimetres_are_refused_or_detected(armsight, tmp_path, seen):
     A = A.copy()
     A[:, :3, 3] *= 1e3
     robot = matrices(tmp_path / "robot.txt", A)
-    assert_rejected(armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "--units mm")
+    assert_rejected(
+        armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "--units mm"
+    )
     document, notes = found(armsight, robot, seen, "--detect-units")
     assert "read as millimetres" in notes
     assert_right(document)
@@ -260,10 +268,14 @@ def test_images_of_one_camera(armsight, tmp_path):
         for j in range(9):
             if (i + j) % 2 == 0:
                 squares[40 + 40 * i : 80 + 40 * i, 40 + 40 * j : 80 + 40 * j] = 0
-    to_board = np.array([[0.025 / 40, 0, -0.05 + 0.5 * 0.025 / 40], [0, 0.025 / 40, -0.05 + 0.5 * 0.025 / 40], [0, 0, 1]])
+    to_board = np.array(
+        [[0.025 / 40, 0, -0.05 + 0.5 * 0.025 / 40], [0, 0.025 / 40, -0.05 + 0.5 * 0.025 / 40], [0, 0, 1]]
+    )
     A = []
     for k in range(9):
-        xi = np.array([*rng.uniform(-0.03, 0.03, 2), rng.uniform(-0.05, 0.05), *rng.uniform(-0.4, 0.4, 2), rng.uniform(-1, 1)])
+        xi = np.array(
+            [*rng.uniform(-0.03, 0.03, 2), rng.uniform(-0.05, 0.05), *rng.uniform(-0.4, 0.4, 2), rng.uniform(-1, 1)]
+        )
         middle = np.array([0.0875, 0.0625, 0, 0, 0, 0])
         T = exp_se3(np.array([0, 0, 0.45, 0, 0, 0])) @ exp_se3(xi) @ inverse(exp_se3(middle))
         H = K @ T[:3, [0, 1, 3]] @ to_board

@@ -33,7 +33,12 @@ def made(seed, *, n=25, in_hand=False, flange=(0.0, 0.0), camera=(0.0, 0.0, 0.0)
     true = true @ exp_se3(rng.normal(0, [flange[0]] * 3 + [flange[1]] * 3, (n, 6)))
     B = inverse(true @ X) @ Z if in_hand else inverse(Z) @ true @ X
     about = exp_se3(np.concatenate([CENTRE, np.zeros(3)]))
-    B = B @ about @ exp_se3(np.concatenate([np.zeros((n, 3)), rng.normal(0, camera[2], (n, 3))], axis=1)) @ inverse(about)
+    B = (
+        B
+        @ about
+        @ exp_se3(np.concatenate([np.zeros((n, 3)), rng.normal(0, camera[2], (n, 3))], axis=1))
+        @ inverse(about)
+    )
     B[:, :3, 3] += rng.normal(0, [camera[0], camera[0], camera[1]], (n, 3))
     if any(walk):
         eye, steps = inverse(B), exp_se3(rng.normal(0, [walk[0]] * 3 + [walk[1]] * 3, (n, 6)))
@@ -75,10 +80,11 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
 
 def test_poses_left_out_tell_the_arms_error_from_the_cameras():
     both = ("robot", "camera, depth apart")
-    arm = calibrate_structured(made(1, n=60, flange=(1e-3, 5e-4))[0], structures=both)
+    arm = calibrate_structured(made(1, n=60, flange=(1e-4, 5e-3))[0], structures=both)
     camera = calibrate_structured(made(1, n=60, camera=(2e-4, 2e-3, 1e-3))[0], structures=both)
     assert (arm.structure, camera.structure) == both
     assert arm.camera_m == 0
+    assert arm.sigmas["flange_rad"] == pytest.approx(5e-3, rel=0.2)
     assert camera.arm_m == 0
     assert camera.sigmas["depth_m"] == pytest.approx(2e-3, rel=0.3)
     assert camera.sigmas["lateral_m"] == pytest.approx(2e-4, rel=0.3)
@@ -131,7 +137,9 @@ def test_rotation_about_one_axis_is_refused_and_the_axis_named_also_under_noise(
     xi = np.zeros((20, 6))
     xi[:, 0], xi[:, 4] = np.linspace(0, 0.3, 20), np.linspace(-0.6, 0.6, 20)
     for noise in (0.0, 2e-3):
-        with pytest.raises(CalibrationError, match=r"one axis only, \[-?0\.00 1\.00 -?0\.00\].*flange-body along this axis"):
+        with pytest.raises(
+            CalibrationError, match=r"one axis only, \[-?0\.00 1\.00 -?0\.00\].*flange-body along this axis"
+        ):
             calibrate_structured(turned(xi, noise=noise))
 
 
@@ -150,13 +158,20 @@ def test_too_few_poses_and_unknown_needs_are_refused():
     assert calibrate_structured(poses, links=links, structures=("robot's geometry off",)).used.any()
 
 
-@pytest.mark.parametrize("structure", ["robot and camera", "robot drifting over its poses", "camera walking"])
+@pytest.mark.parametrize("structure", ["robot", "robot and camera", "robot drifting over its poses", "camera walking"])
 def test_the_gradient_of_the_restricted_likelihood(structure):
     rng = np.random.default_rng(2)
     poses, _, _, _ = made(2, n=6, in_hand=True)
     maps = {
         name: rng.normal(size=(6, 6, k))
-        for name, k in (("flange_m", 3), ("flange_rad", 3), ("lateral_m", 2), ("depth_m", 1), ("seen_rad", 3), ("seen_m", 3))
+        for name, k in (
+            ("flange_m", 3),
+            ("flange_rad", 3),
+            ("lateral_m", 2),
+            ("depth_m", 1),
+            ("seen_rad", 3),
+            ("seen_m", 3),
+        )
     }
     linear = Linear(
         rng.normal(size=(6, 6)),
@@ -186,7 +201,7 @@ def test_streams_give_the_offset_within_its_sigma():
 
     rng = np.random.default_rng(4)
     X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
-    t_hand, t_eye = np.arange(0, 10, 0.01), np.arange(0.5, 9.5, 1 / 20)
+    t_hand, t_eye = np.arange(0, 8, 0.01), np.arange(0.5, 7.5, 1 / 15)
     B = inverse(Z) @ motion(t_eye) @ X @ exp_se3(rng.normal(0, [3e-4] * 3 + [1e-3] * 3, (len(t_eye), 6)))
     found = calibrate_structured_streams(
         PoseStream.of(t_hand, motion(t_hand), "hand"), PoseStream.of(t_eye - 0.3217, B, "eye")

@@ -65,8 +65,8 @@ SHARED = ("robot's geometry off", "robot drifting over its poses", "robot drifti
 OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
-#: A link's errors of position and angle are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
-#: logarithm of their variances' ratio. Few links say little about two variances, and one may come out as nothing by chance.
+#: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
+#: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
 LIKE_EACH_OTHER = 1.5
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
@@ -297,7 +297,7 @@ def left_out_squares(b: Blocks, s: Solved) -> Array:
 
 
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
-    """Return minus the restricted log-likelihood, with the prior of links, and its gradient by the variances' logarithms."""
+    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the variances' logarithms."""
     variances = np.exp(logs)
     s = solve(b, variances)
     n, m = b.e.shape
@@ -307,8 +307,9 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
     gradient = 0.5 * variances * traces
     cost = s.cost
-    if "link_m" in b.sources:
-        m, rad = b.sources.index("link_m"), b.sources.index("link_rad")
+    if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
+        m = len(b.sources) - 2
+        rad = m + 1
         off = (logs[m] - logs[rad] - 2 * np.log(LEVER_M)) / LIKE_EACH_OTHER**2
         cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
         gradient[m] += off
