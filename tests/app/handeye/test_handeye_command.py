@@ -191,7 +191,7 @@ def test_millimetres_are_refused_or_detected(armsight, tmp_path, seen):
 
 
 def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
-    q, A, B = motion()
+    q, A, _ = motion()
 
     def rejected(robot, *words, more=(), eye="in-hand", by=seen):
         assert_rejected(armsight("handeye", "--robot", robot, "--seen", by, "--eye", eye, *more), robot, *words)

@@ -145,7 +145,7 @@ def test_rotation_about_one_axis_is_refused_and_the_axis_named_also_under_noise(
 
 def test_translations_alone_are_refused():
     xi = np.concatenate([np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3)), np.zeros((20, 3))], axis=1)
-    with pytest.raises(CalibrationError, match="hardly rotates .* open in every direction"):
+    with pytest.raises(CalibrationError, match=r"hardly rotates .* open in every direction"):
         calibrate_structured(turned(xi, noise=1e-3))
 
 

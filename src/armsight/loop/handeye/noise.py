@@ -297,7 +297,7 @@ def left_out_squares(b: Blocks, s: Solved) -> Array:
 
 
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
-    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the variances' logarithms."""
+    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the logarithms."""
     variances = np.exp(logs)
     s = solve(b, variances)
     n, m = b.e.shape
