@@ -78,6 +78,8 @@ class Shot(Record):
         right: the same of the right camera.
         t_s: time of the grab, s, on the source's clock; None where it has none.
         problem: why the shot cannot be used; None when it can.
+        encoded: both images as the cameras delivered them, each the bytes of a JPEG or PNG file; None where they were
+            delivered as pixels, or are not kept.
     """
 
     name: str
@@ -85,6 +87,7 @@ class Shot(Record):
     right: Image | None
     t_s: float | None = None
     problem: str | None = None
+    encoded: tuple[bytes, bytes] | None = None
 
     def image(self, side: Side) -> Image | None:
         """Return the image of one side."""

@@ -21,6 +21,7 @@ from armsight.data import Array, JointCommand, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
+from armsight.loop.health.record import Trust
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.lookahead import behind
@@ -41,8 +42,10 @@ FOLLOW_S = 0.08
 #: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), and fully
 #: from that.
 UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
-#: The correction is at most this, rad: an arm that needs more is not the arm of the table.
+#: The correction is at most this, rad, and displaces the tool by at most so much from where the potentiometers alone would
+#: bring it, m: an arm that needs more is not the arm of the table.
 MAX_CORRECTION_RAD = np.deg2rad(5.0)
+MAX_CORRECTION_M = 0.02
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
@@ -53,6 +56,8 @@ class Mode(Enum):
     VISION = "vision"
     BRIDGED = "bridged: no measurement lately, the potentiometers carry on with what was learned"
     POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
+    HELD = "held: vision contradicts what was learned; the correction stays until the cause is known"
+    DISTRUSTED = "potentiometers alone: what vision measures is wrong, the correction is taken back"
 
 
 @dataclass(frozen=True)
@@ -169,19 +174,20 @@ class PoseServo:
         U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None])
         return Aim(goal, ahead, self._arm.forward(np.stack([goal.q, ahead.q])), duty, jacobian, U, s, Vt)
 
-    def step(self, aim: Aim, estimator: Estimator) -> ServoStep:
+    def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
         """Make the next command.
 
         Args:
             aim: its reference, of this period.
             estimator: where the tool is.
+            trust: how far what the estimator took from vision may be relied on.
         """
         estimate = estimator.estimate()
         error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
-        mode = self._mode(estimate)
+        mode = self._mode(estimate, trust)
         resting = self._resting(estimate, aim)
-        change = np.zeros(6)
-        if mode is not Mode.POTENTIOMETERS:
+        change = -self._correction if mode is Mode.DISTRUSTED else np.zeros(6)
+        if mode in (Mode.VISION, Mode.BRIDGED):
             last, following = self._missing(estimator, aim)
             push = following - last
             if mode is Mode.VISION:
@@ -191,8 +197,10 @@ class PoseServo:
             change += self._crossing(estimator, aim, error)
         return self._command(aim, change, mode, error)
 
-    def _mode(self, estimate: ArmEstimate) -> Mode:
+    def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
         """Return what may close the loop."""
+        if trust is not Trust.FULL:
+            return Mode.HELD if trust is Trust.DOUBTED else Mode.DISTRUSTED
         cov = estimate.cov_own[:3, :3]
         # The greatest variance is not above the sum of three; only where that is too much is it worth looking for.
         sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
@@ -240,6 +248,9 @@ class PoseServo:
         step = ahead.q - aim.goal.q
         most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
         wished = _within(-MAX_CORRECTION_RAD, self._correction + _within(-most, change, most), MAX_CORRECTION_RAD)
+        displaced_m = float(np.linalg.norm(aim.jacobian[:3] @ wished))
+        if displaced_m > MAX_CORRECTION_M:
+            wished *= MAX_CORRECTION_M / displaced_m
         q_ref = _within(arm.q_min, ahead.q + wished, arm.q_max)
         held = q_ref != ahead.q + wished
         correction = q_ref - ahead.q
@@ -247,8 +258,9 @@ class PoseServo:
         self._correction, self._goal = correction, ahead
         far = np.abs(wished) >= MAX_CORRECTION_RAD
         said: tuple[str, ...] = ()
-        if held.any() or far.any():
+        if held.any() or far.any() or displaced_m > MAX_CORRECTION_M:
             said = (
+                *(("tool: largest correction",) if displaced_m > MAX_CORRECTION_M else ()),
                 *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
                 *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(far)),
             )

@@ -71,10 +71,10 @@ def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: boo
 
 @command.command(context_settings=_NUMBERS)
 @_arm_argument
-@click.argument("angles", nargs=-1, metavar="Q1 .. Q6")
+@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
 def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
-    """Print the pose of the tool at six joint angles, in degrees.
+    """Print the pose of the tool at joint angles, in degrees.
 
     Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
     """
@@ -98,10 +98,10 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
 
 @command.command(context_settings=_NUMBERS)
 @_arm_argument
-@click.argument("angles", nargs=-1, metavar="Q1 .. Q6")
+@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
 def jacobian(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
-    """Print the Jacobian of the tool's point in base axes at six joint angles, in degrees."""
+    """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
 
@@ -175,14 +175,15 @@ def _number(text: str, name: str) -> float:
 
 
 def _joints(arm: Arm, texts: tuple[str, ...]) -> Array:
-    """Read six joint angles in degrees, and say on stderr which are beyond the limits."""
+    """Read joint angles in degrees, and say on stderr which are beyond the limits."""
     import numpy as np
 
     from armsight.app.arm import description
     from armsight.robot.kinematics.chain import MOST_RADIANS
 
-    if len(_no_options(texts)) != 6:
-        raise InputError(f"{arm.name} has six joints; {len(texts)} angles were given, in degrees: q1 q2 q3 q4 q5 q6")
+    if len(_no_options(texts)) != arm.joints:
+        want = " ".join(f"q{i + 1}" for i in range(arm.joints))
+        raise InputError(f"{arm.name} has {arm.joints} joints; {len(texts)} angles were given, in degrees: {want}")
     degrees = np.array([_number(text, f"q{i + 1}") for i, text in enumerate(texts)])
     most = np.floor(np.degrees(MOST_RADIANS))
     if np.abs(degrees).max() > most:

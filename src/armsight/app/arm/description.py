@@ -1,6 +1,6 @@
 """What ``armsight arm`` answers, as JSON objects (units in the keys) and as text (mm and degrees).
 
-In: an arm, joint angles (6,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
+In: an arm, joint angles (n,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
 NAME_json and a function NAME_text of the same records.
 
 Angles of a rotation are Euler angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x). Robot
@@ -52,12 +52,13 @@ def show_json(arm: Arm) -> dict[str, Any]:
             "qddd_max_rad_s3": arm.qddd_max[i],
             "home_rad": arm.home[i],
         }
-        for i in range(6)
+        for i in range(arm.joints)
     ]
     return {
         "arm": arm.name,
         "convention": arm.convention,
         "joints": joints,
+        "coupling": arm.coupling.tolist(),
         "T_base_0": arm.T_base_0.tolist(),
         "T_flange_tool": arm.T_flange_tool.tolist(),
         "T_base_tool_home": arm.forward(arm.home).tolist(),
@@ -79,7 +80,7 @@ def show_text(arm: Arm) -> str:
             *(_short(deg(x)) for x in (arm.q_min[i], arm.q_max[i], arm.qd_max[i], arm.qdd_max[i], arm.qddd_max[i])),
             _short(deg(arm.home[i])),
         )
-        for i in range(6)
+        for i in range(arm.joints)
     ]
     extent = reach(arm)
     lines = [f"{arm.name}: {arm.convention} Denavit-Hartenberg table; angles in deg, speeds in deg/s, deg/s^2, deg/s^3"]
@@ -87,6 +88,7 @@ def show_text(arm: Arm) -> str:
     for name, T in (("T_base_0", arm.T_base_0), ("T_flange_tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             lines.append(f"{name}: {_pose_text(T)}")
+    lines += _coupling(arm)
     lines.append(f"tool at home: {_pose_text(arm.forward(arm.home))}")
     lines.append(
         f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
@@ -95,8 +97,18 @@ def show_text(arm: Arm) -> str:
     return "\n".join([*lines, f"source: {arm.source}"])
 
 
+def _coupling(arm: Arm) -> list[str]:
+    """Return which joints more than one motor moves, as lines."""
+    lines = []
+    for name, row, one in zip(arm.joint_names, arm.coupling, np.eye(arm.joints), strict=True):
+        if (row != one).any():
+            parts = [f"{factor:+g} {other}" for factor, other in zip(row, arm.joint_names, strict=True) if factor]
+            lines.append(f"coupling: the angle of {name} is that of the motors {' '.join(parts)}")
+    return lines
+
+
 def forward_json(arm: Arm, q: Array, T: Array) -> dict[str, Any]:
-    """Return the pose T (4, 4) of the tool in the base at joint angles (6,), rad."""
+    """Return the pose T (4, 4) of the tool in the base at joint angles (n,), rad."""
     return {
         "arm": arm.name,
         **_angles_json(q),
@@ -111,7 +123,7 @@ def forward_text(T: Array) -> str:
 
 
 def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
-    """Return the Jacobian in base axes at joint angles (6,), rad."""
+    """Return the Jacobian in base axes at joint angles (n,), rad."""
     return {
         "arm": arm.name,
         **_angles_json(q),
@@ -122,7 +134,7 @@ def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
 
 
 def jacobian_text(arm: Arm, q: Array) -> str:
-    """Return the Jacobian in base axes at joint angles (6,), rad, as lines."""
+    """Return the Jacobian in base axes at joint angles (n,), rad, as lines."""
     lines = ["J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint", *_matrix(arm.jacobian(q))]
     return "\n".join([*lines, f"manipulability: {float(arm.manipulability(q)):.6g} (0 is singular)"])
 
@@ -168,7 +180,7 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
         for i, configuration in enumerate(found.configurations)
     ]
     if rows:
-        lines += _table((("", *(f"q{i}" for i in range(1, 7)), "configuration", ""), *rows))
+        lines += _table((("", *(f"q{i + 1}" for i in range(arm.joints)), "configuration", ""), *rows))
     if found.reason is not None:
         lines.append(found.reason)
     if (nearest := found.nearest) is not None:
@@ -181,11 +193,11 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
 
 
 def beyond(arm: Arm, q: Array) -> list[str]:
-    """Return which of the joint angles (6,), rad, are beyond the arm's limits, as text."""
+    """Return which of the joint angles (n,), rad, are beyond the arm's limits, as text."""
     return [
         f"{arm.joint_names[i]} at {np.degrees(q[i]):.3f} deg is outside its limits "
         f"{np.degrees(arm.q_min[i]):.3f} to {np.degrees(arm.q_max[i]):.3f} deg"
-        for i in range(6)
+        for i in range(arm.joints)
         if not arm.q_min[i] <= q[i] <= arm.q_max[i]
     ]
 

@@ -429,7 +429,8 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
             "Latency",
             shown(
                 "latency",
-                "Computing time from a decoded image to its command; decoding and the camera's own delay are not in it.",
+                "Computing time from a decoded image to its command while the body is followed; decoding and the camera's "
+                "own delay are not in it, nor are searches of a lost body, beside which commands continue.",
             ),
         ),
         "studies": (

@@ -27,6 +27,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, sincos
+from armsight.robot.kinematics.table import TOOL
 
 #: Harmonics of a potentiometer's linearity: an eccentric wiper makes the first, its bow the second.
 HARMONICS = 3
@@ -137,7 +138,7 @@ def _loads(table: Array, q: Array, g: Array) -> None:
         axes[i] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_rotation(table, i, c, s, F))
-    F = after(table, 48, F)
+    F = after(table, TOOL, F)
     axes[6] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
     x = y = 0.0
     for i in range(5, -1, -1):
@@ -204,7 +205,7 @@ def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Arra
         s, c = sincos(table[6 * i + 5] * angle + table[6 * i + 4])
         F = after(motions, 12 * (i + 1), after_link(table, i, after_rotation(table, i, c, s, F)))
         frames.append(F)
-    F = after(table, 48, F)
+    F = after(table, TOOL, F)
     for row in range(6):
         H[row, :] = 0.0
         H[row, POSE + row] = 1.0

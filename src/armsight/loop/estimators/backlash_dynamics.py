@@ -22,6 +22,7 @@ from armsight.kernels import kernel
 from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
+from armsight.robot.kinematics.table import rows_of
 
 GRAVITY_M_S2 = 9.81
 #: Friction of a link's bearing over the greatest torque that gravity and acceleration need: typical of rolling bearings.
@@ -45,7 +46,7 @@ def rods(arm: Arm) -> Array:
     Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m. A last link without length is
     a disc as long as it is thick.
     """
-    rows, points = arm.table[:36].reshape(6, 6), []
+    rows, points = rows_of(arm.table), []
     for i, (a, d) in enumerate(rows[:, :2]):
         for along in (-1, 1):
             u = 0.5 + along / np.sqrt(12)
@@ -79,7 +80,7 @@ def masses(arm: Arm) -> tuple[Array, Array]:
 
 def _thickness(arm: Arm) -> float:
     """Return how thick the rods are that stand for an arm's links, m."""
-    return float(_THICK * np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum())
+    return float(_THICK * np.abs(rows_of(arm.table)[:, :2]).sum())
 
 
 @kernel("const f8[::1], f8[:, ::1], f8[::1], const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]")

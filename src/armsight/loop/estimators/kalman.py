@@ -88,6 +88,16 @@ class KalmanEstimator:
         self._newest: ArmEstimate | None = None
 
     @property
+    def sigmas(self) -> Array:
+        """(K,) standard deviations of the state before anything was measured."""
+        return self._model.sigmas
+
+    @property
+    def settings(self) -> tuple[Prior, Delay, bool]:
+        """Prior, delay and whether the delay is corrected: what it was made with."""
+        return self._prior, self._delay, self._learns_delay
+
+    @property
     def span_s(self) -> tuple[float, float]:
         """The oldest and the newest time that can be estimated, s."""
         return self._readings.span_s
