@@ -3,10 +3,10 @@
     pip install kinhec==1.1 pandas pyarrow pyyaml
     python benchmarks/handeye.py --tier small --seed 16180 -o kinhec.json
 
-KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown
-scale, wrong kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation); armsight
-gets the two streams. A sequence counts in the comparison where armsight answers; what it refuses is counted apart, with
-what the baselines answer there.
+KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown scale,
+wrong kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation);
+armsight gets the two streams. A sequence counts in the comparison where armsight answers; what it refuses is counted
+apart, with what the baselines answer there.
 
 Per track: median error of X, mm and degrees, ours and of each baseline; how often the ellipsoid of 95 % of X holds the
 truth; the median NEES (5.35 with six degrees of freedom is honest); refusals; the error of the clock offset.

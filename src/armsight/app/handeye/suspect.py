@@ -23,6 +23,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
+from armsight.loop.handeye.structured import scale_between
 from armsight.robot.arm import Arm
 
 #: Data whose median residual is below this, m, are taken as they are.
@@ -117,6 +118,13 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
     yield from _scaled(p)
+    scale = scale_between(p)
+    B = p.B.copy()
+    B[:, :3, 3] *= scale
+    yield (
+        replace(p, B=B),
+        f"the target seems to be {scale:.3g} times as large as given: is the size of --target right? --scale fits it",
+    )
     table = recording.robot
     if table.convention:
         position = p.A[:, :3, 3]

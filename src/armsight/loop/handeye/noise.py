@@ -35,7 +35,7 @@ from scipy.optimize import minimize
 from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import HARDLY, Poses
+from armsight.loop.handeye.handeye import HARDLY, LEVER_M, Poses
 
 #: Name of a structure -> its sources. Those with a drift or a walk are tried where the poses allow it.
 STRUCTURES: dict[str, tuple[str, ...]] = {
@@ -65,6 +65,9 @@ SHARED = ("robot's geometry off", "robot drifting over its poses", "robot drifti
 OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
+#: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
+#: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
+LIKE_EACH_OTHER = 1.5
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
 
@@ -294,7 +297,7 @@ def left_out_squares(b: Blocks, s: Solved) -> Array:
 
 
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
-    """Return minus the restricted log-likelihood, and its gradient by the logarithms of the variances."""
+    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the logarithms."""
     variances = np.exp(logs)
     s = solve(b, variances)
     n, m = b.e.shape
@@ -302,7 +305,16 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     root = s.inverse @ b.J @ s.root  # the inverse covariance, projected: s.inverse - root root^T
     projected = s.inverse - root @ np.swapaxes(root, 1, 2)
     traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
-    return s.cost, 0.5 * variances * traces
+    gradient = 0.5 * variances * traces
+    cost = s.cost
+    if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
+        m = len(b.sources) - 2
+        rad = m + 1
+        off = (logs[m] - logs[rad] - 2 * np.log(LEVER_M)) / LIKE_EACH_OTHER**2
+        cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
+        gradient[m] += off
+        gradient[rad] -= off
+    return cost, gradient
 
 
 def reml(b: Blocks, start: Array, steps: int = 60) -> Array:

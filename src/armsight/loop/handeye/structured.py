@@ -62,8 +62,10 @@ MAX_VARIANCE, MAX_SHARED = 150, 40
 MAX_FIT, MAX_SHARED_FIT = 1000, 120
 #: Fewest poses for a structure with shared errors.
 MIN_SHARED = 12
-#: Parts that are left out, one after the other.
-FOLDS = 5
+#: Numbers left of the residuals for each variance at least: fewer do not determine it.
+PER_VARIANCE = 8
+#: Parts that are left out, one after the other; of so few poses each one by itself.
+FOLDS, FEW = 5, 24
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: A sigma of the mounting beyond this (m, rad) is no calibration.
@@ -311,7 +313,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
     known, used_known = _robust(problem, _first(problem))
     free = replace(problem, free=(True, problem.free[1]))
-    per_m = 1 / _first_scale(problem)
+    per_m = 1 / scale_between(problem.poses)
     scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
@@ -329,10 +331,12 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     return problem, known, used_known
 
 
-def _first_scale(problem: _Problem) -> float:
-    """Return the scale of B's lengths by closed forms from small parts: that of the smallest median residual."""
-    rows = _spread(np.arange(len(problem.poses.A)), 300)
-    p = problem.poses.rows(rows)
+def scale_between(poses: Poses) -> float:
+    """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
+
+    Of the parts' answers it is that of the smallest median residual.
+    """
+    p = poses.rows(_spread(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
     rng = np.random.default_rng(0)
     best = (np.inf, 1.0)
@@ -426,6 +430,8 @@ def _start_variances(linear: Linear, structure: str) -> Array:
 def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
     """Return whether a structure can be told from these poses."""
     sources = STRUCTURES[structure]
+    if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
+        return False
     if "image" in sources:
         return covered
     if "link_m" in sources:
@@ -468,7 +474,7 @@ def _chosen(
     solved = solve(blocks(linear, best), variances)
     x, cov = solved.x, solved.cov
     guess = guess.moved(x, whole.free)
-    freedom = max(linear.e.size - len(x) - len(variances), 6)
+    freedom = max(linear.e.size // 2 - 6, 3)  # of positions, and of rotations
     # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
     cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
     metric, cov = whole.metric(guess, cov)
@@ -621,7 +627,7 @@ def _trial(
     variances = reml(b, _start_variances(linear, structure))
     n = len(rows)
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
-    parts = [np.sort(part) for part in np.array_split(order, min(max(FOLDS, 2), n))]
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
     density, residual = held_out(linear, structure, variances, parts)
     return float(density.mean()), residual, rows
 
