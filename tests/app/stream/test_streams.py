@@ -90,7 +90,7 @@ def test_openigtlink_is_what_pyigtl_reads():
 
     def parsed(data):
         header = MessageBase.parse_header(data[: MessageBase.IGTL_HEADER_SIZE])
-        found = MessageBase.create_message(header["type"])
+        found = MessageBase.create_message(header["message_type"])
         body = data[MessageBase.IGTL_HEADER_SIZE :]
         assert len(body) == header["body_size"]
         found.unpack(header, body)
