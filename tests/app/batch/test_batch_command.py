@@ -8,7 +8,7 @@ pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
 from armsight.app.batch.run import Batch, found_recordings, run_batch
-from armsight.app.batch.work import Options, work
+from armsight.app.batch.work import Done, Options, work
 from armsight.errors import InputError
 from cli_runs import assert_rejected
 
@@ -46,28 +46,69 @@ def tables(folder):
     return [parquet.read_table(folder / name).to_pylist() for name in ("recordings.parquet", "shots.parquet")]
 
 
-def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, rendered, tmp_path):
+@pytest.fixture(scope="module")
+def clusters():
+    """The addresses of clusters of one and of two workers, in this process: that of processes is in benchmarks/record.py."""
+    from distributed import LocalCluster
+
+    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    with LocalCluster(n_workers=1, **options) as one, LocalCluster(n_workers=2, **options) as two:
+        yield one.scheduler_address, two.scheduler_address
+
+
+def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, rendered, tmp_path, clusters):
     options = Options("measure", str(rendered.rig), str(rendered.plate))
+    one, two = clusters
     said = []
-    done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, workers=1), said.append)
+    done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, scheduler=one), said.append)
     assert (done.recordings, done.ok, done.failed, done.before, done.shots) == (4, 3, 1, 0, 6)
-    assert any(line.startswith("dashboard: http") for line in said)
     recordings, shots = tables(tmp_path / "one")
     assert [row["status"] for row in recordings] == ["ok", "ok", "ok", "failed"]
     assert "take3/shots.csv: line 1: expected the columns" in recordings[3]["reason"]
     assert [row["recording"] for row in recordings] == [str(archive / f"take{k}") for k in range(4)]
     assert all(row["status"] == "ok" and row["x_m"] is not None for row in shots)
     assert json.loads((tmp_path / "one" / "batch.json").read_text())["options"]["operation"] == "measure"
-    # two workers, after one part was lost
-    again = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, workers=2), said.append)
+    again = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=two), said.append)
     assert again.before == 0
     assert tables(tmp_path / "two") == [recordings, shots]
+    # started again, after one part was lost
     next((tmp_path / "two" / "parts").iterdir()).unlink()
     parts = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "two" / "parts").iterdir()}
-    last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, workers=1), said.append)
+    last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=one), said.append)
     assert last.before == 3
     assert tables(tmp_path / "two") == [recordings, shots]
     assert all((tmp_path / "two" / "parts" / name).stat().st_mtime_ns == time for name, time in parts.items())
+
+
+def test_only_a_few_recordings_are_handed_out_at_a_time(monkeypatch):
+    """So the scheduler holds the same however many there are."""
+    import armsight.app.batch.run as module
+
+    class Future:
+        def __init__(self, key, path):
+            self.key, self.path = key, path
+
+        def result(self):
+            return Done({"recording": self.path, "status": "ok", "reason": None}, [])
+
+        def release(self):
+            held.discard(self.key)
+
+    class Client:
+        def submit(self, work, path, options, **how):
+            held.add(path)
+            most.append(len(held))
+            return Future(path, path)
+
+    class Completed(list):
+        add = list.append
+
+    held, most = set(), []
+    monkeypatch.setattr("distributed.as_completed", Completed)
+    paths = [f"{k:05d}" for k in range(10_000)]
+    found = [path for path, _ in module._results(Client(), paths, Options("measure"), 8)]
+    assert found == paths
+    assert max(most) <= 8
 
 
 def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):

@@ -79,8 +79,6 @@ def run(tmp_path_factory):
         sink.put(JointsDatum(states, now.T_base_tool, now.cov, now.vision_age_s))
         if k % 4 == 3:
             shot = Shot(f"{k:06d}", None, None, float(t_s[0]))
-            if k == 20:
-                sink.put(EventDatum(float(t_s[0]), mounting_event(MOUNTING)))
             if k % 12 == 11:
                 sink.put(ShotDatum(shot, Missed("hidden"), float(t_s[-1]), 1e-4))
                 continue
@@ -92,10 +90,10 @@ def run(tmp_path_factory):
             )
             result = estimate(T, np.diag([1e-8] * 3 + [1e-7] * 3))
             seen.append((shot.t_s, result))
-            if k == 23:
+            if k == 27:
                 sink.put(EventDatum(float(t_s[0]), mounting_event(MOUNTING)))
             outcome, T_base_tool = None, None
-            if k >= 23:
+            if k >= 27:
                 measurement = MOUNTING.pose_measurement(result, shot.t_s)
                 outcome, T_base_tool = estimator.vision(measurement).value, measurement.T_base_tool
             sink.put(ShotDatum(shot, result, float(t_s[-1]), 1e-4, outcome, MOUNTING.T_base_rig, T_base_tool))
