@@ -48,7 +48,7 @@ def tables(folder):
 
 @pytest.fixture(scope="module")
 def clusters():
-    """The addresses of clusters of one and of two workers, in this process: that of processes is in benchmarks/record.py."""
+    """The addresses of clusters of one and of two workers, in this process; benchmarks/record.py has processes."""
     from distributed import LocalCluster
 
     options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
