@@ -128,6 +128,7 @@ def test_foreign_names_pages_and_tokens_are_rejected(serving):
         with pytest.raises(urllib.error.HTTPError) as error:
             get(server, path, host)
         assert error.value.code == code
+        error.value.close()
     for path in ("/live", "/stop"):
         for origin in ("http://evil.example", f"http://localhost:{server.port}", "null"):
             with pytest.raises(InvalidStatus, match="403"):
@@ -137,6 +138,7 @@ def test_foreign_names_pages_and_tokens_are_rejected(serving):
         with pytest.raises(urllib.error.HTTPError) as error:
             get(guarded, "/" + token)
         assert error.value.code == 401
+        error.value.close()
         with pytest.raises(InvalidStatus, match="401"):
             page(guarded, "/stop", token=token)
     assert guarded.address.endswith("?token=right")
