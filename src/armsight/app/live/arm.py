@@ -1,8 +1,8 @@
 """The arm: joint readings beside what vision measures, the motions in open and closed loop, and a stop that always works.
 
 In: the arm's board, the session's cameras, rig and body. Out: an :class:`ArmState` at any time, and the folder of a run as
-``armsight run`` writes it. One thread has the board: it reads the joints, runs the experiment, and carries out a stop within
-a period of the loop; nobody else touches the board. A stop is answered with the state that the board itself reports.
+``armsight run`` writes it. One thread has the board: it reads the joints, runs the experiment, and carries out a stop
+within a period of the loop; nobody else touches the board. A stop is answered with the state that the board itself reports.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.live.capture import Capture
+from armsight.app.live.capture import CameraCapture
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.quality import Note
 from armsight.app.live.simulated import SimulatedCameras
@@ -102,7 +102,8 @@ class ArmState:
         running: what is being done; None while nothing is.
         phase: calibration, open_loop, closed_loop, rest; empty while nothing runs.
         motion: name of the motion.
-        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is closed).
+        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is
+            closed).
         handeye: the hand-eye calibration in words.
         results: the results of the last run, line by line.
         folder: of the last run.
@@ -146,7 +147,7 @@ class ArmStep:
         self,
         folder: Path,
         options: ArmOptions,
-        capture: Capture,
+        capture: CameraCapture,
         measuring: MeasureStep,
         simulated: SimulatedCameras | None,
         say: Callable[[Note], None],

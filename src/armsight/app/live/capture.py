@@ -39,13 +39,13 @@ class LiveShot(Record):
     arrived_s: float
 
     def age_s(self, now_s: float) -> float:
-        """Return how old the images are, s: since their stamp where it is on this computer's clock, else since they came."""
+        """Return how old the images are, s: since their stamp if it is on this computer's clock, else since they came."""
         stamp = self.shot.t_s
         live = stamp is not None and 0.0 <= self.arrived_s - stamp < _LIVE_S
         return now_s - (stamp if live and stamp is not None else self.arrived_s)
 
 
-class Capture:
+class CameraCapture:
     """The cameras of a session.
 
     Args:
