@@ -109,7 +109,7 @@ def test_cameras(page, session):
 
 def test_board(page, session):
     click(page, "step-board")
-    until(lambda: "chessboard:9x6:30mm" in page.find_element("id", "b-spec").text)
+    until(lambda: any("9x6:30mm" in each.text for each in page.find_elements("id", "b-spec")))
     page.execute_script("document.getElementById('b-bar').value = '50'")
     click(page, "use-board")
     until(lambda: any("cannot be right" in each.text for each in page.find_elements("css selector", "#events li")))
