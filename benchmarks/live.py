@@ -76,7 +76,9 @@ def stop(count: int) -> None:
     rate = (shown(driver) - frames) / (time.monotonic() - began)
     took = np.array(driver.execute_script("return armsight.stopMs"))
     p50, p99 = np.percentile(took, (50, 99))
-    print(f"stop, key to the board's state, {count} stops: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {took.max():.1f} ms")
+    print(
+        f"stop, key to the board's state, {count} stops: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {took.max():.1f} ms"
+    )
     print(f"views shown meanwhile: {rate:.1f} a second of each side")
     driver.quit()
     server.close()
@@ -172,10 +174,14 @@ def seen(rig, T, name, rng):
 def errors_mm(true, rig, tests):
     """Return the RMS error of points of the working volume, and the rigid RMS of boards nobody fitted, mm."""
     points = working_points(true, 0.8)
-    uv = np.stack([true.left.project(points), true.right.project(transform(inverse(true.T_left_right), points))], axis=1)
+    uv = np.stack(
+        [true.left.project(points), true.right.project(transform(inverse(true.T_left_right), points))], axis=1
+    )
     found, _, _ = optimal_points(rig, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))
     heldout = pair_errors(rig, BOARD.body.points, tests)
-    return 1e3 * float(np.sqrt(((found - points) ** 2).sum(axis=1).mean())), 1e3 * float(np.sqrt((heldout.rigid_m**2).mean()))
+    return 1e3 * float(np.sqrt(((found - points) ** 2).sum(axis=1).mean())), 1e3 * float(
+        np.sqrt((heldout.rigid_m**2).mean())
+    )
 
 
 def guided(seeds: int) -> None:
@@ -221,5 +227,7 @@ def guided(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    what, count = (sys.argv[1:] + ["cost", "10"])[:2] if len(sys.argv) < 2 else (sys.argv[1], (sys.argv[2:] or ["10"])[0])
+    what, count = (
+        (sys.argv[1:] + ["cost", "10"])[:2] if len(sys.argv) < 2 else (sys.argv[1], (sys.argv[2:] or ["10"])[0])
+    )
     {"stop": lambda: stop(int(count)), "cost": cost, "guided": lambda: guided(int(count))}[what]()

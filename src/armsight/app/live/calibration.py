@@ -414,20 +414,23 @@ class CalibrationStep:
         assert sizes is not None
         try:
             result = calibrate_boards(self.board, pairs, sizes, models=_QUICK_MODELS, folds=min(_FOLDS, len(pairs)))
-        except (CalibrationError, np.linalg.LinAlgError) as error:
             with self._lock:
-                self._missing = (str(error),)
-                self._fitted()
-            return
+                self._learned(result)
+                self._add_newer({pair.name for pair in pairs})
+                self._choose(None)
+        except (CalibrationError, np.linalg.LinAlgError) as error:
+            self._missing, self._good = (f"the shots cannot be fitted yet: {error}",), False
+        except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+            self._say(Note("error", f"the fit failed: {type(error).__name__}: {error}"))
         with self._lock:
-            newer = [pair for name, (_, pair) in self._shots.items() if name not in {pair.name for pair in pairs}]
-            self._learned(result)
-            for pair in newer:
-                T = self._pose(_Seen(pair.left, pair.right, 0.0))
-                if T is not None and self._knowledge is not None:
-                    self._knowledge = self._knowledge.after(T)
-            self._choose(None)
             self._fitted()
+
+    def _add_newer(self, fitted: set[str]) -> None:
+        """Add what the shots determine that came while the others were fitted."""
+        for name, (_, pair) in self._shots.items():
+            T = None if name in fitted else self._pose(_Seen(pair.left, pair.right, 0.0))
+            if T is not None and self._knowledge is not None:
+                self._knowledge = self._knowledge.after(T)
 
     def _fitted(self) -> None:
         self._fitting = None

@@ -86,8 +86,8 @@ def command(
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
     try:
-        session.start()
         server.start()
+        session.start()
         if as_json:
             click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
         else:

@@ -217,7 +217,7 @@ class LiveSession:
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
         self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
-        self.capture = CameraCapture(self._open)
+        self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)
         motion = options.motion or (QUICK if simulated else DEFAULT_MOTION)
@@ -352,9 +352,9 @@ class LiveSession:
         self._require_rest()
         if self._simulated is not None or source.startswith(SIM):
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
-        before, self.source = self.capture, source
-        before.close()
-        self.capture = CameraCapture(self._open)
+        self.capture.close()
+        self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
+        self.arm.capture = self.capture
         self.capture.start()
         self.measuring.source = source
         self._looks = None
@@ -439,6 +439,9 @@ class LiveSession:
             raise InputError("these cameras are real: do it yourself")
         self._simulated.person.act(action)
 
+    def _camera_failed(self, problem: str) -> None:
+        self.say(Note("error", problem))
+
     def _open(self) -> Source:
         """Open the cameras, in the thread that reads them."""
         if self._simulated is not None:
@@ -476,6 +479,9 @@ class LiveSession:
                     self.measuring.look(live)
             except ArmsightError as error:
                 self.say(Note("error", str(error)))
+                time.sleep(1.0)
+            except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+                self.say(Note("error", f"looking at an image failed: {type(error).__name__}: {error}"))
                 time.sleep(1.0)
 
     def _flicker(self, shot: Shot) -> None:
