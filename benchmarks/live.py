@@ -1,8 +1,8 @@
 """The live page: how soon it stops, what it costs, whether its memory is flat, and what the guide saves.
 
-python live.py stop 100      stops by the space key in a headless browser, the workcell's two 1280x720 views at 15 Hz meanwhile
-python live.py cost          processor's share of two 1280x720 views at 15 Hz, first picture, memory over ten thousand frames
-python live.py guided 10     guided against random shots on ten seeds: projected points with noise, hands that miss the outline
+python live.py stop 100      stops by the page's button in a headless browser, while the workcell's views run at 15 Hz
+python live.py cost          processor's share of two 1280x720 views, first picture, memory over ten thousand frames
+python live.py guided 10     guided against random shots, ten seeds: projected points, hands that miss the outline
 """
 
 import resource
@@ -22,11 +22,11 @@ from armsight.data import Detections, Shot
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
+from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
-from armsight.vision.bundle import Observations
 from armsight.vision.triangulate import optimal_points
 
 
@@ -70,7 +70,7 @@ def stop(count: int) -> None:
     frames, began = shown(driver), time.monotonic()
     for n in range(count):
         driver.execute_script("stop()")
-        until(lambda: driver.execute_script("return armsight.stopMs.length") > n)
+        until(lambda n=n: driver.execute_script("return armsight.stopMs.length") > n)
         session.execute(records.ClearStop())
         until(lambda: not session.arm.state.stopped)
     rate = (shown(driver) - frames) / (time.monotonic() - began)
@@ -227,7 +227,5 @@ def guided(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    what, count = (
-        (sys.argv[1:] + ["cost", "10"])[:2] if len(sys.argv) < 2 else (sys.argv[1], (sys.argv[2:] or ["10"])[0])
-    )
-    {"stop": lambda: stop(int(count)), "cost": cost, "guided": lambda: guided(int(count))}[what]()
+    what, number = [*sys.argv[1:], "cost", "10"][:2] if len(sys.argv) == 1 else [*sys.argv[1:], "10"][:2]
+    {"stop": lambda: stop(int(number)), "cost": cost, "guided": lambda: guided(int(number))}[what]()
