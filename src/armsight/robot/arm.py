@@ -387,7 +387,7 @@ class Arm(Record):
 
     def _controller_angles(self, angles: Array) -> Array:
         """Return q of the joints' own angles, (n,) or (N, n), rad."""
-        return np.linalg.solve(self.coupling, angles.T).T if self._coupled else angles
+        return np.asarray(np.linalg.solve(self.coupling, angles.T).T) if self._coupled else angles
 
     def _coupled_inverse(self, T: Array, near: ArrayLike | None) -> Solutions:
         """Return the solutions of an arm of six joints whose motors are coupled, from those of the same arm without."""

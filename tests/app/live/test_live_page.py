@@ -7,7 +7,7 @@ import pytest
 
 from armsight.app.live import calibration, records, simulated
 from armsight.app.live.server import LiveServer
-from armsight.app.live.session import Session, SessionOptions, scaled_spec
+from armsight.app.live.session import LiveSession, SessionOptions, scaled_spec
 from armsight.app.measure.poses import CSV_COLUMNS
 from armsight.errors import InputError
 from armsight.files import read_table
@@ -48,7 +48,7 @@ def session(tmp_path_factory, host_firmware):
     quick.setattr(calibration, "STILL_S", 0.05)
     quick.setattr(calibration, "MODELS", ("brown5",))
     folder = tmp_path_factory.mktemp("live")
-    made = Session(SessionOptions(folder, "sim:640x360@15"))
+    made = LiveSession(SessionOptions(folder, "sim:640x360@15"))
     made.start()
     yield made
     made.close()
@@ -77,7 +77,11 @@ def until(true, patience_s=120.0):
 
 
 def click(page, name):
-    until(lambda: page.execute_script(f"const e = document.getElementById('{name}'); return e && !e.disabled && !e.hidden"))
+    until(
+        lambda: page.execute_script(
+            f"const e = document.getElementById('{name}'); return e && !e.disabled && !e.hidden"
+        )
+    )
     page.execute_script(f"document.getElementById('{name}').click()")
 
 
@@ -105,7 +109,7 @@ def test_cameras(page, session):
 
 def test_board(page, session):
     click(page, "step-board")
-    until(lambda: "chessboard:9x6:30mm" in page.find_element("id", "b-spec").text)
+    until(lambda: any("9x6:30mm" in each.text for each in page.find_elements("id", "b-spec")))
     page.execute_script("document.getElementById('b-bar').value = '50'")
     click(page, "use-board")
     until(lambda: any("cannot be right" in each.text for each in page.find_elements("css selector", "#events li")))
@@ -187,7 +191,9 @@ def test_stop_and_two_pages(page, session, server, browsers):
     other = browsers(server.address)
     until(lambda: state(other, "arm") and other.find_elements("id", "take"))
     other.execute_script("command('GoTo', {step: 'health'})")
-    until(lambda: any("another page commands" in each.text for each in other.find_elements("css selector", "#events li")))
+    until(
+        lambda: any("another page commands" in each.text for each in other.find_elements("css selector", "#events li"))
+    )
     assert session.sections()["overview"].step == "arm"
     until(lambda: other.find_element("id", "stopped").text == "or the space key")
     other.execute_script("document.getElementById('stop').click()")

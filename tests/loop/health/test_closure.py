@@ -26,7 +26,7 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, gain=0.0):
     x[102:] = 0.0
     rates, phases = rng.uniform(0.1, 0.3, 6), rng.uniform(0.0, 2 * np.pi, 6)
     kept = np.ones(PARTS.size)
-    kept[PARTS.pose:] = np.exp(-0.05)
+    kept[PARTS.pose :] = np.exp(-0.05)
     for k in range(round(seconds / SHOT_S)):
         t_s = k * SHOT_S
         angle = 2 * np.pi * rates * t_s + phases

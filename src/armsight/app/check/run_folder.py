@@ -437,11 +437,13 @@ def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
     for segment in circle:
         angle = _angle_of(segment)
         rows = values[(values[:, 0] > segment.reference.t_s[0]) & (values[:, 0] < segment.reference.t_s[-1])]
-        for t_s, joints in _together(rows):
+        for t_s, reversed_joints in _together(rows):
             here = float(np.interp(t_s, segment.reference.t_s, angle)) - angle[-1] / 2
             if abs(here) <= np.pi:
                 reversals.append(
-                    Reversal(joints, float(np.sign(angle[-1])), segment.reference.at(np.array([t_s]))[0, :3, 3])
+                    Reversal(
+                        reversed_joints, float(np.sign(angle[-1])), segment.reference.at(np.array([t_s]))[0, :3, 3]
+                    )
                 )
     return reversals
 

@@ -44,7 +44,9 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="Folder of the session.",
 )
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on, such as 0.0.0.0.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(
@@ -63,7 +65,9 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Open a page that leads from two cameras to a closed loop: cameras, board, calibration, body, measuring, arm, health.
+    """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
+
+    The steps: cameras, board, calibration, body, measuring, arm, health; each shows the command line that does the same.
 
     The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
     printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
@@ -74,20 +78,22 @@ def command(
         raise InputError('the page needs websockets, which is not installed: pip install "armsight[live]"') from None
 
     from armsight.app.live.server import LiveServer
-    from armsight.app.live.session import Session, SessionOptions
+    from armsight.app.live.session import LiveSession, SessionOptions
 
     options = SessionOptions(
         output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
     )
-    session = Session(options)
+    session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
     try:
-        session.start()
         server.start()
+        session.start()
         if as_json:
             click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
         else:
-            click.echo(f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session")
+            click.echo(
+                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
+            )
         shown = 0
         while True:
             for event in session.events(shown):

@@ -81,7 +81,7 @@ class Suspect:
 
 @lru_cache
 def _suspects(joints: int) -> tuple[Suspect, ...]:
-    """Return all of an arm of so many joints; the probability of a false alarm is shared by them and the beginnings that are tried."""
+    """Return all of an arm of n joints; they and the beginnings that are tried share the probability of a false alarm."""
     six, one = (_MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, (2 * joints + 3) * _BEGINS) for freedom in (6, 1))
     return (
         Suspect("rig", -1, slice(0, 6), six),
