@@ -23,6 +23,8 @@ FILE_WRITERS = {
     "arm urdf": ("arm.toml",),
     "check plan": ("--arm", "arm.toml"),
     "identify plan": ("--arm", "six_r"),
+    "arm calibrated": ("six_r", "arm.toml"),
+    "rig update": (".",),
 }
 FOLDER_WRITERS = {
     "calibrate --report": (*FILE_WRITERS["calibrate"], "-o", "new.json"),
@@ -32,15 +34,20 @@ FOLDER_WRITERS = {
     "check": ("poses.csv",),
     "record": ("usb:97,98",),
     "demo": ("--arm", "no such arm"),
+    "handeye": ("--robot", "poses.csv", "--eye", "in-hand", "--seen", "poses.csv"),
+    "replay": (".",),
+    "export": (".", "--to", "csv"),
+    "batch": ("measure", "f.yml"),
 }
 SUFFIXES = {
     "arm show": ".png",
     "arm urdf": ".urdf",
     "check plan": ".toml",
     "identify plan": ".csv",
+    "arm calibrated": ".urdf",
     "body draw": ".pdf",
 }
-ELSEWHERE = {"identify", "run", "board build", "board flash"}
+ELSEWHERE = {"identify", "live", "run", "board build", "board flash"}
 
 
 @pytest.fixture

@@ -273,7 +273,7 @@ def test_where_time_passes_by_itself_the_stop_is_sent_repeatedly():
 def test_slow_cameras_are_given_a_longer_sweep(monkeypatch):
     board = Standing()
     loop = looped(board)
-    loop.mounting = SimpleNamespace()
+    loop.mounting = SimpleNamespace(T_base_rig=np.eye(4))
     slow = replace(loop.setup, rate_hz=4.0)
     monkeypatch.setattr(loop, "setup", slow)
     with pytest.raises(CalibrationError, match=r"seen 0 times in 6\.5 s of sweep, 20 times at least") as caught:

@@ -167,7 +167,7 @@ def test_boards_are_opened_by_name():
     board.close()
     with pytest.raises(InputError, match="no board 'emulated:avr'; there are emulated:unicorn, emulated:qemu"):
         open_board("emulated:avr", JointPlant())
-    with pytest.raises(InputError, match=r"no board '/dev/ttyACM0'; .* and serial:PORT"):
+    with pytest.raises(InputError, match=r"no board '/dev/ttyACM0'; .* serial:PORT"):
         open_board("/dev/ttyACM0")
     with pytest.raises(InputError, match="emulated:host needs a plant"):
         open_board("emulated:host")
