@@ -79,9 +79,9 @@ EXACT = [
     *(odd(MODELS[name], f"odd_{name}", i) for i, name in enumerate(("six_r", "ur10", "puma560"))),
 ]
 ALL = [*EXACT, *IDENTIFIED, GENERAL]
-#: Four joints: turning base, two parallel axes, a wrist across them.
+#: Four joints: rotating base, two parallel axes, a wrist across them.
 FOUR = plain("four", [0.02, 0.3, 0.25, 0.0], [0.2, 0.03, 0.0, 0.1], [90, 0, 90, 0])
-#: A PUMA 560 whose third motor turns its forearm against the ground: J3' = J3 + J2.
+#: A PUMA 560 whose third motor rotates its forearm against the ground: J3' = J3 + J2.
 COUPLED = dataclasses.replace(
     MODELS["puma560"], name="coupled", coupling=np.eye(6) + np.eye(6)[2][:, None] * np.eye(6)[1]
 )

@@ -346,24 +346,24 @@ class Arm(Record):
         if numeric.inverse(self.table, self._limits, T, goal, q, off, np.zeros(numeric.SCRATCH)):
             raise pose_rejection(T[None])
         q = self._controller_angles(q)
-        position, angle, turn = off
+        position, angle, axis = off
         reached = position < numeric.REACHED and (self.joints < 6 or angle < numeric.REACHED)
         inside = bool(self.within_limits(q))
         if not reached:
             return Solutions(np.empty((0, self.joints + ROW_END)), _out_of_reach(0), partial(self._there, T, q))
         row = np.array([[*q, position, angle, 0, 0, 0, 0 if inside else OUTSIDE, 0]])
-        reason = "outside limits: a joint is beyond its limits" if not inside else self._left(angle, turn)
+        reason = "outside limits: a joint is beyond its limits" if not inside else self._left(angle, axis)
         return Solutions(row, reason, None if inside else partial(self._there, T, np.clip(q, self.q_min, self.q_max)))
 
-    def _left(self, angle: float, turn: float) -> str | None:
+    def _left(self, angle: float, axis: float) -> str | None:
         """Return what of an orientation fewer than six joints leave, in words; None where nothing is left."""
         if angle < numeric.REACHED:
             return None
-        axis = (
-            f"the tool's z axis is off by {np.degrees(turn):.3g} deg" if turn > numeric.REACHED else "its z axis is met"
+        met = (
+            f"the tool's z axis is off by {np.degrees(axis):.3g} deg" if axis > numeric.REACHED else "its z axis is met"
         )
         return (
-            f"orientation not met: {self.joints} joints bring the tool to the position; {axis}, the orientation is off by "
+            f"orientation not met: {self.joints} joints bring the tool to the position; {met}, the orientation is off by "
             f"{np.degrees(angle):.3g} deg in all"
         )
 
@@ -387,7 +387,7 @@ class Arm(Record):
 
     def _controller_angles(self, angles: Array) -> Array:
         """Return q of the joints' own angles, (n,) or (N, n), rad."""
-        return np.asarray(np.linalg.solve(self.coupling, angles.T).T) if self._coupled else angles
+        return np.asarray(np.linalg.solve(self.coupling, angles.T).T, np.float64) if self._coupled else angles
 
     def _coupled_inverse(self, T: Array, near: ArrayLike | None) -> Solutions:
         """Return the solutions of an arm of six joints whose motors are coupled, from those of the same arm without."""
@@ -404,8 +404,8 @@ class Arm(Record):
         if np.array_equal(self.coupling, np.rint(self.coupling)):
             least = np.ceil((self.q_min - q) / (2 * np.pi) - 1e-13)
             most = np.floor((self.q_max - q) / (2 * np.pi) + 1e-13)
-            turns = np.rint((goal - q) / (2 * np.pi))
-            q = q + 2 * np.pi * np.where(least <= most, np.clip(turns, least, most), turns)
+            whole = np.rint((goal - q) / (2 * np.pi))
+            q = q + 2 * np.pi * np.where(least <= most, np.clip(whole, least, most), whole)
         outside = ~np.asarray(((q >= self.q_min - 1e-12) & (q <= self.q_max + 1e-12)).all(axis=1))
         rows[:, :6], rows[:, STATE] = q, rows[:, STATE] % OUTSIDE + OUTSIDE * outside
         distance = np.linalg.norm(q - goal, axis=1) if near is not None else np.zeros(len(q))

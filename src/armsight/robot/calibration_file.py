@@ -1,8 +1,8 @@
 """Calibrated tables of single arms, as their makers' ROS drivers keep them: Universal Robots' and UFACTORY's YAML.
 
 Both are one form: ``kinematics:`` with x, y, z, m, and roll, pitch, yaw, rad, for every joint: where its frame stands in
-the frame of the joint before; it turns about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1 to
-wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
+the frame of the joint before; it rotates about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1
+to wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
 
 In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a
 little
@@ -160,14 +160,12 @@ def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:
         of the flange along its z, as in the makers' tables.
 
     Raises:
-        InputError: another number of joints, a joint that turns the other way, or coupled motors.
+        InputError: another number of joints, a joint that rotates the other way, or coupled motors.
     """
     if arm.joints != nominal.joints:
         raise InputError(f"{arm.name} has {arm.joints} joints, {nominal.name} {nominal.joints}")
     if ((arm.direction < 0).any() and (nominal.direction > 0).all()) or (arm.coupling != np.eye(arm.joints)).any():
-        raise InputError(
-            f"{arm.name}: joints that turn the other way, and coupled motors, have no place in such a file"
-        )
+        raise InputError(f"{arm.name}: such a file cannot hold joints that rotate the other way, or coupled motors")
     frames, before = _frames(arm, nominal), np.eye(4)
     lines = ["kinematics:"]
     for name, F in zip(_names(nominal), frames, strict=True):
@@ -183,7 +181,7 @@ def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:
 
 
 def write_calibration(arm: Arm, nominal: Arm, path: str | Path) -> tuple[float, float]:
-    """Write an arm as a calibration file; arguments and what is returned as of :func:`calibration_text`."""
+    """Write an arm as a calibration file; arguments and what is rerotated as of :func:`calibration_text`."""
     text, off_m, off_rad = calibration_text(arm, nominal)
     write_text(path, text)
     return off_m, off_rad
@@ -226,7 +224,7 @@ def difference(first: Arm, second: Arm) -> Difference:
     q = np.random.default_rng(0).uniform(first.q_min, first.q_max, (_POSES, first.joints))
     A, B = first.forward(q), second.forward(q)
     far = np.linalg.norm(A[:, :3, 3] - B[:, :3, 3], axis=1)
-    turned = np.linalg.norm(log_so3(np.swapaxes(A[:, :3, :3], 1, 2) @ B[:, :3, :3]), axis=1)
+    rotated = np.linalg.norm(log_so3(np.swapaxes(A[:, :3, :3], 1, 2) @ B[:, :3, :3]), axis=1)
     changes = {name: getattr(second, name) - getattr(first, name) for name in ("a", "d", "alpha", "offset")}
     for name in ("alpha", "offset"):
         changes[name] = np.remainder(changes[name] + np.pi, 2 * np.pi) - np.pi
@@ -234,4 +232,4 @@ def difference(first: Arm, second: Arm) -> Difference:
     unlike = (parallel[0] != parallel[1]) | (first.convention != second.convention)
     unlike = unlike | np.append(False, unlike[:-1])  # the next row takes back what a far normal put into this one
     rows = [np.where(unlike, np.nan, changes[name]) for name in ("a", "d", "alpha", "offset")]
-    return Difference(float(far.mean()), float(far.max()), float(turned.mean()), float(turned.max()), *rows)
+    return Difference(float(far.mean()), float(far.max()), float(rotated.mean()), float(rotated.max()), *rows)

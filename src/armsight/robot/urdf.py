@@ -170,7 +170,7 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
         raise InputError(
             f"{path}: {many}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}: say which link is the tool"
         )
-    whole = {link: chain for link, chain in ends.items() if _turning(chain) == len(revolute)}
+    whole = {link: chain for link, chain in ends.items() if _revolute(chain) == len(revolute)}
     if not whole:
         raise InputError(
             f"{path}: the {len(revolute)} revolute joints do not follow one another; only serial arms are read here: say "
@@ -181,7 +181,7 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
     chain = next(iter(whole.values()))
     last = next(joint.name for joint in chain if joint.kind == "revolute")
     if any(word in last.lower() for word in _GRIPPERS):
-        others = ", ".join(link for link, others in ends.items() if FEWEST_JOINTS <= _turning(others) < len(revolute))
+        others = ", ".join(link for link, others in ends.items() if FEWEST_JOINTS <= _revolute(others) < len(revolute))
         raise InputError(
             f"{path}: joint {last!r} is a gripper's by its name, not the arm's; say which link is the tool "
             f"({others or chain[0].child} is there)"
@@ -189,7 +189,7 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
     return chain[::-1]
 
 
-def _turning(chain: list[_Joint]) -> int:
+def _revolute(chain: list[_Joint]) -> int:
     """Return how many joints of a chain are revolute."""
     return sum(joint.kind == "revolute" for joint in chain)
 
@@ -215,8 +215,8 @@ def _chain_to(path: str | Path, ends: dict[str, list[_Joint]], tool_link: str) -
         InputError: there is no such link, or too few or too many joints before it.
     """
     chain = ends.get(tool_link, [])
-    if not FEWEST_JOINTS <= _turning(chain) <= MOST_JOINTS:
-        whole = [link for link, others in ends.items() if FEWEST_JOINTS <= _turning(others) <= MOST_JOINTS]
+    if not FEWEST_JOINTS <= _revolute(chain) <= MOST_JOINTS:
+        whole = [link for link, others in ends.items() if FEWEST_JOINTS <= _revolute(others) <= MOST_JOINTS]
         raise InputError(
             f"{path}: link {tool_link!r} is not behind {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints; these are: "
             f"{', '.join(whole) or 'none'}"

@@ -15,7 +15,7 @@ from armsight.robot.models import MODELS
 
 
 def coupled():
-    """A PUMA 560 whose third motor turns its forearm against the ground."""
+    """A PUMA 560 whose third motor rotates its forearm against the ground."""
     arm = MODELS["puma560"]
     coupling = np.eye(6)
     coupling[2, 1] = 1.0

@@ -53,7 +53,7 @@ def test_a_calibration_is_read_exactly_and_written_back(name, tmp_path):
     again = read_calibration(tmp_path / "again.yaml", nominal)
     assert difference(arm, again).most_m < 1e-8
     for joint, at in yaml.safe_load((tmp_path / "again.yaml").read_text())["kinematics"].items():
-        # The frames are the makers', but for what may be chosen along an axis; the xArm 6 has a turn about one as well.
+        # The frames are the makers', but for what may be chosen along an axis; the xArm 6 has a rotation about one as well.
         if joint != "hash" and name != "xarm6":
             np.testing.assert_allclose(at["x"], given["kinematics"][joint]["x"], atol=5e-3)
 
@@ -91,7 +91,7 @@ def test_a_file_that_is_none_is_rejected(change, said, tmp_path):
 
 def test_what_a_file_cannot_hold_is_rejected():
     ur5e = MODELS["ur5e"]
-    with pytest.raises(InputError, match="no place in such a file"):
+    with pytest.raises(InputError, match="such a file cannot hold"):
         calibration_text(dataclasses.replace(ur5e, direction=-np.ones(6)), ur5e)
     with pytest.raises(InputError, match="7 joints, ur5e 6"):
         calibration_text(MODELS["xarm7"], ur5e)

@@ -10,7 +10,7 @@ from armsight.robot.models import MODELS
 
 pytest.importorskip("pinocchio")
 
-#: What stands otherwise there: our base in theirs, by which sign joints turn, their tool in ours. See the models' texts.
+#: What stands otherwise there: our base in theirs, by which sign joints rotate, their tool in ours. See the models' texts.
 STANDS = {
     "ar4": (
         Rotation.from_euler("z", -90, degrees=True),

@@ -42,7 +42,7 @@ def test_seven_joints_are_tracked_by_resolved_rate():
     assert motion.deviation_m < 1e-3
 
 
-def test_five_joints_are_told_that_they_hold_no_orientation_on_a_path():
+def test_five_joints_hold_no_orientation_on_a_path():
     arm = MODELS["so101"]
     with pytest.raises(InputError, match="so101 has 5 joints: it cannot move its tool along a path"):
         line(arm, arm.home, shifted(arm.forward(arm.home), [0.0, 0.01, 0.0]))

@@ -191,7 +191,7 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
         write_urdf(arm, output)
     if max(left) > 1e-9:
         click.echo(
-            f"note: {output} has no place for the flange's {1e3 * left[0]:.3f} mm and {math.degrees(left[1]):.3f} deg off "
+            f"note: {output} cannot hold the flange's {1e3 * left[0]:.3f} mm and {math.degrees(left[1]):.3f} deg off "
             "the last joint's axis: give them to the tool",
             err=True,
         )

@@ -426,8 +426,8 @@ def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
         return []
     table = read_table(file)
     header = [_VERSION_1.get(name, name) for name in table[0]] if table else []
-    joints = sum(name.startswith("q") and name.endswith("_ref_rad") for name in header)
-    names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(joints or 6))]
+    count = sum(name.startswith("q") and name.endswith("_ref_rad") for name in header)
+    names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(count or 6))]
     try:
         at = [header.index(name) for name in names]
         values = np.array([[float(row[k]) for k in at] for row in table[1:]])

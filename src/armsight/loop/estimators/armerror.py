@@ -39,7 +39,7 @@ BASIS = 1 + 2 * HARMONICS
 _MIN_TRACE = 1.0 + 2.0 * math.cos(3.0)
 
 
-class Layout(NamedTuple):
+class ErrorLayout(NamedTuple):
     """Where each part begins in the vector of an arm of n joints.
 
     Attributes:
@@ -78,12 +78,12 @@ class Layout(NamedTuple):
 
 
 @functools.cache
-def layout(joints: int) -> Layout:
+def layout(joints: int) -> ErrorLayout:
     """Return the layout of the vector of an arm of so many joints."""
     linearity = 6 * (joints + 1)
     backlash = linearity + joints * BASIS
     floats, compliance, rest, reading, pose = (backlash + joints * n for n in range(1, 6))
-    return Layout(joints, linearity, backlash, floats, compliance, rest, reading, pose, pose + 6, pose + 7)
+    return ErrorLayout(joints, linearity, backlash, floats, compliance, rest, reading, pose, pose + 6, pose + 7)
 
 
 @dataclass(frozen=True)

@@ -417,9 +417,9 @@ class Model(Record):
                     out[:, i] += self.arm.coupling[i, f.joint] * self.arm.direction[i] * off
         return np.asarray(out)
 
-    def _by_source(self, turned: Array, phi: Array) -> Array:
+    def _by_source(self, axes: Array, phi: Array) -> Array:
         """Return what the coefficients move (N, 3, F), from what rotations of the joints move, (n, N, 3)."""
-        by_motor = np.einsum("ij,i,inx->jnx", self.arm.coupling, self.arm.direction, turned)
+        by_motor = np.einsum("ij,i,inx->jnx", self.arm.coupling, self.arm.direction, axes)
         return np.asarray((by_motor[[f.joint for f in self.features]] * phi.T[..., None]).transpose(1, 2, 0))
 
     def motion(self, x: Array, q: Array, phi: Array) -> TableMotion:

@@ -32,7 +32,7 @@ _NONE, _SLOW = 1e-26, 1e-4
 #: Steps of a descent at most, starts, and the least and greatest damping; no joint moves further in a step, rad.
 _STEPS, _STARTS, _STIFF, _FURTHEST = 40, 200, 1e6, 1.0
 #: Weights of the direction of the tool's z axis and of the rotation about it, for fewer than six joints: m for 1 rad.
-_AXIS, _TURN = 0.3, 0.1
+_AXIS, _ROLL = 0.3, 0.1
 #: Fractional parts of multiples of its powers spread evenly in seven dimensions: the root of x^8 = x + 1 (Roberts, 2018).
 _SPREAD = 1.0969815577985598
 #: Steps along the free motion, the furthest of them, rad, the share of a joint's range from its middle from which on it is
@@ -41,7 +41,7 @@ _SLIDES, _SLIDE_RAD, _EDGE, _PUSH = 8, 0.3, 0.85, 100.0
 #: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the damping of the position.
 _LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
 #: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a
-#: radian the wrist would turn over.
+#: radian the wrist would rotate by half a revolution.
 _WEAK = 1e-2
 
 
@@ -79,7 +79,7 @@ def _weigh(F: Frame, joints: int, J: Array, e: Array) -> float:
     """Give the rotation's rows of J and e their weights, for fewer than six joints; return the error's squared length."""
     if joints < 6:
         zx, zy, zz = F[6], F[7], F[8]
-        more = _TURN - _AXIS
+        more = _ROLL - _AXIS
         for i in range(joints):
             along = more * (zx * J[3, i] + zy * J[4, i] + zz * J[5, i])
             J[3, i] = _AXIS * J[3, i] + along * zx
@@ -341,7 +341,7 @@ def _errors_by_level(F: Frame, G: Frame, J: Array, n: int, e: Array) -> None:
         kx, ky, kz = kx / s, ky / s, kz / s
     else:
         kx, ky, kz = F[0], F[1], F[2]
-    # The tool's x axis, rotated with its z axis onto the requested one, and how far it has still to turn.
+    # The tool's x axis, rotated with its z axis onto the requested one, and how far it has still to rotate.
     along = (kx * F[0] + ky * F[1] + kz * F[2]) * (1.0 - c)
     x = c * F[0] + s * (ky * F[2] - kz * F[1]) + along * kx
     y = c * F[1] + s * (kz * F[0] - kx * F[2]) + along * ky

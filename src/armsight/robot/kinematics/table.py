@@ -23,7 +23,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.geometry.pose import inverse
 
-#: How many turning joints an arm may have.
+#: How many revolute joints an arm may have.
 FEWEST_JOINTS, MOST_JOINTS = 4, 7
 BASE, TOOL, MODIFIED, KIND, FOREARM, ACROSS, UNBASE, UNTOOL, BEND, JOINTS, SIZE = (
     *(42, 54, 66, 67, 68, 69),
