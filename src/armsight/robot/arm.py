@@ -357,7 +357,9 @@ class Arm(Record):
         """Return what of an orientation fewer than six joints leave, in words; None where nothing is left."""
         if angle < numeric.REACHED:
             return None
-        axis = f"the tool's z axis is off by {np.degrees(turn):.3g} deg" if turn > numeric.REACHED else "its z axis is met"
+        axis = (
+            f"the tool's z axis is off by {np.degrees(turn):.3g} deg" if turn > numeric.REACHED else "its z axis is met"
+        )
         return (
             f"orientation not met: {self.joints} joints bring the tool to the position; {axis}, the orientation is off by "
             f"{np.degrees(angle):.3g} deg in all"
@@ -392,7 +394,9 @@ class Arm(Record):
         if not len(found):
             nearest = found.nearest
             q = self._controller_angles(nearest.q if nearest else goal)
-            return Solutions(found.rows.copy(), found.reason, partial(self._there, T, np.clip(q, self.q_min, self.q_max)))
+            return Solutions(
+                found.rows.copy(), found.reason, partial(self._there, T, np.clip(q, self.q_min, self.q_max))
+            )
         rows, q = found.rows.copy(), self._controller_angles(found.q)
         # A revolution of a motor brings every joint to where it was only where the coupling consists of whole numbers.
         if np.array_equal(self.coupling, np.rint(self.coupling)):
@@ -407,7 +411,9 @@ class Arm(Record):
         if not outside.all():
             return Solutions(rows, found.reason if found.singular.any() else None)
         closest = np.clip(rows[0, :6], self.q_min, self.q_max)
-        return Solutions(rows, "outside limits: every solution has a joint beyond its limits", partial(self._there, T, closest))
+        return Solutions(
+            rows, "outside limits: every solution has a joint beyond its limits", partial(self._there, T, closest)
+        )
 
     @cached_property
     def _uncoupled(self) -> Arm:

@@ -77,7 +77,11 @@ def until(true, patience_s=120.0):
 
 
 def click(page, name):
-    until(lambda: page.execute_script(f"const e = document.getElementById('{name}'); return e && !e.disabled && !e.hidden"))
+    until(
+        lambda: page.execute_script(
+            f"const e = document.getElementById('{name}'); return e && !e.disabled && !e.hidden"
+        )
+    )
     page.execute_script(f"document.getElementById('{name}').click()")
 
 
@@ -187,7 +191,9 @@ def test_stop_and_two_pages(page, session, server, browsers):
     other = browsers(server.address)
     until(lambda: state(other, "arm") and other.find_elements("id", "take"))
     other.execute_script("command('GoTo', {step: 'health'})")
-    until(lambda: any("another page commands" in each.text for each in other.find_elements("css selector", "#events li")))
+    until(
+        lambda: any("another page commands" in each.text for each in other.find_elements("css selector", "#events li"))
+    )
     assert session.sections()["overview"].step == "arm"
     until(lambda: other.find_element("id", "stopped").text == "or the space key")
     other.execute_script("document.getElementById('stop').click()")

@@ -47,7 +47,10 @@ def test_everything_else_is_one_line(text, said):
 
 
 def test_ten_thousand_malformed_messages_raise_nothing_else():
-    rng, good = random.Random(0), [json.dumps({"command": "UseBoard", "spec": "a", "measured_mm": 3}), '{"command": "Zero"}']
+    rng, good = (
+        random.Random(0),
+        [json.dumps({"command": "UseBoard", "spec": "a", "measured_mm": 3}), '{"command": "Zero"}'],
+    )
     read = 0
     for _ in range(10_000):
         text = list(rng.choice(good))

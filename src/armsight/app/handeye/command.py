@@ -120,7 +120,7 @@ def command(**given: object) -> None:
 
 
 def _require_one_way(options: Options) -> None:
-    """Refuse options that do not go together."""
+    """Reject options that do not go together."""
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,

@@ -30,8 +30,8 @@ from armsight.robot.arm import Arm
 FITS_M = 2e-3
 #: Another reading must fit better by this factor, and its median residual be below this, m.
 BETTER, PLAUSIBLE_M = 4.0, 0.02
-#: Poses that a reading is judged by at most, and the rows by which poses are looked for against the images.
-JUDGED, SHIFTS = 60, (1, -1, 2, -2)
+#: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
+EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
 #: Scales that mistaken units make: mm for m, cm, inches.
 UNITS = {
     1000.0: "millimetres taken for metres",
@@ -42,7 +42,7 @@ UNITS = {
 
 def misfit(poses: Poses) -> float:
     """Return the median residual, m, of the best closed form."""
-    rows = np.linspace(0, len(poses.A) - 1, min(JUDGED, len(poses.A))).round().astype(np.int64)
+    rows = np.linspace(0, len(poses.A) - 1, min(EVALUATED, len(poses.A))).round().astype(np.int64)
     part = poses.rows(rows)
     found = starts(part.A, part.right_side)
     if not found:
@@ -58,7 +58,7 @@ def _angles(Ts: Array) -> Array:
 
 
 def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
-    """Refuse data that fit far better read in another way.
+    """Reject data that fit far better read in another way.
 
     Args:
         recording: the rows.
@@ -166,7 +166,7 @@ def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
 def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
     n = q.shape[1]
-    rows = np.linspace(0, len(q) - 1, min(JUDGED, len(q))).round().astype(np.int64)
+    rows = np.linspace(0, len(q) - 1, min(EVALUATED, len(q))).round().astype(np.int64)
     seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
     orders: list[tuple[int, ...]] = [
         tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
@@ -176,8 +176,8 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
         orders = [order for order in permutations(range(n)) if order != tuple(range(n))]
     scored: list[tuple[float, NDArray[np.int64]]] = []
     for order in orders:
-        turned = _angles(np.asarray(arm.forward(q[rows][:, order])))
-        scored.append((float(np.median(np.abs(turned - seen))), np.array(order)))
+        rotated = _angles(np.asarray(arm.forward(q[rows][:, order])))
+        scored.append((float(np.median(np.abs(rotated - seen))), np.array(order)))
     for _, at in sorted(scored, key=lambda one: one[0])[:3]:
         named = ", ".join(f"q{k + 1}" for k in at)
         yield (

@@ -377,9 +377,7 @@ class ArmStep:
         assert board is not None
         if self._simulated is not None:
             simulated = self._simulated
-            return replace(
-                setup_of(simulated.workcell), target=target, poll=lambda: self._look(simulated.poll_now)
-            )
+            return replace(setup_of(simulated.workcell), target=target, poll=lambda: self._look(simulated.poll_now))
         return Setup(
             options.arm,
             board,
@@ -463,7 +461,9 @@ class ArmStep:
             errors = [e for _, e, c in self._chart if c is closed]
             if errors:
                 rms = float(np.sqrt(np.mean(np.square(errors))))
-                lines.append(f"{name}: {rms:.2f} mm RMS from the reference, as the loop estimates at {len(errors)} shots")
+                lines.append(
+                    f"{name}: {rms:.2f} mm RMS from the reference, as the loop estimates at {len(errors)} shots"
+                )
         if len(outcome.log.latency_s):
             p50, p99 = 1e3 * np.percentile(outcome.log.latency_s, (50, 99))
             lines.append(f"image to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms")

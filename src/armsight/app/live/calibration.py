@@ -246,7 +246,9 @@ class CalibrationStep:
         """
         with self._lock:
             if len(self._shots) < FIRST_FIT:
-                raise InputError(f"{len(self._shots)} shots are too few to calibrate; {LEAST_SHOTS} or more are advised")
+                raise InputError(
+                    f"{len(self._shots)} shots are too few to calibrate; {LEAST_SHOTS} or more are advised"
+                )
             self._running = False
             self._fitting = "choosing the lens model by held-out errors"
             self._pool.submit(self._finished)
@@ -455,7 +457,9 @@ class CalibrationStep:
         if len(result.pairs) < LEAST_SHOTS:
             lines.append(f"{LEAST_SHOTS - len(result.pairs)} more shots, so that the held-out errors mean something")
         if error_m > self.aim.error_m:
-            lines.append(f"predicted error {1e3 * error_m:.2g} mm, {1e3 * self.aim.error_m:g} mm is the aim: more shots")
+            lines.append(
+                f"predicted error {1e3 * error_m:.2g} mm, {1e3 * self.aim.error_m:g} mm is the aim: more shots"
+            )
         lines += [f"{row.name} {row.heldout}: {row.advice}" for row in graded_metrics(result) if row.grade == "poor"]
         return tuple(lines)
 
@@ -488,9 +492,7 @@ class CalibrationStep:
         """Return the command line that does the same with the stored shots."""
         folder = self.folder / "calibration" if self._writer is None else self._writer.folder
         out = self.folder / "rig.json"
-        return (
-            f"armsight calibrate --left '{folder}/left*.png' --right '{folder}/right*.png' --target {self.spec} -o {out}"
-        )
+        return f"armsight calibrate --left '{folder}/left*.png' --right '{folder}/right*.png' --target {self.spec} -o {out}"
 
     def _shown(self) -> CalibrationState:
         """Return the state as it is now."""

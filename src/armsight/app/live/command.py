@@ -44,7 +44,9 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="Folder of the session.",
 )
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on, such as 0.0.0.0.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(
@@ -87,7 +89,9 @@ def command(
         if as_json:
             click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
         else:
-            click.echo(f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session")
+            click.echo(
+                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
+            )
         shown = 0
         while True:
             for event in session.events(shown):

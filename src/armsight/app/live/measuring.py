@@ -268,7 +268,9 @@ class MeasureStep:
         tip, sigma = 1e3 * found.p_body, 1e3 * float(np.sqrt(np.trace(found.cov[:3, :3])))
         held = 1e3 * float(np.sqrt(np.nanmean(found.held_out_m**2)))
         at = ", ".join(f"{x:.2f}" for x in tip)
-        self._pivot_text = f"tip at {at} mm in the body, sigma {sigma:.2g} mm; held out {held:.2g} mm RMS, {len(poses)} poses"
+        self._pivot_text = (
+            f"tip at {at} mm in the body, sigma {sigma:.2g} mm; held out {held:.2g} mm RMS, {len(poses)} poses"
+        )
 
     def record(self) -> None:
         """Begin to write every pose to a new CSV file; or end.
@@ -326,7 +328,9 @@ class MeasureStep:
     def _pose(self) -> PoseEstimate:
         newest = self.newest
         if newest is None or isinstance(newest[1], Missed):
-            raise InputError("no pose is measured now" if newest is None else f"no pose is measured now: {newest[1].reason}")
+            raise InputError(
+                "no pose is measured now" if newest is None else f"no pose is measured now: {newest[1].reason}"
+            )
         return newest[1]
 
     def _lacking(self) -> str:
@@ -451,4 +455,3 @@ def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
 
 def _mm(values: Array) -> tuple[float, ...]:
     return tuple(float(1e3 * x) for x in values)
-

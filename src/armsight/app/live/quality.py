@@ -115,14 +115,20 @@ def quality_notes(quality: ImageQuality) -> tuple[Note, ...]:
     """Return what is wrong with an image, in words."""
     notes = []
     if quality.edge_px is not None and quality.edge_px > BLURRED_PX:
-        notes.append(Note("error", f"out of focus: edges are {quality.edge_px:.1f} px wide; focus until below {SHARP_PX:g}"))
+        notes.append(
+            Note("error", f"out of focus: edges are {quality.edge_px:.1f} px wide; focus until below {SHARP_PX:g}")
+        )
     elif quality.edge_px is not None and quality.edge_px > SHARP_PX:
-        notes.append(Note("hint", f"a little soft: edges are {quality.edge_px:.1f} px wide; {SHARP_PX:g} or less is sharp"))
+        notes.append(
+            Note("hint", f"a little soft: edges are {quality.edge_px:.1f} px wide; {SHARP_PX:g} or less is sharp")
+        )
     if quality.saturated > _SATURATED_SHARE:
         share = 100 * quality.saturated
         notes.append(Note("warn", f"saturated: {share:.0f}% of the pixels are white; lower exposure or gain"))
     if quality.mean < _DARK_MEAN:
-        notes.append(Note("warn", f"too dark: mean grey level {quality.mean:.0f} of 255; more light, or longer exposure"))
+        notes.append(
+            Note("warn", f"too dark: mean grey level {quality.mean:.0f} of 255; more light, or longer exposure")
+        )
     return tuple(notes)
 
 
@@ -164,7 +170,9 @@ class Flicker:
         if amplitude < _FLICKER_SHARE or power[k_image, k_row] < _LINE_SHARE * power.sum():
             return None
         advance = k_image / _FLICKER_IMAGES
-        apart = [min(_circle(advance, hz / self._rate_hz), _circle(-advance, hz / self._rate_hz)) for hz in (100.0, 120.0)]
+        apart = [
+            min(_circle(advance, hz / self._rate_hz), _circle(-advance, hz / self._rate_hz)) for hz in (100.0, 120.0)
+        ]
         return amplitude, (100.0, 120.0)[int(np.argmin(apart))]
 
     def note(self) -> Note | None:
@@ -175,7 +183,8 @@ class Flicker:
         amplitude, hz = found
         exposure = "10 or 20 ms" if hz == 100.0 else "8.3 or 16.7 ms"
         return Note(
-            "warn", f"flicker: lamps at {hz:.0f} Hz change the brightness by {100 * amplitude:.1f}%; expose for {exposure}"
+            "warn",
+            f"flicker: lamps at {hz:.0f} Hz change the brightness by {100 * amplitude:.1f}%; expose for {exposure}",
         )
 
 

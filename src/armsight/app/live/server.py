@@ -176,7 +176,11 @@ class LiveServer:
         if not self._named(host):
             return _text(connection, HTTPStatus.MISDIRECTED_REQUEST, "this server is not the one of that name\n")
         if not self._knows(url.query):
-            return _text(connection, HTTPStatus.UNAUTHORIZED, "open the address that armsight live printed: its token is missing\n")
+            return _text(
+                connection,
+                HTTPStatus.UNAUTHORIZED,
+                "open the address that armsight live printed: its token is missing\n",
+            )
         if url.path in ("/live", "/stop"):
             if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
                 return _text(connection, HTTPStatus.FORBIDDEN, "only pages of this server may connect\n")
@@ -265,7 +269,13 @@ class LiveServer:
         for client in self._clients.values():
             self._send(
                 client,
-                {"you": {"number": client.number, "commands": client.number == self._commander, "pages": len(self._clients)}},
+                {
+                    "you": {
+                        "number": client.number,
+                        "commands": client.number == self._commander,
+                        "pages": len(self._clients),
+                    }
+                },
             )
 
     def _send(self, client: _Client, message: dict[str, Any]) -> None:
@@ -371,7 +381,8 @@ class LiveServer:
     def _texts(self) -> dict[str, str]:
         """Return every section as text."""
         texts = {
-            name: json.dumps({"section": name, "state": json_of(state)}) for name, state in self.session.sections().items()
+            name: json.dumps({"section": name, "state": json_of(state)})
+            for name, state in self.session.sections().items()
         }
         texts["drawn"] = json.dumps({"drawn": json_of(self.session.drawn)})
         return texts
@@ -433,5 +444,3 @@ def _silent() -> Any:  # noqa: ANN401 - a logger
     logger = logging.getLogger("armsight.live")
     logger.setLevel(logging.CRITICAL)
     return logger
-
-

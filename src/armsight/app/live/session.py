@@ -370,13 +370,17 @@ class Session:
         self._require_rest()
         self.capture.swapped = not self.capture.swapped
         self._covering = None
-        self.say(Note("good", "left and right are exchanged" if self.capture.swapped else "left and right as they came"))
+        self.say(
+            Note("good", "left and right are exchanged" if self.capture.swapped else "left and right as they came")
+        )
 
     def _use_board(self, spec: str, measured_mm: float) -> None:
         self._require_rest()
         board = open_board(spec)
         if measured_mm and not 0.8 * _BAR_MM < measured_mm < 1.2 * _BAR_MM:
-            raise InputError(f"the bar on the print is {_BAR_MM:g} mm long by the drawing; {measured_mm:g} mm cannot be right")
+            raise InputError(
+                f"the bar on the print is {_BAR_MM:g} mm long by the drawing; {measured_mm:g} mm cannot be right"
+            )
         if measured_mm:
             spec = scaled_spec(spec, measured_mm / _BAR_MM)
             board = open_board(spec)
@@ -446,7 +450,9 @@ class Session:
             count = len(self._found)
             name = f" ({self._found[0].name})" if count == 1 else ""
             have = f"one camera is attached{name}" if count == 1 else "no camera is attached"
-            raise DeviceError(f"{have}; two are needed. Plug them in: they are looked for again. `armsight cameras` lists them")
+            raise DeviceError(
+                f"{have}; two are needed. Plug them in: they are looked for again. `armsight cameras` lists them"
+            )
         return open_source(self.source)
 
     def _see(self) -> None:
@@ -521,7 +527,11 @@ class Session:
         notes = []
         if "exposure=" not in self.source or "exposure=auto" in self.source:
             notes.append(Note("hint", "automatic exposure is on: add ,exposure=5ms to the source for measuring"))
-        requested = [float(value) for name, value in usb_parts(self.source.removeprefix("usb:"))[1].values() if "per second" in name]
+        requested = [
+            float(value)
+            for name, value in usb_parts(self.source.removeprefix("usb:"))[1].values()
+            if "per second" in name
+        ]
         if rate is not None and requested and rate < _SLOW * requested[0]:
             text = f"{rate:.1f} shots a second come, {requested[0]:g} were requested: USB 2 carries two such cameras only on "
             notes.append(Note("warn", f"{text}two ports of their own, or in format MJPG"))
@@ -580,7 +590,9 @@ class Session:
             finding,
             self.capture.swapped,
             ACTIONS if self._simulated is not None else (),
-            "armsight demo" if self._simulated is not None else f"armsight record {self.source or 'usb:LEFT,RIGHT'} -o shots",
+            "armsight demo"
+            if self._simulated is not None
+            else f"armsight record {self.source or 'usb:LEFT,RIGHT'} -o shots",
         )
 
     def _board(self) -> BoardChoice:
@@ -594,9 +606,7 @@ class Session:
         latency, of = measure.latency_ms, "from an image's arrival to its pose"
         if (loop := self.arm.latency_s) is not None:
             latency, of = (1e3 * loop[0], 1e3 * loop[1]), "from an image to its command in the loop"
-        return HealthState(
-            latency, of, measure.measured, measure.missed, measure.health, 1e3 * self.capture.slowest_s
-        )
+        return HealthState(latency, of, measure.measured, measure.missed, measure.health, 1e3 * self.capture.slowest_s)
 
 
 #: Sections of :meth:`Session.sections` and their records.

@@ -88,7 +88,9 @@ class Person:
                 self._move(near)
                 return
         middle = rig.T_left_right[:3, 3] / 2
-        for step in np.linspace(0.02, 0.9, 30):  # the outline is drawn for other cameras than these: as near as can be seen
+        for step in np.linspace(
+            0.02, 0.9, 30
+        ):  # the outline is drawn for other cameras than these: as near as can be seen
             near = np.array(T)
             near[:3, 3] += step * (np.array([middle[0], middle[1], 1.3 * T[2, 3]]) - T[:3, 3])
             if self._visible(near):

@@ -20,7 +20,9 @@ ARM = Arm(
     a=np.array([-0.0303992, np.hypot(*_UPPER), np.hypot(*_FORE), 0.0, 0.0]),
     d=np.array([-0.0542, -0.0182778, 0.0, 0.0181, -0.0611]),
     alpha=np.deg2rad([-90.0, 0.0, 0.0, -90.0, 0.0]),
-    offset=np.array([0.0, np.pi / 2 + _UPPER_BEND, np.pi / 2 - _UPPER_BEND - _FORE_BEND, np.pi / 2 + _FORE_BEND, np.pi]),
+    offset=np.array(
+        [0.0, np.pi / 2 + _UPPER_BEND, np.pi / 2 - _UPPER_BEND - _FORE_BEND, np.pi / 2 + _FORE_BEND, np.pi]
+    ),
     T_base_0=pose(
         np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.array([0.0207909, -0.0230745, 0.0948817])
     ),
