@@ -141,7 +141,7 @@ def _median(values) -> float:
 def summary(rows: list[Row]) -> list[str]:
     """Return the tables."""
     lines = [
-        "| track | sequences | rejected | mm | deg | best baseline by mm | its mm | by deg | its deg | in 95 % | NEES | s |",
+        "| track | sequences | rejected | mm | deg | best by mm | its mm | best by deg | its deg | in 95 % | NEES | s |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     tracks = list(dict.fromkeys(row.track for row in rows))

@@ -1,7 +1,7 @@
 """The poses to take next: those that lower the sigma of the mounting most.
 
 In: a calibration and its poses. Out: poses of the flange, and the sigma after each. Candidates are views like those seen
-(as far away, as far from the axis) with the body rotated further; the flange stays within the space it was in, a fifth more.
+(as far away, as far from the axis) with the body rotated further; the flange stays within its space, a fifth more.
 Each next pose is the one whose information, given those before, lowers the trace of the mounting's covariance most (a
 radian counting as 0.3 m).
 """
