@@ -19,7 +19,7 @@ from armsight.errors import ArmsightError
 #: ``command.py`` holds a click command called ``command``. Their list imports none of them.
 SECTIONS: dict[str, dict[str, str]] = {
     "See it live": {
-        "live": "Calibrate, measure and close the loop on a page in the browser, step by step, with a stop button.",
+        "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.",
     },
     "Calibrate cameras": {
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",

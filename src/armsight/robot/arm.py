@@ -284,9 +284,11 @@ class Arm(Record):
 
         Of six joints: all of up to eight, exact to rounding, where the table has a closed form (``kinematics.structure``
         says which do); else those that damped least squares finds from many starts. Of another number of joints: one
-        solution within the limits, the first that is found from ``near`` and then from other starts (``kinematics.numeric``).
-        Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and away from the limits. Fewer
-        than six reach few poses exactly: the position comes first, then the direction of the tool's z axis, then the rotation
+        solution within the limits, the first that is found from ``near`` and then from other starts
+        (``kinematics.numeric``).
+        Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and away from the limits.
+        Fewer than six reach few poses exactly: the position comes first, then the direction of the tool's z axis, then the
+        rotation
         about it; ``residual_rad`` says what is left. Nothing is raised for a pose out of reach or singular: the result says
         so.
 
@@ -378,14 +380,14 @@ class Arm(Record):
         return ManySolutions.of(reached.astype(np.int64), rows[:, None])
 
     def _goal(self, near: ArrayLike | None) -> Array:
-        """Return the angles (n,) of the joints that solutions shall be near to, rad: the middle of the limits by default."""
+        """Return the joints' angles (n,) that solutions shall be near to, rad: the middle of the limits by default."""
         if near is None:
             return np.asarray(self._limits.mean(axis=0))
         return np.asarray(self.coupling @ near_angles(near, self.joints))
 
     def _controller_angles(self, angles: Array) -> Array:
         """Return q of the joints' own angles, (n,) or (N, n), rad."""
-        return np.linalg.solve(self.coupling, angles.T).T if self._coupled else angles
+        return np.asarray(np.linalg.solve(self.coupling, angles.T).T) if self._coupled else angles
 
     def _coupled_inverse(self, T: Array, near: ArrayLike | None) -> Solutions:
         """Return the solutions of an arm of six joints whose motors are coupled, from those of the same arm without."""

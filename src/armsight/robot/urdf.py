@@ -102,11 +102,11 @@ def _joint(path: str | Path, element: ET.Element) -> _Joint:
         links.append(link)
     origin = element.find("origin")
     xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
-    T = pose(_rotation(rpy), xyz)
+    T = pose(rotation_of(rpy), xyz)
     return _Joint(name, kind, links[0], links[1], T, element)
 
 
-def _rotation(rpy: Array) -> Array:
+def rotation_of(rpy: Array) -> Array:
     """Return the rotation of URDF's roll, pitch, yaw, exact at multiples of 90 degrees."""
     (cx, cy, cz), (sx, sy, sz) = exact_cos_sin(rpy)
     Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1.0]])

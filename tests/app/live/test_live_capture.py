@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armsight.app.live import capture as module
-from armsight.app.live.capture import Capture, LiveShot
+from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.data import Shot
 from armsight.errors import DeviceError
 
@@ -48,7 +48,7 @@ def cable(monkeypatch):
 
 @pytest.fixture
 def capture(cable):
-    made = Capture(cable.open)
+    made = CameraCapture(cable.open)
     made.start()
     yield made
     made.close()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armsight.app.live.guide import Aim, Guide, Knowledge, error_weights, guessed_rig, working_points
+from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
 from armsight.data import Detections
 from armsight.geometry.pose import inverse, transform
 from armsight.sim.example_rig import board_poses, example_rig
@@ -43,18 +43,18 @@ def five(poses):
 
 
 def test_what_is_predicted_of_a_shot_is_what_it_leaves(five, poses):
-    knowledge = Knowledge.of(five, BOARD, Aim())
+    knowledge = Knowledge.of(five, BOARD, CalibrationAim())
     predicted = knowledge.errors_after_m(poses[5:6])[0]
     assert knowledge.after(poses[5]).error_m == pytest.approx(predicted, rel=1e-6)
     # The adjustment of six shots itself: the same information, up to noise and to what the prior of the print learns.
-    found = Knowledge.of(calibrated(poses[:6]), BOARD, Aim()).error_m
+    found = Knowledge.of(calibrated(poses[:6]), BOARD, CalibrationAim()).error_m
     assert 0.5 < predicted / found < 2.0
     assert predicted < 0.9 * knowledge.error_m
 
 
 def test_the_predicted_error_is_that_of_triangulated_points(five):
     # 200 rigs drawn from the covariance: the RMS error of points of the volume is the predicted one.
-    knowledge, rig = Knowledge.of(five, BOARD, Aim()), five.rig
+    knowledge, rig = Knowledge.of(five, BOARD, CalibrationAim()), five.rig
     points = working_points(rig, 0.8)
     weights, rng = error_weights(rig, points), np.random.default_rng(0)
     uv = np.stack([rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))], axis=1)
@@ -68,7 +68,7 @@ def test_the_predicted_error_is_that_of_triangulated_points(five):
 
 
 def test_guided_shots_beat_random_ones(five, poses):
-    guide, knowledge, rig = Guide(BOARD), Knowledge.of(five, BOARD, Aim()), five.rig
+    guide, knowledge, rig = Guide(BOARD), Knowledge.of(five, BOARD, CalibrationAim()), five.rig
     guided = random = knowledge
     for T in poses[5:7]:
         guided, random = guided.after(guide.best(guided, rig).T_left_board), random.after(T)
@@ -88,7 +88,7 @@ def test_candidates_and_first_poses_are_in_view_of_both_cameras():
 
 
 def test_shots_that_are_missing_are_counted(five):
-    guide, knowledge = Guide(BOARD), Knowledge.of(five, BOARD, Aim())
-    assert guide.shots_missing(knowledge, five.rig, Aim(1.01 * knowledge.error_m)) == 0
-    assert guide.shots_missing(knowledge, five.rig, Aim(1e-7)) is None
-    assert 1 <= guide.shots_missing(knowledge, five.rig, Aim(0.6 * knowledge.error_m)) <= 6
+    guide, knowledge = Guide(BOARD), Knowledge.of(five, BOARD, CalibrationAim())
+    assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1.01 * knowledge.error_m)) == 0
+    assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1e-7)) is None
+    assert 1 <= guide.shots_missing(knowledge, five.rig, CalibrationAim(0.6 * knowledge.error_m)) <= 6

@@ -7,7 +7,7 @@ import pytest
 
 from armsight.app.live import calibration, records, simulated
 from armsight.app.live.server import LiveServer
-from armsight.app.live.session import Session, SessionOptions, scaled_spec
+from armsight.app.live.session import LiveSession, SessionOptions, scaled_spec
 from armsight.app.measure.poses import CSV_COLUMNS
 from armsight.errors import InputError
 from armsight.files import read_table
@@ -48,7 +48,7 @@ def session(tmp_path_factory, host_firmware):
     quick.setattr(calibration, "STILL_S", 0.05)
     quick.setattr(calibration, "MODELS", ("brown5",))
     folder = tmp_path_factory.mktemp("live")
-    made = Session(SessionOptions(folder, "sim:640x360@15"))
+    made = LiveSession(SessionOptions(folder, "sim:640x360@15"))
     made.start()
     yield made
     made.close()
@@ -109,7 +109,7 @@ def test_cameras(page, session):
 
 def test_board(page, session):
     click(page, "step-board")
-    until(lambda: "chessboard:9x6:30mm" in page.find_element("id", "b-spec").text)
+    until(lambda: any("9x6:30mm" in each.text for each in page.find_elements("id", "b-spec")))
     page.execute_script("document.getElementById('b-bar').value = '50'")
     click(page, "use-board")
     until(lambda: any("cannot be right" in each.text for each in page.find_elements("css selector", "#events li")))

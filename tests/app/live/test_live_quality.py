@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armsight.app.live.quality import (
-    Flicker,
+    FlickerWatch,
     ImageQuality,
     edge_spread_px,
     image_quality,
@@ -60,7 +60,7 @@ def test_saturation_and_darkness_are_measured():
 
 @pytest.mark.parametrize(("hz", "rate_hz"), [(100.0, 30.0), (120.0, 25.0), (100.0, 15.0)])
 def test_flicker_is_found_with_its_frequency(hz, rate_hz):
-    flicker, still, rows = Flicker(rate_hz), squares(1.0), np.arange(360)
+    flicker, still, rows = FlickerWatch(rate_hz), squares(1.0), np.arange(360)
     for k in range(12):
         wave = 1 + 0.03 * np.sin(2 * np.pi * hz * (k / rate_hz + 4e-5 * rows))
         flicker.take(np.clip(still * wave[:, None], 0, 255).astype(np.uint8))
@@ -72,11 +72,11 @@ def test_flicker_is_found_with_its_frequency(hz, rate_hz):
 
 def test_what_moves_does_not_flicker():
     texture = np.random.default_rng(1).uniform(40, 200, (36, 64)).astype(np.uint8)
-    flicker, still = Flicker(30.0), cv2.resize(texture, (640, 360), interpolation=cv2.INTER_CUBIC)
+    flicker, still = FlickerWatch(30.0), cv2.resize(texture, (640, 360), interpolation=cv2.INTER_CUBIC)
     for k in range(12):
         flicker.take(np.roll(still, 9 * k, axis=0))
     assert flicker.found() is None
-    assert Flicker(30.0).note() is None
+    assert FlickerWatch(30.0).note() is None
 
 
 def test_one_camera_twice_is_noticed():

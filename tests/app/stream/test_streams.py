@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from armsight.app.stream.datum import NoteDatum, Published, ShotDatum
 from armsight.app.stream.igtl import crc64, message, position_body, status_body, transform_body
@@ -90,7 +91,7 @@ def test_openigtlink_is_what_pyigtl_reads():
 
     def parsed(data):
         header = MessageBase.parse_header(data[: MessageBase.IGTL_HEADER_SIZE])
-        found = MessageBase.create_message(header["type"])
+        found = MessageBase.create_message(header["message_type"])
         body = data[MessageBase.IGTL_HEADER_SIZE :]
         assert len(body) == header["body_size"]
         found.unpack(header, body)
@@ -102,8 +103,13 @@ def test_openigtlink_is_what_pyigtl_reads():
     np.testing.assert_allclose(transform.matrix[:3, :3], T[:3, :3], atol=1e-6)
     np.testing.assert_allclose(transform.matrix[:3, 3], 1e3 * T[:3, 3], atol=1e-3)
     assert transform.timestamp == pytest.approx(1.5)
-    position = parsed(message("POSITION", "armsight_body", 0.0, position_body(T)))
-    np.testing.assert_allclose(position.positions, [1e3 * T[:3, 3]], atol=1e-3)
+
+
+def test_a_position_is_that_of_the_specification():
+    """Three float32 of position, mm, four of the quaternion x y z w; pyigtl reads its own form of POINT under this name."""
+    x, y, z, *q = struct.unpack(">7f", position_body(T))
+    np.testing.assert_allclose([x, y, z], 1e3 * T[:3, 3], rtol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-6)
 
 
 def test_the_checksum_is_that_of_ecma_182():

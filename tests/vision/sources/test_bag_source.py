@@ -1,5 +1,7 @@
 """Recordings of ROS and Foxglove, written by rosbags and mcap, read back as shots, rig, tags, joints and poses."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -247,6 +249,15 @@ def test_what_is_no_recording_is_one_line(tmp_path, name, content, word):
     with pytest.raises(InputError, match=word) as error:
         open_source(f"bag:{path}")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "module"), [("a.bag", "rosbags.highlevel"), ("a.mcap", "mcap.stream_reader")])
+def test_a_missing_package_is_one_line(tmp_path, monkeypatch, name, module):
+    (tmp_path / name).write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0")
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"pip install \"armsight\[ros\]\""):
+        Bag(tmp_path / name)
 
 
 def info(camera, R, P):

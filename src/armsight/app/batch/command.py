@@ -16,9 +16,7 @@ OPERATIONS = ("measure", "replay", "identify", "check")
 @click.option(
     "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder of the results."
 )
-@click.option(
-    "--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info or another is wanted."
-)
+@click.option("--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info, or instead of it.")
 @click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
 @click.option("--arm", metavar="ARM", help="The arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)

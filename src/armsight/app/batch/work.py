@@ -60,7 +60,7 @@ class Done:
 def work(path: str, options: Options) -> Done:
     """Do the operation on one recording; a mistake in it is a row with its reason."""
     try:
-        with _local(path) as local, contextlib.redirect_stderr(io.StringIO()):
+        with _local(path) as local:
             row, shots = OPERATIONS[options.operation](local, options)
     except (ArmsightError, OSError) as error:
         return Done({"recording": path, "status": "failed", "reason": " ".join(str(error).split())}, [])
@@ -121,7 +121,8 @@ def _by_command(path: str, options: Options) -> tuple[Row, list[Row]]:
     arguments = {"identify": ["--data", path, "--arm", str(options.arm)], "check": [path]}[options.operation]
     command = importlib.import_module(f"armsight.app.{options.operation}.command").command
     printed = io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(printed):
+    quiet = contextlib.redirect_stderr(io.StringIO())
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(printed), quiet:
         command.main([*arguments, "-o", str(Path(folder) / "out"), "--json"], standalone_mode=False)
     return {"result": json.dumps(json.loads(printed.getvalue()), sort_keys=True)}, []
 

@@ -1,8 +1,8 @@
 """The arm: joint readings beside what vision measures, the motions in open and closed loop, and a stop that always works.
 
 In: the arm's board, the session's cameras, rig and body. Out: an :class:`ArmState` at any time, and the folder of a run as
-``armsight run`` writes it. One thread has the board: it reads the joints, runs the experiment, and carries out a stop within
-a period of the loop; nobody else touches the board. A stop is answered with the state that the board itself reports.
+``armsight run`` writes it. One thread has the board: it reads the joints, runs the experiment, and carries out a stop
+within a period of the loop; nobody else touches the board. A stop is answered with the state that the board itself reports.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.live.capture import Capture
+from armsight.app.live.capture import CameraCapture
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.quality import Note
 from armsight.app.live.simulated import SimulatedCameras
@@ -102,7 +102,8 @@ class ArmState:
         running: what is being done; None while nothing is.
         phase: calibration, open_loop, closed_loop, rest; empty while nothing runs.
         motion: name of the motion.
-        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is closed).
+        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is
+            closed).
         handeye: the hand-eye calibration in words.
         results: the results of the last run, line by line.
         folder: of the last run.
@@ -140,19 +141,22 @@ class ArmStep:
         measuring: has rig and body; is given the poses that the loop measures.
         simulated: the workcell where it stands for the devices; else None.
         say: called with a note for the person.
+
+    Attributes:
+        capture: the session's cameras.
     """
 
     def __init__(
         self,
         folder: Path,
         options: ArmOptions,
-        capture: Capture,
+        capture: CameraCapture,
         measuring: MeasureStep,
         simulated: SimulatedCameras | None,
         say: Callable[[Note], None],
     ) -> None:
         self.folder, self.options, self._say = folder, options, say
-        self._capture, self._measuring, self._simulated = capture, measuring, simulated
+        self.capture, self._measuring, self._simulated = capture, measuring, simulated
         self._board: Board | None = None
         self._thread: threading.Thread | None = None
         self._closing, self._stop, self._answered = threading.Event(), threading.Event(), threading.Event()
@@ -191,7 +195,7 @@ class ArmStep:
         if self._board is not None:
             return
         if self._simulated is not None:
-            self._capture.pause()
+            self.capture.pause()
             self._board = self._simulated.workcell.board
         elif self.options.board is None:
             raise InputError("no board was named: start with --board serial:/dev/ttyACM0 (docs/howto/board.md)")
@@ -287,27 +291,33 @@ class ArmStep:
                     due = max(due + _IDLE_S, time.monotonic() - 0.1)
                     time.sleep(max(0.0, due - time.monotonic()))
         except ArmsightError as error:
-            self._say(Note("error", f"the board: {error}"))
-            self._board, self._running = None, None
-            if self._simulated is None:
-                board.close()
-            else:
-                self._capture.resume()
+            self._gone(board, str(error))
+        except Exception as error:  # noqa: BLE001 - nobody else watches this thread; the board reacts to the silence itself
+            self._gone(board, f"{type(error).__name__}: {error}")
         finally:
             self._answered.set()
+
+    def _gone(self, board: Board, why: str) -> None:
+        """Give the board up."""
+        self._say(Note("error", f"the board is disconnected: {why}"))
+        self._board, self._running = None, None
+        if self._simulated is None:
+            board.close()
+        else:
+            self.capture.resume()
 
     def _look(self, poll: Callable[[], Shot | None]) -> Shot | None:
         """Return the newest shot of the workcell, and show it; a camera that is gone is only shown."""
         try:
             shot = poll()
         except DeviceError as error:
-            self._capture.problem = str(error)
+            self.capture.problem = str(error)
             if self._running is not None:
                 raise
             return None
         if shot is not None:
-            self._capture.offer(shot)
-            newest = self._capture.newest
+            self.capture.offer(shot)
+            newest = self.capture.newest
             return None if newest is None else newest.shot
         return None
 
@@ -381,10 +391,10 @@ class ArmStep:
         return Setup(
             options.arm,
             board,
-            self._capture.poll,
+            self.capture.poll,
             target,
             lambda q: np.zeros(6),
-            self._capture.rate_hz or options.rate_hz,
+            self.capture.rate_hz or options.rate_hz,
             options.sync_s,
             HostClock(),
         )
@@ -430,7 +440,7 @@ class ArmStep:
             return
         self._seen = len(loop.log.poses)
         name, _, result = loop.log.poses[-1]
-        newest = self._capture.newest
+        newest = self.capture.newest
         if newest is not None and newest.shot.name == name:
             self._measuring.take(newest, result)
         if isinstance(result, PoseEstimate) and loop.mounting is not None:

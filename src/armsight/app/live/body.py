@@ -1,7 +1,7 @@
 """The body that is measured: drawn to scale, and checked before it is built.
 
-In: a body file or a board's spec. Out: a :class:`BodyState`, and a PDF in the folder of the session. What is checked is what
-``armsight body check`` checks, with the session's own rig once there is one.
+In: a body file or a board's spec. Out: a :class:`BodyState`, and a PDF in the folder of the session. What is checked is
+what ``armsight body check`` checks, with the session's own rig once there is one.
 """
 
 from __future__ import annotations

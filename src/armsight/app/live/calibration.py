@@ -1,8 +1,8 @@
 """The guided calibration: it says where to hold the board, takes the shots by itself, and says in mm how good they are.
 
-In: live shots. Out: a :class:`CalibrationState` at any time, a folder of shots, and in the end rig.json. A shot is taken when
-the board stands still and sharp in both views, and lowers the predicted error by at least a good part of what the best pose
-would. Fits run in a thread of their own; until one is done the next pose follows from the predicted information.
+In: live shots. Out: a :class:`CalibrationState` at any time, a folder of shots, and in the end rig.json. A shot is taken
+when the board stands still and sharp in both views, and lowers the predicted error by at least a good part of what the
+best pose would. Fits run in a thread of their own; until one is done the next pose follows from the predicted information.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from armsight.app.calibrate.assessment import assess, graded_metrics
 from armsight.app.calibrate.run import provenance
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.guide import Aim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
+from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
 from armsight.app.live.quality import SHARP_PX, Note, edge_spread_px
 from armsight.app.live.records import Drawn, polyline
 from armsight.app.record.recording import ShotFolder
@@ -44,8 +44,8 @@ _SHARP_SHOT_PX = 1.7 * SHARP_PX
 #: A pose is taken if it lowers the predicted error by this share of what the best one would, and if the board's corners are
 #: on average by such a share of its size elsewhere than in every shot before.
 _WORTH, _OTHER_SHARE = 0.5, 0.06
-#: A person who has stood still for the first time, s, has done what is possible: then this share is enough; after the second
-#: another pose is chosen.
+#: A person who has stood still for the first time, s, has done what is possible: then this share is enough; after the
+#: second another pose is chosen.
 _PATIENT_S, _PATIENT_WORTH, _OTHER_POSE_S = 3.0, 0.15, 6.0
 #: First fit, fewest shots of a calibration that is called good, and folds while shots are still taken.
 FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 8, 5
@@ -158,7 +158,7 @@ class CalibrationStep:
         changed: called with a rig once it is written.
     """
 
-    def __init__(self, folder: Path, spec: str, aim: Aim, say: Callable[[Note], None]) -> None:
+    def __init__(self, folder: Path, spec: str, aim: CalibrationAim, say: Callable[[Note], None]) -> None:
         self.folder, self.spec, self.aim, self._say = folder, spec, aim, say
         self.board = open_board(spec)
         self._guide = Guide(self.board)
@@ -220,7 +220,7 @@ class CalibrationStep:
                 raise InputError("the calibration is paused: continue it first")
             self._forced = True
 
-    def set_aim(self, aim: Aim) -> None:
+    def set_aim(self, aim: CalibrationAim) -> None:
         """Change what the calibration is to be good for."""
         if not (0.0 < aim.error_m < 1.0 and 0.05 <= aim.distance_m <= 20.0):
             raise InputError("the aim must be an error above 0 mm, and a distance from 0.05 to 20 m")
@@ -414,20 +414,23 @@ class CalibrationStep:
         assert sizes is not None
         try:
             result = calibrate_boards(self.board, pairs, sizes, models=_QUICK_MODELS, folds=min(_FOLDS, len(pairs)))
-        except (CalibrationError, np.linalg.LinAlgError) as error:
             with self._lock:
-                self._missing = (str(error),)
-                self._fitted()
-            return
+                self._learned(result)
+                self._add_newer({pair.name for pair in pairs})
+                self._choose(None)
+        except (CalibrationError, np.linalg.LinAlgError) as error:
+            self._missing, self._good = (f"the shots cannot be fitted yet: {error}",), False
+        except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+            self._say(Note("error", f"the fit failed: {type(error).__name__}: {error}"))
         with self._lock:
-            newer = [pair for name, (_, pair) in self._shots.items() if name not in {pair.name for pair in pairs}]
-            self._learned(result)
-            for pair in newer:
-                T = self._pose(_Seen(pair.left, pair.right, 0.0))
-                if T is not None and self._knowledge is not None:
-                    self._knowledge = self._knowledge.after(T)
-            self._choose(None)
             self._fitted()
+
+    def _add_newer(self, fitted: set[str]) -> None:
+        """Add what the shots determine that came while the others were fitted."""
+        for name, (_, pair) in self._shots.items():
+            T = None if name in fitted else self._pose(_Seen(pair.left, pair.right, 0.0))
+            if T is not None and self._knowledge is not None:
+                self._knowledge = self._knowledge.after(T)
 
     def _fitted(self) -> None:
         self._fitting = None

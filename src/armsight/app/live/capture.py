@@ -6,7 +6,6 @@ opened again every few seconds: a cable that is put back continues the work.
 
 from __future__ import annotations
 
-import itertools
 import statistics
 import threading
 import time
@@ -22,6 +21,7 @@ from armsight.vision.sources import Source
 AGAIN_S = 2.0
 _INTERVALS = 30
 _LIVE_S = 10.0  # a stamp on this computer's clock is at most so old
+_UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without times; at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,27 +39,27 @@ class LiveShot(Record):
     arrived_s: float
 
     def age_s(self, now_s: float) -> float:
-        """Return how old the images are, s: since their stamp where it is on this computer's clock, else since they came."""
+        """Return how old the images are, s: since their stamp if it is on this computer's clock, else since they came."""
         stamp = self.shot.t_s
         live = stamp is not None and 0.0 <= self.arrived_s - stamp < _LIVE_S
         return now_s - (stamp if live and stamp is not None else self.arrived_s)
 
 
-class Capture:
+class CameraCapture:
     """The cameras of a session.
 
     Args:
         opening: opens the source; called in the thread.
+        failed: called with why there are no images, once for each cause.
 
     Attributes:
         swapped: whether left and right are exchanged.
         problem: why there are no images now; None while there are.
     """
 
-    def __init__(self, opening: Callable[[], Source]) -> None:
-        self._opening = opening
+    def __init__(self, opening: Callable[[], Source], failed: Callable[[str], None] = lambda problem: None) -> None:
+        self._opening, self._say = opening, failed
         self.swapped, self.problem = False, None
-        self._problem_since: str | None = None
         self._changed = threading.Condition()
         self._newest: LiveShot | None = None
         self._polled = 0
@@ -153,9 +153,8 @@ class Capture:
 
     def _read(self, source: Source) -> None:
         """Read until the source fails or ends."""
-        for _ in itertools.count():
-            if self._ended.is_set():
-                return
+        before: Shot | None = None
+        while not self._ended.is_set():
             if self._paused.is_set():
                 self._idle.set()
                 time.sleep(0.02)
@@ -172,10 +171,22 @@ class Capture:
             if shot.problem is not None:
                 self.problem = shot.problem
                 continue
+            self._pace(before, shot)
+            before = shot
             self.offer(shot)
+
+    def _pace(self, before: Shot | None, shot: Shot) -> None:
+        """Wait until a recorded shot is due: a recording is shown at its own pace."""
+        newest, now = self._newest, time.monotonic()
+        if before is None or newest is None or (shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S):
+            return
+        apart_s = _UNTIMED_S if shot.t_s is None or before.t_s is None else shot.t_s - before.t_s
+        self._ended.wait(min(max(newest.arrived_s + apart_s - now, 0.0), _LONGEST_PAUSE_S))
 
     def _failed(self, problem: str) -> None:
         """Note why there are no images, and wait."""
+        if problem != self.problem:
+            self._say(problem)
         self.problem = problem
         self._intervals.clear()
         self._idle.set()

@@ -65,7 +65,9 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Open a page that leads from two cameras to a closed loop: cameras, board, calibration, body, measuring, arm, health.
+    """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
+
+    The steps: cameras, board, calibration, body, measuring, arm, health; each shows the command line that does the same.
 
     The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
     printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
@@ -76,16 +78,16 @@ def command(
         raise InputError('the page needs websockets, which is not installed: pip install "armsight[live]"') from None
 
     from armsight.app.live.server import LiveServer
-    from armsight.app.live.session import Session, SessionOptions
+    from armsight.app.live.session import LiveSession, SessionOptions
 
     options = SessionOptions(
         output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
     )
-    session = Session(options)
+    session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
     try:
-        session.start()
         server.start()
+        session.start()
         if as_json:
             click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
         else:

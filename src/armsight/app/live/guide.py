@@ -41,7 +41,7 @@ _SHOTS_AHEAD = 12
 
 
 @dataclass(frozen=True)
-class Aim:
+class CalibrationAim:
     """What a calibration is to be good for.
 
     Attributes:
@@ -109,7 +109,7 @@ class Knowledge(Record):
     weights: Array
 
     @staticmethod
-    def of(calibration: Calibration, board: CalibrationBoard, aim: Aim) -> Knowledge:
+    def of(calibration: Calibration, board: CalibrationBoard, aim: CalibrationAim) -> Knowledge:
         """Return what a calibration determines."""
         state, points = calibration.solution.state, board.body.points
         model = printed_board(points) if len(state.shape) else rigid_board(points)
@@ -177,7 +177,8 @@ class Guide:
         points = board.body.points
         low, high = points.min(axis=0), points.max(axis=0)
         pitch = float(np.linalg.norm(points[1] - points[0]))
-        low, high = low - [pitch, pitch, 0.0], high + [pitch, pitch, 0.0]
+        border = np.array([pitch, pitch, 0.0])
+        low, high = low - border, high + border
         self._middle = (low + high) / 2
         self.diagonal_m = float(np.linalg.norm(high - low))
         edges = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
@@ -235,7 +236,7 @@ class Guide:
         k = int(np.nanargmin(errors))
         return NextPose(Ts[k], knowledge.error_m, float(errors[k]))
 
-    def shots_missing(self, knowledge: Knowledge, rig: StereoRig, aim: Aim) -> int | None:
+    def shots_missing(self, knowledge: Knowledge, rig: StereoRig, aim: CalibrationAim) -> int | None:
         """Return how many more guided shots are predicted to reach the aim; None where more than a dozen."""
         Ts = self.candidates(rig, CANDIDATES // 4)
         for count in range(_SHOTS_AHEAD + 1):

@@ -1,7 +1,7 @@
 """Measuring, shot by shot, and whether the calibrations still hold.
 
-In: live shots, a rig, a target. Out: a :class:`MeasureState` at any time; poses as CSV, in the form of ``armsight measure``.
-The sigma is split into precision (the noise of this shot) and what the calibration leaves in all shots alike.
+In: live shots, a rig, a target. Out: a :class:`MeasureState` at any time; poses as CSV, in the form of ``armsight
+measure``. The sigma is split into precision (the noise of this shot) and what the calibration leaves in all shots alike.
 """
 
 from __future__ import annotations
@@ -290,7 +290,7 @@ class MeasureStep:
                 number += 1
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                self._file = path.open("x", encoding="utf-8")  # noqa: SIM115 - open while the recording lasts
+                self._file = path.open("x", encoding="utf-8")  # open while the recording lasts
                 self._file.write(csv_text([]))
             except OSError as error:
                 self._close_file()
@@ -327,11 +327,12 @@ class MeasureStep:
 
     def _pose(self) -> PoseEstimate:
         newest = self.newest
-        if newest is None or isinstance(newest[1], Missed):
-            raise InputError(
-                "no pose is measured now" if newest is None else f"no pose is measured now: {newest[1].reason}"
-            )
-        return newest[1]
+        if newest is None:
+            raise InputError(self._lacking() or "no pose is measured yet")
+        result = newest[1]
+        if isinstance(result, Missed):
+            raise InputError(f"no pose is measured now: {result.reason}")
+        return result
 
     def _lacking(self) -> str:
         if self.rig is None:
@@ -369,7 +370,7 @@ class MeasureStep:
         span = self._times[-1] - self._times[0] if len(self._times) > 2 else 0.0
         pivot = self._pivot_text
         if self._pivot_poses is not None:
-            pivot = f"collecting: {len(self._pivot_poses)} poses; rotate the body about the tip, 30 degrees and more, all ways"
+            pivot = f"collecting: {len(self._pivot_poses)} poses; rotate the body about the tip by 30 degrees, all ways"
         return MeasureState(
             str(self.rig_path),
             self.target_spec,

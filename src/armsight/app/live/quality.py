@@ -3,7 +3,8 @@
 In: grey images. Out: :class:`ImageQuality`, and :class:`Note` lines. The edge spread is the standard deviation, px, of the
 blur that the sharpest edges of an image show: contrast over sqrt(2 pi) times the steepest slope of an edge's profile. The
 flicker of lamps at twice the mains frequency is a wave over the rows of a rolling shutter, or over the images of a global
-one; from image to image its phase advances by the lamp's frequency over the camera's rate, which distinguishes 100 from 120 Hz.
+one; from image to image its phase advances by the lamp's frequency over the camera's rate, which distinguishes 100 from
+120 Hz.
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ def same_camera(left: Grey, right: Grey) -> bool:
     return contrast > 3 * _SAME_DIFFERENCE and float(np.abs(small[0] - small[1]).mean()) < _SAME_DIFFERENCE
 
 
-class Flicker:
+class FlickerWatch:
     """Looks for the flicker of lamps in the images of a camera that stands still.
 
     Args:

@@ -204,18 +204,39 @@ class ClearStop:
 
 
 @dataclass(frozen=True)
-class Person:
+class PersonAction:
     """What the simulated person does: cover_left, cover_right, uncover, unplug, plug, knock, board, no_board."""
 
     action: str
 
 
 Command = (
-    GoTo | UseCameras | FindLeft | Swap | UseBoard | DrawBoard | Calibrate | PauseCalibration | TakeShot | DropShot
-    | FinishCalibration | SetAim | UseBody | DrawBody | Zero | ClearZero | PivotTip | MarkPosition | RecordPoses | OpenArm | RunMotions
-    | Hold | ClearStop | Person
-)  # fmt: skip
-COMMANDS: dict[str, type[Command]] = {kind.__name__: kind for kind in Command.__args__}  # type: ignore[attr-defined]
+    GoTo
+    | UseCameras
+    | FindLeft
+    | Swap
+    | UseBoard
+    | DrawBoard
+    | Calibrate
+    | PauseCalibration
+    | TakeShot
+    | DropShot
+    | FinishCalibration
+    | SetAim
+    | UseBody
+    | DrawBody
+    | Zero
+    | ClearZero
+    | PivotTip
+    | MarkPosition
+    | RecordPoses
+    | OpenArm
+    | RunMotions
+    | Hold
+    | ClearStop
+    | PersonAction
+)
+COMMANDS: dict[str, type[Command]] = {kind.__name__: kind for kind in Command.__args__}
 _KINDS = {"str": str, "float": float, "bool": bool}
 
 

@@ -1,16 +1,18 @@
 """The server of ``armsight live``: it carries states, events, images and commands between a session and pages.
 
-In: a :class:`~armsight.app.live.session.Session`. Out: one HTML file over HTTP, and two WebSockets for each page: ``/live`` for
-everything, and ``/stop`` for the stop alone, so that no image and no state is ever before it in a queue.
+In: a :class:`~armsight.app.live.session.LiveSession`. Out: one HTML file over HTTP, and two WebSockets for each page:
+``/live`` for everything, and ``/stop`` for the stop alone, so that no image and no state is ever before it in a queue.
 
-- Text to a page is ``{"section": NAME, "state": {...}}``, ``{"event": {...}}``, ``{"you": {...}}`` or ``{"rejected": TEXT}``.
-- An image is binary: one byte side, four bytes number, JPEG. The next image of a side is sent when the page has said that it
-  showed the last one (``{"shown": [SIDE, NUMBER]}``), and it is the newest then: a slow page misses images, and stores none.
-- One page commands; the others look on and can stop. A page that commands and is silent while the arm moves is gone: the arm is
-  held.
+- Text to a page is ``{"section": NAME, "state": {...}}``, ``{"event": {...}}``, ``{"you": {...}}`` or ``{"rejected":
+  TEXT}``.
+- An image is binary: one byte side, four bytes number, JPEG. The next image of a side is sent when the page has said that
+  it showed the last one (``{"shown": [SIDE, NUMBER]}``), and it is the newest then: a slow page misses images, and stores
+  none.
+- One page commands; the others look on and can stop. A page that commands and is silent while the arm moves is gone: the
+  arm is held.
 
-Everything is bound to 127.0.0.1 unless a host is given; then the address needs a token. A WebSocket is opened for pages of this
-server alone (their Origin), whatever else the browser shows.
+Everything is bound to 127.0.0.1 unless a host is given; then the address needs a token. A WebSocket is opened for pages of
+this server alone (their Origin), whatever else the browser shows.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ import cv2
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.quality import Note
 from armsight.app.live.records import command_of, json_of
-from armsight.app.live.session import Session
+from armsight.app.live.session import LiveSession
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.vision.image import grey
 
@@ -92,7 +94,9 @@ class LiveServer:
         port: the port that is bound, once :meth:`start` has returned.
     """
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
+    def __init__(
+        self, session: LiveSession, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
+    ) -> None:
         self.session, self.host, self.port, self.token = session, host, port, token
         self._clients: dict[int, _Client] = {}
         self._commander: int | None = None

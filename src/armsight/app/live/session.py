@@ -1,8 +1,8 @@
 """A session of ``armsight live``: the cameras, the steps, and what a person wants of them; it knows nothing of a page.
 
 In: :class:`SessionOptions`, and commands (:mod:`~armsight.app.live.records`). Out: sections of state, events, the newest
-shot, and the folder of the session. Capture, what looks at the images, and the arm have a thread each; none waits for another,
-and none of them for whoever shows the state.
+shot, and the folder of the session. CameraCapture, what looks at the images, and the arm have a thread each; none waits
+for another, and none of them for whoever shows the state.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from armsight.app.live import records
 from armsight.app.live.arm import ArmOptions, ArmState, ArmStep, StopAnswer
 from armsight.app.live.body import BodyState, BodyStep
 from armsight.app.live.calibration import CalibrationState, CalibrationStep
-from armsight.app.live.capture import Capture, LiveShot
-from armsight.app.live.guide import Aim
+from armsight.app.live.capture import CameraCapture, LiveShot
+from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureState, MeasureStep
-from armsight.app.live.quality import Flicker, ImageQuality, Note, image_quality, quality_notes, same_camera
+from armsight.app.live.quality import FlickerWatch, ImageQuality, Note, image_quality, quality_notes, same_camera
 from armsight.app.live.records import Command, Drawn, Event
 from armsight.app.live.simulated import ACTIONS, SimulatedCameras
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
@@ -37,7 +37,7 @@ from armsight.vision.markers.board import open_board
 from armsight.vision.markers.targets import open_target
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source, open_source
-from armsight.vision.sources.usb import _parsed as usb_parts
+from armsight.vision.sources.usb import parsed_usb
 from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 
 SIM = "sim:"
@@ -191,11 +191,11 @@ class Overview:
 class _Look(Record):
     """What the thread that looks at images keeps of a camera."""
 
-    flicker: Flicker
+    flicker: FlickerWatch
     bright: float
 
 
-class Session:
+class LiveSession:
     """Cameras to closed loop, driven by commands.
 
     Args:
@@ -217,8 +217,8 @@ class Session:
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
         self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
-        self.capture = Capture(self._open)
-        self.calibration = self._calibration(spec, Aim())
+        self.capture = CameraCapture(self._open, self._camera_failed)
+        self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)
         motion = options.motion or (QUICK if simulated else DEFAULT_MOTION)
         board = options.board or ("emulated:" if simulated else None)
@@ -324,7 +324,7 @@ class Session:
             records.TakeShot: lambda c: calibration.force(),
             records.DropShot: lambda c: calibration.drop(c.name),
             records.FinishCalibration: lambda c: self._finish(),
-            records.SetAim: lambda c: calibration.set_aim(Aim(1e-3 * c.error_mm, c.distance_m)),
+            records.SetAim: lambda c: calibration.set_aim(CalibrationAim(1e-3 * c.error_mm, c.distance_m)),
             records.UseBody: lambda c: self._use_body(c.target),
             records.DrawBody: lambda c: self._draw_body(c.paper),
             records.Zero: lambda c: measuring.zero(),
@@ -336,7 +336,7 @@ class Session:
             records.RunMotions: lambda c: arm.run(closed=c.closed),
             records.Hold: lambda c: self.hold("a person requested it"),
             records.ClearStop: lambda c: arm.clear_stop(),
-            records.Person: lambda c: self._person(c.action),
+            records.PersonAction: lambda c: self._person(c.action),
         }
 
     def _go(self, step: str) -> None:
@@ -352,9 +352,9 @@ class Session:
         self._require_rest()
         if self._simulated is not None or source.startswith(SIM):
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
-        before, self.source = self.capture, source
-        before.close()
-        self.capture = Capture(self._open)
+        self.capture.close()
+        self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
+        self.arm.capture = self.capture
         self.capture.start()
         self.measuring.source = source
         self._looks = None
@@ -389,7 +389,7 @@ class Session:
         self.calibration = self._calibration(spec, aim)
         self.say(Note("good", f"board: {board.body.name}"))
 
-    def _calibration(self, spec: str, aim: Aim) -> CalibrationStep:
+    def _calibration(self, spec: str, aim: CalibrationAim) -> CalibrationStep:
         step = CalibrationStep(self.folder, spec, aim, self.say)
         step.changed = self._calibrated
         return step
@@ -439,6 +439,9 @@ class Session:
             raise InputError("these cameras are real: do it yourself")
         self._simulated.person.act(action)
 
+    def _camera_failed(self, problem: str) -> None:
+        self.say(Note("error", problem))
+
     def _open(self) -> Source:
         """Open the cameras, in the thread that reads them."""
         if self._simulated is not None:
@@ -477,6 +480,9 @@ class Session:
             except ArmsightError as error:
                 self.say(Note("error", str(error)))
                 time.sleep(1.0)
+            except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+                self.say(Note("error", f"looking at an image failed: {type(error).__name__}: {error}"))
+                time.sleep(1.0)
 
     def _flicker(self, shot: Shot) -> None:
         """Keep the brightness of the images' rows; only while cameras are chosen."""
@@ -486,7 +492,7 @@ class Session:
             rate = self.capture.rate_hz
             if rate is None:
                 return
-            self._looks = (_Look(Flicker(rate), 0.0), _Look(Flicker(rate), 0.0))
+            self._looks = (_Look(FlickerWatch(rate), 0.0), _Look(FlickerWatch(rate), 0.0))
         for look, image in zip(self._looks, (shot.left, shot.right), strict=True):
             look.flicker.take(grey(image))
 
@@ -529,12 +535,14 @@ class Session:
             notes.append(Note("hint", "automatic exposure is on: add ,exposure=5ms to the source for measuring"))
         requested = [
             float(value)
-            for name, value in usb_parts(self.source.removeprefix("usb:"))[1].values()
+            for name, value in parsed_usb(self.source.removeprefix("usb:"))[1].values()
             if "per second" in name
         ]
         if rate is not None and requested and rate < _SLOW * requested[0]:
-            text = f"{rate:.1f} shots a second come, {requested[0]:g} were requested: USB 2 carries two such cameras only on "
-            notes.append(Note("warn", f"{text}two ports of their own, or in format MJPG"))
+            text = (
+                f"{rate:.1f} shots a second come, {requested[0]:g} were requested: USB 2 carries two such cameras only "
+            )
+            notes.append(Note("warn", f"{text}on two ports of their own, or in format MJPG"))
         return notes
 
     def _check_covered(self, before: tuple[float, float]) -> None:
@@ -609,7 +617,7 @@ class Session:
         return HealthState(latency, of, measure.measured, measure.missed, measure.health, 1e3 * self.capture.slowest_s)
 
 
-#: Sections of :meth:`Session.sections` and their records.
+#: Sections of :meth:`LiveSession.sections` and their records.
 SECTIONS = {
     "overview": Overview,
     "cameras": CamerasState,

@@ -1,7 +1,7 @@
 """The workcell as live cameras, and a person in it: who covers a lens, pulls a cable, and holds the calibration board.
 
-In: ``sim:`` with the cameras of :mod:`armsight.sim.workcell`. Out: a source at the cameras' pace. The person sees what a page
-shows, the outline of the board in both views, and moves the board there with an unsteady hand; nothing else is passed.
+In: ``sim:`` with the cameras of :mod:`armsight.sim.workcell`. Out: a source at the cameras' pace. The person sees what a
+page shows, the outline of the board in both views, and moves the board there with an unsteady hand; nothing else is passed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.data import Array, Image, Shot
+from armsight.data import Array, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.robot.arm import Arm
@@ -74,9 +74,8 @@ class Person:
             if self._to is None:
                 self._move(board_poses(self._rng, rig, self._pattern, 1, fill=_FILL, tilt_deg=15.0)[0])
             return
-        if self._shown is not None and self._shown.shape == outline_uv[0].shape:
-            if np.abs(self._shown - outline_uv[0]).max() < 1.0:
-                return
+        if self._shown is not None and np.abs(self._shown - outline_uv[0]).max() < 1.0:
+            return
         self._shown = np.array(outline_uv[0])
         found = body_poses(self._points, rig.left, outline_uv[0])
         if not found:
@@ -200,12 +199,11 @@ class SimulatedCameras:
 
     def seen(self, shot: Shot) -> Shot:
         """Return a shot as it is with the lenses that are covered."""
-        covered: dict[str, Image] = {
-            side: np.full_like(image, 3)
-            for side in self.person.covered
-            if (image := shot.left if side == "left" else shot.right) is not None
-        }
-        return replace(shot, **covered) if covered else shot
+        if shot.left is not None and "left" in self.person.covered:
+            shot = replace(shot, left=np.full_like(shot.left, 3))
+        if shot.right is not None and "right" in self.person.covered:
+            shot = replace(shot, right=np.full_like(shot.right, 3))
+        return shot
 
     def close(self) -> None:
         """Do nothing: the workcell ends with the session."""

@@ -35,7 +35,7 @@ class RunPlan:
     Attributes:
         rig: the calibrated cameras.
         motions: the motions.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
         streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.

@@ -72,7 +72,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
     Args:
         setup: the arm and its board.
         plan: the motions.
-        targets: (N, 6) further joint angles of the run, rad.
+        targets: (N, n) further joint angles of the run, rad.
 
     Raises:
         ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
@@ -93,12 +93,12 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
 
 
 def passed(way: Trajectory) -> Array:
-    """Return joint angles (N, 6) that a motion passes, rad."""
+    """Return joint angles (N, n) that a motion passes, rad."""
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
 def _require_range(setup: Setup, q: Array) -> None:
-    """Reject joint angles (N, 6), rad, beyond the board's own limits: it would stop the joint on the way."""
+    """Reject joint angles (N, n), rad, beyond the board's own limits: it would stop the joint on the way."""
     low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
     if beyond.max() > 1e-3:
@@ -188,7 +188,7 @@ def run_experiment(
         setup: the devices.
         rig: the calibrated cameras.
         plan: the motions; the arm stands at their start.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.

@@ -1,8 +1,9 @@
 """OpenIGTLink, for 3D Slicer and other programs of image-guided surgery: TRANSFORM, POSITION and STATUS.
 
-``igtl:PORT`` listens (18944 is the usual port). Of each measured shot the readers are sent the pose of the body in the left
-camera's frame as TRANSFORM (``armsight_body``) and as POSITION, of a missed one the reason as STATUS; of joints the tool's
-pose in the base (``armsight_tool``). OpenIGTLink's unit is the millimetre, its handedness ours (right).
+``igtl:PORT`` listens (18944 is the usual port). Of each measured shot the readers are sent the pose of the body in the
+left camera's frame as TRANSFORM (``armsight_body``) and as POSITION (``armsight_position``), and whether it was measured,
+or why not, as STATUS (``armsight_status``); of joints the tool's pose in the base (``armsight_tool``). Each has a name of
+its own: some readers keep the newest message of a name. Lengths are in mm, as the protocol has them.
 
 The messages are those of version 1 of the protocol: openigtlink.org, "Header", "TRANSFORM", "POSITION", "STATUS". All
 numbers are big endian. The checksum is CRC-64 of ECMA-182.
@@ -89,18 +90,18 @@ class IgtlSink(TcpSink):
             T = datum.T_base_tool
             return [] if T is None else [message("TRANSFORM", "armsight_tool", t_s, transform_body(T))]
         if isinstance(datum, NoteDatum):
-            return [message("STATUS", "armsight", t_s, status_body(_OK, "", datum.text))]
+            return [message("STATUS", "armsight_log", t_s, status_body(_OK, "", datum.text))]
         if not isinstance(datum, ShotDatum):
             return []
         if isinstance(datum.result, PoseEstimate):
             T = datum.result.T_left_body
             return [
                 message("TRANSFORM", "armsight_body", t_s, transform_body(T)),
-                message("POSITION", "armsight_body", t_s, position_body(T)),
-                message("STATUS", "armsight_body", t_s, status_body(_OK, "", "ok")),
+                message("POSITION", "armsight_position", t_s, position_body(T)),
+                message("STATUS", "armsight_status", t_s, status_body(_OK, "", "ok")),
             ]
         reason = datum.result.reason if isinstance(datum.result, Missed) else "not measured"
-        return [message("STATUS", "armsight_body", t_s, status_body(_NOT_FOUND, "missed", reason))]
+        return [message("STATUS", "armsight_status", t_s, status_body(_NOT_FOUND, "missed", reason))]
 
 
 def open_igtl(rest: str, published: Published) -> IgtlSink:

@@ -59,7 +59,7 @@ def listening(host: str, port: int, what: str) -> socket.socket:
         raise InputError(f"--stream {what}:{port}: cannot listen there: {error.strerror}") from None
 
 
-class _Reader:
+class _Connected:
     """One that has connected: its socket, and the bytes that wait for it."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -94,7 +94,7 @@ class TcpSink(Sink):
         self.published = published
         self._listener = listener
         self._listener.setblocking(False)
-        self._readers: list[_Reader] = []
+        self._readers: list[_Connected] = []
 
     @property
     def port(self) -> int:
@@ -125,7 +125,7 @@ class TcpSink(Sink):
                 connection, _ = self._listener.accept()
             except BlockingIOError:
                 break
-            self._readers.append(_Reader(connection))
+            self._readers.append(_Connected(connection))
         self._send()
 
     def _send(self) -> None:
@@ -164,7 +164,7 @@ class UdpSink(Sink):
             data = json.dumps(content).encode() + b"\n"
         try:
             self._socket.sendto(data, self._address)
-        except (BlockingIOError, ConnectionRefusedError):  # nobody listens, or the network is full
+        except OSError:  # nobody listens, or the network is full
             self.dropped += 1
 
     def finish(self) -> None:

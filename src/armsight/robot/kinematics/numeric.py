@@ -40,8 +40,8 @@ _SPREAD = 1.0969815577985598
 _SLIDES, _SLIDE_RAD, _EDGE, _PUSH = 8, 0.3, 0.85, 100.0
 #: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the damping of the position.
 _LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
-#: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a radian
-#: the wrist would turn over.
+#: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a
+#: radian the wrist would turn over.
 _WEAK = 1e-2
 
 

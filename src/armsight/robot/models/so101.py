@@ -1,6 +1,7 @@
 """TheRobotStudio SO-101 follower: five joints; the gripper's jaw is no joint of the arm.
 
-From the makers' URDF (github.com/TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf): joint angles are 0 in the
+From the makers' URDF (github.com/TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf): joint angles are 0 in
+the
 middle of their ranges, as LeRobot calibrates them. The tool is at the URDF's gripperframe, between the tips, with its axes
 as usual for grippers: z ahead, where the gripper points, and x as there. The same kinematics but for the gripper has the
 SO-100. Speeds, accelerations and jerks are chosen: the URDF gives stand-ins.
