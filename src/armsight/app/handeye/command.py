@@ -169,7 +169,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
         return _streams(options, robot, seen, progress)
     recording = paired(robot, seen, options.eye == "in-hand", arm)
     progress("looking at whether both sides fit")
-    recording = require_plausible(recording, arm, detect_units=options.detect_units)
+    recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
     links = None if arm is None else links_of(recording, arm)
     found = calibrate_structured(
         recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress

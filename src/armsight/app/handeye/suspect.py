@@ -30,6 +30,8 @@ from armsight.robot.arm import Arm
 FITS_M = 2e-3
 #: Another reading must fit better by this factor, and its median residual be below this, m.
 BETTER, PLAUSIBLE_M = 4.0, 0.02
+#: A reading is preferred to those before it where its residual is smaller by this: xyz and ZYX are the same.
+SMALLER = 0.99
 #: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
 EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
 #: Scales that mistaken units make: mm for m, cm, inches.
@@ -52,17 +54,27 @@ def misfit(poses: Poses) -> float:
     return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
 
 
+def _resized(p: Poses) -> Poses:
+    """Return the poses with the target's lengths multiplied by what fits."""
+    B = p.B.copy()
+    B[:, :3, 3] *= scale_between(p)
+    return replace(p, B=B)
+
+
 def _angles(Ts: Array) -> Array:
     """Return the angles between neighbouring poses, rad."""
     return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
 
 
-def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
+def require_plausible(
+    recording: Recording, arm: Arm | None, *, detect_units: bool = False, scale: bool = False
+) -> Recording:
     """Reject data that fit far better read in another way.
 
     Args:
         recording: the rows.
         arm: the model, where the robot's poses come from joints.
+        scale: whether the target's size is fitted, and may be anything.
         detect_units: whether lengths in another unit are converted, with a note, in place of an error.
 
     Returns:
@@ -72,17 +84,17 @@ def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bo
         InputError: what is likely wrong, and what to do.
     """
     p = recording.poses
-    as_given = misfit(p)
+    as_given = misfit(_resized(p) if scale else p)
     if as_given < FITS_M:
         return recording
     best, advice, converted = as_given, "", None
     units = {said for _, said in _scaled(p)}
     for poses, said in _readings(recording, arm):
         try:
-            other = misfit(poses)
+            other = misfit(_resized(poses) if scale else poses)
         except np.linalg.LinAlgError:
             continue
-        if other < best:
+        if other < SMALLER * best:
             best, advice = other, said
             converted = poses if said in units else None
     if best < as_given / BETTER and best < PLAUSIBLE_M:
@@ -118,12 +130,9 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
     yield from _scaled(p)
-    scale = scale_between(p)
-    B = p.B.copy()
-    B[:, :3, 3] *= scale
     yield (
-        replace(p, B=B),
-        f"the target seems to be {scale:.3g} times as large as given: is the size of --target right? --scale fits it",
+        _resized(p),
+        f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right? --scale fits it",
     )
     table = recording.robot
     if table.convention:
