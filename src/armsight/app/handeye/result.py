@@ -14,7 +14,7 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import StructuredHandEye
+from armsight.loop.handeye.structured import POSITIONS, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
@@ -62,7 +62,12 @@ def whose(run: HandEyeRun) -> str:
         name for name, value in found.likelihoods.items() if name != found.structure and best - value < DISTINGUISHED
     ]
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
-    if arm == 0:
+    if found.structure == POSITIONS:
+        said = (
+            f"rotations and positions contradict each other by more than either scatters: positions alone were weighted, and "
+            f"scatter by {camera:.2f} mm RMS at the target"
+        )
+    elif arm == 0:
         said = f"the camera's error, {camera:.2f} mm RMS at the target, explains the residuals best"
     elif camera == 0:
         said = f"the arm's error, {arm:.2f} mm RMS at the target, explains the residuals best"
