@@ -64,7 +64,7 @@ def whose(run: HandEyeRun) -> str:
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
     if found.structure == POSITIONS:
         said = (
-            f"rotations and positions contradict each other by more than either scatters: positions alone were weighted, and "
+            "rotations and positions contradict each other by more than either scatters: positions alone were weighted; they "
             f"scatter by {camera:.2f} mm RMS at the target"
         )
     elif arm == 0:
