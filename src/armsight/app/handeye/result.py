@@ -64,8 +64,8 @@ def whose(run: HandEyeRun) -> str:
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
     if found.structure == POSITIONS:
         said = (
-            "rotations and positions contradict each other by more than either scatters: positions alone were weighted; they "
-            f"scatter by {camera:.2f} mm RMS at the target"
+            "rotations and positions contradict each other by more than either scatters; positions alone were weighted, "
+            f"which scatter by {camera:.2f} mm RMS at the target"
         )
     elif arm == 0:
         said = f"the camera's error, {camera:.2f} mm RMS at the target, explains the residuals best"
