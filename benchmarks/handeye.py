@@ -5,11 +5,11 @@
 
 KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown scale,
 wrong kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation);
-armsight gets the two streams. A sequence counts in the comparison where armsight answers; what it refuses is counted
+armsight gets the two streams. A sequence counts in the comparison where armsight answers; what it rejects is counted
 apart, with what the baselines answer there.
 
 Per track: median error of X, mm and degrees, ours and of each baseline; how often the ellipsoid of 95 % of X holds the
-truth; the median NEES (5.35 with six degrees of freedom is honest); refusals; the error of the clock offset.
+truth; the median NEES (5.35 with six degrees of freedom is honest); rejections; the error of the clock offset.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Row:
     """One sequence.
 
     Attributes:
-        translation_mm, rotation_deg: errors of X; NaN where refused.
+        translation_mm, rotation_deg: errors of X; NaN where rejected.
         nees: squared Mahalanobis length of the error of X.
         offset_ms: error of the clock offset; NaN where there is none.
         peers: baseline -> its errors of X, mm and deg.
@@ -56,7 +56,7 @@ class Row:
     offset_ms: float = float("nan")
     peer_offset_ms: float = float("nan")
     structure: str = ""
-    refused: str = ""
+    rejected: str = ""
     seconds: float = 0.0
     peers: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -92,7 +92,7 @@ def ours(sequence, row: Row, joints: bool) -> None:
             found = streams.handeye
             row.offset_ms = 1e3 * abs(-streams.offset_s - sequence.time_offset)
     except ArmsightError as error:
-        row.refused = str(error)
+        row.rejected = str(error)
     else:
         e = log_se3(inverse(found.T_flange_held) @ sequence.X)
         row.translation_mm = 1e3 * float(np.linalg.norm(found.T_flange_held[:3, 3] - sequence.X[:3, 3]))
@@ -127,7 +127,7 @@ def evaluate(folder: Path, tracks: list[str] | None, limit: int | None, joints: 
         rows.append(row)
         print(
             f"{name} {m['level'][:60]:60s} {row.translation_mm:9.3f} mm {row.rotation_deg:7.3f} deg NEES {row.nees:8.2f} "
-            f"{row.seconds:5.1f} s {row.structure} {row.refused[:60]}",
+            f"{row.seconds:5.1f} s {row.structure} {row.rejected[:60]}",
             flush=True,
         )
     return rows
@@ -141,13 +141,13 @@ def _median(values) -> float:
 def summary(rows: list[Row]) -> list[str]:
     """Return the tables."""
     lines = [
-        "| track | sequences | refused | mm | deg | best baseline by mm | its mm | by deg | its deg | in 95 % | NEES | s |",
+        "| track | sequences | rejected | mm | deg | best by mm | its mm | best by deg | its deg | in 95 % | NEES | s |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     tracks = list(dict.fromkeys(row.track for row in rows))
     for track in tracks:
         of = [row for row in rows if row.track == track]
-        done = [row for row in of if not row.refused]
+        done = [row for row in of if not row.rejected]
         names = sorted({name for row in done for name in row.peers}) or ["none"]
         peers = {n: [_median(r.peers.get(n, (np.inf, np.inf))[k] for r in done) for k in (0, 1)] for n in names}
         by_mm, by_deg = (min(peers, key=lambda n, k=k: peers[n][k]) for k in (0, 1))
@@ -159,13 +159,13 @@ def summary(rows: list[Row]) -> list[str]:
             f"{_median(r.seconds for r in of):.1f} |"
         )
     degenerate = [row for row in rows if row.degenerate]
-    refused = [row for row in rows if row.refused]
+    rejected = [row for row in rows if row.rejected]
     offsets = [row for row in rows if np.isfinite(row.offset_ms)]
-    peers_there = _median(min((e[0] for e in row.peers.values()), default=np.nan) for row in refused)
+    peers_there = _median(min((e[0] for e in row.peers.values()), default=np.nan) for row in rejected)
     lines += [
         "",
-        f"degenerate motions: {len(degenerate)}, of which refused {sum(bool(r.refused) for r in degenerate)}; refused "
-        f"though not degenerate: {sum(not r.degenerate for r in refused)}; median of the best baseline where refused: "
+        f"degenerate motions: {len(degenerate)}, of which rejected {sum(bool(r.rejected) for r in degenerate)}; rejected "
+        f"though not degenerate: {sum(not r.degenerate for r in rejected)}; median of the best baseline where rejected: "
         f"{peers_there:.1f} mm",
         f"clock offset, {len(offsets)} sequences: median {_median(r.offset_ms for r in offsets):.3f} ms; KinHEC's "
         f"correlation {_median(r.peer_offset_ms for r in offsets):.3f} ms",

@@ -1,4 +1,4 @@
-"""``armsight handeye``: forms of tables, what it says, and what it refuses."""
+"""``armsight handeye``: forms of tables, what it says, and what it rejects."""
 
 import json
 
@@ -170,7 +170,7 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
 
 
-def test_millimetres_are_refused_or_detected(armsight, tmp_path, seen):
+def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     _, A, B = motion()
     A = A.copy()
     A[:, :3, 3] *= 1e3
@@ -254,7 +254,7 @@ def test_a_damaged_table_is_one_line(armsight, tmp_path, seen, text, words):
         (("--rig", "r.json", "--target", "chessboard:9x6:25mm"), ["--rig, --left and --right"]),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(armsight, tmp_path, more, words):
+def test_options_that_do_not_go_together_are_rejected(armsight, tmp_path, more, words):
     robot = matrices(tmp_path / "robot.txt", motion()[1])
     assert_rejected(armsight("handeye", "--robot", robot, "--eye", "in-hand", *more), *words)
 
@@ -295,12 +295,12 @@ def test_images_of_one_camera(armsight, tmp_path):
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
-def test_a_board_that_looks_the_same_turned_is_turned_back(in_hand):
+def test_a_board_that_looks_the_same_rotated_is_rotated_back(in_hand):
     _, A, B = motion(12, in_hand=in_hand)
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     flip[:2, 3] = 0.2, 0.1
-    turned = B.copy()
-    turned[[2, 5, 6]] = turned[[2, 5, 6]] @ flip
-    back, which = upright(A, turned, (flip,), in_hand)
+    rotated = B.copy()
+    rotated[[2, 5, 6]] = rotated[[2, 5, 6]] @ flip
+    back, which = upright(A, rotated, (flip,), in_hand)
     np.testing.assert_allclose(back, B, atol=1e-12)
     assert list(np.flatnonzero(which >= 0)) == [2, 5, 6]

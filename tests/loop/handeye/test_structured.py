@@ -78,7 +78,7 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
     assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
 
 
-def test_poses_left_out_tell_the_arms_error_from_the_cameras():
+def test_poses_left_out_distinguish_the_arms_error_from_the_cameras():
     both = ("robot", "camera, depth apart")
     arm = calibrate_structured(made(1, n=60, flange=(1e-4, 5e-3))[0], structures=both)
     camera = calibrate_structured(made(1, n=60, camera=(2e-4, 2e-3, 1e-3))[0], structures=both)
@@ -124,7 +124,7 @@ def test_a_target_of_another_size_is_found():
     assert calibrate_structured(poses, scale=True).sigma_scale == 0.0  # 1 is kept where nothing speaks against it
 
 
-def turned(xi, n=20, seed=0, noise=0.0):
+def rotated(xi, n=20, seed=0, noise=0.0):
     """Poses of a flange that moves along tangents, seen exactly but for the rotation's noise, rad."""
     rng = np.random.default_rng(seed)
     A = exp_se3(xi)
@@ -133,27 +133,27 @@ def turned(xi, n=20, seed=0, noise=0.0):
     return Poses(A, B, np.zeros((n, 6, 6)), False, np.zeros(3))
 
 
-def test_rotation_about_one_axis_is_refused_and_the_axis_named_also_under_noise():
+def test_rotation_about_one_axis_is_rejected_and_the_axis_named_also_under_noise():
     xi = np.zeros((20, 6))
     xi[:, 0], xi[:, 4] = np.linspace(0, 0.3, 20), np.linspace(-0.6, 0.6, 20)
     for noise in (0.0, 2e-3):
         with pytest.raises(
             CalibrationError, match=r"one axis only, \[-?0\.00 1\.00 -?0\.00\].*flange-body along this axis"
         ):
-            calibrate_structured(turned(xi, noise=noise))
+            calibrate_structured(rotated(xi, noise=noise))
 
 
-def test_translations_alone_are_refused():
+def test_translations_alone_are_rejected():
     xi = np.concatenate([np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3)), np.zeros((20, 3))], axis=1)
     with pytest.raises(CalibrationError, match=r"hardly rotates .* open in every direction"):
-        calibrate_structured(turned(xi, noise=1e-3))
+        calibrate_structured(rotated(xi, noise=1e-3))
 
 
-def test_too_few_poses_and_unknown_needs_are_refused():
+def test_too_few_poses_and_unknown_needs_are_rejected():
     poses, _, _, links = made(0)
     with pytest.raises(InputError, match="4 or more poses, got 3"):
         calibrate_structured(poses.rows(np.arange(3)))
-    with pytest.raises(InputError, match="robot's geometry off can be told"):
+    with pytest.raises(InputError, match="robot's geometry off can be determined"):
         calibrate_structured(poses, structures=("robot's geometry off",))
     assert calibrate_structured(poses, links=links, structures=("robot's geometry off",)).used.any()
 

@@ -120,7 +120,7 @@ def command(**given: object) -> None:
 
 
 def _require_one_way(options: Options) -> None:
-    """Refuse options that do not go together."""
+    """Reject options that do not go together."""
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
@@ -169,7 +169,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
         return _streams(options, robot, seen, progress)
     recording = paired(robot, seen, options.eye == "in-hand", arm)
     progress("looking at whether both sides fit")
-    recording = require_plausible(recording, arm, detect_units=options.detect_units)
+    recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
     links = None if arm is None else links_of(recording, arm)
     found = calibrate_structured(
         recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress

@@ -280,16 +280,16 @@ def see_with_rig(
 
 
 def upright(A: Array, B: Array, symmetries: tuple[Array, ...], in_hand: bool) -> tuple[Array, NDArray[np.int64]]:
-    """Decide which way up a board was that looks the same turned: angles between poses are the same on both sides.
+    """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
 
     Args:
         A: (N, 4, 4) poses of the flange.
-        B: (N, 4, 4) poses of the body, some of them turned by a symmetry.
+        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
         symmetries: the motions of the body that change nothing to see.
         in_hand: whether the eye is in the hand.
 
     Returns:
-        B with the turned ones turned back to agree with the first, and which symmetry was used, -1 for none.
+        B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.
     """
     choices = [np.eye(4), *symmetries]
     options = np.stack([B @ S for S in choices])  # (S, N, 4, 4)

@@ -1,7 +1,7 @@
 """The poses to take next: those that lower the sigma of the mounting most.
 
 In: a calibration and its poses. Out: poses of the flange, and the sigma after each. Candidates are views like those seen
-(as far away, as far from the axis) with the body turned further; the flange stays within the space it was in, a fifth more.
+(as far away, as far from the axis) with the body rotated further; the flange stays within its space, a fifth more.
 Each next pose is the one whose information, given those before, lowers the trace of the mounting's covariance most (a
 radian counting as 0.3 m).
 """
@@ -19,8 +19,8 @@ from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals
 from armsight.loop.handeye.noise import STRUCTURES, error_maps
 from armsight.loop.handeye.structured import StructuredHandEye
 
-#: Candidates, how far a body is turned from how it was seen, rad, and how much larger the flange's space may become.
-CANDIDATES, TURN_RAD, WIDER = 1500, np.radians(50), 0.2
+#: Candidates, how far a body is rotated from how it was seen, rad, and how much larger the flange's space may become.
+CANDIDATES, ROTATED_RAD, WIDER = 1500, np.radians(50), 0.2
 #: Sigmas taken where a structure has none for the noise: m and rad.
 LEAST_M, LEAST_RAD = 1e-5, 1e-5
 
@@ -90,10 +90,12 @@ def _candidates(found: StructuredHandEye, poses: Poses, rng: np.random.Generator
     distance = np.linalg.norm(p, axis=1)
     off_axis = float(np.max(np.linalg.norm(p[:, :2], axis=1) / distance))
     k = rng.integers(0, len(p), CANDIDATES)
-    turn = np.concatenate([np.zeros((CANDIDATES, 3)), rng.uniform(-TURN_RAD, TURN_RAD, (CANDIDATES, 3))], axis=1)
+    rotated = np.concatenate(
+        [np.zeros((CANDIDATES, 3)), rng.uniform(-ROTATED_RAD, ROTATED_RAD, (CANDIDATES, 3))], axis=1
+    )
     around = np.eye(4)
     around[:3, 3] = poses.centre
-    B = poses.B[k] @ around @ exp_se3(turn) @ inverse(around)
+    B = poses.B[k] @ around @ exp_se3(rotated) @ inverse(around)
     roll = exp_so3(np.outer(rng.uniform(-np.pi, np.pi, CANDIDATES), [0.0, 0.0, 1.0]))
     B[:, :3] = roll @ B[:, :3]  # the whole view, about the camera's axis
     B[:, :3, 3] *= rng.uniform(distance.min(), distance.max(), CANDIDATES)[:, None] / distance[k, None]

@@ -271,8 +271,8 @@ class _Columns:
     def _checked(self, R: Array) -> Array:
         """Return rotations, cleaned of rounding."""
         for (line, _), one in zip(self.rows, R, strict=True):
-            off, turn = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
-            if off < LOOSE and turn < 0:
+            off, determinant = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
+            if off < LOOSE and determinant < 0:
                 raise InputError(
                     f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
                     "and camera poses are right-handed: exchange no axes without a sign"

@@ -74,10 +74,10 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Reco
         raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
     A, B = robot.Ts[rows], seen.Ts[matched]
     if seen.symmetries:
-        B, turned = upright(A, B, seen.symmetries, in_hand)
-        if (turned >= 0).any():
+        B, rotated = upright(A, B, seen.symmetries, in_hand)
+        if (rotated >= 0).any():
             notes.append(
-                f"the board looks the same turned: {int((turned >= 0).sum())} of {len(B)} were turned to agree"
+                f"the board looks the same rotated: {int((rotated >= 0).sum())} of {len(B)} were rotated to agree"
             )
     both_clocks = robot.t_s is not None and seen.t_s is not None
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
@@ -107,7 +107,7 @@ def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[n
     if len(robot.Ts) != len(seen.Ts):
         raise InputError(
             f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give it a column "
-            "image (or name), or t_s on both sides and --streams, so that they can be told apart"
+            "image (or name), or t_s on both sides and --streams, so that they can be determined apart"
         )
     return np.arange(len(robot.Ts)), np.arange(len(seen.Ts))
 
@@ -127,11 +127,11 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
             f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"
         ]
     p = 1e3 * mean[:3, 3]
-    turn = float(np.degrees(np.linalg.norm(log_se3(mean)[3:])))
-    if np.linalg.norm(p) < 1.0 and turn < 0.5:
+    angle = float(np.degrees(np.linalg.norm(log_se3(mean)[3:])))
+    if np.linalg.norm(p) < 1.0 and angle < 0.5:
         return []
     return [
-        f"{robot.path}: its poses are of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
+        f"{robot.path}: its poses are of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {angle:.1f} deg from the flange "
         f"of {arm.name}: the transform found is from this TCP, not from the flange"
     ]
 

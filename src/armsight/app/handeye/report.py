@@ -71,9 +71,9 @@ def coverage_figure(run: HandEyeRun) -> Figure:
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2)
     p, used = run.recording.poses, run.found.used
-    turned = np.degrees(log_se3(inverse(mean_pose(p.A)) @ p.A)[:, 3:])
+    rotated = np.degrees(log_se3(inverse(mean_pose(p.A)) @ p.A)[:, 3:])
     for other, colour, label in ((1, BLUE, "x and y"), (2, ORANGE, "x and z")):
-        left.scatter(turned[used, 0], turned[used, other], s=14, color=colour, label=label, linewidths=0)
+        left.scatter(rotated[used, 0], rotated[used, other], s=14, color=colour, label=label, linewidths=0)
     left.set_aspect("equal", adjustable="datalim")
     left.set_title("rotation vector from the mean pose, flange, deg")
     left.legend()

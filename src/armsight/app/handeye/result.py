@@ -14,10 +14,10 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import StructuredHandEye
+from armsight.loop.handeye.structured import POSITIONS, StructuredHandEye
 
-#: A structure whose mean log density is within this of the best is not told from it.
-TOLD = 0.2
+#: A structure whose mean log density is within this of the best is not distinguished from it.
+DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
 SCALE_SIGMAS = 5.0
 
@@ -58,16 +58,23 @@ def whose(run: HandEyeRun) -> str:
     """Return how much of the error is the arm's and how much the camera's, as a sentence."""
     found = run.found
     best = found.likelihoods[found.structure]
-    near = [name for name, value in found.likelihoods.items() if name != found.structure and best - value < TOLD]
+    near = [
+        name for name, value in found.likelihoods.items() if name != found.structure and best - value < DISTINGUISHED
+    ]
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
-    if arm == 0:
+    if found.structure == POSITIONS:
+        said = (
+            "rotations and positions contradict each other by more than either scatters; positions alone were weighted, "
+            f"which scatter by {camera:.2f} mm RMS at the target"
+        )
+    elif arm == 0:
         said = f"the camera's error, {camera:.2f} mm RMS at the target, explains the residuals best"
     elif camera == 0:
         said = f"the arm's error, {arm:.2f} mm RMS at the target, explains the residuals best"
     else:
         said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
     if {"robot", "camera", "camera, depth apart"} & set(near) and not (arm and camera):
-        said += "; these poses hardly tell arm from camera"
+        said += "; these poses hardly distinguish arm from camera"
     return f"{said} (structure of the noise: {found.structure})"
 
 
@@ -88,8 +95,8 @@ def open_direction(run: HandEyeRun) -> str:
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
     named = " ".join(f"{value:.2f}" for value in axis)
     ratio = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
-    turned = log_se3(np.linalg.inv(mean_pose(run.recording.poses.A)) @ run.recording.poses.A)[:, 3:]
-    spread, axes = np.linalg.eigh(turned.T @ turned / len(turned))
+    rotated = log_se3(np.linalg.inv(mean_pose(run.recording.poses.A)) @ run.recording.poses.A)[:, 3:]
+    spread, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
     least = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
     about = " ".join(f"{value:.2f}" for value in least)
     return (

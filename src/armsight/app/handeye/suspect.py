@@ -30,8 +30,10 @@ from armsight.robot.arm import Arm
 FITS_M = 2e-3
 #: Another reading must fit better by this factor, and its median residual be below this, m.
 BETTER, PLAUSIBLE_M = 4.0, 0.02
-#: Poses that a reading is judged by at most, and the rows by which poses are looked for against the images.
-JUDGED, SHIFTS = 60, (1, -1, 2, -2)
+#: A reading is preferred to those before it where its residual is smaller by this: xyz and ZYX are the same.
+SMALLER = 0.99
+#: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
+EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
 #: Scales that mistaken units make: mm for m, cm, inches.
 UNITS = {
     1000.0: "millimetres taken for metres",
@@ -42,7 +44,7 @@ UNITS = {
 
 def misfit(poses: Poses) -> float:
     """Return the median residual, m, of the best closed form."""
-    rows = np.linspace(0, len(poses.A) - 1, min(JUDGED, len(poses.A))).round().astype(np.int64)
+    rows = np.linspace(0, len(poses.A) - 1, min(EVALUATED, len(poses.A))).round().astype(np.int64)
     part = poses.rows(rows)
     found = starts(part.A, part.right_side)
     if not found:
@@ -52,17 +54,27 @@ def misfit(poses: Poses) -> float:
     return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
 
 
+def _resized(p: Poses) -> Poses:
+    """Return the poses with the target's lengths multiplied by what fits."""
+    B = p.B.copy()
+    B[:, :3, 3] *= scale_between(p)
+    return replace(p, B=B)
+
+
 def _angles(Ts: Array) -> Array:
     """Return the angles between neighbouring poses, rad."""
     return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
 
 
-def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
-    """Refuse data that fit far better read in another way.
+def require_plausible(
+    recording: Recording, arm: Arm | None, *, detect_units: bool = False, scale: bool = False
+) -> Recording:
+    """Reject data that fit far better read in another way.
 
     Args:
         recording: the rows.
         arm: the model, where the robot's poses come from joints.
+        scale: whether the target's size is fitted, and may be anything.
         detect_units: whether lengths in another unit are converted, with a note, in place of an error.
 
     Returns:
@@ -72,17 +84,17 @@ def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bo
         InputError: what is likely wrong, and what to do.
     """
     p = recording.poses
-    as_given = misfit(p)
+    as_given = misfit(_resized(p) if scale else p)
     if as_given < FITS_M:
         return recording
     best, advice, converted = as_given, "", None
     units = {said for _, said in _scaled(p)}
     for poses, said in _readings(recording, arm):
         try:
-            other = misfit(poses)
+            other = misfit(_resized(poses) if scale else poses)
         except np.linalg.LinAlgError:
             continue
-        if other < best:
+        if other < SMALLER * best:
             best, advice = other, said
             converted = poses if said in units else None
     if best < as_given / BETTER and best < PLAUSIBLE_M:
@@ -118,12 +130,9 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
     yield from _scaled(p)
-    scale = scale_between(p)
-    B = p.B.copy()
-    B[:, :3, 3] *= scale
     yield (
-        replace(p, B=B),
-        f"the target seems to be {scale:.3g} times as large as given: is the size of --target right? --scale fits it",
+        _resized(p),
+        f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right? --scale fits it",
     )
     table = recording.robot
     if table.convention:
@@ -166,7 +175,7 @@ def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
 def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
     n = q.shape[1]
-    rows = np.linspace(0, len(q) - 1, min(JUDGED, len(q))).round().astype(np.int64)
+    rows = np.linspace(0, len(q) - 1, min(EVALUATED, len(q))).round().astype(np.int64)
     seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
     orders: list[tuple[int, ...]] = [
         tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
@@ -176,8 +185,8 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
         orders = [order for order in permutations(range(n)) if order != tuple(range(n))]
     scored: list[tuple[float, NDArray[np.int64]]] = []
     for order in orders:
-        turned = _angles(np.asarray(arm.forward(q[rows][:, order])))
-        scored.append((float(np.median(np.abs(turned - seen))), np.array(order)))
+        rotated = _angles(np.asarray(arm.forward(q[rows][:, order])))
+        scored.append((float(np.median(np.abs(rotated - seen))), np.array(order)))
     for _, at in sorted(scored, key=lambda one: one[0])[:3]:
         named = ", ".join(f"q{k + 1}" for k in at)
         yield (

@@ -6,7 +6,7 @@ the error of poses left out. In order:
 
 1. A robust start: closed forms from all poses and from small parts (:func:`~armsight.loop.handeye.handeye.starts`), then
    least squares with the weights of Student's t; what is further than chance allows is left out as a blunder.
-2. Motions that leave a direction open are refused (:func:`require_rotations`, :func:`require_known`).
+2. Motions that leave a direction open are rejected (:func:`require_rotations`, :func:`require_known`).
 3. For every structure of noise the variances of the greatest restricted likelihood; poses left out decide between the
    structures (:mod:`armsight.loop.handeye.noise`).
 
@@ -72,7 +72,7 @@ CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 OPEN_M, OPEN_RAD = 0.1, 0.1
 #: Degrees of freedom of Student's t in the robust start.
 FREEDOM = 4.0
-#: A scale must be off by this many sigmas to be believed.
+#: A scale must be off by this many sigmas to be taken.
 SURELY = 5.0
 #: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
 HANGING = 1.0
@@ -305,7 +305,7 @@ def _robust(problem: _Problem, guesses: list[_Guess]) -> tuple[_Guess, NDArray[n
     e = problem.linear(best[1]).e
     position, rotation = _middle_sigmas(e)
     far = np.sum((e / np.repeat([position, rotation], 3)) ** 2, axis=1)
-    used = far < 3 * chdtri(6, CHANCE)  # generous: axes differ; the structure's own covariance judges later
+    used = far < 3 * chdtri(6, CHANCE)  # generous: axes differ; the structure's own covariance decides later
     return best[1], used
 
 
@@ -354,7 +354,7 @@ def scale_between(poses: Poses) -> float:
 
 
 def require_rotations(poses: Poses, e: Array) -> None:
-    """Refuse motions whose rotations are about one axis only, as far as the noise allows to tell.
+    """Reject motions whose rotations are about one axis only, as far as the noise shows.
 
     Args:
         poses: the poses used.
@@ -364,8 +364,8 @@ def require_rotations(poses: Poses, e: Array) -> None:
         CalibrationError: the open direction, by name.
     """
     mean = mean_pose(poses.A)
-    turned = log_se3(inverse(mean) @ poses.A)[:, 3:]
-    values, axes = np.linalg.eigh(turned.T @ turned / len(turned))
+    rotated = log_se3(inverse(mean) @ poses.A)[:, 3:]
+    values, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
     noise = _middle_sigmas(e)[1]
     least = max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
     spread = np.sqrt(np.maximum(values[::-1], 0.0))
@@ -386,7 +386,7 @@ def require_rotations(poses: Poses, e: Array) -> None:
 
 
 def require_known(poses: Poses, Z: Array, X: Array, cov: Array) -> None:
-    """Refuse a result one of whose directions is known so badly that it is no calibration.
+    """Reject a result one of whose directions is known so badly that it is no calibration.
 
     Raises:
         CalibrationError: the open direction, by name.
@@ -428,7 +428,7 @@ def _start_variances(linear: Linear, structure: str) -> Array:
 
 
 def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
-    """Return whether a structure can be told from these poses."""
+    """Return whether a structure can be determined from these poses."""
     sources = STRUCTURES[structure]
     if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
         return False
@@ -455,7 +455,7 @@ def _chosen(
     covered = bool((np.abs(whole.poses.cov).reshape(len(used), -1).max(axis=1) > 0).all())
     names = [name for name in structures if _allowed(name, whole, int(used.sum()), covered)]
     if not names:
-        raise InputError(f"none of the structures {', '.join(structures)} can be told from these poses")
+        raise InputError(f"none of the structures {', '.join(structures)} can be determined from these poses")
     gathered = walk_gathered(whole.scaled(guess)) if whole.t_s is not None and whole.poses.in_hand else {}
     simple = "robot and camera" if "robot and camera" in names else names[0]
     guess, used, variances = _settled(whole, guess, used, simple, gathered)
@@ -474,7 +474,7 @@ def _chosen(
     solved = solve(blocks(linear, best), variances)
     x, cov = solved.x, solved.cov
     guess = guess.moved(x, whole.free)
-    freedom = max(linear.e.size // 2 - 6, 3)  # of positions, and of rotations
+    freedom = max(linear.e.size // 2 - 9, 3)  # of positions, whose fit also rotates the frames
     # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
     cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
     metric, cov = whole.metric(guess, cov)
