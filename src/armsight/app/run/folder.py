@@ -47,9 +47,9 @@ from armsight.vision.rig import StereoRig
 
 
 def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
-    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, 6), rad."""
+    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, n), rad."""
     named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
-    for joint in range(6):
+    for joint in range(q.shape[1]):
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
         named[f"q{joint + 1}_ref_rad"] = np.round(q_ref[:, joint], 9)
     return named

@@ -483,7 +483,7 @@ class Loop:
     def _at_rest(self, duration_s: float) -> JointCommand:
         """Return the command to be at rest at the reference of the newest command."""
         newest = self.log.commands[-1][1]
-        return JointCommand(newest.q_ref, np.zeros(6), newest.gravity_duty, duration_s)
+        return JointCommand(newest.q_ref, np.zeros_like(newest.q_ref), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:
         """Raise a DeviceError if the board no longer follows commands."""
