@@ -3,10 +3,10 @@
     pip install kinhec==1.1 pandas pyarrow pyyaml
     python benchmarks/handeye.py --tier small --seed 16180 -o kinhec.json
 
-KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown scale, wrong
-kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation); armsight
-gets the two streams. A sequence counts in the comparison where armsight answers; what it refuses is counted apart, with
-what the baselines answer there.
+KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown scale,
+wrong kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation);
+armsight gets the two streams. A sequence counts in the comparison where armsight answers; what it refuses is counted
+apart, with what the baselines answer there.
 
 Per track: median error of X, mm and degrees, ours and of each baseline; how often the ellipsoid of 95 % of X holds the
 truth; the median NEES (5.35 with six degrees of freedom is honest); refusals; the error of the clock offset.
@@ -61,8 +61,20 @@ class Row:
     peers: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def ours(sequence, row: Row) -> None:
-    """Calibrate a sequence by armsight alone."""
+def _links(sequence, seen) -> np.ndarray | None:
+    """T_link_flange by the joints read and the arm's nominal model; None for a body that no arm moves."""
+    from kinhec.kinematics import forward_kinematics_all
+    from kinhec.robots import get_robot
+
+    if sequence.robot.q_meas is None:
+        return None
+    robot = get_robot(sequence.manifest["robot"])
+    frames = np.array([forward_kinematics_all(robot, q) for q in sequence.robot.q_meas[seen]])
+    return inverse(frames) @ frames[:, -1:]
+
+
+def ours(sequence, row: Row, joints: bool) -> None:
+    """Calibrate a sequence by armsight alone; with ``joints`` the joint angles and the arm's model are known too."""
     seen = sequence.camera.has_measurement
     B, t = sequence.camera.T_cam_target_meas[seen], sequence.camera.t[seen]
     eye = "in_hand" if sequence.eye_in_hand else "to_hand"
@@ -72,7 +84,8 @@ def ours(sequence, row: Row) -> None:
         if sequence.synchronous:
             A = sequence.robot.T_base_ee_meas[seen]
             poses = Poses(A, B, np.zeros((len(A), 6, 6)), eye == "in_hand", np.zeros(3))
-            found = calibrate_structured(poses, t_s=t if ordered else None, scale=True)
+            links = _links(sequence, seen) if joints else None
+            found = calibrate_structured(poses, t_s=t if ordered else None, links=links, scale=True)
         else:
             hand = PoseStream.of(sequence.robot.t, sequence.robot.T_base_ee_meas, "hand")
             streams = calibrate_structured_streams(hand, PoseStream.of(t, B, "eye"), eye=eye, scale=True)
@@ -89,20 +102,23 @@ def ours(sequence, row: Row) -> None:
     row.seconds = time.perf_counter() - started
 
 
-def evaluate(folder: Path, tracks: list[str] | None, limit: int | None) -> list[Row]:
+def evaluate(folder: Path, tracks: list[str] | None, limit: int | None, joints: bool) -> list[Row]:
     """Evaluate the sequences of a folder."""
     from kinhec import load_manifest, load_sequence
     from kinhec.benchmark import SOLVERS, evaluate_sequence
 
     manifest = load_manifest(folder, tracks)
     if limit is not None:  # spread over the levels of each track
-        manifest = manifest[manifest.groupby("track").cumcount() % np.ceil(manifest.groupby("track")["track"].transform("size") / limit) == 0]
+        manifest = manifest[
+            manifest.groupby("track").cumcount() % np.ceil(manifest.groupby("track")["track"].transform("size") / limit)
+            == 0
+        ]
     rows = []
     for k, name in enumerate(manifest["sequence_id"]):
         sequence = load_sequence(folder, name, manifest)
         m = sequence.manifest
         row = Row(name, m["track"], m["level"], bool(m["axis_scatter_lambda2"] < DEGENERATE))
-        ours(sequence, row)
+        ours(sequence, row, joints)
         sync = "oracle" if sequence.synchronous else "estimated"
         for found in evaluate_sequence(sequence, list(SOLVERS), sync, np.random.default_rng(k)):
             if found["ok"]:
@@ -132,7 +148,7 @@ def summary(rows: list[Row]) -> list[str]:
     for track in tracks:
         of = [row for row in rows if row.track == track]
         done = [row for row in of if not row.refused]
-        names = sorted({name for row in done for name in row.peers})
+        names = sorted({name for row in done for name in row.peers}) or ["none"]
         peers = {n: [_median(r.peers.get(n, (np.inf, np.inf))[k] for r in done) for k in (0, 1)] for n in names}
         by_mm, by_deg = (min(peers, key=lambda n, k=k: peers[n][k]) for k in (0, 1))
         holds = np.mean([row.nees < chi2.ppf(0.95, 6) for row in done])
@@ -166,7 +182,9 @@ def generated(tier: str, seed: int, folder: Path) -> None:
     spec["global_seed"] = seed
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "tier.yaml").write_text(yaml.safe_dump(spec))
-    main(["generate", "--tier", str(folder / "tier.yaml"), "--out", str(folder), "--no-card", "--work-dir", str(folder)])
+    main(
+        ["generate", "--tier", str(folder / "tier.yaml"), "--out", str(folder), "--no-card", "--work-dir", str(folder)]
+    )
 
 
 def main() -> None:
@@ -175,6 +193,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=16180, help="another than KinHEC's own")
     parser.add_argument("--data", type=Path, help="sequences made before, in place of --tier and --seed")
     parser.add_argument("--tracks", nargs="*", help="only these")
+    parser.add_argument(
+        "--joints", action="store_true", help="armsight is given the joint angles and the nominal model too"
+    )
     parser.add_argument("--limit", type=int, help="the first so many of each track")
     parser.add_argument("-o", "--output", type=Path, help="write every sequence's figures, JSON")
     given = parser.parse_args()
@@ -182,7 +203,7 @@ def main() -> None:
         folder = given.data or Path(temporary)
         if given.data is None:
             generated(given.tier, given.seed, folder)
-        rows = evaluate(folder, given.tracks, given.limit)
+        rows = evaluate(folder, given.tracks, given.limit, given.joints)
     print("\n" + "\n".join(summary(rows)))
     if given.output is not None:
         given.output.write_text(json.dumps([asdict(row) for row in rows]))

@@ -118,6 +118,8 @@ def _ros(path, container, sent, compression):
     ros1 = container == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(TAGS_MSG, "apriltag_msgs/msg/AprilTagDetectionArray"))
+    if "tf2_msgs/msg/TFMessage" not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     if ros1:
         writer = Writer1(path.with_suffix(".bag"))
         if compression:
@@ -204,7 +206,7 @@ def _foxglove(path, sent):
     from google.protobuf.timestamp_pb2 import Timestamp
     from mcap_protobuf.writer import Writer
 
-    with path.open("wb") as file, Writer(file) as writer:
+    with path.open("wb") as file, Writer(file, chunk_size=100_000) as writer:
         for each in sent:
             seconds, nanos = divmod(each.stamp_ns, 1_000_000_000)
             stamp, what = Timestamp(seconds=seconds, nanos=nanos), each.content

@@ -82,7 +82,9 @@ ALL = [*EXACT, *IDENTIFIED, GENERAL]
 #: Four joints: turning base, two parallel axes, a wrist across them.
 FOUR = plain("four", [0.02, 0.3, 0.25, 0.0], [0.2, 0.03, 0.0, 0.1], [90, 0, 90, 0])
 #: A PUMA 560 whose third motor turns its forearm against the ground: J3' = J3 + J2.
-COUPLED = dataclasses.replace(MODELS["puma560"], name="coupled", coupling=np.eye(6) + np.eye(6)[2][:, None] * np.eye(6)[1])
+COUPLED = dataclasses.replace(
+    MODELS["puma560"], name="coupled", coupling=np.eye(6) + np.eye(6)[2][:, None] * np.eye(6)[1]
+)
 #: Arms of other than six joints.
 OTHERS = [arm for arm in MODELS.values() if arm.joints != 6]
 

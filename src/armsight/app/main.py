@@ -31,6 +31,9 @@ SECTIONS: dict[str, dict[str, str]] = {
         "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
         "handeye": "Calibrate hand and eye from your own data: robot poses, and images or poses of a target.",
         "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
+        "replay": "Measure and estimate again what was recorded, also with another rig, body, arm or estimator.",
+        "export": "Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.",
+        "batch": "Measure many recordings, on all cores or on a cluster; started again it goes on where it was.",
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
     "Operate an arm": {

@@ -284,9 +284,11 @@ class Arm(Record):
 
         Of six joints: all of up to eight, exact to rounding, where the table has a closed form (``kinematics.structure``
         says which do); else those that damped least squares finds from many starts. Of another number of joints: one
-        solution within the limits, the first that is found from ``near`` and then from other starts (``kinematics.numeric``).
-        Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and away from the limits. Fewer
-        than six reach few poses exactly: the position comes first, then the direction of the tool's z axis, then the rotation
+        solution within the limits, the first that is found from ``near`` and then from other starts
+        (``kinematics.numeric``).
+        Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and away from the limits.
+        Fewer than six reach few poses exactly: the position comes first, then the direction of the tool's z axis, then the
+        rotation
         about it; ``residual_rad`` says what is left. Nothing is raised for a pose out of reach or singular: the result says
         so.
 
@@ -357,7 +359,9 @@ class Arm(Record):
         """Return what of an orientation fewer than six joints leave, in words; None where nothing is left."""
         if angle < numeric.REACHED:
             return None
-        axis = f"the tool's z axis is off by {np.degrees(turn):.3g} deg" if turn > numeric.REACHED else "its z axis is met"
+        axis = (
+            f"the tool's z axis is off by {np.degrees(turn):.3g} deg" if turn > numeric.REACHED else "its z axis is met"
+        )
         return (
             f"orientation not met: {self.joints} joints bring the tool to the position; {axis}, the orientation is off by "
             f"{np.degrees(angle):.3g} deg in all"
@@ -376,7 +380,7 @@ class Arm(Record):
         return ManySolutions.of(reached.astype(np.int64), rows[:, None])
 
     def _goal(self, near: ArrayLike | None) -> Array:
-        """Return the angles (n,) of the joints that solutions shall be near to, rad: the middle of the limits by default."""
+        """Return the joints' angles (n,) that solutions shall be near to, rad: the middle of the limits by default."""
         if near is None:
             return np.asarray(self._limits.mean(axis=0))
         return np.asarray(self.coupling @ near_angles(near, self.joints))
@@ -392,7 +396,9 @@ class Arm(Record):
         if not len(found):
             nearest = found.nearest
             q = self._controller_angles(nearest.q if nearest else goal)
-            return Solutions(found.rows.copy(), found.reason, partial(self._there, T, np.clip(q, self.q_min, self.q_max)))
+            return Solutions(
+                found.rows.copy(), found.reason, partial(self._there, T, np.clip(q, self.q_min, self.q_max))
+            )
         rows, q = found.rows.copy(), self._controller_angles(found.q)
         # A revolution of a motor brings every joint to where it was only where the coupling consists of whole numbers.
         if np.array_equal(self.coupling, np.rint(self.coupling)):
@@ -407,7 +413,9 @@ class Arm(Record):
         if not outside.all():
             return Solutions(rows, found.reason if found.singular.any() else None)
         closest = np.clip(rows[0, :6], self.q_min, self.q_max)
-        return Solutions(rows, "outside limits: every solution has a joint beyond its limits", partial(self._there, T, closest))
+        return Solutions(
+            rows, "outside limits: every solution has a joint beyond its limits", partial(self._there, T, closest)
+        )
 
     @cached_property
     def _uncoupled(self) -> Arm:

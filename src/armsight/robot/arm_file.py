@@ -147,7 +147,9 @@ def joint_rows(path: str | Path, rows: object) -> list[dict[str, Any]]:
     """
     there = rows if isinstance(rows, list) and all(isinstance(row, dict) for row in rows) else []
     if not FEWEST_JOINTS <= len(there) <= MOST_JOINTS:
-        raise InputError(f"{path}: {FEWEST_JOINTS} to {MOST_JOINTS} [[joint]] tables are needed, there are {len(there)}")
+        raise InputError(
+            f"{path}: {FEWEST_JOINTS} to {MOST_JOINTS} [[joint]] tables are needed, there are {len(there)}"
+        )
     return there
 
 

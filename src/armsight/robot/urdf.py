@@ -102,11 +102,11 @@ def _joint(path: str | Path, element: ET.Element) -> _Joint:
         links.append(link)
     origin = element.find("origin")
     xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
-    T = pose(_rotation(rpy), xyz)
+    T = pose(rotation_of(rpy), xyz)
     return _Joint(name, kind, links[0], links[1], T, element)
 
 
-def _rotation(rpy: Array) -> Array:
+def rotation_of(rpy: Array) -> Array:
     """Return the rotation of URDF's roll, pitch, yaw, exact at multiples of 90 degrees."""
     (cx, cy, cz), (sx, sy, sz) = exact_cos_sin(rpy)
     Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1.0]])
@@ -167,7 +167,9 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
     revolute = [joint.name for joint in joints if joint.kind == "revolute"]
     if not FEWEST_JOINTS <= len(revolute) <= MOST_JOINTS:
         many = f"{len(revolute)} revolute joints ({', '.join(revolute)})"
-        raise InputError(f"{path}: {many}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}: say which link is the tool")
+        raise InputError(
+            f"{path}: {many}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}: say which link is the tool"
+        )
     whole = {link: chain for link, chain in ends.items() if _turning(chain) == len(revolute)}
     if not whole:
         raise InputError(
@@ -201,7 +203,9 @@ def _reject_others(path: str | Path, joints: list[_Joint]) -> None:
     unsupported = [j for j in joints if j.kind in _MOVING[1:] or j.element.find("mimic") is not None]
     if unsupported:
         named = ", ".join(f"{j.name!r} is {'a mimic' if j.kind == 'revolute' else j.kind}" for j in unsupported)
-        raise InputError(f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints are read here; {named}")
+        raise InputError(
+            f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints are read here; {named}"
+        )
 
 
 def _chain_to(path: str | Path, ends: dict[str, list[_Joint]], tool_link: str) -> list[_Joint]:
@@ -253,7 +257,11 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
     joints = len(revolute)
     home = np.zeros(joints) if extra is None else _written(f"{path}: <armsight>", extra, "home_rad", joints)
     matrix = extra is not None and extra.get("coupling") is not None
-    coupling = _written(f"{path}: <armsight>", extra, "coupling", joints**2) if extra is not None and matrix else np.eye(joints)
+    coupling = (
+        _written(f"{path}: <armsight>", extra, "coupling", joints**2)
+        if extra is not None and matrix
+        else np.eye(joints)
+    )
     try:
         arm = Arm(
             name=robot.get("name", "") or Path(path).stem,

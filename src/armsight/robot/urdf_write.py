@@ -144,7 +144,7 @@ def _origin(arm: Arm, i: int) -> tuple[Array, Array]:
         T = arm.T_base_0 if i == 0 else arm.T_flange_tool
         if i == 0 and arm.convention == "modified":
             T = T @ _step(0.0, 0.0, arm.a[0], arm.alpha[0])
-        return T[:3, 3], _roll_pitch_yaw(T[:3, :3])
+        return T[:3, 3], roll_pitch_yaw(T[:3, :3])
     a, alpha = (
         (arm.a, arm.alpha) if arm.convention == "standard" else (np.append(x[1:], 0.0) for x in (arm.a, arm.alpha))
     )
@@ -160,7 +160,7 @@ def _step(offset: float, d: float, a: float, alpha: float) -> Array:
     return pose(R, np.array([a * cz, a * sz, d]))
 
 
-def _roll_pitch_yaw(R: Array) -> Array:
+def roll_pitch_yaw(R: Array) -> Array:
     """Return URDF's roll, pitch, yaw, rad, of a rotation (3, 3): R = Rz(yaw) Ry(pitch) Rx(roll), at any pitch."""
     yaw = np.arctan2(R[1, 0], R[0, 0])
     s, c = np.sin(yaw), np.cos(yaw)

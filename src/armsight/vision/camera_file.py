@@ -67,9 +67,7 @@ def camera_of(path: str | Path, entry: Mapping[str, Any], name: str = "the camer
     except InputError as error:
         raise InputError(f"{path}: {name}: {error}") from None
     if abs(K[0, 1]) > 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
-        raise InputError(
-            f"{path}: {name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not modelled"
-        )
+        raise InputError(f"{path}: {name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not modelled")
     model = _MODELS.get(len(distortion))
     if str(entry.get("distortion_model", "")).startswith("fisheye"):
         model = "fisheye" if len(distortion) == 4 else None

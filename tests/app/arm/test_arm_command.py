@@ -150,7 +150,7 @@ def test_reach_is_what_no_pose_goes_beyond(name):
     arm = MODELS[name]
     extent = reach(arm)
     q = np.random.default_rng(99).uniform(arm.q_min, arm.q_max, (100_000, arm.joints))
-    p = arm.forward(q)[:, :3, 3]
+    p = arm.forward(q)[:, :3, 3] - [*arm.T_base_0[:2, 3], 0.0]
     seen = np.hypot(p[:, 0], p[:, 1]).max(), -p[:, 2].min(), p[:, 2].max()
     found = extent.radius_m, -extent.low_m, extent.high_m
     for far, most in zip(seen, found, strict=True):

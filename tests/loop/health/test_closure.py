@@ -1,16 +1,19 @@
 """Changes of rig, body and joints that a filter would follow: found by closure, named, sized; none where none is."""
 
+import faults
 import numpy as np
 import pytest
 from arm_rig import ARM
 
 from armsight.loop.estimators import Innovation, Outcome, Prior
-from armsight.loop.estimators.armerror import BACKLASH, FLOAT, POSE, SIZE, ZEROS
+from armsight.loop.estimators.armerror import layout
 from armsight.loop.estimators.errormodel import ErrorModel
 from armsight.loop.health.closure import ClosureWatch
+from armsight.loop.servo import Mode
 
 SHOT_S, AT_S, PRIOR = 0.1, 18.0, Prior()
 SHOT = np.repeat([1.5e-4, np.radians(0.02)], 3)
+PARTS = layout(6)
 COLUMNS = {"rig": slice(0, 6), "drift": slice(0, 6), "body": slice(36, 42)}
 
 
@@ -19,24 +22,24 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, gain=0.0):
     rng = np.random.default_rng(seed)
     watch = ClosureWatch(PRIOR.sigmas(0.0), ARM.joint_names)
     model = ErrorModel(ARM, PRIOR, 0.0)
-    x, delta = PRIOR.sigmas(0.0) * rng.normal(size=SIZE), np.zeros(SIZE)
+    x, delta = PRIOR.sigmas(0.0) * rng.normal(size=PARTS.size), np.zeros(PARTS.size)
     x[102:] = 0.0
     rates, phases = rng.uniform(0.1, 0.3, 6), rng.uniform(0.0, 2 * np.pi, 6)
-    kept = np.ones(SIZE)
-    kept[POSE:] = np.exp(-0.05)
+    kept = np.ones(PARTS.size)
+    kept[PARTS.pose:] = np.exp(-0.05)
     for k in range(round(seconds / SHOT_S)):
         t_s = k * SHOT_S
         angle = 2 * np.pi * rates * t_s + phases
         q = ARM.home + 0.5 * np.sin(angle)
         unseen = np.zeros((1, 3, 6))
         unseen[0, 0] = unseen[0, 1] = np.sign(np.cos(angle))
-        (T,), (H,) = model.poses(np.zeros((1, SIZE)), q[None], unseen)
+        (T,), (H,) = model.poses(np.zeros((1, PARTS.size)), q[None], unseen)
         e = H @ x + SHOT * rng.normal(size=6)
         if kind is not None and t_s >= AT_S:
             if kind == "backlash":
-                column = H[:, [BACKLASH + joint]] + H[:, [FLOAT + joint]]
+                column = 0.5 * (H[:, [PARTS.backlash + joint]] + H[:, [PARTS.floats + joint]])
             else:
-                column = H[:, COLUMNS.get(kind, [ZEROS[joint]])]
+                column = H[:, COLUMNS.get(kind, [PARTS.zeros[joint]])]
             e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
         delta *= kept
         z = e - H @ delta
@@ -62,9 +65,9 @@ SHIFT = np.array([6e-4, 0.0, 3e-4, 0.0, np.radians(0.03), 0.0])
         ("rig", SHIFT, 0, "fixed"),
         ("drift", SHIFT / 20.0, 0, "fixed"),
         ("body", 2.0 * SHIFT, 0, "body"),
-        ("joint", np.radians(0.3), 2, "joint"),
-        ("joint", np.radians(-0.3), 1, "joint"),
-        ("backlash", np.radians(0.25), 1, "joint"),
+        ("joint", np.radians(0.5), 2, "joint"),
+        ("joint", np.radians(-0.5), 1, "joint"),
+        ("backlash", np.radians(0.5), 1, "joint"),
     ],
 )
 @pytest.mark.parametrize("gain", [0.0, 0.1])
@@ -84,7 +87,7 @@ def test_a_change_is_named_sized_and_dated_though_a_filter_follows_it(kind, size
 
 
 def test_the_first_joint_looks_like_a_rotation_of_the_rig_about_its_axis():
-    (found,) = watched(12, "joint", np.radians(0.3), 0).findings()
+    (found,) = watched(12, "joint", np.radians(0.5), 0).findings()
     assert "or the rig rotated about the axis of this joint" in found.what
 
 
@@ -97,3 +100,13 @@ def test_sizes_scatter_as_their_covariance_says():
         off = change.size - SHIFT
         squares.append(off @ np.linalg.solve(change.cov, off))
     assert np.mean(squares) < 12.0
+
+
+def test_a_loop_on_a_rig_that_moved_is_no_worse_than_the_potentiometers(monkeypatch):
+    monkeypatch.setattr(faults, "LEARNED_S", 3.0)
+    monkeypatch.setattr(faults, "AT_S", 4.0)
+    alone = max(row[1] for row in faults.closed_loop(40, closes=False, seconds=9.0))
+    rows = faults.closed_loop(40, lambda t_s: np.array([0.01, 0.0, 0.0, 0.0, np.radians(0.8), 0.0]), seconds=9.0)
+    assert max(distance for t_s, distance, *_ in rows if t_s > 4.0) < 1.2 * alone
+    assert rows[-1][3] is Mode.DISTRUSTED
+    assert any(mode is Mode.VISION for *_, mode in rows)

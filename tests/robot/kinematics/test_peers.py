@@ -7,7 +7,6 @@ import numpy as np
 import peers
 import pytest
 
-
 models = pytest.mark.parametrize("arm", [*arms.CLOSED.values()], ids=[*arms.CLOSED])
 
 

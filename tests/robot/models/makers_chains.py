@@ -34,8 +34,8 @@ CHAINS = {
     "ur3e": ur(0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
     "ur5e": ur(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
     "ur10e": ur(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
-    # ycheng517/ar4_ros_driver, annin_ar4_description/urdf/ar_macro.xacro with ar_description/config/mk3.yaml; without the 7 mm
-    # by which joint 3 stands sideways there, which the maker's table does not have
+    # ycheng517/ar4_ros_driver, annin_ar4_description/urdf/ar_macro.xacro with ar_description/config/mk3.yaml; without the
+    # 7 mm by which joint 3 stands sideways there, which the maker's table does not have
     "ar4": [
         ((0, 0, 0), (pi, 0, 0), Z),
         ((0, 0.0642, -0.16977), (H, 0, -H), BACK),
@@ -45,7 +45,8 @@ CHAINS = {
         ((0, 0, 0.041), (0, 0, pi), Z),
         ((0, 0, 0), (0, 0, 0), None),
     ],
-    # TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf, up to gripperframe; without a pitch of 9e-8 in joint 5
+    # TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf, up to gripperframe; without a pitch of 9e-8 in joint
+    # 5
     "so101": [
         ((0.0207909, -0.0230745, 0.0948817), (-pi, 0, H), Z),
         ((-0.0303992, -0.0182778, -0.0542), (-H, -H, 0), Z),

@@ -12,7 +12,11 @@ pytest.importorskip("pinocchio")
 
 #: What stands otherwise there: our base in theirs, by which sign joints turn, their tool in ours. See the models' texts.
 STANDS = {
-    "ar4": (Rotation.from_euler("z", -90, degrees=True), [-1, 1, 1, 1, 1, 1], Rotation.from_euler("z", -90, degrees=True)),
+    "ar4": (
+        Rotation.from_euler("z", -90, degrees=True),
+        [-1, 1, 1, 1, 1, 1],
+        Rotation.from_euler("z", -90, degrees=True),
+    ),
     "so101": (Rotation.identity(), [1] * 5, Rotation.from_euler("x", -90, degrees=True)),
 }
 

@@ -18,6 +18,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm import Arm
+from armsight.robot.calibration_file import Difference
 from armsight.robot.reach import reach
 from armsight.robot.solutions import Solutions
 
@@ -190,6 +191,46 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
             + " ".join(_fixed(angle) for angle in np.degrees(nearest.q))
         )
     return "\n".join(lines)
+
+
+def difference_json(nominal: Arm, arm: Arm, found: Difference) -> dict[str, Any]:
+    """Return how far an arm puts its tool from where the nominal one does, and the changes of its table."""
+    changes = {name: getattr(found, name) for name in ("a_m", "d_m", "alpha_rad", "offset_rad")}
+    return {
+        "nominal": nominal.name,
+        "arm": arm.name,
+        "tool_apart_mean_m": found.mean_m,
+        "tool_apart_max_m": found.most_m,
+        "tool_rotated_mean_rad": found.mean_rad,
+        "tool_rotated_max_rad": found.most_rad,
+        "changes": {name: [None if np.isnan(v) else v for v in values.tolist()] for name, values in changes.items()},
+    }
+
+
+def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
+    """Return the same as lines."""
+    rows = [
+        (
+            nominal.joint_names[i],
+            *(_change(1e3 * x) for x in (found.a_m[i], found.d_m[i])),
+            *(_change(np.degrees(x)) for x in (found.alpha_rad[i], found.offset_rad[i])),
+        )
+        for i in range(nominal.joints)
+    ]
+    lines = [
+        f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, "
+        f"{1e3 * found.most_m:.3f} mm at most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, "
+        f"{np.degrees(found.most_rad):.3f} deg at most",
+        "(the same joint angles and base; poses all over the joint limits)",
+        *_table((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
+    ]
+    if np.isnan(found.a_m).any():
+        lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
+    return "\n".join(lines)
+
+
+def _change(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:+.4f}"
 
 
 def beyond(arm: Arm, q: Array) -> list[str]:

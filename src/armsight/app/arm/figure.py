@@ -36,7 +36,7 @@ def write_arm_figure(arm: Arm, path: Path) -> None:
 
 
 def skeleton(arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Return the arm as a line through its joints and links (K, 3), m, and its frames (n + 2, 4, 4), at joint angles (n,)."""
+    """Return the arm as a line through its joints and links (K, 3), m, and its frames (n + 2, 4, 4), at angles (n,)."""
     Ts = arm.links(q)
     points = [np.zeros(3), Ts[0, :3, 3]]
     for i in range(arm.joints):

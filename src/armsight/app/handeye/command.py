@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -49,15 +49,22 @@ class Options:
 @click.command("handeye")
 @click.option("--robot", required=True, metavar="POSES.csv", type=click.Path(path_type=Path), help="Poses or joints.")
 @click.option(
-    "--eye", required=True, type=click.Choice(["in-hand", "to-hand"]), help="Does the arm carry the camera, or the target?"
+    "--eye",
+    required=True,
+    type=click.Choice(["in-hand", "to-hand"]),
+    help="Does the arm carry the camera, or the target?",
 )
 @click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
 @click.option(
-    "--rotation", metavar="CONVENTION", help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ..."
+    "--rotation",
+    metavar="CONVENTION",
+    help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ...",
 )
 @click.option("--units", type=click.Choice(["m", "mm"]), help="Of lengths whose columns do not name a unit.")
 @click.option("--columns", metavar="NAME=COLUMN,...", help="Names of columns in your table, such as x_mm=X,rx_deg=A.")
-@click.option("--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera.")
+@click.option(
+    "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
+)
 @click.option("--seen-rotation", metavar="CONVENTION", help="The same for the target's table.")
 @click.option("--seen-units", type=click.Choice(["m", "mm"]), help="The same for the target's table.")
 @click.option("--images", metavar="GLOB", help="Images of one camera; quote the glob.")
@@ -70,7 +77,9 @@ class Options:
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
 @click.option("--detect-units", is_flag=True, help="Take lengths that cannot be metres for millimetres, and say so.")
 @click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files.")
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def command(**given: object) -> None:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
@@ -115,11 +124,13 @@ def _require_one_way(options: Options) -> None:
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
-        "--rig with --left and --right": options.rig is not None or options.left is not None or options.right is not None,
+        "--rig with --left and --right": options.rig is not None
+        or options.left is not None
+        or options.right is not None,
     }
     if sum(ways.values()) != 1:
         raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
-    if options.images is None and options.camera is not None or options.images is not None and options.camera is None:
+    if (options.images is None) != (options.camera is None):
         raise InputError("--images and --camera belong together: --camera CAMERA.json, or --camera fit")
     if ways["--rig with --left and --right"] and None in (options.rig, options.left, options.right):
         raise InputError("--rig, --left and --right belong together")
@@ -137,7 +148,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
     """
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.read import read_pose_table
-    from armsight.app.handeye.recording import paired
+    from armsight.app.handeye.recording import links_of, paired
     from armsight.app.handeye.result import HandEyeRun
     from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.structured import calibrate_structured
@@ -159,7 +170,10 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
     recording = paired(robot, seen, options.eye == "in-hand", arm)
     progress("looking at whether both sides fit")
     recording = require_plausible(recording, arm, detect_units=options.detect_units)
-    found = calibrate_structured(recording.poses, t_s=recording.t_s, scale=options.scale, progress=progress)
+    links = None if arm is None else links_of(recording, arm)
+    found = calibrate_structured(
+        recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress
+    )
     progress("choosing poses")
     plan = plan_poses(found, recording.poses, options.plan) if options.plan else None
     return HandEyeRun(recording, found, None, 0.0, plan)
@@ -193,10 +207,11 @@ def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[
     for path, t_s in ((options.robot, robot.t_s), (options.seen, seen.t_s)):
         if t_s is None:
             raise InputError(f"{path}: line 1: --streams needs a column t_s, seconds")
-    assert robot.t_s is not None and seen.t_s is not None
+    assert robot.t_s is not None
+    assert seen.t_s is not None
     hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
     eye_stream = PoseStream.of(seen.t_s, seen.Ts, str(options.seen))
-    eye = "in_hand" if options.eye == "in-hand" else "to_hand"
+    eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
     found = calibrate_structured_streams(
         hand, eye_stream, eye=eye, centre=seen.centre, scale=options.scale, progress=progress
     )

@@ -100,7 +100,7 @@ def see_with_camera(
     if camera is None and size is not None:
         camera = fit_camera(found, detections, size)
         notes = (
-            f"the camera was calibrated from these images: fx {camera.intrinsics[0]:.1f} px; a calibration of its own, from "
+            f"the camera was calibrated from these images: fx {camera.intrinsics[0]:.1f} px; one of its own, from "
             "tilted views of a large board, would be independent of the arm",
         )
     assert camera is not None
@@ -124,7 +124,9 @@ def read_camera(path: Path) -> Camera:
         except json.JSONDecodeError as error:
             raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
         if not isinstance(document, dict) or "K" not in document:
-            raise InputError(f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera')
+            raise InputError(
+                f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera'
+            )
         return camera_of(path, document)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{path}: a camera is a .json, .yaml or .yml file, or fit (from the images themselves)")
@@ -162,8 +164,8 @@ def fit_camera(target: Target, detections: Sequence[Detections], size: tuple[int
     if len(seen) < MIN_IMAGES:
         raise InputError(f"the target was found in {len(seen)} images; {MIN_IMAGES} are needed to calibrate the camera")
     points = [np.asarray(target.body.points[d.ids], np.float32) for d in seen]
-    _, K, k, _, _ = cv2.calibrateCamera(points, [d.uv.astype(np.float32) for d in seen], size, None, None)  # type: ignore[call-overload]
-    return Camera(size, "brown5", np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), k.ravel()[:5])
+    _, K, k, _, _ = cv2.calibrateCamera(points, [d.uv.astype(np.float32) for d in seen], size, None, None)
+    return Camera(size, "brown5", np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), np.asarray(k, np.float64).ravel()[:5])
 
 
 def _posed(

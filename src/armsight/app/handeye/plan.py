@@ -54,7 +54,7 @@ def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0
     rng = np.random.default_rng(seed)
     A, B = _candidates(found, poses.rows(found.used), rng)
     candidates = Poses(A, B, np.zeros((len(A), 6, 6)), poses.in_hand, poses.centre)
-    e, J, carry = residuals(candidates, found.T_base_still, found.T_flange_held)
+    _, J, carry = residuals(candidates, found.T_base_still, found.T_flange_held)
     maps = error_maps(candidates, carry, None)
     C = np.mean(poses.cov, axis=0) + np.zeros((len(A), 6, 6))
     for name in STRUCTURES[found.structure]:

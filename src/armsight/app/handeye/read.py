@@ -157,7 +157,7 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     if len(head) not in forms:
         raise InputError(
             f"{path}: line {rows[0][0]}: {len(head)} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
-            "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name the columns"
+            "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
     return forms[len(head)], _even(path, rows, len(head))
 
@@ -166,7 +166,9 @@ def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tup
     """Return the rows if all have as many fields as there are columns."""
     for line, row in rows:
         if len(row) != count:
-            raise InputError(f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line")
+            raise InputError(
+                f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line"
+            )
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     return rows
@@ -210,7 +212,7 @@ class _Columns:
         """Return joint angles (N, J), rad."""
         if arm is not None and len(names) != len(arm.joint_names):
             raise InputError(
-                f"{self.path}: line 1: {len(names)} joints ({names[0]} .. {names[-1]}); {arm.name} has {len(arm.joint_names)}"
+                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has {len(arm.joint_names)}"
             )
         q = self.numbers(names)
         return np.radians(q) if names[0].endswith("_deg") else q
@@ -272,11 +274,13 @@ class _Columns:
             off, turn = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
             if off < LOOSE and turn < 0:
                 raise InputError(
-                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot and "
-                    "camera poses are right-handed: exchange no axes without a sign"
+                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
+                    "and camera poses are right-handed: exchange no axes without a sign"
                 )
             if off >= LOOSE:
-                raise InputError(f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})")
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})"
+                )
         return np.asarray([nearest_rotation(one) for one in R])
 
 
@@ -326,5 +330,9 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
                 f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
                 "give --units m, or --detect-units"
             )
-        return p, 1.0, (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",)
+        return (
+            p,
+            1.0,
+            (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
+        )
     return unit_m * p, unit_m, ()

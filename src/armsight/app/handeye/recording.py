@@ -76,7 +76,9 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Reco
     if seen.symmetries:
         B, turned = upright(A, B, seen.symmetries, in_hand)
         if (turned >= 0).any():
-            notes.append(f"the board looks the same turned: {int((turned >= 0).sum())} of {len(B)} were turned to agree")
+            notes.append(
+                f"the board looks the same turned: {int((turned >= 0).sum())} of {len(B)} were turned to agree"
+            )
     both_clocks = robot.t_s is not None and seen.t_s is not None
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
     names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
@@ -88,8 +90,13 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Reco
 def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the rows of both sides that belong together."""
     if robot.names is not None:
-        there = {name: k for k, name in enumerate(seen.names)} | {Path(name).stem: k for k, name in enumerate(seen.names)}
-        keys = [next((key for key in (name, Path(name).name, Path(name).stem) if key in there), None) for name in robot.names]
+        there = {name: k for k, name in enumerate(seen.names)} | {
+            Path(name).stem: k for k, name in enumerate(seen.names)
+        }
+        keys = [
+            next((key for key in (name, Path(name).name, Path(name).stem) if key in there), None)
+            for name in robot.names
+        ]
         found = [(r, there[key]) for r, key in enumerate(keys) if key is not None]
         if not found:
             raise InputError(
@@ -99,7 +106,7 @@ def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[n
         return rows, matched
     if len(robot.Ts) != len(seen.Ts):
         raise InputError(
-            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give the table a column "
+            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give it a column "
             "image (or name), or t_s on both sides and --streams, so that they can be told apart"
         )
     return np.arange(len(robot.Ts)), np.arange(len(seen.Ts))
@@ -112,22 +119,35 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     offset = inverse(np.asarray(arm.forward(robot.q))) @ robot.Ts
     mean = mean_pose(offset)
     left = log_se3(inverse(mean) @ offset)
-    if np.median(np.linalg.norm(left[:, :3], axis=1)) > TCP_M or np.median(np.linalg.norm(left[:, 3:], axis=1)) > TCP_RAD:
-        return [f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"]
+    if (
+        np.median(np.linalg.norm(left[:, :3], axis=1)) > TCP_M
+        or np.median(np.linalg.norm(left[:, 3:], axis=1)) > TCP_RAD
+    ):
+        return [
+            f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"
+        ]
     p = 1e3 * mean[:3, 3]
     turn = float(np.degrees(np.linalg.norm(log_se3(mean)[3:])))
     if np.linalg.norm(p) < 1.0 and turn < 0.5:
         return []
     return [
-        f"{robot.path}: its poses are those of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
+        f"{robot.path}: its poses are of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
         f"of {arm.name}: the transform found is from this TCP, not from the flange"
     ]
 
 
+def links_of(recording: Recording, arm: Arm) -> Array | None:
+    """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
+    if recording.robot.q is None:
+        return None
+    frames = np.array([arm.links(q) for q in recording.robot.q[recording.rows]])
+    return np.asarray(inverse(frames) @ frames[:, -1:])
+
 
 def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> Recording:
     """Return the rows of two streams that were calibrated; the flange's poses are interpolated."""
-    assert robot.t_s is not None and seen.t_s is not None
+    assert robot.t_s is not None
+    assert seen.t_s is not None
     rows = np.clip(np.searchsorted(robot.t_s, found.t_s + found.offset_s), 0, len(robot.t_s) - 1)
     matched = np.searchsorted(seen.t_s, found.t_s)
     poses = Poses(found.A, found.B, np.zeros((len(found.A), 6, 6)), found.handeye.eye == "in_hand", seen.centre)

@@ -93,9 +93,13 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
     "errors": (
         errors_figure,
         "Errors on poses left out",
-        "Each pose was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
+        "Each was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
     ),
-    "sigma": (sigma_figure, "How well the transforms are known", "A bar that stands out is the direction to rotate more in."),
+    "sigma": (
+        sigma_figure,
+        "How well the transforms are known",
+        "A bar that stands out is the direction to rotate more in.",
+    ),
     "structure": (
         structure_figure,
         "Whose error it is",
@@ -105,7 +109,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
     "coverage": (
         coverage_figure,
         "Motion and views",
-        "Good: the rotations spread in both colours, by 20 degrees and more; points on a line are rotations about one axis.",
+        "Good: rotations spread in both colours, by 20 degrees and more; points on a line are rotations about one axis.",
     ),
 }
 

@@ -118,7 +118,7 @@ def text(run: HandEyeRun) -> str:
         )
     if found.sigma_scale:
         lines.append(
-            f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of what was given: correct --target's size"
+            f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
         )
     out = blunders(run)
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]

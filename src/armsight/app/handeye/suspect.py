@@ -21,8 +21,9 @@ from armsight.app.handeye.read import CONVENTIONS, rotations_by, stacked
 from armsight.app.handeye.recording import Recording
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.geometry.pose import log_se3
+from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
+from armsight.loop.handeye.structured import scale_between
 from armsight.robot.arm import Arm
 
 #: Data whose median residual is below this, m, are taken as they are.
@@ -32,7 +33,11 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 #: Poses that a reading is judged by at most, and the rows by which poses are looked for against the images.
 JUDGED, SHIFTS = 60, (1, -1, 2, -2)
 #: Scales that mistaken units make: mm for m, cm, inches.
-UNITS = {1000.0: "millimetres taken for metres", 100.0: "centimetres taken for metres", 39.37: "inches taken for metres"}
+UNITS = {
+    1000.0: "millimetres taken for metres",
+    100.0: "centimetres taken for metres",
+    39.37: "inches taken for metres",
+}
 
 
 def misfit(poses: Poses) -> float:
@@ -49,7 +54,7 @@ def misfit(poses: Poses) -> float:
 
 def _angles(Ts: Array) -> Array:
     """Return the angles between neighbouring poses, rad."""
-    return np.asarray(np.linalg.norm(log_se3(np.linalg.inv(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
+    return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
 
 
 def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
@@ -84,7 +89,9 @@ def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bo
         if detect_units and converted is not None:
             note = f"{advice.partition(':')[0]}; converted"
             return replace(recording, poses=converted, notes=(*recording.notes, note))
-        raise InputError(f"{recording.robot.path}: {advice} (median residual {1e3 * best:.1f} mm; as given {1e3 * as_given:.1f})")
+        raise InputError(
+            f"{recording.robot.path}: {advice} (median residual {1e3 * best:.1f} mm; as given {1e3 * as_given:.1f})"
+        )
     return recording
 
 
@@ -94,7 +101,9 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
     n = len(p.A)
     for shift in SHIFTS:
         if n - abs(shift) >= 6:
-            first, second = (slice(shift, None), slice(None, -shift)) if shift > 0 else (slice(None, shift), slice(-shift, None))
+            first, second = (
+                (slice(shift, None), slice(None, -shift)) if shift > 0 else (slice(None, shift), slice(-shift, None))
+            )
             rows = np.arange(n)
             yield (
                 replace(p.rows(rows[second]), A=p.A[first]),
@@ -109,6 +118,13 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
     yield from _scaled(p)
+    scale = scale_between(p)
+    B = p.B.copy()
+    B[:, :3, 3] *= scale
+    yield (
+        replace(p, B=B),
+        f"the target seems to be {scale:.3g} times as large as given: is the size of --target right? --scale fits it",
+    )
     table = recording.robot
     if table.convention:
         position = p.A[:, :3, 3]
@@ -117,10 +133,16 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
             if convention == table.convention or width != table.numbers.shape[1]:
                 continue
             R = rotations_by(table.numbers[recording.rows], convention, table.path)
-            yield replace(p, A=stacked(R, position)), f"the rotations are {convention}, not {table.convention}: --rotation {convention}"
+            yield (
+                replace(p, A=stacked(R, position)),
+                f"the rotations are {convention}, not {table.convention}: --rotation {convention}",
+            )
         if table.numbers.shape[1] == 3:
             R = rotations_by(np.degrees(table.numbers[recording.rows]), table.convention, table.path)
-            yield replace(p, A=stacked(R, position)), "the rotations are in radians, not degrees: name the columns rx_rad ry_rad rz_rad"
+            yield (
+                replace(p, A=stacked(R, position)),
+                "the rotations are in radians, not degrees: name the columns rx_rad ry_rad rz_rad",
+            )
     if arm is not None and table.q is not None and table.numbers.shape[1] == 0:
         yield from _joints(p, arm, table.q[recording.rows])
 
@@ -128,7 +150,10 @@ def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, st
 def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
     """Yield readings of the target's lengths in other units."""
     for factor, said in UNITS.items():
-        for scale, whose in ((factor, f"the robot's lengths are {said}"), (1 / factor, f"the target's lengths are {said}")):
+        for scale, whose in (
+            (factor, f"the robot's lengths are {said}"),
+            (1 / factor, f"the target's lengths are {said}"),
+        ):
             B = p.B.copy()
             B[:, :3, 3] *= scale
             A = p.A.copy()
@@ -142,7 +167,7 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
     n = q.shape[1]
     rows = np.linspace(0, len(q) - 1, min(JUDGED, len(q))).round().astype(np.int64)
-    seen = _angles(p.B[rows] if not p.in_hand else np.linalg.inv(p.B[rows]))
+    seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
     orders: list[tuple[int, ...]] = [
         tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
     ]
@@ -153,6 +178,9 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     for order in orders:
         turned = _angles(np.asarray(arm.forward(q[rows][:, order])))
         scored.append((float(np.median(np.abs(turned - seen))), np.array(order)))
-    for _, order in sorted(scored, key=lambda one: one[0])[:3]:
-        named = ", ".join(f"q{k + 1}" for k in order)
-        yield replace(p, A=np.asarray(arm.forward(q[:, order]))), f"the joints are in another order: {arm.name}'s are {named} here"
+    for _, at in sorted(scored, key=lambda one: one[0])[:3]:
+        named = ", ".join(f"q{k + 1}" for k in at)
+        yield (
+            replace(p, A=np.asarray(arm.forward(q[:, at]))),
+            f"the joints are in another order: {arm.name}'s are {named} here",
+        )

@@ -35,7 +35,7 @@ from armsight.files import read_text, write_text
 from armsight.loop.estimators import Mounting
 from armsight.robot.arm import Arm
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command
+from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.opening import open_board
 from armsight.vision.follow.follower import follows
 from armsight.vision.markers.targets import Composite, open_target
@@ -102,7 +102,7 @@ class ArmState:
         running: what is being done; None while nothing is.
         phase: calibration, open_loop, closed_loop, rest; empty while nothing runs.
         motion: name of the motion.
-        error_mm: (time, s; distance of the tool that vision measures from the reference, mm; whether the loop is closed).
+        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is closed).
         handeye: the hand-eye calibration in words.
         results: the results of the last run, line by line.
         folder: of the last run.
@@ -431,24 +431,24 @@ class ArmStep:
         if len(loop.log.poses) == self._seen:
             return
         self._seen = len(loop.log.poses)
-        name, t_s, result = loop.log.poses[-1]
+        name, _, result = loop.log.poses[-1]
         newest = self._capture.newest
         if newest is not None and newest.shot.name == name:
             self._measuring.take(newest, result)
         if isinstance(result, PoseEstimate) and loop.mounting is not None:
             self._mounting = loop.mounting
-            self._note_error(loop, result, t_s)
+            self._note_error(loop)
 
-    def _note_error(self, loop: Loop, pose: PoseEstimate, t_s: float) -> None:
-        """Append the distance of the tool from its reference to the chart."""
-        segment, mounting = loop.segment, loop.mounting
-        if segment is None or segment.trajectory is None or mounting is None or t_s < segment.begin_s:
+    def _note_error(self, loop: Loop) -> None:
+        """Append the distance of the tool, as the loop estimates it now, from its reference to the chart."""
+        segment, now = loop.segment, loop.log.live[-1]
+        if segment is None or segment.trajectory is None or segment.phase == "calibration":
             return
         way = segment.trajectory
-        since = way.duration_s if segment.phase == "rest" else t_s - segment.begin_s
+        since = way.duration_s if segment.phase == "rest" else now.t_s - segment.begin_s
         reference = self.options.arm.forward(way.at(since).q)
-        tool = mounting.pose_measurement(pose, t_s).T_base_tool
-        self._chart.append((t_s, 1e3 * float(np.linalg.norm(tool[:3, 3] - reference[:3, 3])), segment.closed))
+        away = now.T_base_tool[:3, 3] - reference[:3, 3]
+        self._chart.append((now.t_s, 1e3 * float(np.linalg.norm(away)), segment.closed))
 
     def _take(self, outcome: RunResult) -> None:
         """Take in what a run found."""
@@ -463,7 +463,7 @@ class ArmStep:
             errors = [e for _, e, c in self._chart if c is closed]
             if errors:
                 rms = float(np.sqrt(np.mean(np.square(errors))))
-                lines.append(f"{name}: {rms:.2f} mm RMS from the reference, as vision measures, {len(errors)} shots")
+                lines.append(f"{name}: {rms:.2f} mm RMS from the reference, as the loop estimates at {len(errors)} shots")
         if len(outcome.log.latency_s):
             p50, p99 = 1e3 * np.percentile(outcome.log.latency_s, (50, 99))
             lines.append(f"image to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
@@ -492,14 +492,17 @@ class ArmStep:
         status, q = board.status, self._q
         segment = None if loop is None else loop.segment
         vision, scene = self._vision(q)
+        state, faults = STATE_TEXTS[status.state], tuple(str(fault) for fault in status.faults)
+        if status.state is BoardState.HOLDING and all(each.fault is Fault.HOST_SILENT for each in status.faults):
+            state, faults = "held at rest by the board since the last motion", ()
         return ArmState(
             options.arm.name,
             board.welcome.board,
             self._lacking(),
-            STATE_TEXTS[status.state],
+            state,
             status.drives_on,
             status.state is BoardState.STOPPED,
-            tuple(str(fault) for fault in status.faults),
+            faults,
             () if q is None else tuple(float(x) for x in np.degrees(q)),
             vision,
             self._running,

@@ -43,7 +43,7 @@ STILL_PX, STILL_S, STILL_DETECTIONS = 0.8, 0.3, 3
 _SHARP_SHOT_PX = 1.7 * SHARP_PX
 #: A pose is taken if it lowers the predicted error by this share of what the best one would, and if the board's corners are
 #: on average by such a share of its size elsewhere than in every shot before.
-_WORTH, _OTHER_SHARE = 0.5, 0.1
+_WORTH, _OTHER_SHARE = 0.5, 0.06
 #: A person who has stood still for the first time, s, has done what is possible: then this share is enough; after the second
 #: another pose is chosen.
 _PATIENT_S, _PATIENT_WORTH, _OTHER_POSE_S = 3.0, 0.15, 6.0
@@ -176,6 +176,7 @@ class CalibrationStep:
         self._writer: ShotFolder | None = None
         self._state = CalibrationState(spec, aim_mm=1e3 * aim.error_m, distance_m=aim.distance_m)
         self._running, self._fitting, self._again, self._forced = False, None, False, False
+        self._first = 0  # number of the pose before the first fit
         self._must_move, self._rest_s = False, 0.0  # since when the board has not moved on, s
         self._instruction, self._edge_px, self._rig_path = "", None, None
         self._progress: list[Progress] = []
@@ -382,13 +383,17 @@ class CalibrationStep:
         if self._knowledge is not None and self._rig is not None:
             self._next = self._guide.best(self._knowledge, self._rig)
             self._missing_shots = self._guide.shots_missing(self._knowledge, self._rig, self.aim)
+        elif seen is None and self._rig is not None:
+            self._first += 1
+            self._next = self._guide.first(self._first, self._rig)
         elif seen is not None and self._sizes is not None:
             points = self.board.body.points
             cameras = [guessed_camera(size) for size in self._sizes]
             poses = [body_poses(points[d.ids], c, d.uv) for c, d in zip(cameras, (seen.left, seen.right), strict=True)]
             if all(poses):
                 self._rig = guessed_rig(self._sizes, poses[0][0][0] @ inverse(poses[1][0][0]))
-                self._next = self._guide.first(len(self._shots), self._rig)
+                self._first += 1
+                self._next = self._guide.first(self._first, self._rig)
 
     def _fit_soon(self) -> None:
         """Fit all shots in the background, if there are enough; once more afterwards if shots came meanwhile."""

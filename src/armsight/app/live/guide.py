@@ -27,7 +27,7 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
 #: Candidates of one choice, and how they are sampled: share of the image's height that the board takes, tilt, roll.
-CANDIDATES = 120
+CANDIDATES = 80
 _FILL, _TILT_RAD, _ROLL_RAD = (0.35, 1.05), np.radians(42.0), np.radians(20.0)
 #: A board is read up to this angle between its normal and the line of sight, and this far from the image's border, px.
 _SLANT_COS, _MARGIN_PX = np.cos(np.radians(60.0)), 6.0

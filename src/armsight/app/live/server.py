@@ -54,6 +54,7 @@ _JPEG, _SIDE_PX = 72, 1280
 SILENT_S = 1.5
 #: Longest message from a page, bytes; so many malformed ones end its connection.
 _LONGEST, _MALFORMED = 8192, 200
+_MALFORMED_BEGIN = ("a command ", "no command ")
 _HEADER = struct.Struct("<BI")
 _CSP = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src blob: data:; "
@@ -96,7 +97,7 @@ class LiveServer:
         self._clients: dict[int, _Client] = {}
         self._commander: int | None = None
         self._number = 0
-        self._loop = asyncio.new_event_loop()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._work, self._stops = ThreadPoolExecutor(3, "serve"), ThreadPoolExecutor(2, "stop")
         self._page = importlib.resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
         self._jpeg: list[tuple[int, bytes]] = [(0, b""), (0, b"")]
@@ -127,24 +128,22 @@ class LiveServer:
 
     def close(self) -> None:
         """End all connections and the thread."""
-        if self._thread.is_alive() and self._ended is not None:
+        if self._thread.is_alive() and self._ended is not None and self._loop is not None:
             self._loop.call_soon_threadsafe(self._ended.set)
             self._thread.join(5.0)
         self._work.shutdown(wait=False, cancel_futures=True)
         self._stops.shutdown(wait=False)
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._serve())
+            asyncio.run(self._serve())
         finally:
             self._ready.set()
-            self._loop.close()
 
     async def _serve(self) -> None:
         from websockets.asyncio.server import serve
 
-        self._ended = asyncio.Event()
+        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
         self._encoding = [asyncio.Lock(), asyncio.Lock()]
         try:
             server = await serve(
@@ -227,7 +226,7 @@ class LiveServer:
         """Answer stops, and the question whether this socket is alive."""
         async for message in socket:
             if message == "stop":
-                answer = await self._loop.run_in_executor(self._stops, self.session.stop)
+                answer = await asyncio.get_running_loop().run_in_executor(self._stops, self.session.stop)
                 await socket.send(json.dumps(json_of(answer)))
             elif message == "alive":
                 await socket.send("alive")
@@ -278,7 +277,7 @@ class LiveServer:
         """Take a message of a page; False ends its connection."""
         try:
             if isinstance(message, bytes):
-                raise InputError("a message of a page is text")
+                raise InputError("a command is text")
             if message == "alive":
                 return True
             if not message.startswith('{"command"'):
@@ -287,11 +286,11 @@ class LiveServer:
             command = command_of(message)
             if client.number != self._commander:
                 raise InputError("another page commands: this one looks on, and can stop; or take over")
-            await self._loop.run_in_executor(self._work, self.session.execute, command)
+            await asyncio.get_running_loop().run_in_executor(self._work, self.session.execute, command)
         except ArmsightError as error:
-            client.malformed += isinstance(error, InputError) and "command" in str(error)[:40]
+            client.malformed += isinstance(error, InputError) and str(error).startswith(_MALFORMED_BEGIN)
             if client.malformed > _MALFORMED:
-                await client.socket.close(1008, "too many malformed messages")
+                client.socket.transport.abort()
                 return False
             self._send(client, {"rejected": str(error)})
         return True
@@ -348,7 +347,7 @@ class LiveServer:
         async with self._encoding[side]:
             number, data = self._jpeg[side]
             if number != live.number:
-                data = await self._loop.run_in_executor(self._work, _jpeg, live, side)
+                data = await asyncio.get_running_loop().run_in_executor(self._work, _jpeg, live, side)
                 self._jpeg[side] = (live.number, data)
         return data
 
@@ -359,7 +358,7 @@ class LiveServer:
             if not self._clients:
                 continue
             try:
-                texts = await self._loop.run_in_executor(self._work, self._texts)
+                texts = await asyncio.get_running_loop().run_in_executor(self._work, self._texts)
             except ArmsightError as error:
                 self.session.say(Note("error", str(error)))
                 continue

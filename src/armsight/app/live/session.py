@@ -216,7 +216,7 @@ class Session:
         arm = open_arm(options.arm)
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
-        self.measuring = MeasureStep(self.folder, self.source, self.say)
+        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
         self.capture = Capture(self._open)
         self.calibration = self._calibration(spec, Aim())
         self.body = BodyStep(self.folder, self.say)
@@ -580,7 +580,7 @@ class Session:
             finding,
             self.capture.swapped,
             ACTIONS if self._simulated is not None else (),
-            f"armsight record {self.source or 'usb:LEFT,RIGHT'} -o shots",
+            "armsight demo" if self._simulated is not None else f"armsight record {self.source or 'usb:LEFT,RIGHT'} -o shots",
         )
 
     def _board(self) -> BoardChoice:

@@ -149,7 +149,10 @@ class SimulatedCameras:
             if self.person.holds:
                 time.sleep(max(0.0, self._due_s - time.monotonic()))
                 continue
+            time.sleep(max(0.0, self._due_s - time.monotonic()))
+            self._due_s = max(time.monotonic(), self._due_s + self.period_s)
             waited = self.workcell.source.read()
+            self.workcell.board.receive()  # what the board said meanwhile must not pile up
             return None if waited is None else self.seen(waited)
         return shot
 

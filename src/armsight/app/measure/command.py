@@ -40,6 +40,12 @@ from armsight.errors import InputError
     help="Write the rig with the skew and readout found.",
 )
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+)
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(
@@ -53,6 +59,7 @@ def command(
     readout: str | None,
     save_rig: Path | None,
     output: Path | None,
+    stream: tuple[str, ...],
     view_dir: Path | None,
     as_json: bool,
 ) -> None:
@@ -84,6 +91,7 @@ def command(
         readout=readout,
         save_rig=save_rig,
         output=output,
+        streams=stream,
         view_dir=view_dir,
         as_json=as_json,
     )

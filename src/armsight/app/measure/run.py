@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,8 @@ from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
+from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
@@ -35,11 +37,14 @@ from armsight.vision.sources import PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.bag import BagSource
 from armsight.vision.sources.bag.camera_info import open_rig
 from armsight.vision.sources.bag.tags import read_tags
+from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource
 from armsight.vision.sources.video import VideoSource
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
+#: A shot that is younger by its own stamp was stamped by a live camera, s.
+_LIVE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,7 @@ def measure_shots(
     readout: str | None,
     save_rig: Path | None,
     output: Path | None,
+    streams: Sequence[str],
     view_dir: Path | None,
     as_json: bool,
 ) -> tuple[HealthFinding, ...]:
@@ -83,6 +89,7 @@ def measure_shots(
         readout: time from the first row to the last, with its unit, or ``find``.
         save_rig: file for the rig with the skew and readout that were found or given.
         output: CSV file of the poses.
+        streams: what to publish each pose to.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
 
@@ -146,8 +153,9 @@ def measure_shots(
         if output is not None:
             stack.callback(_write, output, records)
         monitor = HealthMonitor(stereo, body, _SYNC_S)
+        publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(results, total, body, records, as_json, view, monitor)
+            _run(results, total, body, records, as_json, view, monitor, publisher)
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
@@ -192,11 +200,26 @@ def _say(notes: Iterable[str]) -> None:
         click.echo(f"note: {note}", err=True)
 
 
+def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
+    """Open the streams of the command line."""
+    if not specs:
+        return Fanout()
+    from armsight.app.stream.streams import open_streams
+
+    return open_streams(specs, Published(rig, body), lambda line: click.echo(line, err=True))
+
+
+def _arrival_s(shot: Shot) -> float | None:
+    """Return the time by the clock of live cameras, s; None where the shot is of a recording."""
+    now = time.monotonic()
+    return now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
+
+
 def _timed(source: Source) -> bool:
     """Whether a source is a recording whose shots have times."""
     if isinstance(source, StoredSource):
         return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource | BagSource)
+    return isinstance(source, VideoSource | BagSource | LeRobotSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
@@ -256,6 +279,7 @@ def _run(
     as_json: bool,
     view: PictureFolder | None,
     monitor: HealthMonitor,
+    publisher: Publisher,
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
@@ -265,6 +289,7 @@ def _run(
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
             records.append(record)
+            publisher.put(ShotDatum(shot, result, _arrival_s(shot)))
             click.echo(json.dumps(record.to_json()) if as_json else _line(record))
             if view is not None:
                 view.add(shot, result, record)

@@ -36,6 +36,7 @@ def command(
       video:LEFT.mp4,RIGHT.mp4            or one side-by-side file
       folder:DIR                          or just DIR
       bag:FILE[,left=TOPIC,right=TOPIC]   a ROS or Foxglove recording
+      lerobot:DIR[,left=KEY,right=KEY]    a LeRobot dataset
 
     Beside the images the folder has run.mcap, which Foxglove, Lichtblick and rerun open. Ctrl-C stops the recording; what
     was stored until then is complete and readable.

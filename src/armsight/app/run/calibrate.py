@@ -61,13 +61,13 @@ def calibrated(target_spec: str, shots: Iterable[Shot], progress: Progress) -> C
 
 
 def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
-    """Sample joint angles (count, 6), rad, that show the body from many sides, near given ones at which it is in view.
+    """Sample joint angles (count, n), rad, that show the body from many sides, near given ones at which it is in view.
 
     They are in the order of a short way: from the first of ``around`` always on to the nearest.
 
     Args:
         arm: the nominal arm.
-        around: (M, 6) joint angles at which the body is in view, rad.
+        around: (M, n) joint angles at which the body is in view, rad.
         count: how many.
         seed: of the samples.
 
@@ -107,10 +107,10 @@ class HandEyeRun(Record):
             a real arm defines its base only to within its own errors. So their covariance is zero here; how well the arm
             agrees with them is in ``found``.
         found: the hand-eye calibration.
-        q: (N, 6) potentiometer readings at rest at each pose that was used, rad.
+        q: (N, n) potentiometer readings at rest at each pose that was used, rad.
         Ts_left_body: (N, 4, 4) measured poses of the body in the left camera's frame.
         covs: (N, 6, 6) their covariances, right tangents [m; rad].
-        approach: (N, 6) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
+        approach: (N, n) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
         missed: poses at which the body was not measured, and why.
     """
 
@@ -131,9 +131,9 @@ def find_mounting(
     Args:
         loop: runs the motions.
         arm: the nominal arm.
-        q_start: (6,) joint angles at which the arm stands, rad.
-        targets: (N, 6) joint angles to visit, rad.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        q_start: (n,) joint angles at which the arm stands, rad.
+        targets: (N, n) joint angles to visit, rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
         progress: called with a line about what is being done.
 
     Raises:
@@ -186,9 +186,9 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     Args:
         loop: runs the motions; its mounting is known, its shutters and its delay are set.
         arm: the nominal arm.
-        q_start: (6,) joint angles at which the arm stands, rad.
-        q_middle: (6,) joint angles about which to sweep, rad; the arm stands there afterwards.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        q_start: (n,) joint angles at which the arm stands, rad.
+        q_middle: (n,) joint angles about which to sweep, rad; the arm stands there afterwards.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
 
     Raises:
         CalibrationError: the sweep does not determine the delay.

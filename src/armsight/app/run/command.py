@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import dataclass
@@ -34,8 +35,9 @@ class RunPlan:
     Attributes:
         rig: the calibrated cameras.
         motions: the motions.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
+        streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.
     """
 
@@ -43,6 +45,7 @@ class RunPlan:
     motions: MotionPlan
     targets: Array
     close_loop: bool
+    streams: tuple[str, ...]
     began: float
 
 
@@ -94,6 +97,12 @@ class RunPlan:
     show_default=True,
     help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
 )
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+)
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
     "-o",
@@ -115,6 +124,7 @@ def command(
     motion: Path | None,
     rate: float,
     sync_ms: float,
+    stream: tuple[str, ...],
     open_loop: bool,
     output: Path,
     as_json: bool,
@@ -166,7 +176,7 @@ def command(
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
-    plan = RunPlan(rig, motions, targets, not open_loop, time.perf_counter())
+    plan = RunPlan(rig, motions, targets, not open_loop, stream, time.perf_counter())
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration)
     with steps() as progress:
         progress("opening the devices")
@@ -177,7 +187,7 @@ def command(
                 write_text(output / name, text)
             rig.save(output / "rig.json")
             try:
-                summary = _run(setup, plan, output, progress)
+                summary = _run(setup, plan, output, files["body.toml"], progress)
             except KeyboardInterrupt:
                 click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
                 raise
@@ -237,12 +247,32 @@ def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
         ) from None
 
 
-def _run(setup: Setup, plan: RunPlan, output: Path, progress: Progress) -> RunSummary:
+def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Progress) -> RunSummary:
     """Run and write; raises what ended the run early after everything is written."""
     from armsight.app.run.experiment import run_experiment
     from armsight.app.run.folder import Finished, finish
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.mcap_file import LazyMcap, properties
+    from armsight.app.stream.sink import Fanout
+    from armsight.app.stream.streams import open_streams
 
-    outcome = run_experiment(setup, plan.rig, plan.motions, plan.targets, progress=progress, close_loop=plan.close_loop)
+    def say(line: str) -> None:
+        click.echo(line, err=True)
+
+    texts = properties(plan.rig, body_text, setup.arm, command="run")
+    published = Published(plan.rig, setup.target.body, setup.arm, texts)
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(contextlib.closing(LazyMcap(output, published, say)))
+        streams = stack.enter_context(contextlib.closing(open_streams(plan.streams, published, say)))
+        outcome = run_experiment(
+            setup,
+            plan.rig,
+            plan.motions,
+            plan.targets,
+            progress=progress,
+            close_loop=plan.close_loop,
+            publisher=Fanout((file, streams)),
+        )
     progress("writing and plotting")
-    properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, properties, plan.began, [], None), output)
+    of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, of_run, plan.began, [], None), output)

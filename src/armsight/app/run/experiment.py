@@ -21,6 +21,8 @@ from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, estimator_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
@@ -70,7 +72,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
     Args:
         setup: the arm and its board.
         plan: the motions.
-        targets: (N, 6) further joint angles of the run, rad.
+        targets: (N, n) further joint angles of the run, rad.
 
     Raises:
         ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
@@ -91,12 +93,12 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
 
 
 def passed(way: Trajectory) -> Array:
-    """Return joint angles (N, 6) that a motion passes, rad."""
+    """Return joint angles (N, n) that a motion passes, rad."""
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
 def _require_range(setup: Setup, q: Array) -> None:
-    """Reject joint angles (N, 6), rad, beyond the board's own limits: it would stop the joint on the way."""
+    """Reject joint angles (N, n), rad, beyond the board's own limits: it would stop the joint on the way."""
     low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
     if beyond.max() > 1e-3:
@@ -178,6 +180,7 @@ def run_experiment(
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
     begun: Callable[[Loop], None] = lambda loop: None,
+    publisher: Publisher | None = None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -185,18 +188,19 @@ def run_experiment(
         setup: the devices.
         rig: the calibrated cameras.
         plan: the motions; the arm stands at their start.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
         begun: called with the loop before the drives are switched on.
+        publisher: is given everything that is measured; it returns at once.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun, publisher or Fanout())
     return outcome
 
 
@@ -210,6 +214,7 @@ def _run(
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
     begun: Callable[[Loop], None],
+    publisher: Publisher,
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
@@ -218,7 +223,9 @@ def _run(
         follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        first = KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY)
+        publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
+        loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
         enable(setup.board)
         _require_seen(loop, setup, plan)
@@ -316,7 +323,7 @@ def _passes(
     servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     begin = loop.t_s
     try:
-        drive(loop, plan, closed_on(servo, setup.gravity), closed=True, progress=progress)
+        drive(loop, plan, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=progress)
     finally:
         outcome.closed_s = (begin, loop.t_s)
 

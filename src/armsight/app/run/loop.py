@@ -24,6 +24,8 @@ import numpy as np
 
 from armsight.app.run.record import Log, RunSegment, Skew, ToolTrack
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
 from armsight.geometry.pose import inverse, log_se3
@@ -198,6 +200,7 @@ class Loop:
         on_period: called in every period before its command; what it raises ends the motion.
         segment: the entry of the log of what is running, with its begin; None before the first.
         t_s: time of the newest reading, board's clock, s.
+        publisher: is given every batch of readings, and every shot after the command that follows from it was sent.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
@@ -210,6 +213,9 @@ class Loop:
         self.on_period: Callable[[], None] = lambda: None
         self.segment: RunSegment | None = None
         self.t_s = 0.0
+        self.publisher: Publisher = Fanout()
+        self._datum: ShotDatum | None = None
+        self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
         self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
@@ -228,13 +234,21 @@ class Loop:
         self._due = self._taken_s = 0.0
 
     @classmethod
-    def open(cls, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> Loop:
-        """Return a loop that has received the first joint reading; arguments as for the class.
+    def open(
+        cls,
+        setup: Setup,
+        follower: Follower,
+        log: Log,
+        estimator: KalmanEstimator,
+        publisher: Publisher | None = None,
+    ) -> Loop:
+        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher.
 
         Raises:
             DeviceError: the board sends none.
         """
         loop = cls(setup, follower, log, estimator)
+        loop.publisher = publisher or Fanout()
         while not log.joints:
             loop.pass_time(PERIOD_S)
         return loop
@@ -252,6 +266,7 @@ class Loop:
                     t_s, pose = seen.popleft()
                     estimator.vision(mounting.pose_measurement(pose, t_s))
 
+        self.publisher.put(EventDatum(self.t_s, estimator_event(estimator, anew=True)))
         received = list(self.log.joints)
         self.compute(lambda: learn(received))
         learn(self.log.joints[len(received) :])  # what arrived meanwhile
@@ -286,7 +301,9 @@ class Loop:
             self.setup.clock.heard(self.t_s)
         self.log.joints.append(states)
         self.estimator.joints(states)
-        self.log.live.append(self.estimator.estimate())
+        estimate = self.estimator.estimate()
+        self.log.live.append(estimate)
+        self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
         self._record()
 
     def _record(self) -> None:
@@ -334,6 +351,7 @@ class Loop:
         if measured is None:
             return None
         shot, result = measured
+        outcome, T_base_tool, suspected = None, None, None
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
@@ -341,9 +359,23 @@ class Loop:
         if isinstance(result, PoseEstimate) and shot.t_s is not None:
             result = self.health.received(result, shot.t_s)
             if self.mounting is not None:
-                measurement = self.health.widened(self.mounting.pose_measurement(result, shot.t_s))
-                self.log.outcomes.append(self.estimator.vision(measurement))
+                plain = self.mounting.pose_measurement(result, shot.t_s)
+                measurement = self.health.widened(plain)
+                if measurement is not plain and self.health.moved is not None:
+                    suspected = self.health.moved.suspected
+                outcome, T_base_tool = self.estimator.vision(measurement), measurement.T_base_tool
+                self.log.outcomes.append(outcome)
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
+        self._datum = ShotDatum(
+            shot,
+            result,
+            self.t_s,
+            self.setup.sync_s,
+            None if outcome is None else outcome.value,
+            None if self.mounting is None else self.mounting.T_base_rig,
+            T_base_tool,
+            suspected,
+        )
         return shot, self._taken_s, result
 
     def _at_one_time(self, result: PoseEstimate, t_s: float) -> PoseEstimate | Missed:
@@ -371,6 +403,17 @@ class Loop:
         scatter = xi - X @ (np.linalg.pinv(X) @ xi)
         variance = (scatter**2).sum(axis=0) / (len(near) - 4) / _SCATTER_SHARE**2
         return Motion(twist, 2.0 * half, np.diag(variance) * float(fit[1] @ fit[1]), True)
+
+    def _publish(self) -> None:
+        """Publish the shot that was measured in this iteration, and before it a mounting that is new."""
+        if self._datum is None:
+            return
+        mounting = self.mounting
+        if mounting is not None and mounting is not self._known:
+            self._known = mounting
+            self.publisher.put(EventDatum(self.t_s, mounting_event(mounting)))
+        self.publisher.put(self._datum)
+        self._datum = None
 
     def _in_lock_step(self) -> tuple[Shot, PoseEstimate | Missed] | None:
         """Measure the newest shot of a simulation; the result of a search is returned ``SIMULATED_SEARCH_S`` later."""
@@ -450,6 +493,7 @@ class Loop:
                 self.board.send(command)
                 self.log.commands.append((self.t_s, command))
                 self.log.modes.append(mode)
+                self._publish()
                 if measured is not None:
                     shot, began, result = measured
                     if self.mounting is not None:  # before, no command depended on images

@@ -92,7 +92,7 @@ class Setup:
         board: the controller board of its joints, drives off.
         poll: returns the newest shot not returned yet, or None.
         target: the body on the tool.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad; zeros where it is
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad; zeros where it is
             unknown.
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.

@@ -6,7 +6,7 @@ docs/reference/data.md lists the names. Numbers are SI; NaN and infinity are nul
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from armsight.app.measure.poses import left_axes, shot_pose
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.files import finite_json
 from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.estimators import KalmanEstimator, Mounting
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
@@ -48,6 +49,7 @@ class ShotDatum(Record):
         outcome: what the estimator did with the pose; None without one.
         T_base_rig: (4, 4) the rig in the base of the arm; None before the hand-eye calibration.
         T_base_tool: (4, 4) the tool as vision measured it; None before.
+        suspected: (6, 6) what the health monitor added to the common covariance of the tool's pose; None for nothing.
     """
 
     shot: Shot
@@ -57,6 +59,7 @@ class ShotDatum(Record):
     outcome: str | None = None
     T_base_rig: Array | None = None
     T_base_tool: Array | None = None
+    suspected: Array | None = None
 
     @property
     def time_s(self) -> float:
@@ -76,13 +79,8 @@ class ShotDatum(Record):
             found |= {"status": "recorded", "reason": None}
         found |= {"sigma_t_s": self.sigma_t_s, "arrival_s": self.arrival_s, "age_s": self.age_s}
         if isinstance(result, PoseEstimate):
-            T = result.T_left_body
-            share = np.maximum(np.diag(left_axes(T, result.cov - result.cov_noise)), 0.0)
             found |= {
-                "T_left_body": T.tolist(),
-                "sigma": np.sqrt(np.diag(left_axes(T, result.cov))).tolist(),
-                "sigma_precision": np.sqrt(np.diag(left_axes(T, result.cov_noise))).tolist(),
-                "sigma_calibration": np.sqrt(share).tolist(),
+                "T_left_body": result.T_left_body.tolist(),
                 "covariance_precision_body": result.cov_noise.tolist(),
                 "points": len(result.points.ids),
             }
@@ -90,6 +88,8 @@ class ShotDatum(Record):
             found["outcome"] = self.outcome
         if self.T_base_tool is not None:
             found["T_base_tool"] = self.T_base_tool.tolist()
+        if self.suspected is not None:
+            found["covariance_suspected"] = self.suspected.tolist()
         return dict(finite_json(found))
 
 
@@ -155,6 +155,33 @@ class EventDatum:
 
     time_s: float
     content: Mapping[str, Any]
+
+
+def mounting_event(mounting: Mounting) -> dict[str, Any]:
+    """Return the content of the event that a mounting is known."""
+    return {
+        "event": "mounting",
+        "T_base_rig": mounting.T_base_rig.tolist(),
+        "T_tool_body": mounting.T_tool_body.tolist(),
+        "covariance": mounting.cov.tolist(),
+    }
+
+
+def estimator_event(estimator: KalmanEstimator, *, anew: bool) -> dict[str, Any]:
+    """Return the content of the event that an estimator begins.
+
+    Args:
+        estimator: the estimator.
+        anew: whether everything measured before is given to it first.
+    """
+    prior, delay, learns_delay = estimator.settings
+    return {
+        "event": "estimator",
+        "anew": anew,
+        "prior": asdict(prior),
+        "delay": asdict(delay),
+        "learns_delay": learns_delay,
+    }
 
 
 Datum = ShotDatum | JointsDatum | NoteDatum | EventDatum

@@ -6,7 +6,6 @@ left camera's frame is the rig's. Covariances are along the axes of the frame th
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from armsight.app.measure.poses import left_axes
 from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
-from armsight.data import SIDES, Array, Missed, PoseEstimate, Shot
+from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.vision.rigfiles.rigfile import rectification
@@ -23,7 +22,9 @@ from armsight.vision.rigfiles.rigfile import rectification
 #: A protobuf message.
 Message: TypeAlias = Any
 #: Images that cameras deliver as pixels are compressed here, at most one pair in this time, s: it takes long.
-_COMPRESS_EVERY_S = 1.0
+_COMPRESS_EVERY_S, _QUALITY = 1.0, 85
+#: Joints and the tool are shown at most once in this time, s; as JSON all are published.
+_JOINTS_EVERY_S = 0.02
 #: The ellipsoid has this many sigmas, and at least this radius, m, to be seen.
 _SIGMAS, _LEAST_M = 3.0, 2e-4
 _NS = 1_000_000_000
@@ -66,7 +67,7 @@ class Messages:
 
         self._published = published
         self._Calibration: Message = CameraCalibration_pb2.CameraCalibration
-        self._Image: Message = CompressedImage_pb2.CompressedImage
+        self._Compressed: Message = CompressedImage_pb2.CompressedImage
         self._Transforms: Message = FrameTransforms_pb2.FrameTransforms
         self._Annotations: Message = ImageAnnotations_pb2.ImageAnnotations
         self._Joints: Message = JointStates_pb2.JointStates
@@ -77,6 +78,7 @@ class Messages:
         self._Timestamp: Message = Timestamp
         self._calibrated = False
         self._compressed_s = -np.inf
+        self._joints_s = -np.inf
         self._T_base_rig: Array | None = None
 
     def of(self, datum: ShotDatum | JointsDatum | NoteDatum | EventDatum) -> Iterator[tuple[str, Message]]:
@@ -118,20 +120,18 @@ class Messages:
             yield "/log", self._log(stamp, "warning", f"{datum.shot.name}: {datum.outcome}")
 
     def _images(self, shot: Shot, stamp: Message) -> Iterator[tuple[str, Message]]:
-        """Yield both images as the cameras delivered them; of pixels one pair a second, as PNG."""
+        """Yield both images as the cameras delivered them; of pixels one pair a second, to look at, as JPEG."""
         encoded = shot.encoded
         if encoded is None and shot.left is not None and shot.right is not None:
-            now = time.monotonic()
-            if now - self._compressed_s < _COMPRESS_EVERY_S:
+            if shot.t_s is not None and 0.0 <= shot.t_s - self._compressed_s < _COMPRESS_EVERY_S:
                 return
-            self._compressed_s = now
-            images = (np.asarray(shot.left), np.asarray(shot.right))
-            encoded = (_png(images[0]), _png(images[1]))
+            self._compressed_s = -np.inf if shot.t_s is None else shot.t_s
+            encoded = (_jpeg(shot.left), _jpeg(shot.right))
         if encoded is None:
             return
         for side, data in zip(SIDES, encoded, strict=True):
             kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
-            yield f"/{side}/image", self._Image(timestamp=stamp, frame_id=side, data=data, format=kind)
+            yield f"/{side}/image", self._Compressed(timestamp=stamp, frame_id=side, data=data, format=kind)
 
     def _calibrations(self, stamp: Message) -> Iterator[tuple[str, Message]]:
         rig = self._published.rig
@@ -221,6 +221,9 @@ class Messages:
             yield found
 
     def _of_joints(self, datum: JointsDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
+        if 0.0 <= datum.time_s - self._joints_s < _JOINTS_EVERY_S:
+            return
+        self._joints_s = datum.time_s
         q = datum.states.q[-1]
         joints = self._Joints(timestamp=stamp)
         for k, angle in enumerate(q.tolist(), start=1):
@@ -255,8 +258,10 @@ def nanoseconds(t_s: float) -> int:
     return max(0, round(1e9 * t_s))
 
 
-def _png(image: Array) -> bytes:
-    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+def _jpeg(image: Image) -> bytes:
+    """Return an image to look at: 8 bits, JPEG."""
+    shown = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    return bytes(cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
 
 def _set_pose(position: Message, orientation: Message, T: Array) -> None:

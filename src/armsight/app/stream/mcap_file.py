@@ -13,8 +13,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any
+
+import numpy as np
 
 from armsight import __version__
 from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
@@ -22,13 +25,14 @@ from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
+from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.bag.camera_info import METADATA, RIG
 
 #: Name of the file in the folder of a run.
 RUN_MCAP = "run.mcap"
-#: Keys of its metadata beside the rig file: the body file.
-BODY = "body.toml"
+#: Keys of its metadata beside the rig file: the body file, and the nominal arm.
+BODY, ARM = "body.toml", "arm.json"
 #: Topics of the data as JSON, by kind.
 TOPICS: dict[type, str] = {
     ShotDatum: "/armsight/shot",
@@ -63,8 +67,8 @@ class McapSink(Sink):
             self._file: IO[bytes] = path.open("xb")
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-        # Images are compressed already, and the rest is small: compressing again costs more than it saves.
-        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.NONE)
+        # Images are compressed already: LZ4 passes over them fastest.
+        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.LZ4)
         self._writer.start(profile="", library="armsight")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -102,7 +106,7 @@ class McapSink(Sink):
 
     def _json_channel(self, topic: str) -> int:
         if topic not in self._channels:
-            schema = self._writer.register_schema(f"armsight{topic.replace('/', '.')}", "jsonschema", _SCHEMA)
+            schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", _SCHEMA)
             self._channels[topic] = self._writer.register_channel(topic, "json", schema)
         return self._channels[topic]
 
@@ -163,7 +167,7 @@ class LazyMcap:
         """Take a shot that was recorded and not measured."""
         now = time.monotonic()  # the clock of live cameras' stamps
         live = shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S
-        self.put(ShotDatum(shot, None, now if live else None))
+        self.put(ShotDatum(shot, None, now if live or shot.t_s is None else None))
 
     def close(self) -> None:
         """Write what was taken, and end."""
@@ -176,11 +180,25 @@ class LazyMcap:
                 self._say(f"note: {self._path}: {sink.dropped} of {sink.taken} data were dropped: the disk is too slow")
 
 
-def properties(rig: StereoRig | None, body_text: str | None, **more: str) -> dict[str, str]:
-    """Return the metadata of a run: versions, the rig file and the body file."""
-    found = {"version": __version__, "command": more.pop("command", "")} | more
+def properties(rig: StereoRig | None, body_text: str | None, arm: Arm | None = None, **more: str) -> dict[str, str]:
+    """Return the metadata of a run: versions, the rig file, the body file and the nominal arm, with all digits."""
+    found = {"version": __version__} | more
     if rig is not None:
         found[RIG] = rig.to_text()
     if body_text is not None:
         found[BODY] = body_text
+    if arm is not None:
+        values = {each.name: getattr(arm, each.name) for each in fields(arm) if each.init}
+        listed = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+        found[ARM] = json.dumps(listed)
     return found
+
+
+def arm_of(text: str) -> Arm:
+    """Return the arm of a run's metadata."""
+    values: dict[str, Any] = json.loads(text)
+    names = tuple(values.pop("joint_names"))
+    arrays: dict[str, Any] = {
+        name: np.array(value, float) if isinstance(value, list) else value for name, value in values.items()
+    }
+    return Arm(joint_names=names, **arrays)

@@ -9,8 +9,12 @@ those that neighbours share (a drift) one block (1, 6N, 6N): the same functions 
 - ``flange_m``, ``flange_rad``: the flange by the joints, about the flange.
 - ``lateral_m``, ``depth_m``: the measured body's middle across and along the optical axis; ``seen_m``: alike in all three.
 - ``seen_rad``: the measured body's rotation about its middle.
+- ``hardly_rad``: the same, of a sigma so large that rotations have hardly any weight: an arm's rotations and its positions
+  may contradict each other by more than either scatters.
 - ``image``: the covariance given, times this.
 - ``time_s``: the time stamp, along the motion (streams).
+- ``link_m``, ``link_rad``: a constant error of every link's frame, along and about its three axes, where the joints and a
+  model are known: what an arm whose lengths and zeros are not its model's does in each of its poses.
 - ``drift_m``, ``drift_rad``: an error of the flange that neighbouring poses share: a smooth function of the pose (an arm
   whose kinematics are not its model's) or of time (an arm that warms up), a Gaussian process (Rasmussen and Williams,
   "Gaussian Processes for Machine Learning", 2006, eq. 2.31).
@@ -31,7 +35,7 @@ from scipy.optimize import minimize
 from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import Poses
+from armsight.loop.handeye.handeye import HARDLY, LEVER_M, Poses
 
 #: Name of a structure -> its sources. Those with a drift or a walk are tried where the poses allow it.
 STRUCTURES: dict[str, tuple[str, ...]] = {
@@ -41,16 +45,29 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "robot and camera": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad"),
     "robot and image": ("flange_m", "flange_rad", "image"),
     "robot, camera and time stamps": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "time_s"),
-    "robot drifting over its poses": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "drift_m", "drift_rad"),
+    "robot's geometry off": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "link_m", "link_rad"),
+    "robot drifting over its poses": (
+        "flange_m",
+        "flange_rad",
+        "lateral_m",
+        "depth_m",
+        "seen_rad",
+        "drift_m",
+        "drift_rad",
+    ),
     "robot drifting over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
     "camera walking": ("flange_m", "flange_rad", "walk_m", "walk_rad"),
+    "positions alone": ("seen_m", "hardly_rad"),
 }
 #: Structures whose errors are shared between poses.
-SHARED = ("robot drifting over its poses", "robot drifting over time", "camera walking")
+SHARED = ("robot's geometry off", "robot drifting over its poses", "robot drifting over time", "camera walking")
 #: Sources that are the arm's.
-OF_THE_ARM = ("flange_m", "flange_rad", "drift_m", "drift_rad")
+OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
+#: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
+#: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
+LIKE_EACH_OTHER = 1.5
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
 
@@ -87,13 +104,14 @@ class Linear(Record):
         )
 
 
-def error_maps(poses: Poses, carry: Array, speed: Array | None) -> dict[str, Array]:
+def error_maps(poses: Poses, carry: Array, speed: Array | None, links: Array | None = None) -> dict[str, Array]:
     """Return what unit errors of each independent source do to the residuals.
 
     Args:
         poses: N poses.
         carry: (N, 6, 6) adjoints that map an error of the flange to the residuals.
         speed: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams.
+        links: (N, L, 4, 4) T_link_flange, m; None: no model.
     """
     n = len(poses.A)
     axes = np.zeros((n, 6, 3))
@@ -107,9 +125,13 @@ def error_maps(poses: Poses, carry: Array, speed: Array | None) -> dict[str, Arr
         "lateral_m": axes[..., :2],
         "depth_m": axes[..., 2:],
         "seen_rad": about,
+        "hardly_rad": about,
     }
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
+    if links is not None:
+        moved = np.swapaxes(carry[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
+        maps["link_m"], maps["link_rad"] = (moved[..., part].reshape(n, 6, -1) for part in (slice(3), slice(3, 6)))
     return maps
 
 
@@ -178,14 +200,17 @@ def blocks(linear: Linear, structure: str) -> Blocks:
         return Blocks(linear.e, linear.J, given, np.array([own[name] for name in sources]), sources)
     parts = []
     for name in sources:
-        if name in own:
+        if name.startswith("link"):
+            M = linear.maps[name].reshape(6 * n, -1)
+            parts.append(M @ M.T)
+        elif name in own:
             parts.append(_spread(own[name]))
         elif name in linear.walk:
             first = np.minimum(np.arange(n)[:, None], np.arange(n)[None])
             parts.append(_joined(linear.walk[name][first]))
         else:
             M = linear.maps["flange_m" if name == "drift_m" else "flange_rad"]
-            K = linear.kernel[structure]
+            K = 1 + linear.kernel[structure]  # what changes by so much from pose to pose has a constant part as large
             parts.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
     return Blocks(
         linear.e.reshape(1, -1),
@@ -238,7 +263,7 @@ def solve(b: Blocks, variances: Array) -> Solved:
     """Solve the weighted least squares."""
     C = b.covariance(variances)
     L = np.linalg.cholesky(C)
-    Ci = np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None]
+    Ci = np.asarray(np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None])
     CiJ = Ci @ b.J
     H = np.einsum("nki,nkj->ij", b.J, CiJ)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
@@ -272,7 +297,7 @@ def left_out_squares(b: Blocks, s: Solved) -> Array:
 
 
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
-    """Return minus the restricted log-likelihood, and its gradient by the logarithms of the variances."""
+    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the logarithms."""
     variances = np.exp(logs)
     s = solve(b, variances)
     n, m = b.e.shape
@@ -280,7 +305,16 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     root = s.inverse @ b.J @ s.root  # the inverse covariance, projected: s.inverse - root root^T
     projected = s.inverse - root @ np.swapaxes(root, 1, 2)
     traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
-    return s.cost, 0.5 * variances * traces
+    gradient = 0.5 * variances * traces
+    cost = s.cost
+    if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
+        m = len(b.sources) - 2
+        rad = m + 1
+        off = (logs[m] - logs[rad] - 2 * np.log(LEVER_M)) / LIKE_EACH_OTHER**2
+        cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
+        gradient[m] += off
+        gradient[rad] -= off
+    return cost, gradient
 
 
 def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
@@ -293,6 +327,8 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
     """
     low = 2 * np.log(LOW)
     bounds = [(low, 2 * np.log(HIGH_IMAGE if name == "image" else HIGH)) for name in b.sources]
+    if "hardly_rad" in b.sources:
+        bounds[b.sources.index("hardly_rad")] = (2 * np.log(HARDLY),) * 2
     found = minimize(
         _value_and_gradient,
         np.clip(np.log(start), *np.transpose(bounds)),
@@ -346,4 +382,3 @@ def _log_normal(e: Array, S: Array) -> Array:
     """Return the logarithm of the normal density of residuals (N, 6) with covariances (N, 6, 6)."""
     squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
     return np.asarray(-0.5 * (squares + np.linalg.slogdet(S)[1] + 6 * np.log(2 * np.pi)))
-

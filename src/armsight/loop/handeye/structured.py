@@ -27,7 +27,19 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import CHANCE, MIN_POSES, PART, PARTS, Eye, HeldOut, Poses, kronecker, residuals, starts
+from armsight.loop.handeye.handeye import (
+    CHANCE,
+    CLEARLY,
+    MIN_POSES,
+    PART,
+    PARTS,
+    Eye,
+    HeldOut,
+    Poses,
+    kronecker,
+    residuals,
+    starts,
+)
 from armsight.loop.handeye.noise import (
     OF_THE_ARM,
     SHARED,
@@ -50,8 +62,10 @@ MAX_VARIANCE, MAX_SHARED = 150, 40
 MAX_FIT, MAX_SHARED_FIT = 1000, 120
 #: Fewest poses for a structure with shared errors.
 MIN_SHARED = 12
-#: Parts that are left out, one after the other.
-FOLDS = 5
+#: Numbers left of the residuals for each variance at least: fewer do not determine it.
+PER_VARIANCE = 8
+#: Parts that are left out, one after the other; of so few poses each one by itself.
+FOLDS, FEW = 5, 24
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: A sigma of the mounting beyond this (m, rad) is no calibration.
@@ -62,6 +76,10 @@ FREEDOM = 4.0
 SURELY = 5.0
 #: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
 HANGING = 1.0
+#: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
+POSITIONS, SURELY_LOWER = "positions alone", 3.0
+#: The structures that are tried only then.
+HANGS = tuple(name for name in SHARED if name != "robot's geometry off")
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -141,10 +159,12 @@ class _Problem(Record):
     t_s: Array | None
     speed: Array | None
     free: tuple[bool, bool]
+    links: Array | None = None
 
     def rows(self, rows: NDArray[np.int64]) -> _Problem:
-        t_s = None if self.t_s is None else self.t_s[rows]
-        return _Problem(self.poses.rows(rows), t_s, None if self.speed is None else self.speed[rows], self.free)
+        """Return a part of the rows."""
+        t_s, speed, links = (None if a is None else a[rows] for a in (self.t_s, self.speed, self.links))
+        return _Problem(self.poses.rows(rows), t_s, speed, self.free, links)
 
     def scaled(self, guess: _Guess) -> Poses:
         """Return the poses with the guess's time, the flange's lengths in the body's unit."""
@@ -165,7 +185,7 @@ class _Problem(Record):
         carry = carry * unit
         if self.free[1] and self.speed is not None:
             J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
-        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed), {}, {})
+        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {})
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -192,6 +212,7 @@ def calibrate_structured(
     *,
     t_s: Array | None = None,
     speed: Array | None = None,
+    links: Array | None = None,
     scale: bool = False,
     structures: Sequence[str] = tuple(STRUCTURES),
     progress: Callable[[str], None] = lambda line: None,
@@ -202,6 +223,7 @@ def calibrate_structured(
         poses: four or more.
         t_s: (N,) times of the poses, s, where they are known: what drifts over time, or walks, needs them.
         speed: (N, 6) twist of the flange, right tangent, m/s and rad/s, of streams: the rest of the time offset is fitted.
+        links: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
         scale: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it is
             surely not 1.
         structures: names to choose from.
@@ -215,7 +237,7 @@ def calibrate_structured(
     if n < MIN_POSES:
         raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
     order = _own_order(poses, t_s)
-    whole = _Problem(poses, t_s, speed, (False, speed is not None)).rows(order)
+    whole = _Problem(poses, t_s, speed, (False, speed is not None), links).rows(order)
     progress("hand-eye: start")
     if scale:
         whole, guess, used = _with_scale(whole)
@@ -291,7 +313,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
     known, used_known = _robust(problem, _first(problem))
     free = replace(problem, free=(True, problem.free[1]))
-    per_m = 1 / _first_scale(problem)
+    per_m = 1 / scale_between(problem.poses)
     scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
@@ -309,10 +331,12 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     return problem, known, used_known
 
 
-def _first_scale(problem: _Problem) -> float:
-    """Return the scale of B's lengths by closed forms from small parts: that of the smallest median residual."""
-    rows = _spread(np.arange(len(problem.poses.A)), 300)
-    p = problem.poses.rows(rows)
+def scale_between(poses: Poses) -> float:
+    """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
+
+    Of the parts' answers it is that of the smallest median residual.
+    """
+    p = poses.rows(_spread(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
     rng = np.random.default_rng(0)
     best = (np.inf, 1.0)
@@ -355,8 +379,8 @@ def require_rotations(poses: Poses, e: Array) -> None:
         axis = axes[:, 2] * np.sign(axes[np.argmax(np.abs(axes[:, 2])), 2])
         named = " ".join(f"{value:.2f}" for value in axis)
         raise CalibrationError(
-            f"the flange rotates about one axis only, [{named}] in the flange (RMS {np.degrees(spread[0]):.1f} deg; across "
-            f"it {np.degrees(spread[1]):.2f} deg, where the noise is {np.degrees(noise):.2f} deg): the translation of {held} "
+            f"the flange rotates about one axis only, [{named}] in the flange ({np.degrees(spread[0]):.1f} deg RMS; across "
+            f"it {np.degrees(spread[1]):.2f} deg, the noise {np.degrees(noise):.2f} deg): the translation of {held} "
             "along this axis stays open; rotate about a second axis, by 20 degrees and more"
         )
 
@@ -400,14 +424,18 @@ def _start_variances(linear: Linear, structure: str) -> Array:
     sources = STRUCTURES[structure]
     small = {"time_s": 1e-6, "image": 1.0, "walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
     even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
-    return np.maximum(np.array([small.get(name, even[name]) for name in sources]), 1e-13)
+    return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
 
 
 def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
     """Return whether a structure can be told from these poses."""
     sources = STRUCTURES[structure]
+    if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
+        return False
     if "image" in sources:
         return covered
+    if "link_m" in sources:
+        return problem.links is not None and count >= MIN_SHARED
     if "time_s" in sources:
         return problem.speed is not None
     if structure == "robot drifting over time" or "walk_m" in sources:
@@ -434,11 +462,11 @@ def _chosen(
     hanging = _hanging(whole, guess, used, simple, variances, gathered)
     trials = {}
     for name in names:
-        if name in SHARED and name not in hanging:
+        if name in HANGS and name not in hanging:
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best = max(trials, key=lambda name: trials[name][0])
+    best = _best(whole, trials)
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -446,7 +474,7 @@ def _chosen(
     solved = solve(blocks(linear, best), variances)
     x, cov = solved.x, solved.cov
     guess = guess.moved(x, whole.free)
-    freedom = max(linear.e.size - len(x) - len(variances), 6)
+    freedom = max(linear.e.size // 2 - 6, 3)  # of positions, and of rotations
     # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
     cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
     metric, cov = whole.metric(guess, cov)
@@ -475,6 +503,28 @@ def _chosen(
         distance=distance,
     )
     return found, used
+
+
+#: Mean log density of poses left out, their residuals, and their rows.
+_Trial = tuple[float, Array, NDArray[np.int64]]
+
+
+def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
+    """Return the structure that poses left out are most probable under.
+
+    Positions alone never win so: they do where they predict positions left out better, clearly and surely.
+    """
+    others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
+    best = max(others, key=lambda name: others[name][0])
+    if POSITIONS not in trials or best in SHARED or best == POSITIONS:
+        return best
+    of, alone = (
+        np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
+        for e in (trials[best][1], trials[POSITIONS][1])
+    )
+    lower = of - alone
+    sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
+    return POSITIONS if sure and of.mean() > CLEARLY**2 * alone.mean() else best
 
 
 def _hanging(
@@ -506,7 +556,9 @@ def _hanging(
     return found
 
 
-def _linear(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]) -> Linear:
+def _linear(
+    whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]
+) -> Linear:
     """Return the residuals of rows, with what the structure needs."""
     part = whole.rows(rows)
     linear = part.linear(guess)
@@ -549,9 +601,7 @@ def _settled(
     return guess, used, variances
 
 
-def _distances(
-    whole: _Problem, guess: _Guess, structure: str, variances: Array, gathered: dict[str, Array]
-) -> Array:
+def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array, gathered: dict[str, Array]) -> Array:
     """Return the squared Mahalanobis length (N,) of each pose's own residual, over 6."""
     linear = whole.linear(guess)
     C = np.array(linear.given) * (0.0 if "image" in STRUCTURES[structure] else 1.0)
@@ -569,7 +619,7 @@ def _distances(
 
 def _trial(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
-) -> tuple[float, Array, NDArray[np.int64]]:
+) -> _Trial:
     """Return the mean log density of poses left out under a structure, their residuals, and their rows."""
     rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
     linear = _linear(whole, guess, rows, structure, gathered)
@@ -577,7 +627,7 @@ def _trial(
     variances = reml(b, _start_variances(linear, structure))
     n = len(rows)
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
-    parts = [np.sort(part) for part in np.array_split(order, min(max(FOLDS, 2), n))]
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
     density, residual = held_out(linear, structure, variances, parts)
     return float(density.mean()), residual, rows
 

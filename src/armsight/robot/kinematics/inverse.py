@@ -1,4 +1,4 @@
-"""Inverse kinematics of six joints: from a requested pose to checked, polished and sorted joint angles, or to the nearest pose.
+"""Inverse kinematics of six joints: a requested pose to checked, polished and sorted joint angles, or the nearest pose.
 
 In: the packed table (102,), the table of its closed form, limits and T_base_tool. Out: rows of joint angles with what is
 left of the error, their configuration and their state. In this order:

@@ -40,8 +40,8 @@ _SPREAD = 1.0969815577985598
 _SLIDES, _SLIDE_RAD, _EDGE, _PUSH = 8, 0.3, 0.85, 100.0
 #: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the damping of the position.
 _LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
-#: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a radian
-#: the wrist would turn over.
+#: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a
+#: radian the wrist would turn over.
 _WEAK = 1e-2
 
 
@@ -94,7 +94,9 @@ def _weigh(F: Frame, joints: int, J: Array, e: Array) -> float:
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
-def _step(J: Array, e: Array, q: Array, low: Array, high: Array, damping: float, A: Array, g: Array, step: Array) -> bool:
+def _step(
+    J: Array, e: Array, q: Array, low: Array, high: Array, damping: float, A: Array, g: Array, step: Array
+) -> bool:
     """Write the damped step (n,) towards an error; a joint at a bound and pulled beyond it is left out of J."""
     n = q.shape[0]
     for i in range(n):
@@ -403,9 +405,7 @@ def _start(k: int, limits: Array, goal: Array, q: Array) -> None:
     nogil=True,
     fastmath={"contract", "nsz"},
 )
-def inverse(
-    table: Array, limits: Array, T: Array, goal: Array, q: Array, off: Array, scratch: Array
-) -> int:
+def inverse(table: Array, limits: Array, T: Array, goal: Array, q: Array, off: Array, scratch: Array) -> int:
     """Write joint angles within the limits that bring the tool to a pose, or as near as descent finds.
 
     Args:
@@ -450,9 +450,7 @@ def inverse(
     nogil=True,
     fastmath={"contract", "nsz"},
 )
-def inverse_batch(
-    table: Array, limits: Array, Ts: Array, goal: Array, q: Array, off: Array, scratch: Array
-) -> int:
+def inverse_batch(table: Array, limits: Array, Ts: Array, goal: Array, q: Array, off: Array, scratch: Array) -> int:
     """Write joint angles (N, n) and what is left of the error (N, 3) for poses (N, 4, 4); return the worst validity."""
     worst = 0
     for k in range(Ts.shape[0]):

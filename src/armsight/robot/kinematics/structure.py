@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.geometry.pose import inverse
-from armsight.robot.kinematics.table import ACROSS, BASE, BEND, FOREARM, KIND, TOOL, UNTOOL, link
+from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND, TOOL, UNTOOL, link
 
 NEITHER, PARALLEL, SPHERICAL = 0, 1, 2
 

@@ -1,9 +1,9 @@
 """Annin Robotics AR4-MK3.
 
-Lengths: the maker's Denavit-Hartenberg table (anninrobotics.com, AR4 software), in the arm's own joint angles. Limits and the
-greatest speed: ar4_ros_driver (github.com/ycheng517/ar4_ros_driver), ar_description/config/mk3.yaml and ar_macro.xacro,
-which has the same lengths, but stands rotated by -90 degrees, turns joint 1 the other way and moves the forearm 7 mm sideways.
-Accelerations and jerks are chosen.
+Lengths: the maker's Denavit-Hartenberg table (anninrobotics.com, AR4 software), in the arm's own joint angles. Limits and
+the greatest speed: ar4_ros_driver (github.com/ycheng517/ar4_ros_driver), ar_description/config/mk3.yaml and ar_macro.xacro,
+which has the same lengths, but stands rotated by -90 degrees, turns joint 1 the other way and moves the forearm 7 mm
+sideways. Accelerations and jerks are chosen.
 """
 
 import numpy as np

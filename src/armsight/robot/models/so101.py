@@ -1,6 +1,7 @@
 """TheRobotStudio SO-101 follower: five joints; the gripper's jaw is no joint of the arm.
 
-From the makers' URDF (github.com/TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf): joint angles are 0 in the
+From the makers' URDF (github.com/TheRobotStudio/SO-ARM100, Simulation/SO101/so101_new_calib.urdf): joint angles are 0 in
+the
 middle of their ranges, as LeRobot calibrates them. The tool is at the URDF's gripperframe, between the tips, with its axes
 as usual for grippers: z ahead, where the gripper points, and x as there. The same kinematics but for the gripper has the
 SO-100. Speeds, accelerations and jerks are chosen: the URDF gives stand-ins.
@@ -20,7 +21,9 @@ ARM = Arm(
     a=np.array([-0.0303992, np.hypot(*_UPPER), np.hypot(*_FORE), 0.0, 0.0]),
     d=np.array([-0.0542, -0.0182778, 0.0, 0.0181, -0.0611]),
     alpha=np.deg2rad([-90.0, 0.0, 0.0, -90.0, 0.0]),
-    offset=np.array([0.0, np.pi / 2 + _UPPER_BEND, np.pi / 2 - _UPPER_BEND - _FORE_BEND, np.pi / 2 + _FORE_BEND, np.pi]),
+    offset=np.array(
+        [0.0, np.pi / 2 + _UPPER_BEND, np.pi / 2 - _UPPER_BEND - _FORE_BEND, np.pi / 2 + _FORE_BEND, np.pi]
+    ),
     T_base_0=pose(
         np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.array([0.0207909, -0.0230745, 0.0948817])
     ),

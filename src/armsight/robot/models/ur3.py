@@ -1,7 +1,8 @@
 """Universal Robots UR3 (CB3).
 
 Table: the maker's article "DH parameters for calculations of kinematics and dynamics" (universal-robots.com). Limits: the
-maker's user manual; joint 6, which turns without end, has the range of the others. Accelerations and jerks are chosen: the maker publishes none.
+maker's user manual; joint 6, which turns without end, has the range of the others. Accelerations and jerks are chosen: the
+maker publishes none.
 """
 
 import numpy as np

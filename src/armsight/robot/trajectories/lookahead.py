@@ -150,8 +150,8 @@ def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obst
     """
     if arm.joints < 6:
         raise InputError(
-            f"{arm.name} has {arm.joints} joints: it cannot move its tool along a path with its orientation held; use a motion "
-            "from joint angles to joint angles, or a tracked path"
+            f"{arm.name} has {arm.joints} joints: it cannot move its tool along a path with its orientation held; use a "
+            "motion from joint angles to joint angles, or a tracked path"
         )
     share = _steps(path, bends)
     points = path.at(share)

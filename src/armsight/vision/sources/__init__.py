@@ -17,6 +17,7 @@ from collections.abc import Callable
 from armsight.errors import InputError
 from armsight.vision.sources.bag import open_bag_source
 from armsight.vision.sources.folder import FolderSource
+from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
 from armsight.vision.sources.source import Source
 from armsight.vision.sources.url import open_url
@@ -32,6 +33,7 @@ SOURCES: dict[str, Callable[[str], Source]] = {
     "url": open_url,
     "usb": open_usb,
     "bag": open_bag_source,
+    "lerobot": open_lerobot,
 }
 
 

@@ -103,6 +103,10 @@ def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing
     if allowed_s is None:
         allowed_s = min(_APART_S, left.period_s / 2, right.period_s / 2)
     a, b = np.array(left.t_ns, dtype=np.int64), np.array(right.t_ns, dtype=np.int64)
+    if len(a) == len(b) > 1 and not (a != a[0]).any() and not (b != b[0]).any():
+        note = f"{left.topic} and {right.topic}: all stamps are the same: paired in the order of the recording"
+        pairs_ = tuple((k, k) for k in range(len(a)))
+        return Pairing(pairs_, (), allowed_s, 0.0, (*left.notes, *right.notes, note))
     there, back = _nearest(a, b), _nearest(b, a)
     pairs = [(k, int(n)) for k, n in enumerate(there) if back[n] == k and abs(int(b[n]) - int(a[k])) * _NS <= allowed_s]
     if not pairs:

@@ -7,6 +7,7 @@ as far as it goes.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 import struct
@@ -21,6 +22,8 @@ from armsight.errors import InputError
 Decoded: TypeAlias = Any
 #: A record of the library mcap.
 _McapRecord: TypeAlias = Any
+#: A reader of the library rosbags.
+_RosReader: TypeAlias = Any
 #: Topic of a message, time of its arrival, ns, encoding, bytes, and what decodes them.
 _Raw: TypeAlias = tuple[str, int, str, bytes, Callable[[], Decoded]]
 
@@ -118,7 +121,8 @@ class Bag:
     def holds(self) -> str:
         """Return what a recording holds, for messages."""
         listed = [f"{t.name} ({t.kind}, {t.count})" for t in sorted(self.topics.values(), key=lambda t: t.name)]
-        return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "") or "nothing"
+        text = ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "") or "nothing"
+        return "; ".join([text, *self.notes])
 
 
 def _files(path: str | Path) -> list[Path]:
@@ -154,47 +158,52 @@ def _plain(kind: str) -> str:
 
 
 class _RosFile:
-    """A ROS 1 bag or a ROS 2 bag of sqlite3."""
+    """A ROS 1 bag or a ROS 2 bag of sqlite3; it is open only while it is read."""
 
     def __init__(self, path: str | Path) -> None:
         try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
+            import rosbags.highlevel  # noqa: F401 - only whether it is there
         except ImportError:
             raise InputError(f"{path}: a ROS bag is read with rosbags, which is not installed: {_INSTALL}") from None
         self._path = path
-        self._reader = AnyReader([Path(path).expanduser()], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        counts: dict[tuple[str, str], int] = {}
+        with self._opened() as reader:
+            self._store, self._is_cdr = reader.typestore, bool(reader.is2)
+            for each in reader.connections:
+                key = (each.topic, _plain(each.msgtype))
+                counts[key] = counts.get(key, 0) + each.msgcount
+        self._topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[_RosReader]:
+        """Open the file for a block; whatever the library finds wrong with it becomes one line."""
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
         try:
-            self._reader.open()
-        except Exception as error:  # noqa: BLE001 - a damaged file fails in many ways; it is named, and nothing was done
-            raise InputError(f"{path}: {_ros_problem(path, error)}") from None
+            path = Path(self._path).expanduser()
+            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+                yield reader
+        except (InputError, GeneratorExit):
+            raise
+        except Exception as error:  # noqa: BLE001 - a damaged file fails in many ways
+            raise InputError(f"{self._path}: {_ros_problem(self._path, error)}") from None
 
     def topics(self) -> list[Topic]:
-        counts: dict[tuple[str, str], int] = {}
-        for each in self._reader.connections:
-            key = (each.topic, _plain(each.msgtype))
-            counts[key] = counts.get(key, 0) + each.msgcount
-        return [Topic(name, kind, count) for (name, kind), count in counts.items()]
+        return self._topics
 
     def messages(self, topics: Collection[str]) -> Iterator[_Raw]:
-        connections = [each for each in self._reader.connections if each.topic in topics]
-        if not connections:
-            return
-        rows = self._reader.messages(connections)
-        while True:
-            try:
-                connection, arrival_ns, data = next(rows)
-            except StopIteration:
-                return
-            except Exception as error:  # noqa: BLE001 - as above
-                raise InputError(f"{self._path}: {_ros_problem(self._path, error)}") from None
-            encoding = "cdr" if self._reader.is2 else "ros1"
-            yield connection.topic, arrival_ns, encoding, bytes(data), self._decoder(bytes(data), connection.msgtype)
+        encoding = "cdr" if self._is_cdr else "ros1"
+        with self._opened() as reader:
+            connections = [each for each in reader.connections if each.topic in topics]
+            for connection, arrival_ns, data in reader.messages(connections) if connections else ():
+                decode = self._decoder(bytes(data), connection.msgtype)
+                yield connection.topic, arrival_ns, encoding, bytes(data), decode
 
     def _decoder(self, data: bytes, kind: str) -> Callable[[], Decoded]:
         def decode() -> Decoded:
             try:
-                return self._reader.deserialize(data, kind)
+                return (self._store.deserialize_cdr if self._is_cdr else self._store.deserialize_ros1)(data, kind)
             except Exception as error:  # noqa: BLE001 - as above
                 raise InputError(f"{self._path}: a message of type {_plain(kind)} cannot be decoded: {error}") from None
 
