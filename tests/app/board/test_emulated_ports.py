@@ -91,25 +91,6 @@ def test_a_pulled_cable_is_one_line(so101, teensy):
                 board.receive(0.2)
 
 
-def test_the_makers_sdk_reads_the_emulated_bus_as_we_do(so101):
-    sdk = pytest.importorskip("scservo_sdk", reason="pip install feetech-servo-sdk")
-    port, handler = sdk.PortHandler(so101.name), sdk.PacketHandler(0)
-    assert port.setBaudRate(1_000_000)
-    try:
-        model, result, _ = handler.ping(port, 4)
-        assert (model, result) == (777, sdk.COMM_SUCCESS)
-        reader = sdk.GroupSyncRead(port, handler, 56, 8)
-        for servo in range(1, 7):
-            reader.addParam(servo)
-        assert reader.txRxPacket() == sdk.COMM_SUCCESS
-        degrees = [(reader.getData(servo, 56, 2) - 2048) * 360 / 4096 for servo in range(1, 6)]
-    finally:
-        port.closePort()
-    with open_motion_board(f"feetech:{so101.name}") as board:
-        ours = np.degrees(board.receive(0.0).q[-1])
-    assert degrees == pytest.approx(ours.tolist(), abs=1e-6)
-
-
 @pytest.mark.parametrize(("arm", "kind"), [("so101", "feetech"), ("ar4", "ar4")])
 def test_emulate_serves_an_arm_and_names_its_port(armsight, arm, kind):
     said = armsight("board", "emulate", arm, "--seconds", 0.01, "--json")
