@@ -188,7 +188,8 @@ def estimate_shutters(
                 f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
                 "the body faster, or longer"
             )
-    return Shutters(float(theta[0]), float(theta[1]), cov, math.sqrt(jitter2))
+    # Of global shutters the noise makes half of the readouts negative; no camera's is.
+    return Shutters(float(theta[0]), max(float(theta[1]), 0.0), cov, math.sqrt(jitter2))
 
 
 def _jitter2(scores: Array, curvatures: Array) -> float:

@@ -146,7 +146,8 @@ def find_mounting(
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
         way = point_to_point(arm, q_from, q_to)
         segment = RunSegment("calibration", f"hand-eye {n + 1}", "joints", False, trajectory=way)
-        loop.run(Planned(way, loop.t_s, gravity), way.duration_s + SETTLE_S, segment, watch=False)
+        settle_s = SETTLE_S + 2.0 * loop.setup.board.abilities.latency_s
+        loop.run(Planned(way, loop.t_s, gravity), way.duration_s + settle_s, segment, watch=False)
         poses_before = len(loop.log.poses)
         joints_before = len(loop.log.joints)
         stands = Planned(way, loop.t_s - way.duration_s, gravity)

@@ -157,13 +157,15 @@ def command(
     from armsight.app.run.setup import Devices, open_devices
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
+    from armsight.robot.boards.opening import slowed
     from armsight.vision.follow.follower import follows
     from armsight.vision.markers.targets import open_target
     from armsight.vision.rig import StereoRig
 
     require_matplotlib()
     require_pyarrow()
-    arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
+    arm = slowed(open_arm(arm_spec), board_spec)
+    rig, target = StereoRig.load(rig_path), open_target(target_spec)
     if not follows(target):
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"

@@ -7,13 +7,15 @@ instead of sending what nobody acts on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
 
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import InputError
+from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Command
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
 
@@ -25,7 +27,9 @@ class Abilities:
     Attributes:
         joints: how many joints it drives.
         rate_hz: readings a second, at most.
-        latency_s: time from a command to the state that shows it, s; 0 where it is the tick's.
+        latency_s: by how much the arm lags behind a motion within the two limits below, s; 0 where it is the tick's.
+        most_speed_rad_s: fastest motion that the controller follows with this lag, rad/s.
+        most_acceleration_rad_s2: the same of its acceleration, rad/s^2.
         takes_duty: whether ``gravity_duty`` of a command reaches the motors.
         own_controller: whether the joints are controlled by a controller that armsight cannot tune, configure or test.
         releases: whether the drives can be switched off.
@@ -34,9 +38,19 @@ class Abilities:
     joints: int
     rate_hz: float
     latency_s: float = 0.0
+    most_speed_rad_s: float = math.inf
+    most_acceleration_rad_s2: float = math.inf
     takes_duty: bool = True
     own_controller: bool = False
     releases: bool = True
+
+    def slowed(self, arm: Arm) -> Arm:
+        """Return an arm whose motions are planned no faster than the controller follows them."""
+        return replace(
+            arm,
+            qd_max=np.minimum(arm.qd_max, self.most_speed_rad_s),
+            qdd_max=np.minimum(arm.qdd_max, self.most_acceleration_rad_s2),
+        )
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -12,12 +12,14 @@ from pathlib import Path
 
 from armsight import firmware
 from armsight.errors import InputError
+from armsight.robot.arm import Arm
 from armsight.robot.boards.ar4 import board as ar4_board
 from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.configuration import Configuration, lab_configuration
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.feetech import board as feetech_board
 from armsight.robot.boards.feetech import bus as feetech_bus
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
@@ -95,6 +97,12 @@ def open_motion_board(
         link = SerialLink.open(port, ar4_board.BAUD if baud is None else baud)
         return Ar4Board.connect(link, name=port, model=model or "mk3")
     return open_board(name, plant, config=config, baud=BAUD if baud is None else baud)
+
+
+def slowed(arm: Arm, name: str) -> Arm:
+    """Return an arm whose motions are planned no faster than the board of this name follows them."""
+    own = {FEETECH: feetech_board.ABILITIES, AR4: ar4_board.ABILITIES}
+    return next((abilities.slowed(arm) for kind, abilities in own.items() if name.startswith(kind)), arm)
 
 
 def open_bus(name: str, baud: int | None = None) -> ServoBus:

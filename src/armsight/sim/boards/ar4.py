@@ -27,6 +27,8 @@ from armsight.sim.boards.device import STEP_S
 
 _JOINTS = 6
 _BYTE_S = 10 / 115200
+#: Lengths of the arm, and the lever from which on a joint's load keeps its backlash on one side, m.
+_UPPER_ARM_M, _FOREARM_M, _LOADED_M = 0.305, 0.223, 0.05
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,13 @@ class Ar4Teensy:
         self._follow()
 
     def _follow(self) -> None:
+        """Let the joints follow their motors: loaded ones lean to the side that gravity pulls to, the others stay."""
         half = np.array(self.mechanics.backlash_deg) / 2
+        upper, fore = np.radians(self._motor[1]), np.radians(self._motor[1] + self._motor[2])
+        reach_m = _FOREARM_M * np.cos(fore)
+        for joint, lever_m in ((1, _UPPER_ARM_M * np.sin(upper) + reach_m), (2, reach_m)):
+            if abs(lever_m) > _LOADED_M:
+                self._joint[joint] = self._motor[joint] + np.sign(lever_m) * half[joint]
         self._joint = np.clip(self._joint, self._motor - half, self._motor + half)
 
     def _steps(self) -> Array:
@@ -236,7 +244,8 @@ class Ar4Teensy:
             beside = SENSE[k] * self.mechanics.homing_deg[k] + self.mechanics.scatter_deg * self._rng.standard_normal()
             self._encoder_zero[k] = beside + model.offset_deg[k]
             self._motor[k] = self._target[k] = beside
-            self._joint[k] = beside + SWITCH_AT[k] * self.mechanics.backlash_deg[k] / 2
+            self._joint[k] = beside + SENSE[k] * SWITCH_AT[k] * self.mechanics.backlash_deg[k] / 2
+        self._follow()
         self._say("JC" + "".join(f"{'ABCDEF'[k]}{counts[k]}" for k in range(_JOINTS)))
 
     def _say(self, line: str) -> None:

@@ -1,6 +1,7 @@
 """The bytes of the servo bus: worked examples, the maker's SDK as oracle, and a stream with anything in it."""
 
 import hypothesis.strategies as st
+import numpy as np
 import pytest
 from hypothesis import given, settings
 
@@ -13,7 +14,16 @@ from armsight.robot.boards.feetech.packets import (
     sync_read,
     sync_write,
 )
-from armsight.robot.boards.feetech.registers import GOAL_POSITION, HOMING_OFFSET, LOAD, POSITION, STATE_BYTES
+from armsight.robot.boards.feetech.registers import (
+    GOAL_POSITION,
+    HOMING_OFFSET,
+    LOAD,
+    POSITION,
+    RAD_PER_COUNT,
+    STATE_BYTES,
+    TORQUE,
+)
+from armsight.sim.boards.so101 import So101Bus
 
 
 class Port:
@@ -101,6 +111,55 @@ def test_what_does_not_fit_a_register_is_rejected(register, value):
 
 def test_load_has_a_sign_of_its_own():
     assert LOAD.decode((1024 | 300).to_bytes(2, "little")) == -300
+
+
+class DevicePort:
+    """The SDK's port at an emulated bus, whose time passes as it is read."""
+
+    is_using = False
+
+    def __init__(self, device):
+        self.device, self.data, self.left = device, b"", 0
+
+    def clearPort(self):
+        self.data = b""
+
+    def writePort(self, data):
+        self.device.write(bytes(data))
+        return len(data)
+
+    def readPort(self, length):
+        self.device.step()
+        self.left -= 1
+        self.data += self.device.read()
+        data, self.data = self.data[:length], self.data[length:]
+        return data
+
+    def setPacketTimeout(self, length):
+        self.left = 50
+
+    def isPacketTimeout(self):
+        return self.left <= 0
+
+
+def test_the_sdk_reads_and_moves_the_emulated_bus(sdk):
+    device = So101Bus.made(load=lambda q: np.zeros(6))
+    port, handler = DevicePort(device), sdk.PacketHandler(0)
+    assert handler.ping(port, 4)[:2] == (777, sdk.COMM_SUCCESS)
+    assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
+    reader = sdk.GroupSyncRead(port, handler, POSITION.address, STATE_BYTES)
+    for servo in range(1, 7):
+        reader.addParam(servo)
+    assert reader.txRxPacket() == sdk.COMM_SUCCESS
+    counts = [reader.getData(servo, POSITION.address, 2) for servo in range(1, 7)]
+    assert counts == (np.round(device.servos.shaft / RAD_PER_COUNT) + 2048).tolist()
+    assert handler.write1ByteTxRx(port, 1, TORQUE.address, 1) == (sdk.COMM_SUCCESS, 0)
+    assert handler.write2ByteTxRx(port, 1, GOAL_POSITION.address, counts[0] + 100) == (sdk.COMM_SUCCESS, 0)
+    for _ in range(1000):
+        device.step()
+    value, result, _ = handler.read2ByteTxRx(port, 1, POSITION.address)
+    assert result == sdk.COMM_SUCCESS
+    assert abs(value - counts[0] - 100) <= 2
 
 
 servos = st.integers(0, 252)

@@ -20,7 +20,14 @@ from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.ar4 import lines
 from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
-from armsight.robot.boards.ar4.models import HOMING_GROUPS, MODELS, MOST_SPEED_DEG_S, SENSE, Ar4Model
+from armsight.robot.boards.ar4.models import (
+    HOMING_GROUPS,
+    MODELS,
+    MOST_ACCELERATION_DEG_S2,
+    MOST_SPEED_DEG_S,
+    SENSE,
+    Ar4Model,
+)
 from armsight.robot.boards.codes import Alarm, BoardState, Command, Limited
 from armsight.robot.boards.contract import Abilities, checked_goals
 from armsight.robot.boards.link import Link
@@ -31,7 +38,9 @@ BAUD = 115200
 VERSION = "2.1.0"
 #: Readings a second: a position line takes 7 ms at 115200 baud.
 RATE_HZ = 50.0
-LATENCY_S = 0.05
+#: Steppers slow down towards every goal as if it were the last: they follow goals that move with v at a distance of
+#: v^2 / (2 a). At 20 degrees/s and 30 degrees/s^2 that is 6.7 degrees, or 0.33 s, and as much again from and to rest.
+MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
@@ -41,6 +50,16 @@ _HOMING_S = 60.0
 _STOPS = 3
 #: What an encoder may show beyond the limits and beyond the fastest motion, degrees.
 _MARGIN_DEG = 5.0
+ABILITIES = Abilities(
+    JOINTS,
+    RATE_HZ,
+    LATENCY_S,
+    MOST_SPEED_RAD_S,
+    float(np.radians(MOST_ACCELERATION_DEG_S2)),
+    takes_duty=False,
+    own_controller=True,
+    releases=False,
+)
 
 
 class Ar4Board:
@@ -55,7 +74,7 @@ class Ar4Board:
 
     def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
         self.name, self.model = name, model
-        self.abilities = Abilities(JOINTS, RATE_HZ, LATENCY_S, takes_duty=False, own_controller=True, releases=False)
+        self.abilities = ABILITIES
         self.welcome = Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None)
         self._link, self._now = link, now
         self._reader = LineReader()

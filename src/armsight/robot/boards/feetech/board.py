@@ -7,6 +7,7 @@ gripper's servo is left alone.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -41,8 +42,13 @@ LATENCY_S = 0.115
 MOST_STEP_RAD = float(np.radians(20.0))
 #: Speed and acceleration of the servos towards a goal: 2.6 rad/s, 25 rad/s^2 (100 counts/s^2 a unit).
 _GOAL_SPEED, _ACCELERATION = 1700, 164
+#: What they follow with LATENCY_S, rad/s and rad/s^2.
+_MOST_SPEED, _MOST_ACCELERATION = 1.5, 10.0
 #: The torque goes off so many times: a disturbed byte must not swallow it.
 _STOPS = 3
+ABILITIES = Abilities(
+    len(NAMES), RATE_HZ, LATENCY_S, _MOST_SPEED, _MOST_ACCELERATION, takes_duty=False, own_controller=True
+)
 
 
 class FeetechBoard:
@@ -57,7 +63,7 @@ class FeetechBoard:
     def __init__(self, bus: ServoBus, calibration: ServoCalibration, *, enabled: bool) -> None:
         self._bus, self.calibration = bus, calibration
         count = len(calibration.ids)
-        self.abilities = Abilities(count, RATE_HZ, LATENCY_S, takes_duty=False, own_controller=True)
+        self.abilities = replace(ABILITIES, joints=count)
         self.welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
         self._begin_s = bus.now()
         self._sent = 0
