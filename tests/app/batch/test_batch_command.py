@@ -51,7 +51,7 @@ def clusters():
     """The addresses of clusters of one and of two workers, in this process; benchmarks/record.py has processes."""
     from distributed import LocalCluster
 
-    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": 50}
     with LocalCluster(n_workers=1, **options) as one, LocalCluster(n_workers=2, **options) as two:
         yield one.scheduler_address, two.scheduler_address
 
