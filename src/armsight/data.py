@@ -267,9 +267,9 @@ class JointCommand(Record):
     """Where the joints are to be, as a board takes it.
 
     Attributes:
-        q_ref: (6,) joint angles to be at when ``duration_s`` has passed, rad.
-        qd_ref: (6,) speeds to have there, rad/s.
-        gravity_duty: (6,) duty that compensates the gravity load, -1 to 1.
+        q_ref: (n,) joint angles to be at when ``duration_s`` has passed, rad.
+        qd_ref: (n,) speeds to have there, rad/s.
+        gravity_duty: (n,) duty that compensates the gravity load, -1 to 1.
         duration_s: usually the time until the next command; a whole number of the board's ticks.
     """
 
@@ -285,7 +285,7 @@ class JointStates(Record):
 
     Attributes:
         t_s: (N,) times on the board's clock, s.
-        q: (N, 6) measured joint angles, rad.
+        q: (N, n) measured joint angles, rad.
     """
 
     t_s: Array

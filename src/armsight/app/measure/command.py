@@ -33,6 +33,12 @@ from armsight.errors import InputError
 @click.option(
     "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
 )
+@click.option(
+    "--save-rig",
+    metavar="RIG2.json",
+    type=click.Path(path_type=Path),
+    help="Write the rig with the skew and readout found.",
+)
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
 @click.option(
     "--stream",
@@ -51,6 +57,7 @@ def command(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
     stream: tuple[str, ...],
     view_dir: Path | None,
@@ -82,6 +89,7 @@ def command(
         detections=detections,
         skew=skew,
         readout=readout,
+        save_rig=save_rig,
         output=output,
         streams=stream,
         view_dir=view_dir,

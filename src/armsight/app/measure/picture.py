@@ -272,8 +272,8 @@ def header(shot: ShotPose) -> list[str]:
     count, dropped = len(shot.points_m), len(shot.dropped)
     _, precision, calibration = (1e3 * sigma for sigma in shot.position_sigmas_m)
     fit = (
-        f"precision {precision:.3f} mm, calibration {calibration:.3f} mm; reprojection {shot.reprojection_rms_px:.3f} px RMS, "
-        f"misfit {shot.misfit:.1f}, {count} points"
+        f"precision {precision:.3f} mm, calibration {calibration:.3f} mm; "
+        f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {count} points"
     )
     return [
         ", ".join(first),

@@ -4,8 +4,8 @@ In: what vision measured in a shot. Out: a :class:`ShotPose`. All is in the left
 [translation m; rotation rad] along the axes of the left camera (the true pose is the estimate rotated by the rotation
 vector about the body's origin, and shifted); ``covariance_body`` is the same along the body's axes, as
 docs/concepts/conventions.md defines it (perturbation on the right). ``covariance`` is the sum of two shares:
-``covariance_precision`` differs from shot to shot (noise of the images), ``covariance_calibration`` is common to all shots of a
-rig: no mean over shots lowers it.
+``covariance_precision`` differs from shot to shot (noise of the images), ``covariance_calibration`` is common to all shots
+of a rig: no mean over shots lowers it.
 
 ``euler_zyx_deg`` are the angles about z, y and x, in this order: R = R_z R_y R_x. ROS lists the same three angles the other
 way round, as roll (about x), pitch, yaw (about z).

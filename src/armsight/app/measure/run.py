@@ -70,6 +70,7 @@ def measure_shots(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
     streams: Sequence[str],
     view_dir: Path | None,
@@ -86,6 +87,7 @@ def measure_shots(
         detections: a file of detections, where there are no images.
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
+        save_rig: file for the rig with the skew and readout that were found or given.
         output: CSV file of the poses.
         streams: what to publish each pose to.
         view_dir: folder for pictures.
@@ -100,6 +102,10 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
+    if save_rig is not None:
+        if requested is None:
+            raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
+        check_writable(save_rig, apart_from=(rig, target, output))
     stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
@@ -155,6 +161,9 @@ def measure_shots(
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
+    moved = next((r.shutters for r in records if r.shutters is not None), None)
+    if save_rig is not None and moved is not None:
+        replace(stereo, shutters=moved).save(save_rig)
     health = monitor.findings()
     if skewed and any(each.cause == "rig" for each in health):
         # Of a moving body a skew looks like cameras that moved against each other.

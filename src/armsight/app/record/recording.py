@@ -69,7 +69,7 @@ def record(
         InputError: the folder is not empty, or holds a recording already.
     """
     folder = unused_folder(directory)
-    writer = _Writer(folder)
+    writer = ShotFolder(folder)
     stopped, interrupted = None, False
     first: Shot | None = None
     started_s = time.monotonic()
@@ -123,25 +123,40 @@ def unused_folder(directory: str | Path) -> Path:
     return check_folder(directory, problem="no recording can be made here")
 
 
-class _Writer:
-    """The folder being written; it is made with the first shot."""
+class ShotFolder:
+    """A folder of shots being written; it is made with the first shot.
+
+    Args:
+        folder: a new or empty folder.
+
+    Attributes:
+        shots: number of shots in the index.
+        problems: number of those without images.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._index: int | None = None
         self._whole = 0  # bytes of the index that are complete
         self.shots = 0
         self.problems = 0
 
     def add(self, shot: Shot) -> Shot:
-        """Store one shot, completely or not at all; return it with its files' bytes, unless it has those of the cameras."""
+        """Store one shot, completely or not at all.
+
+        Returns:
+            The shot with its files' bytes, unless it has those of the cameras.
+
+        Raises:
+            InputError: it cannot be written, the disk is full.
+        """
         index = self._opened()
         files: list[Path] = []
         encoded: list[bytes] = []
         try:
             if shot.problem is None:
                 for side in SIDES:
-                    files.append(self._folder / f"{side}{self.shots:06d}.png")
+                    files.append(self.folder / f"{side}{self.shots:06d}.png")
                     _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
                     with replacing(files[-1], "wb") as file:
                         file.write(data)
@@ -164,16 +179,16 @@ class _Writer:
         if self._index is not None:
             os.close(self._index)
             if self._whole == 0:
-                (self._folder / INDEX).unlink()
+                (self.folder / INDEX).unlink()
 
     def _opened(self) -> int:
         """Return the open index, a file descriptor; make folder and index the first time."""
         if self._index is None:
             try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                self._index = os.open(self._folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self._index = os.open(self.folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             except OSError as error:
-                raise InputError(f"{self._folder}: no recording can be made here: {error.strerror}") from None
+                raise InputError(f"{self.folder}: no recording can be made here: {error.strerror}") from None
         return self._index
 
     def _append(self, index: int, row: list[str]) -> None:
@@ -185,4 +200,4 @@ class _Writer:
             if os.write(index, data) < len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            raise InputError(f"{self._folder / INDEX}: cannot be written: {error.strerror}") from None
+            raise InputError(f"{self.folder / INDEX}: cannot be written: {error.strerror}") from None

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
 
 _HANDEYE_POSES = 30
+_POSES = "poses:"
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class RunPlan:
     Attributes:
         rig: the calibrated cameras.
         motions: the motions.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
         streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.
@@ -59,7 +60,14 @@ class RunPlan:
     "--board",
     "board_spec",
     required=True,
-    help="The controller: serial:PORT (docs/howto/board.md); emulated: with sim:.",
+    help="The controller: serial:PORT, feetech:PORT, ar4:PORT (docs/howto/board.md); emulated: with sim:; poses:FILE"
+    " where another program moves the arm and logs its angles.",
+)
+@click.option(
+    "--calibration",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048.",
 )
 @click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
@@ -87,7 +95,7 @@ class RunPlan:
     type=click.FloatRange(min=0.0, max=1_000.0),
     default=0.1,
     show_default=True,
-    help="Sigma of the time between the two exposures of a shot, ms; sim: knows its own.",
+    help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
 )
 @click.option(
     "--stream",
@@ -109,6 +117,7 @@ class RunPlan:
 def command(
     source_spec: str,
     board_spec: str,
+    calibration: Path | None,
     rig_path: Path,
     target_spec: str,
     arm_spec: str,
@@ -124,7 +133,18 @@ def command(
 
     The arm moves on its own: hand-eye poses around those of the motion, a sweep, the motions twice. Keep the emergency stop
     at hand. Ctrl-C stops the arm first and then saves what was measured.
+
+    With --board poses:FILE nothing is commanded: FILE is a CSV of joint angles (q1_deg ..) that another program logged, by
+    name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
+    if board_spec.startswith(_POSES):
+        if motion is not None or open_loop:
+            raise InputError(f"--board {board_spec} commands no motion: leave out --motion and --open-loop")
+        _run_logged(
+            source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
+        )
+        return
+
     import numpy as np
 
     from armsight.app.progress import steps
@@ -155,7 +175,7 @@ def command(
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
     plan = RunPlan(rig, motions, targets, not open_loop, stream, time.perf_counter())
-    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
+    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration)
     with steps() as progress:
         progress("opening the devices")
         with open_devices(devices) as setup:
@@ -174,6 +194,38 @@ def command(
     else:
         print_summary(summary, output)
     if summary.health:
+        click.get_current_context().exit(UNTRUSTED)
+
+
+def _run_logged(
+    source_spec: str, path: Path, rig_path: Path, target_spec: str, arm_spec: str, output: Path, as_json: bool
+) -> None:
+    """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
+    import contextlib
+
+    from armsight.app.messages import colour, weak
+    from armsight.app.progress import steps
+    from armsight.app.report.page import writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.run.angles import read_angles
+    from armsight.app.run.logged import run_logged, summary_lines, write_logged
+    from armsight.robot.arm_file import open_arm
+    from armsight.vision.markers.targets import open_target
+    from armsight.vision.rig import StereoRig
+    from armsight.vision.sources import open_source
+
+    require_matplotlib()
+    arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
+    angles = read_angles(path, arm)
+    folder = writable_folder(output, "no run")
+    with contextlib.closing(open_source(source_spec)) as source, steps() as progress:
+        result = run_logged(source, rig, target, arm, angles, progress)
+        progress("writing and plotting")
+        summary = write_logged(folder, result, {"arm": arm_spec, "board": f"{_POSES}{path}"})
+    click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, folder)))
+    for line in result.weak:
+        click.echo(weak(line), err=True, color=colour())
+    if result.weak:
         click.get_current_context().exit(UNTRUSTED)
 
 

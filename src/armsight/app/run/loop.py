@@ -28,11 +28,15 @@ from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estima
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
+from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower
+from armsight.vision.rig import Shutters
+from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
 #: How long one thread may hold the interpreter lock, s. An iteration of the loop takes the lock back about twelve times;
 #: with Python's default of 5 ms it would last longer than a board waits for commands.
@@ -156,6 +160,9 @@ SIMULATED_SEARCH_S = 0.06
 RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # interval of the fused track that is noted at once: cheaper than every iteration
 _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was sent: cheaper still
+#: The motion of the body about an exposure is a cubic through the live estimates so near to it, s, which are among the
+#: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
+_MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
 
@@ -185,8 +192,13 @@ class Loop:
 
     Attributes:
         mounting: poses of cameras and body on the arm; None before they are known: then the estimator has the joints alone.
+        delay_s: delay of the images, s; None before it was measured.
+        shutters: when the cameras expose, where they do not at one time: from the rig file, or found by the sweep. Once the
+            delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
+        on_period: called in every period before its command; what it raises ends the motion.
+        segment: the entry of the log of what is running, with its begin; None before the first.
         t_s: time of the newest reading, board's clock, s.
         publisher: is given every batch of readings, and every shot after the command that follows from it was sent.
     """
@@ -195,12 +207,17 @@ class Loop:
         self.board, self.setup, self.follower = setup.board, setup, follower
         self.estimator, self.log = estimator, log
         self.mounting: Mounting | None = None
+        self.delay_s: float | None = None
+        self.shutters: Shutters | None = follower.rig.shutters
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
+        self.on_period: Callable[[], None] = lambda: None
+        self.segment: RunSegment | None = None
         self.t_s = 0.0
         self.publisher: Publisher = Fanout()
         self._datum: ShotDatum | None = None
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
+        self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
@@ -209,7 +226,9 @@ class Loop:
         self._noted: list[Interval] = []
         self._first = 0
         self._watch = Watch(self._measured, PERIOD_S)
-        self._expected: Array | None = None  # predicted pose of a lost body in the shot that is measured
+        # Of a lost body in the shot that is measured: its predicted pose and its velocity.
+        self._expected: Array | None = None
+        self._twist: Array | None = None
         self._search: tuple[Shot, PoseEstimate | Missed, float] | None = None  # in lock-step; and when it will be over
         # Of the host's clock, s: when the next iteration is due, and when the measurement of the newest shot began.
         self._due = self._taken_s = 0.0
@@ -336,7 +355,9 @@ class Loop:
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
-            result = self._skew.widened(self.health.received(result, shot.t_s), shot.t_s)
+            result = self._at_one_time(result, shot.t_s)
+        if isinstance(result, PoseEstimate) and shot.t_s is not None:
+            result = self.health.received(result, shot.t_s)
             if self.mounting is not None:
                 plain = self.mounting.pose_measurement(result, shot.t_s)
                 measurement = self.health.widened(plain)
@@ -356,6 +377,32 @@ class Loop:
             suspected,
         )
         return shot, self._taken_s, result
+
+    def _at_one_time(self, result: PoseEstimate, t_s: float) -> PoseEstimate | Missed:
+        """Move what the cameras saw at several times to the time of a shot, s; what is not known of the skew widens it."""
+        motion = None if self.shutters is None else self._motion(t_s)
+        if self.shutters is None or motion is None:
+            return self._skew.widened(result, t_s)
+        seen = TimedShot(t_s, result.points.seen, result.T_left_body)
+        return measure_with_motion(self.follower.rig, self.setup.target.body, seen, motion, self.shutters)
+
+    def _motion(self, t_s: float) -> Motion | None:
+        """Return the motion of the body about the exposure of a shot that is stamped ``t_s``; None where it is unknown."""
+        if self.mounting is None or self.delay_s is None:
+            return None
+        exposed_s = t_s - self.delay_s
+        near = [live for live in self.log.live[-_MOTION_NEWEST:] if abs(live.t_s - exposed_s) <= _MOTION_S]
+        if len(near) < 8:
+            return None
+        tau = np.array([live.t_s for live in near]) - exposed_s
+        Ts = np.array([live.T_base_tool for live in near]) @ self.mounting.T_tool_body
+        xi = log_se3(inverse(Ts[np.argmin(np.abs(tau))]) @ Ts)
+        X = (tau[:, None] / _MOTION_S) ** np.arange(4)
+        fit = np.linalg.pinv(X) / (_MOTION_S ** np.arange(4))[:, None]
+        _, twist, half, _ = fit @ xi
+        scatter = xi - X @ (np.linalg.pinv(X) @ xi)
+        variance = (scatter**2).sum(axis=0) / (len(near) - 4) / _SCATTER_SHARE**2
+        return Motion(twist, 2.0 * half, np.diag(variance) * float(fit[1] @ fit[1]), True)
 
     def _publish(self) -> None:
         """Publish the shot that was measured in this iteration, and before it a mounting that is new."""
@@ -385,16 +432,21 @@ class Loop:
         return shot, result
 
     def _measured(self, shot: Shot) -> PoseEstimate | Missed:
-        return self.follower.measure(shot, self._expected)
+        return self.follower.measure(shot, self._expected, self._twist)
 
     def _newest(self) -> Shot | None:
         """Return the newest shot, if there is one, with its time on the board's clock."""
         shot, clock = self.setup.poll(), self.setup.clock
         self._taken_s = time.perf_counter()
-        self._expected = None
+        self._expected = self._twist = None
+        shot = shot if shot is None or clock is None else clock.on_board(shot)
+        if shot is not None and shot.t_s is not None:
+            shot = replace(shot, t_s=self._frames.time(shot.t_s))
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
-        return shot if shot is None or clock is None else clock.on_board(shot)
+            motion = None if shot.t_s is None else self._motion(shot.t_s)
+            self._twist = None if motion is None else motion.twist
+        return shot
 
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
         """Let a controller command the joints for some time.
@@ -425,11 +477,13 @@ class Loop:
     def _iterate(self, controller: Controller, over: Callable[[], bool], segment: RunSegment, *, watch: bool) -> None:
         """Let a controller command the joints, period by period, until ``over`` returns True."""
         begin_s = self.t_s
+        self.segment = replace(segment, begin_s=begin_s)
         self._watch.forget()
         self._search = None
         try:
             while not over():
                 self.pass_time(self._rest_of_period())
+                self.on_period()
                 self._check_board()
                 controller.prepare(self.t_s)  # before the image is measured, so that its command need not wait for it
                 measured = self.look() if watch else None
@@ -473,7 +527,7 @@ class Loop:
     def _at_rest(self, duration_s: float) -> JointCommand:
         """Return the command to be at rest at the reference of the newest command."""
         newest = self.log.commands[-1][1]
-        return JointCommand(newest.q_ref, np.zeros(6), newest.gravity_duty, duration_s)
+        return JointCommand(newest.q_ref, np.zeros_like(newest.q_ref), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:
         """Raise a DeviceError if the board no longer follows commands."""

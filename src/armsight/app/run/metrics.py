@@ -124,7 +124,7 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
 
 
 def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
-    """Return the RMS distance of the tool from its reference in the last fifth of a second of each rest that is as long, m."""
+    """Return the RMS distance of the tool from its reference over the last fifth of a second of each rest as long, m."""
     found = {}
     for segment in run.segments:
         rows = (run.reference.t_s > segment.end_s - _SETTLED_S) & (run.reference.t_s <= segment.end_s)
@@ -150,7 +150,7 @@ def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]
 
 
 def partly_uncorrected(arm: Arm, q: Array) -> bool:
-    """Return whether the servo corrects the tool only in part at joint angles (6,), rad, as the arm is nearly singular.
+    """Return whether the servo corrects the tool only in part at joint angles (n,), rad, as the arm is nearly singular.
 
     That is where the least singular value of the Jacobian (linear rows divided by the arm's size) is below
     ``CORRECTED_ABOVE``, a tuning of the servo: from there on it reduces its correction in that direction. Rests there are

@@ -277,8 +277,8 @@ class RunData(Record):
 
     Attributes:
         t_s: (N,) times of the potentiometers' readings, s.
-        q: (N, 6) joint angles from the potentiometers, rad.
-        q_ref: (N, 6) reference joint angles, rad; NaN where nothing was planned.
+        q: (N, n) joint angles from the potentiometers, rad.
+        q_ref: (N, n) reference joint angles, rad; NaN where nothing was planned.
         potentiometers: tool track by the nominal arm's forward kinematics of ``q``.
         vision: tool track measured by vision, one row a shot.
         fused: estimated tool track, smoothed, with vision before and after each time.
@@ -391,7 +391,7 @@ def _mistimed(seen: list[PoseMeasurement], delay: Delay) -> Array:
 
 
 def joints_of(log: Log) -> tuple[Array, Array, Array]:
-    """Return the times (N,) of a log's readings, s, the joints (N, 6), and their reference, rad; NaN where none is."""
+    """Return the times (N,) of a log's readings, s, the joints (N, n), and their reference, rad; NaN where none is."""
     t_s = np.concatenate([s.t_s for s in log.joints])
     q = np.concatenate([s.q for s in log.joints])
     q_ref = np.full_like(q, np.nan)

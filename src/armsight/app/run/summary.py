@@ -35,6 +35,7 @@ from armsight.app.run.record import RunData, ToolTrack
 from armsight.files import finite_json
 from armsight.loop.health import HealthFinding, health_lines
 from armsight.robot.arm import Arm
+from armsight.vision.rig import Shutters
 
 #: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.
 VERSION = 2
@@ -115,6 +116,7 @@ class RunSummary:
         search: the same where the body was searched, and commands continued meanwhile, s; None without a search.
         handeye: the hand-eye calibration; None where the run ended before it.
         delay_s: delay of the cameras' time stamps, s, and its sigma, s.
+        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
         shots: numbers of shots.
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
@@ -131,6 +133,7 @@ class RunSummary:
     search: Spread | None = None
     handeye: HandEyeSummary | None = None
     delay_s: tuple[float, float] | None = None
+    shutters: Shutters | None = None
     shots: ShotCounts | None = None
     studies: Sequence[Study] = ()
     health: Sequence[HealthFinding] = ()
@@ -154,6 +157,8 @@ class RunSummary:
             found["handeye"] = asdict(self.handeye)
         if self.delay_s is not None:
             found["camera_delay_s"] = {"value": self.delay_s[0], "sigma": self.delay_s[1]}
+        if self.shutters is not None:
+            found["shutters"] = self.shutters.to_json()
         if self.shots is not None:
             found["shots"] = asdict(self.shots)
         if self.handeye is not None:
@@ -247,6 +252,7 @@ def summary_of(
         spread(run.search_s) if len(run.search_s) else None,
         HandEyeSummary(*result.handeye.found.held_out.rms(), len(result.handeye.q)),
         (result.delay.delay_s, result.delay.sigma_s),
+        result.shutters,
         ShotCounts(len(run.vision), run.missed, run.rejected, run.reopened, run.misfit_max),
         studies,
         result.health,
