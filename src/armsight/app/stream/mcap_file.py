@@ -137,10 +137,11 @@ class LazyMcap:
         folder: of the run.
         published: what all data have in common.
         say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
+        name: of the file.
     """
 
-    def __init__(self, folder: Path, published: Published, say: Callable[[str], None]) -> None:
-        self._path, self._published, self._say = folder / RUN_MCAP, published, say
+    def __init__(self, folder: Path, published: Published, say: Callable[[str], None], name: str = RUN_MCAP) -> None:
+        self._path, self._published, self._say = folder / name, published, say
         self._began = False
         self.sink: McapSink | None = None
 
