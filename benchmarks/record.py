@@ -207,7 +207,7 @@ def batch(count: int = 100) -> None:
     from pyarrow import parquet
 
     from armsight.app.batch.run import Batch, run_batch
-    from armsight.app.batch.work import Options
+    from armsight.app.batch.work import BatchOptions
 
     with tempfile.TemporaryDirectory() as name:
         here = Path(name)
@@ -223,7 +223,7 @@ def batch(count: int = 100) -> None:
             for left in itertools.islice(itertools.cycle(lefts), k % len(lefts), k % len(lefts) + 4):
                 for file in (left, folder / left.name.replace("left", "right")):
                     os.symlink(file, take / file.name)
-        options = Options("measure", str(here / "rig.json"), spec)
+        options = BatchOptions("measure", str(here / "rig.json"), spec)
         seconds, tables = {}, {}
         for workers in (1, 2, 4):
             out = here / f"out{workers}"

@@ -8,7 +8,7 @@ pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
 from armsight.app.batch.run import Batch, found_recordings, run_batch
-from armsight.app.batch.work import Done, Options, work
+from armsight.app.batch.work import Done, BatchOptions, work
 from armsight.errors import InputError
 from cli_runs import assert_rejected
 
@@ -51,13 +51,13 @@ def clusters():
     """The addresses of clusters of one and of two workers, in this process; benchmarks/record.py has processes."""
     from distributed import LocalCluster
 
-    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": 50}
     with LocalCluster(n_workers=1, **options) as one, LocalCluster(n_workers=2, **options) as two:
         yield one.scheduler_address, two.scheduler_address
 
 
 def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, rendered, tmp_path, clusters):
-    options = Options("measure", str(rendered.rig), str(rendered.plate))
+    options = BatchOptions("measure", str(rendered.rig), str(rendered.plate))
     one, two = clusters
     said = []
     done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, scheduler=one), said.append)
@@ -106,13 +106,13 @@ def test_only_a_few_recordings_are_handed_out_at_a_time(monkeypatch):
     held, most = set(), []
     monkeypatch.setattr("distributed.as_completed", Completed)
     paths = [f"{k:05d}" for k in range(10_000)]
-    found = [path for path, _ in module._results(Client(), paths, Options("measure"), 8)]
+    found = [path for path, _ in module._results(Client(), paths, BatchOptions("measure"), 8)]
     assert found == paths
     assert max(most) <= 8
 
 
 def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
-    done = work(str(tmp_path / "none.bag"), Options("measure", target="chessboard:9x6:25mm"))
+    done = work(str(tmp_path / "none.bag"), BatchOptions("measure", target="chessboard:9x6:25mm"))
     assert done.recording["status"] == "failed"
     assert "no such recording" in done.recording["reason"]
     assert done.shots == []
@@ -125,7 +125,10 @@ def test_recordings_are_found_in_any_store(tmp_path):
     memory.pipe("/a/x.bag", b"1")
     memory.pipe("/a/b/y.bag", b"2")
     assert found_recordings(["memory://a/**/*.bag"]) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
-    assert "damaged" in work("memory:///a/x.bag", Options("measure", target="chessboard:9x6:25mm")).recording["reason"]
+    assert (
+        "damaged"
+        in work("memory:///a/x.bag", BatchOptions("measure", target="chessboard:9x6:25mm")).recording["reason"]
+    )
     memory.rm("/a", recursive=True)
     with pytest.raises(InputError, match="no such recording; quote the pattern"):
         found_recordings([str(tmp_path / "*.bag")])

@@ -17,12 +17,12 @@ pytest.importorskip("foxglove_schemas_protobuf")
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text, quaternion
 from armsight.app.stream.mcap_file import LazyMcap, McapSink, arm_of, properties
 from armsight.data import Body, Dropped, JointStates, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import exp_so3
+from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.robot.arm_file import open_arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.measure import measure_seen
@@ -165,6 +165,21 @@ def test_the_file_is_hardly_larger_than_its_images(tmp_path):
         [ShotDatum(Shot(f"{k}", None, None, 0.1 * k, None, (jpeg, jpeg)), result) for k in range(20)],
     )
     assert (tmp_path / "a.mcap").stat().st_size < 1.05 * 40 * len(jpeg)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 2.0, np.pi - 1e-6, np.pi])
+def test_the_quaternion_is_that_of_scipy(angle):
+    for axis in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(1).normal(size=(20, 3))]):
+        R = exp_so3(angle * axis / np.linalg.norm(axis))
+        ours, theirs = np.array(quaternion(R)), quaternion_wxyz(R)
+        assert ours[0] >= 0.0
+        np.testing.assert_allclose(abs(ours @ theirs), 1.0, atol=1e-12)
+        if angle < 3.0:
+            np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
+def test_infinity_becomes_null():
+    assert json_text({"a": [1.5, float("inf")], "b": {"c": float("nan")}}) == b'{"a": [1.5, null], "b": {"c": null}}'
 
 
 def test_the_arm_comes_back_with_all_digits():

@@ -173,6 +173,13 @@ def test_topics_that_are_no_stereo_pair_are_named(tmp_path, change, words):
     assert open_source(f"bag:{path},left={LEFT},right={RIGHT}") if words[0].startswith("nothing") else True
 
 
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_recording_without_joints_has_none(tmp_path, container):
+    bag = Bag(write_bag(tmp_path / "a", container, images()))
+    assert read_joints(bag) is None
+    assert list(bag.messages([])) == []
+
+
 def test_the_user_names_the_topics(tmp_path):
     sent = [Sent(s.topic.replace("left", "b").replace("right", "a"), s.stamp_ns, s.content) for s in images()]
     path = write_bag(tmp_path / "a", "mcap", sent)

@@ -42,12 +42,12 @@ def command(
     (armsight replay -h).
     """
     from armsight.app.batch.run import Batch, run_batch
-    from armsight.app.batch.work import Options
+    from armsight.app.batch.work import BatchOptions
     from armsight.errors import InputError
 
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: a cluster has its own workers; give one of the two")
-    options = Options(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
+    options = BatchOptions(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
     batch = Batch(recordings, output.expanduser(), options, workers, scheduler)
     done = run_batch(batch, lambda line: click.echo(line, err=True))
     if as_json:

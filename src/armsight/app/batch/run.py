@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from armsight import __version__
-from armsight.app.batch.work import Done, Options, work
+from armsight.app.batch.work import Done, BatchOptions, work
 from armsight.app.progress import bar
 from armsight.errors import InputError
 from armsight.files import check_folder, replacing, write_text
@@ -45,7 +45,7 @@ class Batch:
 
     recordings: Sequence[str]
     output: Path
-    options: Options
+    options: BatchOptions
     workers: int | None = None
     scheduler: str | None = None
 
@@ -105,7 +105,7 @@ def found_recordings(patterns: Sequence[str]) -> list[str]:
     return sorted(found)
 
 
-def _key(path: str, options: Options) -> str:
+def _key(path: str, options: BatchOptions) -> str:
     """Return a name that changes with a recording's path, size and time, the options and the version."""
     try:
         import fsspec
@@ -173,7 +173,7 @@ def _client(batch: Batch, count: int, say: Callable[[str], None]) -> Iterator[tu
         yield client, max(1, len(client.scheduler_info()["workers"]))
 
 
-def _results(client: _Client, paths: list[str], options: Options, in_hand: int) -> Iterator[tuple[str, Done]]:
+def _results(client: _Client, paths: list[str], options: BatchOptions, in_hand: int) -> Iterator[tuple[str, Done]]:
     """Yield what comes back, in any order."""
     from distributed import as_completed
 

@@ -22,7 +22,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Options:
+class BatchOptions:
     """What is done with every recording.
 
     Attributes:
@@ -57,7 +57,7 @@ class Done:
     shots: list[Row]
 
 
-def work(path: str, options: Options) -> Done:
+def work(path: str, options: BatchOptions) -> Done:
     """Do the operation on one recording; a mistake in it is a row with its reason."""
     try:
         with _local(path) as local:
@@ -84,7 +84,7 @@ def _local(path: str) -> Iterator[str]:
         yield str(local)
 
 
-def _replay(path: str, options: Options) -> tuple[Row, list[Row]]:
+def _replay(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     """Replay a recording."""
     from armsight.app.measure.poses import csv_text
     from armsight.app.replay.open import Request, replay
@@ -114,7 +114,7 @@ def _cell(name: str, text: str) -> str | float | None:
     return float(text) if text else None
 
 
-def _by_command(path: str, options: Options) -> tuple[Row, list[Row]]:
+def _by_command(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     """Run a command of one recording, and take the JSON that it prints."""
     import importlib
 
@@ -128,7 +128,7 @@ def _by_command(path: str, options: Options) -> tuple[Row, list[Row]]:
 
 
 #: Operation -> what does it.
-OPERATIONS: dict[str, Callable[[str, Options], tuple[Row, list[Row]]]] = {
+OPERATIONS: dict[str, Callable[[str, BatchOptions], tuple[Row, list[Row]]]] = {
     "measure": _replay,
     "replay": _replay,
     "identify": _by_command,

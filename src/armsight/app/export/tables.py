@@ -81,7 +81,8 @@ def _joints(run: RecordedRun) -> Table:
         for each in run.of(JointsDatum)
         for t_s, q in zip(each.content["t_s"], each.content["q_rad"], strict=True)
     ]
-    return ["t_s", *(f"q{k}_rad" for k in range(1, 7))], rows
+    count = max((len(row) for row in rows), default=1)
+    return ["t_s", *(f"q{k}_rad" for k in range(1, count))], rows
 
 
 def write_csv(run: RecordedRun, folder: Path) -> list[Path]:

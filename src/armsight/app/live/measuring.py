@@ -20,6 +20,8 @@ from armsight.app.live.capture import LiveShot
 from armsight.app.live.quality import Note
 from armsight.app.live.records import Drawn, polyline
 from armsight.app.measure.poses import csv_text, shot_pose
+from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array, Missed, PoseEstimate
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
@@ -160,6 +162,7 @@ class MeasureStep:
         self._pivot_poses: list[Array] | None = None
         self._pivot_text = ""
         self._file: TextIO | None = None
+        self._mcap: LazyMcap | None = None
         self._file_path, self._rows = Path(), 0
         self._clear()
 
@@ -273,7 +276,7 @@ class MeasureStep:
         )
 
     def record(self) -> None:
-        """Begin to write every pose to a new CSV file; or end.
+        """Begin to write every pose to a new CSV file, and an MCAP file beside it; or end.
 
         Raises:
             InputError: nothing is measured, or the file cannot be made.
@@ -296,6 +299,12 @@ class MeasureStep:
                 self._close_file()
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
             self._file_path, self._rows = path, 0
+            published = Published(self.rig, self._target.body, None, properties(self.rig, None, command="live"))
+            self._mcap = LazyMcap(self.folder, published, self._said, path.with_suffix(".mcap").name)
+
+    def _said(self, line: str) -> None:
+        """Pass a line about the recording on to the person."""
+        self._say(Note("warn", line.removeprefix("note: ")))
 
     def _write(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Write a row, whole; a full disk ends the recording."""
@@ -307,6 +316,8 @@ class MeasureStep:
             self._file.write(row)
             self._file.flush()
             self._rows += 1
+            if self._mcap is not None:
+                self._mcap.put(ShotDatum(live.shot, result, time.monotonic()))
         except OSError as error:
             self._close_file()
             why = f"the recording has ended: {error.strerror}; {self._rows} poses are in {self._file_path}"
@@ -314,6 +325,9 @@ class MeasureStep:
 
     def _close_file(self) -> None:
         file, self._file = self._file, None
+        mcap, self._mcap = self._mcap, None
+        if mcap is not None:
+            mcap.close()
         if file is not None:
             try:
                 file.close()

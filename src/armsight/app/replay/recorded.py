@@ -51,7 +51,8 @@ class RecordedDatum:
     @property
     def states(self) -> JointStates:
         """The readings of a batch."""
-        return JointStates(np.array(self.content["t_s"], float), np.array(self.content["q_rad"], float).reshape(-1, 6))
+        t_s = np.array(self.content["t_s"], float)
+        return JointStates(t_s, np.array(self.content["q_rad"], float).reshape(len(t_s), -1))
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ import numpy as np
 
 from armsight.app.measure.poses import ShotPose, left_axes, shot_pose
 from armsight.app.replay.recorded import EventDatum, JointsDatum, RecordedDatum, RecordedRun, ShotDatum
+from armsight.app.stream.datum import quaternion
 from armsight.app.stream.sink import Publisher
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Estimator, Mounting, Prior
 from armsight.robot.arm import Arm
 from armsight.vision.detections import SeenShot
@@ -74,7 +74,7 @@ def live_row(estimate: ArmEstimate) -> LiveRow:
     return LiveRow(
         estimate.t_s,
         T[:3, 3],
-        quaternion_wxyz(T[:3, :3]),
+        np.array(quaternion(T[:3, :3])),
         left_axes(T, estimate.cov),
         estimate.vision_age_s,
     )

@@ -351,7 +351,7 @@ class Loop:
         if measured is None:
             return None
         shot, result = measured
-        outcome, T_base_tool, suspected = None, None, None
+        outcome, T_base_rig, T_base_tool, suspected = None, None, None, None
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
@@ -363,7 +363,8 @@ class Loop:
                 measurement = self.health.widened(plain)
                 if measurement is not plain and self.health.moved is not None:
                     suspected = self.health.moved.suspected
-                outcome, T_base_tool = self.estimator.vision(measurement), measurement.T_base_tool
+                outcome = self.estimator.vision(measurement)
+                T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
         self._datum = ShotDatum(
@@ -372,7 +373,7 @@ class Loop:
             self.t_s,
             self.setup.sync_s,
             None if outcome is None else outcome.value,
-            None if self.mounting is None else self.mounting.T_base_rig,
+            T_base_rig,
             T_base_tool,
             suspected,
         )
@@ -409,7 +410,7 @@ class Loop:
         if self._datum is None:
             return
         mounting = self.mounting
-        if mounting is not None and mounting is not self._known:
+        if mounting is not None and mounting is not self._known and self._datum.outcome is not None:
             self._known = mounting
             self.publisher.put(EventDatum(self.t_s, mounting_event(mounting)))
         self.publisher.put(self._datum)

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 
 from armsight.app.measure.poses import left_axes
-from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.geometry.rotation import quaternion_wxyz
 from armsight.vision.rigfiles.rigfile import rectification
 
 #: A protobuf message.
@@ -266,7 +265,7 @@ def _jpeg(image: Image) -> bytes:
 
 def _set_pose(position: Message, orientation: Message, T: Array) -> None:
     position.x, position.y, position.z = T[:3, 3].tolist()
-    orientation.w, orientation.x, orientation.y, orientation.z = quaternion_wxyz(T[:3, :3]).tolist()
+    orientation.w, orientation.x, orientation.y, orientation.z = quaternion(T[:3, :3])
 
 
 def _colour(field: Message, rgba: tuple[float, float, float, float]) -> None:

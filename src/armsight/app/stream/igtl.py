@@ -16,10 +16,9 @@ from functools import cache
 
 import numpy as np
 
-from armsight.app.stream.datum import Datum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import Datum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
 from armsight.app.stream.network import TcpSink, host_and_port, listening
 from armsight.data import Array, Missed, PoseEstimate
-from armsight.geometry.rotation import quaternion_wxyz
 
 _HEADER = struct.Struct(">H12s20sQQQ")
 _VERSION = 1
@@ -51,7 +50,7 @@ def transform_body(T: Array) -> bytes:
 
 def position_body(T: Array) -> bytes:
     """Return the content of POSITION: position, mm, and quaternion x y z w."""
-    w, x, y, z = quaternion_wxyz(T[:3, :3]).tolist()
+    w, x, y, z = quaternion(T[:3, :3])
     return struct.pack(">7f", *(1e3 * T[:3, 3]).tolist(), x, y, z, w)
 
 

@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 
 from armsight import __version__
-from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
@@ -89,7 +89,7 @@ class McapSink(Sink):
                 datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
             )
             channel = self._json_channel(TOPICS[type(datum)])
-            self._add(channel, log_ns, stamp_ns, json.dumps(content, allow_nan=False).encode())
+            self._add(channel, log_ns, stamp_ns, json_text(content))
 
     def _add(self, channel: int, log_ns: int, stamp_ns: int, data: bytes) -> None:
         self._writer.add_message(channel, log_ns, data, stamp_ns)
@@ -137,10 +137,11 @@ class LazyMcap:
         folder: of the run.
         published: what all data have in common.
         say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
+        name: of the file.
     """
 
-    def __init__(self, folder: Path, published: Published, say: Callable[[str], None]) -> None:
-        self._path, self._published, self._say = folder / RUN_MCAP, published, say
+    def __init__(self, folder: Path, published: Published, say: Callable[[str], None], name: str = RUN_MCAP) -> None:
+        self._path, self._published, self._say = folder / name, published, say
         self._began = False
         self.sink: McapSink | None = None
 

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
 
@@ -32,7 +32,7 @@ def json_line(datum: Datum, published: Published) -> bytes:
         content = {"t_s": datum.time_s, **datum.content}
     else:
         content = datum.to_json(published.body)
-    return json.dumps({"kind": _KINDS[type(datum)], **content}, allow_nan=False).encode() + b"\n"
+    return json_text({"kind": _KINDS[type(datum)], **content}) + b"\n"
 
 
 def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:

@@ -6,10 +6,9 @@ foxglove-sdk; it drops messages for a reader that is too slow.
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from armsight.app.stream.datum import Datum, EventDatum, NoteDatum, Published
+from armsight.app.stream.datum import Datum, EventDatum, NoteDatum, Published, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_file import TOPICS
 from armsight.app.stream.network import host_and_port
@@ -74,7 +73,7 @@ class FoxgloveSink(Sink):
         if topic not in self._channels:
             self._channels[topic] = self._foxglove.Channel(topic, message_encoding="json", context=self._context)
         content = datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
-        self._channels[topic].log(json.dumps(content).encode(), log_time=log_ns)
+        self._channels[topic].log(json_text(content), log_time=log_ns)
 
     def finish(self) -> None:
         """Stop the server."""

@@ -109,6 +109,8 @@ class Bag:
         Raises:
             InputError: the file is damaged where nothing more can be read.
         """
+        if not topics:
+            return
         counts = dict.fromkeys(topics, 0)
         for topic, arrival_ns, encoding, data, decode in self._container.messages(set(topics)):
             yield BagMessage(topic, self.topics[topic].kind, counts[topic], arrival_ns, encoding, data, decode)
