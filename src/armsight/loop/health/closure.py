@@ -283,7 +283,9 @@ class ClosureWatch:
             for k in range(len(e)):
                 self._sum(k)
             if not last:
-                best = max(self._tested(_begins(len(e)), SUSPECTS), key=lambda each: each.above)
+                # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
+                tested = self._tested(_begins(len(e)), SUSPECTS)
+                best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
                 A = np.concatenate([A, self._by_change(best)], axis=2)
 
     def _by_change(self, found: _Tested) -> Array:
