@@ -70,7 +70,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
     assert said.endswith(f"what was written before is in {disk}")
     assert json.loads((disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
     assert list(csv.reader((disk / "poses.csv").read_text().splitlines()))
-    assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv", "detections.csv"}
+    assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv"}
 
 
 FOUND = HealthFinding("rig", "a camera is rotated", 1.5, 0.05, 0.001, "deg", "calibrate again")

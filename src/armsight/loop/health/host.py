@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.data import Array, PoseEstimate
+from armsight.data import Array, Ids, PoseEstimate
 from armsight.loop.health.record import HealthFinding
 
 #: So many repeated shots, and this share of all, are reported.
@@ -19,7 +19,7 @@ class HostWatch:
     """Watches for repeated images."""
 
     def __init__(self) -> None:
-        self._last: tuple[Array, Array] | None = None
+        self._last: tuple[Ids, Array] | None = None
         self._shots = self._repeated = 0
         self._first_s: float | None = None
 
