@@ -22,7 +22,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
         "cameras": "List the attached cameras and their modes.",
         "record": "Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.",
-        "rig": "Show a rig file, import a rig of another program, or export one.",
+        "rig": "Show a rig file, import a rig of another program, export one, or update one from what a run saw.",
     },
     "Measure": {
         "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
