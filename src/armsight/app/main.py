@@ -18,6 +18,9 @@ from armsight.errors import ArmsightError
 #: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
 #: ``command.py`` holds a click command called ``command``. Their list imports none of them.
 SECTIONS: dict[str, dict[str, str]] = {
+    "See it live": {
+        "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.",
+    },
     "Calibrate cameras": {
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
         "cameras": "List the attached cameras and their modes.",
@@ -26,7 +29,11 @@ SECTIONS: dict[str, dict[str, str]] = {
     },
     "Measure": {
         "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
+        "handeye": "Calibrate hand and eye from your own data: robot poses, and images or poses of a target.",
         "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
+        "replay": "Measure and estimate again what was recorded, also with another rig, body, arm or estimator.",
+        "export": "Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.",
+        "batch": "Measure many recordings, on all cores or on a cluster; started again it goes on where it was.",
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
     "Operate an arm": {

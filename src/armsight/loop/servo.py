@@ -1,7 +1,7 @@
 """The outer loop: corrects the joints' commands until the tool, as vision measures it, follows its reference.
 
 In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
-The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
+The command is the motion's joints plus a correction c (n,), with the motion's speeds fed forward. While the arm moves, c
 is the joint error, by the estimator's model, that must be made up for at the next pose to be reached; at rest, c integrates
 the tool's error itself. Tool errors become joint errors through the Jacobian, except in directions in which the arm is near
 a singularity. Gain, its margin, and what happens when vision is lost: docs/concepts/loop.md.
@@ -107,11 +107,11 @@ class Aim(Record):
         goal: the joints now, as the motion has them.
         ahead: those a period from now.
         Ts_base_tool: (2, 4, 4) where they put the tool.
-        duty: (6,) that holds the arm against gravity ahead.
-        jacobian: (6, 6) at the goal.
-        U: (6, 6) of its singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
-        s: (6,).
-        Vt: (6, 6).
+        duty: (n,) that holds the arm against gravity ahead.
+        jacobian: (6, n) at the goal.
+        U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
+        s: (k,).
+        Vt: (k, n).
     """
 
     goal: Joints
@@ -131,7 +131,7 @@ class ServoStep(Record):
     Attributes:
         command: what the board is to be sent.
         mode: what the loop is closed on.
-        correction: (6,) what is added to the motion's joints, rad.
+        correction: (n,) what is added to the motion's joints, rad.
         error: (6,) from the estimated tool to its reference now, [m; rad] in base axes.
         limited: what kept a joint from being corrected further, one text each.
     """
@@ -155,7 +155,7 @@ class PoseServo:
         self.timing = timing
         self._arm, self._scale = arm, np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])
         self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
-        self._correction = np.zeros(6)
+        self._correction = np.zeros(arm.joints)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
 
@@ -165,13 +165,13 @@ class PoseServo:
         Args:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
-            gravity: returns the duty (6,) that holds the arm against gravity at joint angles (6,), passed on.
+            gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
         """
         ahead = motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
-        duty = checked(gravity(ahead.q), (6,), "gravity")
+        duty = checked(gravity(ahead.q), (self._arm.joints,), "gravity")
         jacobian = self._arm.jacobian(goal.q)
-        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None])
+        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None], full_matrices=False)
         return Aim(goal, ahead, self._arm.forward(np.stack([goal.q, ahead.q])), duty, jacobian, U, s, Vt)
 
     def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
@@ -186,7 +186,7 @@ class PoseServo:
         error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
         mode = self._mode(estimate, trust)
         resting = self._resting(estimate, aim)
-        change = -self._correction if mode is Mode.DISTRUSTED else np.zeros(6)
+        change = -self._correction if mode is Mode.DISTRUSTED else np.zeros(self._arm.joints)
         if mode in (Mode.VISION, Mode.BRIDGED):
             last, following = self._missing(estimator, aim)
             push = following - last
@@ -217,7 +217,7 @@ class PoseServo:
         return behind(aim.Ts_base_tool, estimator.tool(q + self._correction, qd))
 
     def _joints(self, aim: Aim, error: Array) -> Array:
-        """Return the joint angles (6,) that make up for an error of the tool (6,).
+        """Return the joint angles (n,) that make up for an error of the tool (6,).
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
         """
@@ -225,11 +225,11 @@ class PoseServo:
         return np.asarray((able / np.maximum(aim.s, UNCORRECTED_BELOW) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
-        """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
+        """Return a step (n,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
         self._lasting += self.timing.gain * (error - self._lasting)
         requested = self._joints(aim, self._lasting)
         worth = np.abs(requested) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
-        sides = np.stack([np.zeros(6), np.where(worth, np.sign(requested), 0.0)])
+        sides = np.stack([np.zeros_like(requested), np.where(worth, np.sign(requested), 0.0)])
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 

@@ -32,11 +32,15 @@ class SeenShot(Record):
         name: the shot.
         ids: per camera (N,) rows of the body's points, in the file's order; one may stand more than once.
         uv: per camera (N, 2) raw pixels.
+        t_s: its time, s; None where it has none.
+        problem: why the shot cannot be used; None when it can.
     """
 
     name: str
     ids: tuple[Ids, Ids]
     uv: tuple[Array, Array]
+    t_s: float | None = None
+    problem: str | None = None
 
 
 def read_detections(path: str | Path, body: Body) -> list[SeenShot]:

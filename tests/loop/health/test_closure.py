@@ -6,13 +6,14 @@ import pytest
 from arm_rig import ARM
 
 from armsight.loop.estimators import Innovation, Outcome, Prior
-from armsight.loop.estimators.armerror import BACKLASH, FLOAT, POSE, SIZE, ZEROS
+from armsight.loop.estimators.armerror import layout
 from armsight.loop.estimators.errormodel import ErrorModel
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.servo import Mode
 
 SHOT_S, AT_S, PRIOR = 0.1, 18.0, Prior()
 SHOT = np.repeat([1.5e-4, np.radians(0.02)], 3)
+PARTS = layout(6)
 COLUMNS = {"rig": slice(0, 6), "drift": slice(0, 6), "body": slice(36, 42)}
 
 
@@ -21,24 +22,24 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, gain=0.0):
     rng = np.random.default_rng(seed)
     watch = ClosureWatch(PRIOR.sigmas(0.0), ARM.joint_names)
     model = ErrorModel(ARM, PRIOR, 0.0)
-    x, delta = PRIOR.sigmas(0.0) * rng.normal(size=SIZE), np.zeros(SIZE)
+    x, delta = PRIOR.sigmas(0.0) * rng.normal(size=PARTS.size), np.zeros(PARTS.size)
     x[102:] = 0.0
     rates, phases = rng.uniform(0.1, 0.3, 6), rng.uniform(0.0, 2 * np.pi, 6)
-    kept = np.ones(SIZE)
-    kept[POSE:] = np.exp(-0.05)
+    kept = np.ones(PARTS.size)
+    kept[PARTS.pose :] = np.exp(-0.05)
     for k in range(round(seconds / SHOT_S)):
         t_s = k * SHOT_S
         angle = 2 * np.pi * rates * t_s + phases
         q = ARM.home + 0.5 * np.sin(angle)
         unseen = np.zeros((1, 3, 6))
         unseen[0, 0] = unseen[0, 1] = np.sign(np.cos(angle))
-        (T,), (H,) = model.poses(np.zeros((1, SIZE)), q[None], unseen)
+        (T,), (H,) = model.poses(np.zeros((1, PARTS.size)), q[None], unseen)
         e = H @ x + SHOT * rng.normal(size=6)
         if kind is not None and t_s >= AT_S:
             if kind == "backlash":
-                column = 0.5 * (H[:, [BACKLASH + joint]] + H[:, [FLOAT + joint]])
+                column = 0.5 * (H[:, [PARTS.backlash + joint]] + H[:, [PARTS.floats + joint]])
             else:
-                column = H[:, COLUMNS.get(kind, [ZEROS[joint]])]
+                column = H[:, COLUMNS.get(kind, [PARTS.zeros[joint]])]
             e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
         delta *= kept
         z = e - H @ delta

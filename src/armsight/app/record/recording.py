@@ -12,7 +12,7 @@ import io
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -60,7 +60,7 @@ def record(
         directory: a new or empty folder.
         shots: stop after this many, those with a problem included; None is no limit.
         seconds: stop at this age of the first shot, s, by the shots' own time, or by the clock for a source without one.
-        on_shot: called after each shot is stored.
+        on_shot: called after each shot is stored; its ``encoded`` are the files, unless the cameras delivered others.
 
     Returns:
         How much is stored. An interrupt, a full disk or a failing camera raises no exception: ``stopped`` has it.
@@ -69,7 +69,7 @@ def record(
         InputError: the folder is not empty, or holds a recording already.
     """
     folder = unused_folder(directory)
-    writer = _Writer(folder)
+    writer = ShotFolder(folder)
     stopped, interrupted = None, False
     first: Shot | None = None
     started_s = time.monotonic()
@@ -82,7 +82,7 @@ def record(
             if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
             with uninterrupted() as came:  # no shot is stored in part
-                writer.add(shot)
+                shot = writer.add(shot)
             if came:
                 raise KeyboardInterrupt
             if on_shot is not None:
@@ -123,27 +123,44 @@ def unused_folder(directory: str | Path) -> Path:
     return check_folder(directory, problem="no recording can be made here")
 
 
-class _Writer:
-    """The folder being written; it is made with the first shot."""
+class ShotFolder:
+    """A folder of shots being written; it is made with the first shot.
+
+    Args:
+        folder: a new or empty folder.
+
+    Attributes:
+        shots: number of shots in the index.
+        problems: number of those without images.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._index: int | None = None
         self._whole = 0  # bytes of the index that are complete
         self.shots = 0
         self.problems = 0
 
-    def add(self, shot: Shot) -> None:
-        """Store one shot, completely or not at all."""
+    def add(self, shot: Shot) -> Shot:
+        """Store one shot, completely or not at all.
+
+        Returns:
+            The shot with its files' bytes, unless it has those of the cameras.
+
+        Raises:
+            InputError: it cannot be written, the disk is full.
+        """
         index = self._opened()
         files: list[Path] = []
+        encoded: list[bytes] = []
         try:
             if shot.problem is None:
                 for side in SIDES:
-                    files.append(self._folder / f"{side}{self.shots:06d}.png")
+                    files.append(self.folder / f"{side}{self.shots:06d}.png")
                     _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
                     with replacing(files[-1], "wb") as file:
                         file.write(data)
+                    encoded.append(data.tobytes())
             names = [file.name for file in files] or ["", ""]
             t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
             self._append(index, [shot.name, t_s, *names, " ".join((shot.problem or "").split())])
@@ -155,22 +172,23 @@ class _Writer:
         self._whole = os.fstat(index).st_size
         self.shots += 1
         self.problems += shot.problem is not None
+        return shot if shot.encoded is not None or not encoded else replace(shot, encoded=(encoded[0], encoded[1]))
 
     def close(self) -> None:
         """Close the index, and remove it if it names no shot."""
         if self._index is not None:
             os.close(self._index)
             if self._whole == 0:
-                (self._folder / INDEX).unlink()
+                (self.folder / INDEX).unlink()
 
     def _opened(self) -> int:
         """Return the open index, a file descriptor; make folder and index the first time."""
         if self._index is None:
             try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                self._index = os.open(self._folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self._index = os.open(self.folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             except OSError as error:
-                raise InputError(f"{self._folder}: no recording can be made here: {error.strerror}") from None
+                raise InputError(f"{self.folder}: no recording can be made here: {error.strerror}") from None
         return self._index
 
     def _append(self, index: int, row: list[str]) -> None:
@@ -182,4 +200,4 @@ class _Writer:
             if os.write(index, data) < len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            raise InputError(f"{self._folder / INDEX}: cannot be written: {error.strerror}") from None
+            raise InputError(f"{self.folder / INDEX}: cannot be written: {error.strerror}") from None

@@ -31,7 +31,7 @@ class Planned:
     Args:
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
     """
 
     def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
@@ -57,7 +57,7 @@ class Sweep:
 
     Args:
         arm: the nominal arm, its base upright.
-        q_middle: (6,) joint angles about which they move, rad; the trajectory begins and ends there.
+        q_middle: (n,) joint angles about which they move, rad; the trajectory begins and ends there.
         reach_rad: amplitude, rad.
         duration_s: duration, s.
     """
@@ -89,7 +89,7 @@ class Closed:
         trust: returns how far vision may be relied on.
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
     """
 
     def __init__(

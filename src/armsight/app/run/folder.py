@@ -36,6 +36,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, RunReport, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
+from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
@@ -49,9 +50,9 @@ from armsight.vision.rig import StereoRig
 
 
 def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
-    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, 6), rad."""
+    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, n), rad."""
     named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
-    for joint in range(6):
+    for joint in range(q.shape[1]):
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
         named[f"q{joint + 1}_ref_rad"] = np.round(q_ref[:, joint], 9)
     return named
@@ -74,12 +75,12 @@ def write_handeye(folder: Path, run: HandEyeRun) -> None:
     write_text(folder / "handeye.json", json.dumps(calibration, indent=1) + "\n")
     T = run.Ts_left_body
     covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
-    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
+    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(run.q.shape[1])}
     named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
     quaternions = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
     named |= {f"q{axis}": quaternions[:, i] for i, axis in enumerate("wxyz")}
     named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
-    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
+    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(run.q.shape[1])}
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
     writer.writerow(named)
@@ -229,6 +230,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
+        if outcome.shutters is not None:
+            keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.moved)
         keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
@@ -283,7 +286,7 @@ def make_room(folder: Path) -> None:
     writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*NAMES, "pose", "workcell", *_OLD_FIGURES)]
     names += [f"{name}.{kind}" for name in (*_TRACKS, *_OLD_TRACKS, "joints") for kind in ("csv", "parquet")]
-    names += [PAGE, "run.log", "poses.csv", DETECTIONS, "handeye.json", "handeye_poses.csv"]
+    names += [PAGE, "run.log", "poses.csv", DETECTIONS, "handeye.json", "handeye_poses.csv", RUN_MCAP]
     try:
         if (folder / _SHOTS).is_dir():
             shutil.rmtree(folder / _SHOTS)
@@ -342,6 +345,11 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         f"delay of the images, by a sweep: {1e3 * outcome.delay.delay_s:.2f} ms, sigma {1e3 * outcome.delay.sigma_s:.2f} ms"
         if outcome.delay_found
         else f"the delay of the images was not measured: {1e3 * outcome.delay.delay_s:g} ms assumed",
+        *(
+            []
+            if outcome.shutters is None
+            else [f"exposures: {outcome.shutters}; detections were moved to one time by the motion of the arm"]
+        ),
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.rejected} rejected by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} {_BASED.get(mode, f'on {mode}')}" for mode, count in modes.most_common()),

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from scipy.linalg import solve_triangular
 
 from armsight.data import Array, Record
 from armsight.loop.estimators import Innovation, Outcome
-from armsight.loop.estimators.armerror import BACKLASH, FLOAT, POSE, REST, SIZE, ZEROS
+from armsight.loop.estimators.armerror import Layout, layout
 from armsight.loop.health.fixed import BaseMotion
 from armsight.loop.health.record import HealthFinding, alarm_limit
 
@@ -55,9 +56,8 @@ _RARER = 5.0
 #: Two changes whose chi-squares, less their limits, differ by less than this cannot be distinguished.
 _ALIKE = 12.0
 #: The parameters that may change, of the state: tangents of base and tool, zeros of the joints after the first (its own is
-#: a rotation of the base), widths of the backlash.
-_TOOL = slice(36, 42)
-_CHANGES, _RAMPS = 6 + 6 + 5 + 6, 6
+#: a rotation of the base), widths of the backlash. Those that may change slowly come first, so many.
+_RAMPS = 6
 
 Kind = Literal["rig", "drift", "body", "joint", "backlash"]
 
@@ -79,20 +79,18 @@ class Suspect:
     limit: float
 
 
-def _suspects() -> tuple[Suspect, ...]:
-    """Return all; the probability of a false alarm is shared by them and the beginnings that are tried."""
-    six, one = (_MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, 15 * _BEGINS) for freedom in (6, 1))
+@lru_cache
+def _suspects(joints: int) -> tuple[Suspect, ...]:
+    """Return all of an arm of n joints; they and the beginnings that are tried share the probability of a false alarm."""
+    six, one = (_MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, (2 * joints + 3) * _BEGINS) for freedom in (6, 1))
     return (
         Suspect("rig", -1, slice(0, 6), six),
         Suspect("drift", -1, slice(0, 6), six),
         Suspect("body", -1, slice(6, 12), six),
         Suspect("joint", 0, slice(5, 6), one),
-        *(Suspect("joint", i, slice(11 + i, 12 + i), one) for i in range(1, 6)),
-        *(Suspect("backlash", i, slice(17 + i, 18 + i), one) for i in range(6)),
+        *(Suspect("joint", i, slice(11 + i, 12 + i), one) for i in range(1, joints)),
+        *(Suspect("backlash", i, slice(11 + joints + i, 12 + joints + i), one) for i in range(joints)),
     )
-
-
-SUSPECTS = _suspects()
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +142,9 @@ class _Tested(NamedTuple):
 class _Block:
     """Sums of the shots of one block."""
 
-    def __init__(self, begin_s: float) -> None:
+    def __init__(self, begin_s: float, size: int) -> None:
         self.begin_s, self.count, self.kept = begin_s, 0, 1.0
-        self.t, self.e, self.H = 0.0, np.zeros(6), np.zeros((6, SIZE))
+        self.t, self.e, self.H = 0.0, np.zeros(6), np.zeros((6, size))
 
 
 class _RunningSums:
@@ -195,8 +193,9 @@ class ClosureWatch:
     """
 
     def __init__(self, sigmas: Array, joint_names: tuple[str, ...]) -> None:
-        self._sigmas, self._names = sigmas[:REST], joint_names
-        self._delta = np.zeros(SIZE)
+        self._parts = layout(len(joint_names))
+        self._sigmas, self._names = sigmas[: self._parts.rest], joint_names
+        self._delta = np.zeros(self._parts.size)
         self._block: _Block | None = None
         self._t: list[float] = []
         self._e: list[Array] = []
@@ -208,7 +207,8 @@ class ClosureWatch:
         self.strongest = 0.0
 
     def _clear(self) -> None:
-        self._N, self._b, self._square, self._sums = np.eye(REST), np.zeros(REST), 0.0, _RunningSums()
+        rest = self._parts.rest
+        self._N, self._b, self._square, self._sums = np.eye(rest), np.zeros(rest), 0.0, _RunningSums()
 
     def take(self, innovation: Innovation) -> None:
         """Take what the estimator did with a measurement, in order of time; rejected ones count if later ones agree."""
@@ -226,9 +226,9 @@ class ClosureWatch:
         self._delta *= innovation.kept
         e = innovation.z + innovation.by_state @ self._delta
         self._delta += innovation.gain @ innovation.z
-        block = self._block = self._block or _Block(innovation.t_s)
+        block = self._block = self._block or _Block(innovation.t_s, self._parts.size)
         block.count += 1
-        block.kept *= float(innovation.kept[POSE])
+        block.kept *= float(innovation.kept[self._parts.pose])
         block.t += innovation.t_s
         block.e += e
         block.H += innovation.by_state
@@ -253,7 +253,8 @@ class ClosureWatch:
 
     def _sum(self, k: int) -> None:
         """Add block k to the information."""
-        H, changes, white = self._H[k][:, :REST] * self._sigmas, _changes(self._H[k]), np.linalg.inv(self._cov)
+        changes, white = _changes(self._parts, self._H[k]), np.linalg.inv(self._cov)
+        H = self._H[k][:, : self._parts.rest] * self._sigmas
         e, H_white, changes_white = self._e[k], H.T @ white, changes.T @ white
         self._N += H_white @ H
         self._b += H_white @ e
@@ -265,7 +266,7 @@ class ClosureWatch:
 
         The second time the change that explains most is fitted as well: it must not be taken for errors.
         """
-        A, e = np.array(self._H)[:, :, :REST] * self._sigmas, np.array(self._e)
+        A, e = np.array(self._H)[:, :, : self._parts.rest] * self._sigmas, np.array(self._e)
         for last in (False, True):
             whiten = np.linalg.cholesky(np.linalg.inv(self._cov)).T
             flat = (whiten @ A).reshape(len(A) * 6, -1)
@@ -284,7 +285,7 @@ class ClosureWatch:
                 self._sum(k)
             if not last:
                 # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
-                tested = self._tested(_begins(len(e)), SUSPECTS)
+                tested = self._tested(_begins(len(e)), _suspects(self._parts.joints))
                 best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
                 A = np.concatenate([A, self._by_change(best)], axis=2)
 
@@ -295,14 +296,14 @@ class ClosureWatch:
         after = (t > begin_s).astype(float)
         if found.suspect.kind == "drift":
             after *= (t - begin_s) / (t[-1] - begin_s)
-        columns = np.array([_changes(H)[:, found.suspect.columns] for H in self._H])
+        columns = np.array([_changes(self._parts, H)[:, found.suspect.columns] for H in self._H])
         wide = _WIDE if columns.shape[2] == 6 else _WIDE_RAD
         return np.asarray(columns * wide * after[:, None, None])
 
     def _decide(self) -> None:
         """Test all hypotheses at some beginnings, and the best of them at those between."""
         begins = _begins(len(self._t))
-        found = self._tested(begins, SUSPECTS)
+        found = self._tested(begins, _suspects(self._parts.joints))
         self.strongest = max(self.strongest, *(each.chi_square / each.suspect.limit for each in found))
         best = max(found, key=lambda each: each.above)
         if best.above <= 0.0:
@@ -312,7 +313,7 @@ class ClosureWatch:
         finest = max((self._refined(each, begins) for each in either), key=lambda each: each.above)
         least = max(finest.above - _ALIKE, 0.0)
         alike = tuple(each.suspect for each in found if each.suspect is not finest.suspect and each.above > least)
-        effect = _changes(self._H[-1])[:, finest.suspect.columns]
+        effect = _changes(self._parts, self._H[-1])[:, finest.suspect.columns]
         begin_s = (self._t[finest.begin - 1] + self._t[finest.begin]) / 2
         change = Change(finest.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
         shift = change.size if change.motion is None else change.motion.motion[:3]
@@ -330,16 +331,16 @@ class ClosureWatch:
         t = np.array(self._t)
         L = np.linalg.cholesky(self._N)
         steps, step_C, step_b, ramps, ramp_C, ramp_b = self._sums.since(begins, t[begins - 1], t[-1])
-        whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(REST, -1)
+        whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(self._parts.rest, -1)
         solved = solve_triangular(L, np.column_stack([whole, self._b]), lower=True, check_finite=False)
-        b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(REST, len(begins), -1), 1, 0)
+        b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(self._parts.rest, len(begins), -1), 1, 0)
         # What the model leaves beyond the blocks' errors widens them.
         excess = max((self._square - float(b @ b)) / max(6.0 * len(t), 1.0), 1.0)
         found: list[_Tested] = []
         for each in hypotheses:
             part = each.columns
             if each.kind == "drift":
-                G, C, right = white[:, :, _CHANGES:], ramp_C, ramp_b
+                G, C, right = white[:, :, steps.shape[2] :], ramp_C, ramp_b
             else:
                 G, C, right = white[:, :, part], step_C[:, part, part], step_b[:, part]
             wide = _WIDE if part.stop - part.start == 6 else _WIDE_RAD
@@ -358,11 +359,12 @@ class ClosureWatch:
         return () if self.change is None else (_finding(self.change, self._names),)
 
 
-def _changes(H: Array) -> Array:
-    """Return the columns (6, 23) of what may change, of the derivative (6, K) of the tool's pose by the state."""
+def _changes(parts: Layout, H: Array) -> Array:
+    """Return the columns (6, 12 + 2 n - 1) of what may change, of the derivative (6, K) of the tool's pose by the state."""
     # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
-    widths = 0.5 * (H[:, BACKLASH : BACKLASH + 6] + H[:, FLOAT : FLOAT + 6])
-    return np.concatenate([H[:, :6], H[:, _TOOL], H[:, ZEROS[1:]], widths], axis=1)
+    n, tool = parts.joints, 6 * parts.joints
+    widths = 0.5 * (H[:, parts.backlash : parts.backlash + n] + H[:, parts.floats : parts.floats + n])
+    return np.concatenate([H[:, :6], H[:, tool : tool + 6], H[:, parts.zeros[1:]], widths], axis=1)
 
 
 def _begins(count: int) -> Array:

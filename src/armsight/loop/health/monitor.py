@@ -8,7 +8,7 @@ import numpy as np
 
 from armsight.data import Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
-from armsight.loop.estimators.armerror import SIZE
+from armsight.loop.estimators.armerror import layout
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
 from armsight.loop.health.host import HostWatch
@@ -78,7 +78,7 @@ class HealthMonitor:
 
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
-        self._fixed = FixedWatch(arm.T_base_0, SIZE)
+        self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
         self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
         self._innovations = []
         estimator.on_innovation = self._note

@@ -176,7 +176,7 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
         InputError: the text is not of that form.
         DeviceError: a device is missing, busy, or does not take a setting.
     """
-    devices, settings = _parsed(rest)
+    devices, settings = parsed_usb(rest)
     cameras: list[UsbCamera] = []
     opened: list[Capture] = []
     try:
@@ -191,7 +191,7 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
     return UsbSource(left, right)
 
 
-def _parsed(rest: str) -> tuple[list[str], Settings]:
+def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     """Read the text after ``usb:``."""
     form = re.fullmatch(r"([^,]+),([^,@]+)(?:@(\d+)x(\d+))?(?:@(\d+(?:\.\d+)?))?((?:,[a-z]+=[^,=]+)*)", rest)
     named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}

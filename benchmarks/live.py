@@ -1,0 +1,231 @@
+"""The live page: how soon it stops, what it costs, whether its memory is flat, and what the guide saves.
+
+python live.py stop 100      stops by the page's button in a headless browser, while the workcell's views run at 15 Hz
+python live.py cost          processor's share of two 1280x720 views, first picture, memory over ten thousand frames
+python live.py guided 10     guided against random shots, ten seeds: projected points, hands that miss the outline
+"""
+
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from armsight.app.live import records
+from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, working_points
+from armsight.app.live.server import LiveServer
+from armsight.app.live.session import LiveSession, SessionOptions
+from armsight.data import Detections, Shot
+from armsight.geometry.pose import exp_se3, inverse, transform
+from armsight.sim.example_rig import board_poses, example_rig
+from armsight.sim.render.scene import chessboard
+from armsight.vision.bundle import Observations
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.heldout import pair_errors
+from armsight.vision.markers.board import open_board
+from armsight.vision.match import join
+from armsight.vision.triangulate import optimal_points
+
+
+def browser(address):
+    """Open the page in a headless browser."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium")
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    driver.get(address)
+    return driver
+
+
+def until(true, patience_s=120.0):
+    """Wait for something."""
+    end = time.monotonic() + patience_s
+    while not true():
+        if time.monotonic() > end:
+            raise SystemExit("did not happen in time")
+        time.sleep(0.02)
+
+
+def shown(driver):
+    """Return how many images the page has shown of the slower side."""
+    return driver.execute_script("return window.armsight ? Math.min(...armsight.frames) : 0")
+
+
+def stop(count: int) -> None:
+    """Measure stops in the browser, from the key to the state of the board."""
+    session = LiveSession(SessionOptions(Path(tempfile.mkdtemp()) / "live", "sim:1280x720@15"))
+    session.start()
+    server = LiveServer(session, port=0)
+    server.start()
+    driver = browser(server.address)
+    until(lambda: shown(driver) > 2)
+    session.execute(records.OpenArm())
+    until(lambda: session.arm.state.q_deg)
+    frames, began = shown(driver), time.monotonic()
+    for n in range(count):
+        driver.execute_script("stop()")
+        until(lambda n=n: driver.execute_script("return armsight.stopMs.length") > n)
+        session.execute(records.ClearStop())
+        until(lambda: not session.arm.state.stopped)
+    rate = (shown(driver) - frames) / (time.monotonic() - began)
+    took = np.array(driver.execute_script("return armsight.stopMs"))
+    p50, p99 = np.percentile(took, (50, 99))
+    print(
+        f"stop, key to the board's state, {count} stops: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {took.max():.1f} ms"
+    )
+    print(f"views shown meanwhile: {rate:.1f} a second of each side")
+    driver.quit()
+    server.close()
+    session.close()
+
+
+class Pictures:
+    """A source of two pictures with something that moves, at a rate."""
+
+    count = None
+
+    def __init__(self, rate_hz: float) -> None:
+        self.period_s, self.due_s, self.number = 1.0 / rate_hz, time.monotonic(), 0
+        rng = np.random.default_rng(0)
+        small = rng.integers(0, 255, (45, 80), dtype=np.uint8)
+        self.image = np.kron(small, np.ones((16, 16), np.uint8))
+
+    def read(self):
+        """Return the next shot when it is due."""
+        self.due_s += self.period_s
+        time.sleep(max(0.0, self.due_s - time.monotonic()))
+        self.number += 1
+        left = np.roll(self.image, 7 * self.number, axis=1)
+        return Shot(f"{self.number}", left, np.roll(left, 40, axis=1), time.monotonic())
+
+    def close(self):
+        """Do nothing."""
+
+
+class OfPictures(LiveSession):
+    """A session whose cameras are pictures."""
+
+    rate_hz = 15.0
+
+    def _open(self):
+        return Pictures(self.rate_hz)
+
+
+def resident_mb() -> float:
+    """Return the memory of this process that is resident, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def cost() -> None:
+    """Measure the processor's share, the first picture, and memory."""
+    session = OfPictures(SessionOptions(Path(tempfile.mkdtemp()) / "live", "folder:none"))
+    session.start()
+    server = LiveServer(session, port=0)
+    server.start()
+    until(lambda: session.newest is not None)
+
+    def share(seconds: float) -> float:
+        before, began = time.process_time(), time.monotonic()
+        time.sleep(seconds)
+        return (time.process_time() - before) / (time.monotonic() - began)
+
+    alone = share(10.0)
+    driver = browser(server.address)
+    until(lambda: shown(driver) > 10)
+    print(f"first picture {driver.execute_script('return armsight.firstMs'):.0f} ms after the page's script began")
+    frames, began = shown(driver), time.monotonic()
+    both = share(10.0)
+    rate = (shown(driver) - frames) / (time.monotonic() - began)
+    print(
+        f"two 1280x720 views: {rate:.1f} a second of each side shown; the processor's share {100 * both:.1f}% of a core, "
+        f"{100 * alone:.1f}% without a page"
+    )
+    session.capture.close()
+    OfPictures.rate_hz = 150.0
+    session.capture = type(session.capture)(session._open)
+    session.capture.start()
+    until(lambda: session.newest is not None and session.newest.number > 500)
+    first, begun = session.newest.number, resident_mb()
+    until(lambda: session.newest.number - first >= 10_000, 600.0)
+    print(f"{session.newest.number - first} frames: memory {begun:.0f} -> {resident_mb():.0f} MB")
+    driver.quit()
+    server.close()
+    session.close()
+
+
+BOARD, SIGMA_PX, HAND = open_board("chessboard:9x6:30mm"), 0.05, np.repeat((0.012, np.radians(3.0)), 3)
+
+
+def seen(rig, T, name, rng):
+    """Return what both cameras detect of the board at a pose, with noise."""
+    p, count = transform(T, BOARD.body.points), len(BOARD.body.points)
+    cov = np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1))
+    views = rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))
+    return Pair(name, *(Detections(np.arange(count), uv + rng.normal(0, SIGMA_PX, uv.shape), cov) for uv in views))
+
+
+def errors_mm(true, rig, tests):
+    """Return the RMS error of points of the working volume, and the rigid RMS of boards nobody fitted, mm."""
+    points = working_points(true, 0.8)
+    uv = np.stack(
+        [true.left.project(points), true.right.project(transform(inverse(true.T_left_right), points))], axis=1
+    )
+    found, _, _ = optimal_points(rig, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))
+    heldout = pair_errors(rig, BOARD.body.points, tests)
+    return 1e3 * float(np.sqrt(((found - points) ** 2).sum(axis=1).mean())), 1e3 * float(
+        np.sqrt((heldout.rigid_m**2).mean())
+    )
+
+
+def guided(seeds: int) -> None:
+    """Compare guided shots, by a hand that misses the outline, with random ones."""
+    counts, rows = (10, 15, 25), []
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 22])
+        true = example_rig((1280, 720), float(rng.uniform(850, 1000)), convergence_deg=float(rng.uniform(0, 12)))
+        pattern = chessboard(9, 6, 0.030)
+        tests = board_poses(rng, true, pattern, 30)
+        flat = Observations.from_shots([join(p.left, p.right) for p in (seen(true, T, "", rng) for T in tests)])
+        random = [seen(true, T, f"r{n}", rng) for n, T in enumerate(board_poses(rng, true, pattern, 40))]
+        sizes = (true.left.image_size_px, true.right.image_size_px)
+
+        def fit(pairs, sizes=sizes):
+            return calibrate_boards(BOARD, pairs, sizes, models=("brown5",), folds=4)
+
+        guide, aim, result, knowledge = Guide(BOARD, seed), CalibrationAim(), None, None
+        row = [errors_mm(true, fit(random[:n]).rig, flat) for n in (*counts, 40)]
+        pairs = random[:4]
+        for n in range(5, counts[-1] + 1):
+            if result is None or n in (6, 8, 11, 16, 21):
+                result = fit(pairs)
+                knowledge = Knowledge.of(result, BOARD, aim)
+            T = guide.best(knowledge, result.rig).T_left_board
+            for share in (1.0, 0.5, 0.25, 0.0):
+                shown_at = T @ exp_se3(share * rng.normal(0, 1, 6) * HAND)
+                if guide.in_view(true, shown_at[None])[0]:
+                    break
+            pairs = [*pairs, seen(true, shown_at, f"g{n}", rng)]
+            knowledge = knowledge.after(shown_at)
+            if n in counts:
+                row.append(errors_mm(true, fit(pairs).rig, flat))
+        rows.append(row)
+        print(seed, " ".join(f"{volume:.3f}/{held:.4f}" for volume, held in row), flush=True)
+    median = np.median(np.array(rows), axis=0)
+    names = [*(f"random {n}" for n in (*counts, 40)), *(f"guided {n}" for n in counts)]
+    print("median over the seeds: error of points in the volume, mm; rigid RMS of boards nobody fitted, mm")
+    for name, (volume, held) in zip(names, median, strict=True):
+        print(f"{name:10s} {volume:.4f} {held:.4f}")
+    worse = sum(row[-1][0] > row[len(counts)][0] for row in rows)
+    print(f"guided {counts[-1]} worse in the volume than random 40: {worse} of {len(rows)} seeds")
+
+
+if __name__ == "__main__":
+    what, number = [*sys.argv[1:], "cost", "10"][:2] if len(sys.argv) == 1 else [*sys.argv[1:], "10"][:2]
+    {"stop": lambda: stop(int(number)), "cost": cost, "guided": lambda: guided(int(number))}[what]()

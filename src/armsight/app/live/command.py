@@ -1,0 +1,105 @@
+"""``armsight live``: from two cameras that nobody has calibrated to a closed loop, on one page."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from pathlib import Path
+
+import click
+
+from armsight.errors import InputError
+
+_HERE = ("127.0.0.1", "localhost", "::1")
+
+
+@click.command("live")
+@click.option("--source", help="The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell.")
+@click.option("--rig", type=click.Path(path_type=Path), help="A calibrated rig; begins with measuring.")
+@click.option("--target", help="The body that is measured: a body file or a board.")
+@click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
+@click.option("--board", help="The arm's controller: serial:PORT (docs/howto/board.md).")
+@click.option(
+    "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
+)
+@click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")
+@click.option(
+    "--rate", type=click.FloatRange(0.1, 1000.0), default=30.0, show_default=True, help="Rate of the cameras, Hz."
+)
+@click.option(
+    "--sync-ms",
+    type=click.FloatRange(0.0, 1000.0),
+    default=1.0,
+    show_default=True,
+    help="Sigma of the time between the two exposures of a shot, ms.",
+)
+@click.option(
+    "-o",
+    "--output",
+    default="live",
+    show_default=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder of the session.",
+)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on, such as 0.0.0.0.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
+@click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
+def command(
+    source: str | None,
+    rig: Path | None,
+    target: str | None,
+    calibration_board: str | None,
+    board: str | None,
+    arm: str,
+    motion: Path | None,
+    rate: float,
+    sync_ms: float,
+    output: Path,
+    host: str,
+    port: int,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
+
+    The steps: cameras, board, calibration, body, measuring, arm, health; each shows the command line that does the same.
+
+    The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
+    printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
+    """
+    try:
+        import websockets  # noqa: F401 - only whether it is there
+    except ImportError:
+        raise InputError('the page needs websockets, which is not installed: pip install "armsight[live]"') from None
+
+    from armsight.app.live.server import LiveServer
+    from armsight.app.live.session import LiveSession, SessionOptions
+
+    options = SessionOptions(
+        output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
+    )
+    session = LiveSession(options)
+    server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
+    try:
+        server.start()
+        session.start()
+        if as_json:
+            click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
+        else:
+            click.echo(
+                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
+            )
+        shown = 0
+        while True:
+            for event in session.events(shown):
+                shown = event.number
+                click.echo(f"{event.at} {event.text}", err=True)
+            time.sleep(0.2)
+    finally:
+        server.close()
+        session.close()

@@ -1,0 +1,458 @@
+"""Measuring, shot by shot, and whether the calibrations still hold.
+
+In: live shots, a rig, a target. Out: a :class:`MeasureState` at any time; poses as CSV, in the form of ``armsight
+measure``. The sigma is split into precision (the noise of this shot) and what the calibration leaves in all shots alike.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from armsight.app.live.capture import LiveShot
+from armsight.app.live.quality import Note
+from armsight.app.live.records import Drawn, polyline
+from armsight.app.measure.poses import csv_text, shot_pose
+from armsight.data import Array, Missed, PoseEstimate
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, transform
+from armsight.geometry.rotation import euler_zyx
+from armsight.loop.handeye.pivot import MIN_POSES, calibrate_pivot
+from armsight.loop.health import HealthMonitor
+from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.markers.targets import open_target
+from armsight.vision.measure import measure
+from armsight.vision.rig import StereoRig
+
+#: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises.
+_SYNC_S = 1e-3
+#: Poses of the path and of the chart that are kept, and latencies for the percentiles.
+_TRAIL, _LATENCIES = 240, 600
+_AXIS_M = 0.05
+
+
+@dataclass(frozen=True)
+class PoseShown:
+    """A measured pose in mm and degrees, in the left camera's frame or relative to the zero.
+
+    Attributes:
+        position_mm: (3,) position.
+        euler_zyx_deg: (3,) angles about z, y, x.
+        sigma_mm: (3,) one sigma of the position along the left camera's axes, all errors together.
+        precision_mm: (3,) the share of this shot's noise.
+        calibration_mm: (3,) what the calibration leaves.
+        sigma_deg: (3,) one sigma of the rotation about these axes.
+        misfit: how many times larger the residuals are than the noise allows.
+        points: number of points that both cameras saw.
+        ellipsoid_mm: (3, 3) covariance of the position, mm^2.
+    """
+
+    position_mm: tuple[float, ...]
+    euler_zyx_deg: tuple[float, ...]
+    sigma_mm: tuple[float, ...]
+    precision_mm: tuple[float, ...]
+    calibration_mm: tuple[float, ...]
+    sigma_deg: tuple[float, ...]
+    misfit: float
+    points: int
+    ellipsoid_mm: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The rig and the body for a view in space, m, left camera's frame.
+
+    Attributes:
+        T_left_right: (4, 4) the right camera.
+        tangents: half width and half height of the left camera's view, per distance.
+        body: (M, 3) the body's points where it is now; empty while it is not seen.
+        trail: the last positions of the body.
+    """
+
+    T_left_right: tuple[tuple[float, ...], ...]
+    tangents: tuple[float, float]
+    body: tuple[tuple[float, ...], ...]
+    trail: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class MeasureState:
+    """What a page shows of measuring.
+
+    Attributes:
+        rig: the rig's file; None without one.
+        target: what is measured.
+        ready: whether rig and target are there.
+        missing: what is missing, one line.
+        pose: the newest pose; None where it was missed.
+        reason: why it was missed.
+        rate_hz: poses a second.
+        latency_ms: p50 and p99 from an image's arrival to its pose, ms.
+        age_ms: age of the newest pose's image when it was shown, ms.
+        dropped: points that were left out of the newest pose, with the reason.
+        measured: number of poses so far.
+        missed: number of misses so far, by reason.
+        relative: whether poses are relative to a zero.
+        distance_mm: distance from the mark, and its sigma, mm; None without a mark.
+        pivot: state of the pivot calibration, one line.
+        recording: the file that is written, and how many rows; None while nothing is.
+        health: what no longer holds.
+        scene: for a view in space.
+        command: the command line that does the same.
+        drawn: what to draw over the views.
+    """
+
+    rig: str | None = None
+    target: str | None = None
+    ready: bool = False
+    missing: str = ""
+    pose: PoseShown | None = None
+    reason: str | None = None
+    rate_hz: float | None = None
+    latency_ms: tuple[float, float] | None = None
+    age_ms: float | None = None
+    dropped: tuple[str, ...] = ()
+    measured: int = 0
+    missed: tuple[tuple[str, int], ...] = ()
+    relative: bool = False
+    distance_mm: tuple[float, float] | None = None
+    pivot: str = ""
+    recording: str | None = None
+    health: tuple[str, ...] = ()
+    scene: Scene | None = None
+    command: str = ""
+    drawn: tuple[Drawn, ...] = ()
+
+
+class MeasureStep:
+    """Measures a target in live shots.
+
+    Args:
+        folder: of the session; recordings go there.
+        source: spec of the cameras, for the command line shown.
+        say: called with a note for the person.
+
+    Attributes:
+        rig: the rig; None before there is one.
+        rig_path: its file.
+        target_spec: spec or file of the target.
+        newest: the newest shot with its pose; None before.
+    """
+
+    def __init__(self, folder: Path, source: str, say: Callable[[Note], None]) -> None:
+        self.folder, self.source, self._say = folder, source, say
+        self.rig: StereoRig | None = None
+        self.rig_path: Path | None = None
+        self.target_spec: str | None = None
+        self.newest: tuple[LiveShot, PoseEstimate | Missed] | None = None
+        self._lock = threading.RLock()
+        self._measure: Callable[[LiveShot], PoseEstimate | Missed] | None = None
+        self._monitor: HealthMonitor | None = None
+        self._zero: Array | None = None
+        self._mark: tuple[Array, Array] | None = None
+        self._pivot_poses: list[Array] | None = None
+        self._pivot_text = ""
+        self._file: TextIO | None = None
+        self._file_path, self._rows = Path(), 0
+        self._clear()
+
+    def _clear(self) -> None:
+        """Forget what was measured with another rig or target."""
+        self._trail: deque[Array] = deque(maxlen=_TRAIL)
+        self._times: deque[float] = deque(maxlen=30)
+        self._latency: deque[float] = deque(maxlen=_LATENCIES)
+        self._missed: Counter[str] = Counter()
+        self._measured, self._health_s, self._health = 0, 0.0, ()
+        self.newest = None
+
+    _health: tuple[str, ...]
+
+    def use_rig(self, rig: StereoRig, path: Path) -> None:
+        """Measure with a rig from now on."""
+        with self._lock:
+            self.rig, self.rig_path = rig, path
+            self._prepare()
+
+    def use_target(self, spec: str) -> None:
+        """Measure another target from now on.
+
+        Raises:
+            InputError: it cannot be opened.
+        """
+        open_target(spec)
+        with self._lock:
+            self.target_spec = spec
+            self._prepare()
+
+    def _prepare(self) -> None:
+        """Get ready for rig and target."""
+        self._clear()
+        self._measure = None
+        if self.rig is None or self.target_spec is None:
+            return
+        rig, target = self.rig, open_target(self.target_spec)
+        self._target = target
+        if follows(target):
+            follower = Follower(rig, target)
+            self._measure = lambda live: follower.measure(live.shot)
+        else:
+            self._measure = lambda live: measure(rig, target, live.shot)
+        self._monitor = HealthMonitor(rig, target.body, _SYNC_S)
+
+    def look(self, live: LiveShot) -> None:
+        """Measure a live shot. Called from one thread."""
+        with self._lock:
+            work = self._measure
+        if work is not None:
+            self.take(live, work(live))
+
+    def take(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
+        """Take in what was measured in a shot, here or in a control loop."""
+        now = time.monotonic()
+        with self._lock:
+            if self._monitor is None:
+                return
+            if isinstance(result, PoseEstimate):
+                result = self._monitor.measured(result, live.shot.t_s)
+                self._trail.append(result.T_left_body[:3, 3])
+                self._measured += 1
+                if self._pivot_poses is not None:
+                    self._pivot_poses.append(result.T_left_body)
+            else:
+                self._missed[result.reason] += 1
+            self._times.append(now)
+            self._latency.append(1e3 * (now - live.arrived_s))
+            self.newest = live, result
+            self._write(live, result)
+            if now - self._health_s > 1.0:
+                self._health_s = now
+                self._health = tuple(found.line() for found in self._monitor.findings())
+
+    def zero(self) -> None:
+        """Show poses relative to the present one from now on."""
+        self._zero = inverse(self._pose().T_left_body)
+
+    def clear_zero(self) -> None:
+        """Show poses in the left camera's frame."""
+        self._zero = None
+
+    def mark(self) -> None:
+        """Measure distances from the present position."""
+        pose = self._pose()
+        R = pose.T_left_body[:3, :3]
+        self._mark = np.array(pose.T_left_body[:3, 3]), R @ pose.cov_noise[:3, :3] @ R.T
+
+    def pivot(self) -> None:
+        """Begin to collect poses about a tip that stands still; or end, and compute the tip.
+
+        Raises:
+            InputError: too few poses.
+            CalibrationError: too little rotation.
+        """
+        with self._lock:
+            if self._pivot_poses is None:
+                self._pose()
+                self._pivot_poses, self._pivot_text = [], ""
+                return
+            poses, self._pivot_poses = self._pivot_poses, None
+        if len(poses) < MIN_POSES:
+            raise InputError(f"{len(poses)} poses are too few for a pivot calibration; 30 and more are advised")
+        found = calibrate_pivot(np.array(poses))
+        tip, sigma = 1e3 * found.p_body, 1e3 * float(np.sqrt(np.trace(found.cov[:3, :3])))
+        held = 1e3 * float(np.sqrt(np.nanmean(found.held_out_m**2)))
+        at = ", ".join(f"{x:.2f}" for x in tip)
+        self._pivot_text = (
+            f"tip at {at} mm in the body, sigma {sigma:.2g} mm; held out {held:.2g} mm RMS, {len(poses)} poses"
+        )
+
+    def record(self) -> None:
+        """Begin to write every pose to a new CSV file; or end.
+
+        Raises:
+            InputError: nothing is measured, or the file cannot be made.
+        """
+        with self._lock:
+            if self._file is not None:
+                self._close_file()
+                self._say(Note("good", f"{self._rows} poses written to {self._file_path}"))
+                return
+            if self._measure is None:
+                raise InputError(self._lacking())
+            number = 1
+            while (path := self.folder / f"poses-{number}.csv").exists():
+                number += 1
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self._file = path.open("x", encoding="utf-8")  # open while the recording lasts
+                self._file.write(csv_text([]))
+            except OSError as error:
+                self._close_file()
+                raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+            self._file_path, self._rows = path, 0
+
+    def _write(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
+        """Write a row, whole; a full disk ends the recording."""
+        if self._file is None:
+            return
+        text = csv_text([shot_pose(live.shot.name, live.shot.t_s, self._target.body, result)])
+        row = text.partition("\n")[2]
+        try:
+            self._file.write(row)
+            self._file.flush()
+            self._rows += 1
+        except OSError as error:
+            self._close_file()
+            why = f"the recording has ended: {error.strerror}; {self._rows} poses are in {self._file_path}"
+            self._say(Note("error", why))
+
+    def _close_file(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.close()
+            except OSError:  # what is still buffered does not fit on the disk: the row that failed
+                return
+
+    def close(self) -> None:
+        """Close the recording."""
+        with self._lock:
+            self._close_file()
+
+    def _pose(self) -> PoseEstimate:
+        newest = self.newest
+        if newest is None:
+            raise InputError(self._lacking() or "no pose is measured yet")
+        result = newest[1]
+        if isinstance(result, Missed):
+            raise InputError(f"no pose is measured now: {result.reason}")
+        return result
+
+    def _lacking(self) -> str:
+        if self.rig is None:
+            return "no calibrated rig yet: finish the calibration first, or give --rig"
+        return "" if self.target_spec is not None else "no body yet: choose one in the step Body"
+
+    @property
+    def state(self) -> MeasureState:
+        """What to show now."""
+        with self._lock:
+            return self._shown()
+
+    def _shown(self) -> MeasureState:
+        if self._measure is None or self.rig is None or self.target_spec is None:
+            return MeasureState(
+                None if self.rig_path is None else str(self.rig_path), self.target_spec, missing=self._lacking()
+            )
+        newest, now = self.newest, time.monotonic()
+        pose = reason = age_ms = distance = None
+        dropped: tuple[str, ...] = ()
+        drawn: tuple[Drawn, ...] = ()
+        body = np.zeros((0, 3))
+        if newest is not None:
+            live, result = newest
+            age_ms = 1e3 * live.age_s(now)
+            if isinstance(result, PoseEstimate):
+                pose = shown_pose(result, self._zero)
+                dropped = tuple(f"{each.point}: {each.reason}" for each in result.dropped)
+                drawn = self._drawings(result)
+                body = transform(result.T_left_body, self._target.body.points)
+                distance = self._distance(result)
+            else:
+                reason = result.reason
+        latency = np.percentile(list(self._latency), (50, 99)) if self._latency else None
+        span = self._times[-1] - self._times[0] if len(self._times) > 2 else 0.0
+        pivot = self._pivot_text
+        if self._pivot_poses is not None:
+            pivot = f"collecting: {len(self._pivot_poses)} poses; rotate the body about the tip by 30 degrees, all ways"
+        return MeasureState(
+            str(self.rig_path),
+            self.target_spec,
+            True,
+            "",
+            pose,
+            reason,
+            (len(self._times) - 1) / span if span > 0 else None,
+            None if latency is None else (float(latency[0]), float(latency[1])),
+            age_ms,
+            dropped,
+            self._measured,
+            tuple(self._missed.most_common(5)),
+            self._zero is not None,
+            distance,
+            pivot,
+            None if self._file is None else f"{self._file_path.name}: {self._rows} poses",
+            self._health,
+            self._scene(body),
+            f"armsight measure {self.rig_path} --target {self.target_spec} --source {self.source} -o poses.csv",
+            drawn,
+        )
+
+    def _distance(self, pose: PoseEstimate) -> tuple[float, float] | None:
+        """Return the distance from the mark and its sigma by the noise of both poses, mm."""
+        if self._mark is None:
+            return None
+        marked, cov = self._mark
+        R = pose.T_left_body[:3, :3]
+        away = pose.T_left_body[:3, 3] - marked
+        size = float(np.linalg.norm(away))
+        both = cov + R @ pose.cov_noise[:3, :3] @ R.T
+        along = away / size if size > 0 else np.array([0.0, 0.0, 1.0])
+        return 1e3 * size, 1e3 * float(np.sqrt(along @ both @ along))
+
+    def _scene(self, body: Array) -> Scene:
+        assert self.rig is not None
+        camera = self.rig.left
+        width, height = camera.image_size_px
+        trail = tuple(tuple(round(float(x), 5) for x in p) for p in self._trail)
+        return Scene(
+            tuple(tuple(float(x) for x in row) for row in self.rig.T_left_right),
+            (0.5 * width / float(camera.intrinsics[0]), 0.5 * height / float(camera.intrinsics[1])),
+            tuple(tuple(round(float(x), 5) for x in p) for p in body),
+            trail,
+        )
+
+    def _drawings(self, pose: PoseEstimate) -> tuple[Drawn, ...]:
+        """Return the body's points and axes as both cameras see them."""
+        assert self.rig is not None
+        rig, T = self.rig, pose.T_left_body
+        drawn = []
+        axes = transform(T, np.vstack([np.zeros(3), _AXIS_M * np.eye(3)]))
+        points = transform(T, self._target.body.points[pose.points.seen.ids])
+        for side, camera in enumerate(rig.cameras):
+            to = np.eye(4) if side == 0 else inverse(rig.T_left_right)
+            uv, ends = camera.project(transform(to, points)), camera.project(transform(to, axes))
+            drawn.append(Drawn(side, "body", tuple(polyline(each[None]) for each in uv)))
+            drawn += [Drawn(side, f"axis{k}", (polyline(ends[[0, k + 1]]),)) for k in range(3)]
+        return tuple(drawn)
+
+
+def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
+    """Return a pose as people read it; relative to a zero where one is given."""
+    T = pose.T_left_body
+    R = T[:3, :3]
+    whole, noise = R @ pose.cov[:3, :3] @ R.T, R @ pose.cov_noise[:3, :3] @ R.T
+    rotation = R @ pose.cov[3:, 3:] @ R.T
+    shown = T if T_zero_left is None else T_zero_left @ T
+    left = np.sqrt(np.maximum(np.diag(whole - noise), 0.0))
+    return PoseShown(
+        _mm(shown[:3, 3]),
+        tuple(float(x) for x in np.degrees(euler_zyx(shown[:3, :3])[0])),
+        _mm(np.sqrt(np.diag(whole))),
+        _mm(np.sqrt(np.diag(noise))),
+        _mm(left),
+        tuple(float(x) for x in np.degrees(np.sqrt(np.diag(rotation)))),
+        pose.misfit,
+        len(pose.points.ids),
+        tuple(tuple(float(x) for x in row) for row in 1e6 * whole),
+    )
+
+
+def _mm(values: Array) -> tuple[float, ...]:
+    return tuple(float(1e3 * x) for x in values)

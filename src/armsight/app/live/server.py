@@ -1,0 +1,450 @@
+"""The server of ``armsight live``: it carries states, events, images and commands between a session and pages.
+
+In: a :class:`~armsight.app.live.session.LiveSession`. Out: one HTML file over HTTP, and two WebSockets for each page:
+``/live`` for everything, and ``/stop`` for the stop alone, so that no image and no state is ever before it in a queue.
+
+- Text to a page is ``{"section": NAME, "state": {...}}``, ``{"event": {...}}``, ``{"you": {...}}`` or ``{"rejected":
+  TEXT}``.
+- An image is binary: one byte side, four bytes number, JPEG. The next image of a side is sent when the page has said that
+  it showed the last one (``{"shown": [SIDE, NUMBER]}``), and it is the newest then: a slow page misses images, and stores
+  none.
+- One page commands; the others look on and can stop. A page that commands and is silent while the arm moves is gone: the
+  arm is held.
+
+Everything is bound to 127.0.0.1 unless a host is given; then the address needs a token. A WebSocket is opened for pages of
+this server alone (their Origin), whatever else the browser shows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import hmac
+import importlib.resources
+import json
+import re
+import secrets
+import struct
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+
+from armsight.app.live.capture import LiveShot
+from armsight.app.live.quality import Note
+from armsight.app.live.records import command_of, json_of
+from armsight.app.live.session import LiveSession
+from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.vision.image import grey
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+#: How often states are looked at, s; how often a page is sent the age of what it sees.
+_STATE_S = 0.1
+#: JPEG quality of the views, and the longest side that is sent, px.
+_JPEG, _SIDE_PX = 72, 1280
+#: A page that commands and says nothing for so long is gone, s; pages say something twice a second.
+SILENT_S = 1.5
+#: Longest message from a page, bytes; so many malformed ones end its connection.
+_LONGEST, _MALFORMED = 8192, 200
+_MALFORMED_BEGIN = ("a command ", "no command ")
+_HEADER = struct.Struct("<BI")
+_CSP = (
+    "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src blob: data:; "
+    "connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+PAGE = "page.html"
+
+
+@dataclass
+class _Client:
+    """A page: what it was sent, and what it said last."""
+
+    socket: ServerConnection
+    number: int
+    visible: bool = True
+    heard_s: float = field(default_factory=time.monotonic)
+    sent: dict[str, str] = field(default_factory=dict)
+    event: int = 0
+    #: For each side: number of the newest image sent, and whether the page has shown it.
+    images: list[tuple[int, bool]] = field(default_factory=lambda: [(0, True), (0, True)])
+    malformed: int = 0
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class LiveServer:
+    """Serves one session, in a thread of its own.
+
+    Args:
+        session: what is served.
+        host: address to bind to.
+        port: port; 0 takes a free one.
+        token: what the address must carry; None where it is bound to this computer alone.
+
+    Attributes:
+        port: the port that is bound, once :meth:`start` has returned.
+    """
+
+    def __init__(
+        self, session: LiveSession, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
+    ) -> None:
+        self.session, self.host, self.port, self.token = session, host, port, token
+        self._clients: dict[int, _Client] = {}
+        self._commander: int | None = None
+        self._number = 0
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._work, self._stops = ThreadPoolExecutor(3, "serve"), ThreadPoolExecutor(2, "stop")
+        self._page = importlib.resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
+        self._jpeg: list[tuple[int, bytes]] = [(0, b""), (0, b"")]
+        self._encoding: list[asyncio.Lock] = []
+        self._ended: asyncio.Event | None = None
+        self._failed: ArmsightError | None = None
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser."""
+        host = self.host if self.host not in ("0.0.0.0", "::") else _own_name()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def start(self) -> None:
+        """Begin to serve.
+
+        Raises:
+            InputError: the port is in use, or the host is none of this computer's.
+        """
+        sys.setswitchinterval(min(sys.getswitchinterval(), 1e-3))  # a stop waits no longer for whoever computes
+        self._thread.start()
+        self._ready.wait()
+        if self._failed is not None:
+            raise self._failed
+
+    def close(self) -> None:
+        """End all connections and the thread."""
+        if self._thread.is_alive() and self._ended is not None and self._loop is not None:
+            self._loop.call_soon_threadsafe(self._ended.set)
+            self._thread.join(5.0)
+        self._work.shutdown(wait=False, cancel_futures=True)
+        self._stops.shutdown(wait=False)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        finally:
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve
+
+        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
+        self._encoding = [asyncio.Lock(), asyncio.Lock()]
+        try:
+            server = await serve(
+                self._connected,
+                self.host,
+                self.port,
+                process_request=self._request,
+                max_size=_LONGEST,
+                max_queue=16,
+                compression=None,
+                ping_interval=5,
+                ping_timeout=10,
+                write_limit=1 << 16,
+                logger=_silent(),
+            )
+        except OSError as error:
+            self._failed = _bind_error(error, self.host, self.port)
+            return
+        self.port = int(server.sockets[0].getsockname()[1])
+        self._ready.set()
+        states = asyncio.create_task(self._states())
+        await self._ended.wait()
+        states.cancel()
+        await _closed(server)
+
+    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer plain HTTP, and check who opens a WebSocket."""
+        url = urlsplit(request.path)
+        host = request.headers.get("Host", "")
+        if not self._named(host):
+            return _text(connection, HTTPStatus.MISDIRECTED_REQUEST, "this server is not the one of that name\n")
+        if not self._knows(url.query):
+            return _text(
+                connection,
+                HTTPStatus.UNAUTHORIZED,
+                "open the address that armsight live printed: its token is missing\n",
+            )
+        if url.path in ("/live", "/stop"):
+            if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
+                return _text(connection, HTTPStatus.FORBIDDEN, "only pages of this server may connect\n")
+            return None
+        if url.path == "/":
+            return self._html(connection, host)
+        return _text(connection, HTTPStatus.NOT_FOUND, "there is only /\n")
+
+    def _named(self, host: str) -> bool:
+        """Whether a Host header is one of ours: a foreign name on our address is another page's (DNS rebinding)."""
+        if self.token is not None:
+            return True
+        return host in {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]", self.host)}
+
+    def _knows(self, query: str) -> bool:
+        """Whether an address carries the token."""
+        if self.token is None:
+            return True
+        given = parse_qs(query).get("token", [""])[0]
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+    def _html(self, connection: ServerConnection, host: str) -> Response:
+        nonce = secrets.token_urlsafe(16)
+        response = _text(connection, HTTPStatus.OK, self._page.replace("NONCE", nonce))
+        headers = response.headers
+        del headers["Content-Type"]
+        headers["Content-Type"] = "text/html; charset=utf-8"
+        safe = f" ws://{host} wss://{host}" if re.fullmatch(r"[\w.\-:\[\]]+", host) else ""
+        headers["Content-Security-Policy"] = _CSP.format(nonce=nonce, sockets=safe)
+        headers["Referrer-Policy"] = "no-referrer"
+        headers["X-Content-Type-Options"] = "nosniff"
+        headers["Cache-Control"] = "no-store"
+        return response
+
+    async def _connected(self, socket: ServerConnection) -> None:
+        """Serve one WebSocket until it closes."""
+        from websockets.exceptions import ConnectionClosed
+
+        assert socket.request is not None
+        with contextlib.suppress(ConnectionClosed):
+            if urlsplit(socket.request.path).path == "/stop":
+                await self._stop_socket(socket)
+            else:
+                await self._live_socket(socket)
+
+    async def _stop_socket(self, socket: ServerConnection) -> None:
+        """Answer stops, and the question whether this socket is alive."""
+        async for message in socket:
+            if message == "stop":
+                answer = await asyncio.get_running_loop().run_in_executor(self._stops, self.session.stop)
+                await socket.send(json.dumps(json_of(answer)))
+            elif message == "alive":
+                await socket.send("alive")
+
+    async def _live_socket(self, socket: ServerConnection) -> None:
+        self._number += 1
+        client = _Client(socket, self._number)
+        self._clients[client.number] = client
+        if self._commander is None:
+            self._commander = client.number
+        images = asyncio.create_task(self._images(client))
+        try:
+            self._introduce()
+            async for message in socket:
+                client.heard_s = time.monotonic()
+                if not await self._heard(client, message):
+                    break
+        finally:
+            images.cancel()
+            del self._clients[client.number]
+            self._gone(client)
+
+    def _gone(self, client: _Client) -> None:
+        """A page is gone: if it commanded, the arm is held, and the next page may command."""
+        if client.number != self._commander:
+            return
+        self._hold("the page that commanded was closed, or its connection was lost")
+        self._commander = min(self._clients, default=None)
+        self._introduce()
+
+    def _hold(self, why: str) -> None:
+        self._work.submit(self.session.hold, why)
+
+    def _introduce(self) -> None:
+        """Say to every page whether it commands."""
+        for client in self._clients.values():
+            self._send(
+                client,
+                {
+                    "you": {
+                        "number": client.number,
+                        "commands": client.number == self._commander,
+                        "pages": len(self._clients),
+                    }
+                },
+            )
+
+    def _send(self, client: _Client, message: dict[str, Any]) -> None:
+        """Send in the background."""
+        task = asyncio.ensure_future(client.socket.send(json.dumps(message)))
+        task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
+
+    async def _heard(self, client: _Client, message: str | bytes) -> bool:
+        """Take a message of a page; False ends its connection."""
+        try:
+            if isinstance(message, bytes):
+                raise InputError("a command is text")
+            if message == "alive":
+                return True
+            if not message.startswith('{"command"'):
+                self._said(client, message)
+                return True
+            command = command_of(message)
+            if client.number != self._commander:
+                raise InputError("another page commands: this one looks on, and can stop; or take over")
+            await asyncio.get_running_loop().run_in_executor(self._work, self.session.execute, command)
+        except ArmsightError as error:
+            client.malformed += isinstance(error, InputError) and str(error).startswith(_MALFORMED_BEGIN)
+            if client.malformed > _MALFORMED:
+                client.socket.transport.abort()
+                return False
+            self._send(client, {"rejected": str(error)})
+        return True
+
+    def _said(self, client: _Client, message: str) -> None:
+        """Take what a page says of itself: what it showed, whether it is visible, that it takes over.
+
+        Raises:
+            InputError: it is none of this.
+        """
+        try:
+            said = json.loads(message)
+        except (json.JSONDecodeError, RecursionError):
+            raise InputError("a command is JSON that begins with the key command") from None
+        match said:
+            case {"shown": [0 | 1 as side, int(number)]} if not isinstance(side, bool):
+                if number == client.images[side][0]:
+                    client.images[side] = (number, True)
+                    client.wake.set()
+            case {"visible": bool(visible)}:
+                client.visible = visible
+                client.images = [(0, True), (0, True)]
+                client.wake.set()
+            case {"take_over": True}:
+                if client.number != self._commander:
+                    self._hold("another page took over")
+                    self._commander = client.number
+                    self._introduce()
+            case _:
+                raise InputError("a command is an object with the key command")
+
+    async def _images(self, client: _Client) -> None:
+        """Send a page the newest images, as fast as it shows them."""
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                newest = self.session.newest if client.visible else None
+                sent = False
+                for side in (0, 1):
+                    number, shown = client.images[side]
+                    if newest is not None and shown and newest.number != number:
+                        client.images[side] = (newest.number, False)
+                        data = await self._encoded(side, newest)
+                        await client.socket.send(_HEADER.pack(side, newest.number) + data)
+                        sent = True
+                if not sent:
+                    client.wake.clear()
+                    with contextlib.suppress(asyncio.TimeoutError):
+                        await asyncio.wait_for(client.wake.wait(), 0.01 if client.visible else 0.5)
+
+    async def _encoded(self, side: int, live: LiveShot) -> bytes:
+        """Return a view as JPEG, encoded once for all pages."""
+        async with self._encoding[side]:
+            number, data = self._jpeg[side]
+            if number != live.number:
+                data = await asyncio.get_running_loop().run_in_executor(self._work, _jpeg, live, side)
+                self._jpeg[side] = (live.number, data)
+        return data
+
+    async def _states(self) -> None:
+        """Send every page what has changed; watch whether the one that commands is still there."""
+        while True:
+            await asyncio.sleep(_STATE_S)
+            if not self._clients:
+                continue
+            try:
+                texts = await asyncio.get_running_loop().run_in_executor(self._work, self._texts)
+            except ArmsightError as error:
+                self.session.say(Note("error", str(error)))
+                continue
+            for client in list(self._clients.values()):
+                self._update(client, texts)
+            commander = self._clients.get(self._commander or 0)
+            if commander is not None and time.monotonic() - commander.heard_s > SILENT_S and self.session.arm.busy:
+                self._hold("the page that commands does not answer")
+
+    def _texts(self) -> dict[str, str]:
+        """Return every section as text."""
+        texts = {
+            name: json.dumps({"section": name, "state": json_of(state)})
+            for name, state in self.session.sections().items()
+        }
+        texts["drawn"] = json.dumps({"drawn": json_of(self.session.drawn)})
+        return texts
+
+    def _update(self, client: _Client, texts: dict[str, str]) -> None:
+        """Send a page what has changed, unless it has not taken what it was sent before."""
+        if client.socket.transport.get_write_buffer_size() > 1 << 18 or not client.visible:
+            return
+        for name, text in texts.items():
+            if client.sent.get(name) != text:
+                client.sent[name] = text
+                task = asyncio.ensure_future(client.socket.send(text))
+                task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
+        for event in self.session.events(client.event):
+            client.event = event.number
+            self._send(client, {"event": json_of(event)})
+
+
+def _jpeg(live: LiveShot, side: int) -> bytes:
+    """Return one view as JPEG."""
+    image = live.shot.left if side == 0 else live.shot.right
+    assert image is not None
+    image = image if image.ndim == 3 and image.dtype == "uint8" else grey(image)
+    scale = _SIDE_PX / max(image.shape)
+    if scale < 1.0:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
+
+
+def _text(connection: ServerConnection, status: HTTPStatus, text: str) -> Response:
+    return connection.respond(status, text)
+
+
+async def _closed(server: Server) -> None:
+    server.close()
+    with contextlib.suppress(asyncio.TimeoutError):
+        await asyncio.wait_for(server.wait_closed(), 2.0)
+
+
+def _bind_error(error: OSError, host: str, port: int) -> ArmsightError:
+    """Return why an address cannot be bound, and what to do."""
+    if error.errno == errno.EADDRINUSE:
+        return InputError(f"port {port} is in use, perhaps by another armsight live: give another one with --port")
+    if error.errno == errno.EACCES:
+        return InputError(f"port {port} needs rights that you do not have: give one above 1023 with --port")
+    return DeviceError(f"{host}:{port} cannot be bound: {error.strerror or error}; is it an address of this computer?")
+
+
+def _own_name() -> str:
+    import socket
+
+    return socket.gethostname()
+
+
+def _silent() -> Any:  # noqa: ANN401 - a logger
+    """Return a logger for the library: what fails is handled here, and not logged."""
+    import logging
+
+    logger = logging.getLogger("armsight.live")
+    logger.setLevel(logging.CRITICAL)
+    return logger

@@ -1,0 +1,213 @@
+"""The workcell as live cameras, and a person in it: who covers a lens, pulls a cable, and holds the calibration board.
+
+In: ``sim:`` with the cameras of :mod:`armsight.sim.workcell`. Out: a source at the cameras' pace. The person sees what a
+page shows, the outline of the board in both views, and moves the board there with an unsteady hand; nothing else is passed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from armsight.data import Array, Shot
+from armsight.errors import DeviceError, InputError
+from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
+from armsight.robot.arm import Arm
+from armsight.sim.example_rig import board_poses
+from armsight.sim.render.scene import chessboard
+from armsight.sim.workcell.workcell import CHESSBOARD, Workcell
+from armsight.vision.markers.board import open_board
+from armsight.vision.pnp import body_poses
+
+ACTIONS = ("cover_left", "cover_right", "uncover", "unplug", "plug", "board", "no_board")
+#: A hand comes so near to an outline, m and rad; moves so fast, s per pose; and trembles, m and rad.
+_HAND, _MOVE_S, _TREMOR = (0.012, np.radians(3.0)), 1.2, (1e-4, np.radians(0.02))
+_FILL = (0.5, 0.8)
+_PACE_HZ = 15.0
+
+
+class Person:
+    """A person with a board before the workcell's cameras.
+
+    Args:
+        workcell: the workcell.
+        seed: of the hand.
+    """
+
+    def __init__(self, workcell: Workcell, seed: int) -> None:
+        self._workcell = workcell
+        self._rng = np.random.default_rng([seed, 21])
+        self._pattern = chessboard(9, 6, 0.030)
+        self._points = open_board(CHESSBOARD).body.points
+        self._from: Array | None = None
+        self._to: Array | None = None
+        self._began_s = 0.0
+        self._shown: Array | None = None  # the outline that is being reached
+        self.covered: set[str] = set()
+        self.unplugged = False
+        self.holds = False
+
+    def act(self, action: str) -> None:
+        """Do something.
+
+        Raises:
+            InputError: an unknown action.
+        """
+        if action not in ACTIONS:
+            raise InputError(f"the simulated person does not know {action!r}; known are {', '.join(ACTIONS)}")
+        if action.startswith("cover_"):
+            self.covered.add(action.removeprefix("cover_"))
+        elif action == "uncover":
+            self.covered.clear()
+        elif action in ("unplug", "plug"):
+            self.unplugged = action == "unplug"
+        else:
+            self.holds = action == "board"
+
+    def reach(self, outline_uv: tuple[Array, Array] | None) -> None:
+        """Move the board to where its points (M, 2) are drawn in both views; somewhere in view where nothing is drawn."""
+        rig = self._workcell.truth.rig
+        if outline_uv is None:
+            if self._to is None:
+                self._move(board_poses(self._rng, rig, self._pattern, 1, fill=_FILL, tilt_deg=15.0)[0])
+            return
+        if self._shown is not None and np.abs(self._shown - outline_uv[0]).max() < 1.0:
+            return
+        self._shown = np.array(outline_uv[0])
+        found = body_poses(self._points, rig.left, outline_uv[0])
+        if not found:
+            return
+        T = found[0][0]
+        for share in (1.0, 0.5, 0.0):
+            near = T @ exp_se3(share * self._rng.normal(0, 1, 6) * np.repeat(_HAND, 3))
+            if self._visible(near):
+                self._move(near)
+                return
+        middle = rig.T_left_right[:3, 3] / 2
+        for step in np.linspace(
+            0.02, 0.9, 30
+        ):  # the outline is drawn for other cameras than these: as near as can be seen
+            near = np.array(T)
+            near[:3, 3] += step * (np.array([middle[0], middle[1], 1.3 * T[2, 3]]) - T[:3, 3])
+            if self._visible(near):
+                break
+        self._move(near)
+
+    def _visible(self, T_left_board: Array) -> bool:
+        """Return whether both cameras see all of the board's points, and a little around them."""
+        rig, p = self._workcell.truth.rig, transform(T_left_board, 1.1 * self._points - 0.1 * self._points.mean(axis=0))
+        views = rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))
+        return all(
+            bool(((uv > 4) & (uv < np.array(camera.image_size_px) - 5)).all())
+            for camera, uv in zip(rig.cameras, views, strict=True)
+        )
+
+    def _move(self, T: Array) -> None:
+        self._from = T if self._to is None else self._now()
+        self._to, self._began_s = T, time.monotonic()
+
+    def _now(self) -> Array:
+        """Return where the board is, T_left_board (4, 4)."""
+        assert self._from is not None
+        assert self._to is not None
+        x = min((time.monotonic() - self._began_s) / _MOVE_S, 1.0)
+        smooth = x * x * (3.0 - 2.0 * x)
+        return np.asarray(self._from @ exp_se3(smooth * log_se3(inverse(self._from) @ self._to)))
+
+    def shot(self, number: int) -> Shot | None:
+        """Return what the cameras see while the board is held; None while it is not."""
+        if not self.holds or self._to is None:
+            return None
+        T = self._now() @ exp_se3(self._rng.normal(0, 1, 6) * np.repeat(_TREMOR, 3))
+        return replace(self._workcell.source.still((self._pattern,), T, number), name=f"board{number:06d}")
+
+
+class SimulatedCameras:
+    """The workcell's cameras as a source; fulfils :class:`~armsight.vision.sources.source.Source`.
+
+    Args:
+        cameras: as the workcell names them, such as 1280x720@15.
+        arm: nominal, used, worn, or a TOML file.
+        seed: of all that is sampled.
+        emulator: what runs the board's firmware.
+        model: the nominal arm.
+    """
+
+    count: int | None = None
+
+    def __init__(self, cameras: str, arm: str, seed: int, emulator: str, model: Arm | None = None) -> None:
+        self.workcell = Workcell.open(arm=arm, cameras=cameras, seed=seed, emulator=emulator, model=model)
+        self.person = Person(self.workcell, seed)
+        self.outline: Callable[[], tuple[Array, Array] | None] = lambda: None
+        self._number, self._due_s = 0, 0.0
+
+    def read(self) -> Shot | None:
+        """Return the next shot, at the cameras' pace at most."""
+        while (shot := self.poll()) is None:
+            if self.person.holds:
+                time.sleep(max(0.0, self._due_s - time.monotonic()))
+                continue
+            time.sleep(max(0.0, self._due_s - time.monotonic()))
+            self._due_s = max(time.monotonic(), self._due_s + self.period_s)
+            waited = self.workcell.source.read()
+            self.workcell.board.receive()  # what the board said meanwhile must not pile up
+            return None if waited is None else self.seen(waited)
+        return shot
+
+    def poll(self) -> Shot | None:
+        """Return the next shot if it is there; no time passes in the workcell.
+
+        Raises:
+            DeviceError: the person pulled a cable.
+        """
+        shot = None
+        if time.monotonic() < self._due_s:
+            self._require_plugged()
+        elif self.person.holds:
+            self._require_plugged()
+            self.person.reach(self.outline())
+            self._number += 1
+            shot = self.person.shot(self._number)
+            shot = None if shot is None else self.seen(shot)
+        else:
+            shot = self.poll_now()
+        if shot is not None:
+            self._due_s = max(time.monotonic(), self._due_s + self.period_s)
+        return shot
+
+    def poll_now(self) -> Shot | None:
+        """Return the newest shot of the workcell, however fast its time passes, for its control loop.
+
+        Raises:
+            DeviceError: the person pulled a cable.
+        """
+        self._require_plugged()
+        shot = self.workcell.poll()
+        return None if shot is None else self.seen(shot)
+
+    def _require_plugged(self) -> None:
+        if self.person.unplugged:
+            raise DeviceError("left camera: the camera is gone: unplugged, or its USB port was reset")
+
+    @property
+    def period_s(self) -> float:
+        """Time between two shots, s."""
+        return max(1.0 / self.workcell.timing.rate_hz, 1.0 / _PACE_HZ)
+
+    def seen(self, shot: Shot) -> Shot:
+        """Return a shot as it is with the lenses that are covered."""
+        if shot.left is not None and "left" in self.person.covered:
+            shot = replace(shot, left=np.full_like(shot.left, 3))
+        if shot.right is not None and "right" in self.person.covered:
+            shot = replace(shot, right=np.full_like(shot.right, 3))
+        return shot
+
+    def close(self) -> None:
+        """Do nothing: the workcell ends with the session."""
+
+    def end(self) -> None:
+        """End the workcell."""
+        self.workcell.close()

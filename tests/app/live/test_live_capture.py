@@ -1,0 +1,109 @@
+"""The capture: the newest shot alone, a camera that is pulled out and put back, left and right exchanged."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from armsight.app.live import capture as module
+from armsight.app.live.capture import CameraCapture, LiveShot
+from armsight.data import Shot
+from armsight.errors import DeviceError
+
+LEFT, RIGHT = np.full((4, 6), 1, np.uint8), np.full((4, 6), 2, np.uint8)
+
+
+class Cable:
+    """A source that gives shots while it is plugged in."""
+
+    count = None
+
+    def __init__(self):
+        self.plugged, self.opened, self.closed, self.number = threading.Event(), 0, 0, 0
+        self.plugged.set()
+
+    def open(self):
+        if not self.plugged.is_set():
+            raise DeviceError("/dev/video0: no such camera")
+        self.opened += 1
+        return self
+
+    def read(self):
+        if not self.plugged.is_set():
+            raise DeviceError("/dev/video0: the camera is gone")
+        time.sleep(0.005)
+        self.number += 1
+        return Shot(str(self.number), LEFT, RIGHT, time.monotonic())
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def cable(monkeypatch):
+    monkeypatch.setattr(module, "AGAIN_S", 0.05)
+    return Cable()
+
+
+@pytest.fixture
+def capture(cable):
+    made = CameraCapture(cable.open)
+    made.start()
+    yield made
+    made.close()
+
+
+def until(true, patience_s=10.0):
+    end = time.monotonic() + patience_s
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_whoever_waits_gets_the_newest_shot(capture):
+    first = capture.after(0, 10.0)
+    time.sleep(0.1)
+    later = capture.after(first.number, 10.0)
+    assert later.number > first.number + 3
+    assert capture.after(10**9, 0.01) is None
+    polled = capture.poll()
+    assert int(polled.name) >= later.number
+    until(lambda: capture.rate_hz is not None)
+    assert 0.0 <= later.age_s(later.arrived_s) < 1.0
+
+
+def test_a_camera_that_is_pulled_out_and_put_back_goes_on(capture, cable):
+    before = capture.after(0, 10.0)
+    cable.plugged.clear()
+    until(lambda: capture.problem is not None)
+    assert "the camera is gone" in capture.problem
+    until(lambda: capture.problem == "/dev/video0: no such camera")
+    cable.plugged.set()
+    assert capture.after(before.number + 1, 10.0) is not None
+    until(lambda: capture.problem is None)
+    assert cable.opened == 2
+    assert cable.closed == 1
+
+
+def test_left_and_right_are_exchanged(capture):
+    capture.swapped = True
+    until(lambda: capture.newest is not None and capture.newest.shot.left[0, 0] == 2)
+
+
+def test_while_it_is_paused_somebody_else_gives_the_shots(capture, cable):
+    capture.after(0, 10.0)
+    capture.pause()
+    count = cable.number
+    time.sleep(0.05)
+    assert cable.number == count
+    capture.offer(Shot("other", LEFT, RIGHT))
+    assert capture.newest.shot.name == "other"
+    capture.resume()
+    until(lambda: cable.number > count)
+
+
+def test_the_age_is_by_the_stamp_where_that_is_on_this_clock():
+    assert LiveShot(Shot("a", LEFT, RIGHT, 99.9), 1, 100.0).age_s(100.1) == pytest.approx(0.2)
+    for stamp in (None, 5.0, 200.0):  # none, or of another clock
+        assert LiveShot(Shot("a", LEFT, RIGHT, stamp), 1, 100.0).age_s(100.1) == pytest.approx(0.1)

@@ -1,0 +1,94 @@
+"""The next pose of a guided calibration: its prediction is that of bundle adjustment, and guided shots beat random ones."""
+
+import numpy as np
+import pytest
+
+from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
+from armsight.data import Detections
+from armsight.geometry.pose import inverse, transform
+from armsight.sim.example_rig import board_poses, example_rig
+from armsight.sim.render.scene import chessboard
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.markers.board import open_board
+from armsight.vision.triangulate import optimal_points
+
+SIGMA_PX = 0.05
+BOARD = open_board("chessboard:9x6:30mm")
+RIG = example_rig((640, 360), 450.0, model="brown5")
+SIZES = (RIG.left.image_size_px, RIG.right.image_size_px)
+
+
+def seen(T, name, rng):
+    """What both cameras detect of the board at a pose, with noise."""
+    p, count = transform(T, BOARD.body.points), len(BOARD.body.points)
+    cov = np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1))
+    views = RIG.left.project(p), RIG.right.project(transform(inverse(RIG.T_left_right), p))
+    return Pair(name, *(Detections(np.arange(count), uv + rng.normal(0, SIGMA_PX, uv.shape), cov) for uv in views))
+
+
+def calibrated(Ts, seed=1):
+    rng = np.random.default_rng(seed)
+    pairs = [seen(T, f"{n}", rng) for n, T in enumerate(Ts)]
+    return calibrate_boards(BOARD, pairs, SIZES, models=("brown5",), folds=4)
+
+
+@pytest.fixture(scope="module")
+def poses():
+    return board_poses(np.random.default_rng(3), RIG, chessboard(9, 6, 0.030), 7)
+
+
+@pytest.fixture(scope="module")
+def five(poses):
+    return calibrated(poses[:5])
+
+
+def test_what_is_predicted_of_a_shot_is_what_it_leaves(five, poses):
+    knowledge = Knowledge.of(five, BOARD, CalibrationAim())
+    predicted = knowledge.errors_after_m(poses[5:6])[0]
+    assert knowledge.after(poses[5]).error_m == pytest.approx(predicted, rel=1e-6)
+    # The adjustment of six shots itself: the same information, up to noise and to what the prior of the print learns.
+    found = Knowledge.of(calibrated(poses[:6]), BOARD, CalibrationAim()).error_m
+    assert 0.5 < predicted / found < 2.0
+    assert predicted < 0.9 * knowledge.error_m
+
+
+def test_the_predicted_error_is_that_of_triangulated_points(five):
+    # 200 rigs drawn from the covariance: the RMS error of points of the volume is the predicted one.
+    knowledge, rig = Knowledge.of(five, BOARD, CalibrationAim()), five.rig
+    points = working_points(rig, 0.8)
+    weights, rng = error_weights(rig, points), np.random.default_rng(0)
+    uv = np.stack([rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))], axis=1)
+    cov_uv = np.tile(np.eye(2), (len(uv), 2, 1, 1))
+    drawn = [
+        ((optimal_points(rig.perturbed(d), uv, cov_uv)[0] - points) ** 2).sum(axis=1).mean()
+        for d in rng.multivariate_normal(np.zeros(rig.parameter_count), 0.01 * rig.cov, 200)
+    ]
+    assert np.sqrt(np.mean(drawn)) == pytest.approx(0.1 * knowledge.error_m, rel=0.15)
+    assert np.sqrt(np.trace(weights @ rig.cov)) == pytest.approx(knowledge.error_m, rel=1e-6)
+
+
+def test_guided_shots_beat_random_ones(five, poses):
+    guide, knowledge, rig = Guide(BOARD), Knowledge.of(five, BOARD, CalibrationAim()), five.rig
+    guided = random = knowledge
+    for T in poses[5:7]:
+        guided, random = guided.after(guide.best(guided, rig).T_left_board), random.after(T)
+    assert guided.error_m < 0.9 * random.error_m
+
+
+def test_candidates_and_first_poses_are_in_view_of_both_cameras():
+    guide = Guide(BOARD)
+    Ts = guide.candidates(RIG)
+    assert len(Ts) > 40
+    rig = guessed_rig(SIZES, RIG.T_left_right)
+    first = [guide.first(n, rig).T_left_board for n in range(5)]
+    for cameras, shown in ((RIG, Ts), (rig, np.array(first))):
+        for camera, to in zip(cameras.cameras, (np.eye(4), inverse(cameras.T_left_right)), strict=True):
+            uv = camera.project(transform(to @ shown[:, None], BOARD.body.points[None]).reshape(-1, 3))
+            assert ((uv > 0) & (uv < np.array(camera.image_size_px) - 1)).all()
+
+
+def test_shots_that_are_missing_are_counted(five):
+    guide, knowledge = Guide(BOARD), Knowledge.of(five, BOARD, CalibrationAim())
+    assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1.01 * knowledge.error_m)) == 0
+    assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1e-7)) is None
+    assert 1 <= guide.shots_missing(knowledge, five.rig, CalibrationAim(0.6 * knowledge.error_m)) <= 6
