@@ -221,7 +221,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
     outcome, wall_s = finished.outcome, _wall_s(finished)
     with _as_much_as_fits() as keep:
         keep(write_text, folder / "poses.csv", csv_text(_shot_poses(finished)))
-        keep(write_text, folder / DETECTIONS, detections_text(_drawn_shots(outcome.log), outcome.body))
+        if drawn := _drawn_shots(outcome.log):
+            keep(write_text, folder / DETECTIONS, detections_text(drawn, outcome.body))
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))

@@ -284,7 +284,9 @@ class ClosureWatch:
             for k in range(len(e)):
                 self._sum(k)
             if not last:
-                best = max(self._tested(_begins(len(e)), _suspects(self._parts.joints)), key=lambda each: each.above)
+                # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
+                tested = self._tested(_begins(len(e)), _suspects(self._parts.joints))
+                best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
                 A = np.concatenate([A, self._by_change(best)], axis=2)
 
     def _by_change(self, found: _Tested) -> Array:
@@ -306,17 +308,23 @@ class ClosureWatch:
         best = max(found, key=lambda each: each.above)
         if best.above <= 0.0:
             return
-        row = int(np.searchsorted(begins, best.begin))
-        between = np.arange(begins[max(row - 1, 0)], begins[min(row + 1, len(begins) - 1)] + 1)
-        (finest,) = self._tested(between, (best.suspect,))
+        # A jump between two beginnings looks like a drift: both are tried at those between.
+        either = [each for each in found if each is best or {each.suspect.kind, best.suspect.kind} == {"rig", "drift"}]
+        finest = max((self._refined(each, begins) for each in either), key=lambda each: each.above)
         least = max(finest.above - _ALIKE, 0.0)
-        alike = tuple(each.suspect for each in found if each is not best and each.above > least)
-        effect = _changes(self._parts, self._H[-1])[:, best.suspect.columns]
+        alike = tuple(each.suspect for each in found if each.suspect is not finest.suspect and each.above > least)
+        effect = _changes(self._parts, self._H[-1])[:, finest.suspect.columns]
         begin_s = (self._t[finest.begin - 1] + self._t[finest.begin]) / 2
-        change = Change(best.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
+        change = Change(finest.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
         shift = change.size if change.motion is None else change.motion.motion[:3]
         if float(np.linalg.norm(shift)) > (_LEAST_RAD if change.motion is None else _LEAST_M):
             self.change = change
+
+    def _refined(self, found: _Tested, begins: Array) -> _Tested:
+        """Test a suspect at the beginnings between the neighbours of the one that was found for it."""
+        row = int(np.searchsorted(begins, found.begin))
+        between = np.arange(begins[max(row - 1, 0)], begins[min(row + 1, len(begins) - 1)] + 1)
+        return self._tested(between, (found.suspect,))[0]
 
     def _tested(self, begins: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
         """Test hypotheses at beginnings (S,); return each at the one of largest chi-square."""
