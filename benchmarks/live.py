@@ -168,7 +168,9 @@ def seen(rig, T, name, rng, noise_px=SIGMA_PX):
     p, count = transform(T, BOARD.body.points), len(BOARD.body.points)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1))
     views = rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))
-    return Pair(name, *(Detections(np.arange(count), uv + noise_px * rng.standard_normal(uv.shape), cov) for uv in views))
+    return Pair(
+        name, *(Detections(np.arange(count), uv + noise_px * rng.standard_normal(uv.shape), cov) for uv in views)
+    )
 
 
 def errors_mm(true, rig, tests):
