@@ -27,7 +27,7 @@ docs: $(VENV)/.armsight-test  ## the site, into docs/_build/html; runs the tutor
 
 bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA; about an hour
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
-	cd benchmarks && for each in calibration markers kinematics motions board dense identify experiment health; do ../$(BIN)/python $$each.py || exit 1; done
+	cd benchmarks && for each in calibration markers kinematics motions board dense identify experiment health speed; do ../$(BIN)/python $$each.py || exit 1; done
 
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)

@@ -30,8 +30,11 @@ METRICS = {
     "loop closed, rest error RMS": ("closed_loop", "rest_error_after_m", 1e3, "mm", 0.15),
     "loop open, path error RMS": ("closed_loop", "path_error_before_m", 1e3, "mm", None),
     "loop closed, path error RMS": ("closed_loop", "path_error_after_m", 1e3, "mm", None),
-    "image to command, p50": ("latency_s", "p50", 1e3, "ms", None),
+    "image to command, p50": ("latency_s", "p50", 1e3, "ms", 1.2),
     "image to command, p99": ("latency_s", "p99", 1e3, "ms", 2.0),
+    "image to command, p99.9": ("latency_s", "p999", 1e3, "ms", 5.0),
+    "image to command, longest": ("latency_s", "max", 1e3, "ms", 10.0),
+    "search of the body, longest": ("search_s", "max", 1e3, "ms", None),
 }
 
 

@@ -1,7 +1,8 @@
 """Kinematics beside pinocchio, EAIK and roboticstoolbox in one run, one thread.
 
-    python benchmarks/kinematics.py            both metrics, 1,000,000 poses
-    python benchmarks/kinematics.py 100000     both metrics, fewer poses
+    python benchmarks/kinematics.py            all metrics, 1,000,000 poses
+    python benchmarks/kinematics.py 100000     all metrics, fewer poses
+    python benchmarks/kinematics.py others     metrics 3 and 4 alone
 
 Metric 1, time: forward kinematics, Jacobian and all solutions of the inverse. "kernel" is the compiled function called
 from compiled code, "call" is the public method called from Python, "batch" is the public method on 100,000 at once.
@@ -10,6 +11,11 @@ several runs of the processor's own time, so that other work on the computer cou
 
 Metric 2, exactness: over seeded random poses, as many near singularities as elsewhere, the errors of every solution
 returned (measured anew through ``forward``), doubles, NaN, and what EAIK finds and armsight does not.
+
+Metric 3: the models that their makers publish as URDF against pinocchio on that, forward kinematics and Jacobian.
+
+Metric 4: the numeric inverse of arms of other than six joints over 100,000 seeded poses, joint angles drawn evenly in
+the limits: how many are solved within the limits, and the wall-clock time of each compiled call.
 
 Peers are optional: pip install pin EAIK roboticstoolbox-python.
 """
@@ -25,16 +31,20 @@ from pathlib import Path
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"
 # The peers' wrappers and the sampling near singularities are the tests' own.
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "robot"))
+sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("robot", "robot/models")]
 
 import arms  # noqa: E402
+import makers_chains  # noqa: E402
 import numpy as np  # noqa: E402
 import peers  # noqa: E402
 
-from armsight.robot.kinematics import chain, inverse  # noqa: E402
+from armsight.robot.kinematics import chain, inverse, numeric  # noqa: E402
 from armsight.robot.kinematics.inverse import MOST, WIDTH  # noqa: E402
+from armsight.robot.kinematics.table import KIND  # noqa: E402
 from armsight.robot.models import MODELS  # noqa: E402
 
+#: The models whose inverse is a closed form.
+CLOSED = [arm for arm in MODELS.values() if arm.joints == 6 and arm.table[KIND]]
 POSES, BATCH, CHUNK = 1_000_000, 100_000, 20_000
 
 
@@ -76,7 +86,7 @@ def inverses(table, closed, limits, Ts, near, rows, scratch, n, rounds):
 def metric_1(rng):
     print("metric 1: time, us; required: forward 0.4 kernel, 6 call, 0.08 batch; jacobian 0.6 kernel; inverse 3, 15, 2")
     print(f"{'':19}{'kernel':>8}{'call':>8}{'batch':>8}   peers, called from Python")
-    for arm in MODELS.values():
+    for arm in CLOSED:
         q = rng.uniform(-np.pi, np.pi, (1000, 6))
         Ts = arm.forward(q)
         each, eachT = iter_forever(list(q)), iter_forever(list(Ts))
@@ -144,8 +154,8 @@ def metric_2(rng, poses):
         f"{'':9}{'poses':>8}{'solutions':>11}{'worst m':>10}{'worst rad':>10}{'NaN':>5}{'twice':>6}"
         f"{'none':>6}{'EAIK finds':>12}{'of a family':>13}{'undetermined':>14}{'missed':>8}"
     )
-    each = poses // len(MODELS) // 2
-    for arm in MODELS.values():
+    each = poses // len(CLOSED) // 2
+    for arm in CLOSED:
         total = np.zeros(9, dtype=np.int64)  # as the columns, without the errors
         worst = np.zeros(2)
         for start in range(0, each, CHUNK // 2):
@@ -209,10 +219,55 @@ def beside_eaik(arm, Ts, many, there):
     return len(q), family, undetermined, missed
 
 
+def metric_3(rng):
+    print("\nmetric 3: largest difference from pinocchio on the makers' URDF, 1000 poses; required: below 1e-12")
+    if not have("pinocchio"):
+        print("pinocchio is not installed")
+        return
+    from scipy.spatial.transform import Rotation
+    from test_makers_chains import STANDS
+
+    for name in makers_chains.CHAINS:
+        arm, peer = MODELS[name], makers_chains.Peer(name)
+        base, way, tool = STANDS.get(name, (Rotation.identity(), np.ones(arm.joints), Rotation.identity()))
+        L, R = np.eye(4), np.eye(4)
+        L[:3, :3], R[:3, :3] = base.as_matrix(), tool.as_matrix()
+        worst = np.zeros(2)
+        for q in rng.uniform(arm.q_min, arm.q_max, (1000, arm.joints)):
+            far = np.abs(L @ arm.forward(q) @ R - peer.forward(way * q)).max()
+            J = np.kron(np.eye(2), L[:3, :3]) @ arm.jacobian(q)
+            worst = np.maximum(worst, (far, np.abs(J - peer.jacobian(way * q) * way).max()))
+        print(f"{name:9} forward {worst[0]:.1e}  Jacobian {worst[1]:.1e}")
+
+
+def metric_4(rng, poses=100_000):
+    print(f"\nmetric 4: numeric inverse, {poses} reachable poses; required: 99.99 % solved, at most 100 us each")
+    print(
+        f"{'':9}{'joints':>7}{'solved %':>10}{'missed':>8}{'mean us':>9}{'median':>8}{'p99':>8}{'worst m':>10}{'rad':>10}"
+    )
+    for arm in (*arms.OTHERS, arms.FOUR):
+        Ts = arm.forward(rng.uniform(arm.q_min, arm.q_max, (poses, arm.joints)))
+        q, off, us = np.empty((poses, arm.joints)), np.empty((poses, 3)), np.empty(poses)
+        goal, scratch = arm._limits.mean(axis=0), np.zeros(numeric.SCRATCH)
+        for k in range(poses):
+            begin = time.perf_counter_ns()
+            numeric.inverse(arm.table, arm._limits, Ts[k], goal, q[k], off[k], scratch)
+            us[k] = (time.perf_counter_ns() - begin) / 1e3
+        far, rotated = arms.off(arm.forward(q), Ts)
+        good = (far < 1e-9) & (rotated < 1e-9) & arm.within_limits(q)
+        print(
+            f"{arm.name:9}{arm.joints:7}{100 * good.mean():10.3f}{(~good).sum():8}{us.mean():9.1f}{np.median(us):8.1f}"
+            f"{np.percentile(us, 99):8.1f}{far[good].max():10.1e}{rotated[good].max():10.1e}"
+        )
+
+
 def main() -> None:
     rng = np.random.default_rng(20)
-    metric_1(rng)
-    metric_2(rng, int(sys.argv[1]) if len(sys.argv) > 1 else POSES)
+    if sys.argv[1:] != ["others"]:
+        metric_1(rng)
+        metric_2(rng, int(sys.argv[1]) if len(sys.argv) > 1 else POSES)
+    metric_3(np.random.default_rng(21))
+    metric_4(np.random.default_rng(22))
 
 
 if __name__ == "__main__":

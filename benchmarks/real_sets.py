@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import real_mrcal
 from armsight.data import Correspondences, PoseEstimate
 from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -139,6 +140,15 @@ def heldout_beside_opencv() -> None:
                     best[key] = min(best.get(key, np.inf), getattr(h, key))
             cross = errors_on(ours.rig, points, list(mine.values()))
             print(line("   our rig on those same OpenCV corners", len(mine), cross))
+        for who, shots in (
+            ("findChessboardCornersSB", s.opencv["findChessboardCornersSB"]),
+            ("our corners", ours_of(s.pairs)),
+        ):
+            mine = [c for k, c in shots.items() if parity(k)]
+            even = [c for k, c in shots.items() if parity(k) == 0]
+            for lens in real_mrcal.MODELS if real_mrcal.available() else ():
+                rig = real_mrcal.mrcal_rig(even, s.size, float(np.linalg.norm(points[1] - points[0])), lens)
+                print(line(f"mrcal, {who}, {lens}", len(mine), errors_on(rig, points, mine)))
         h = errors_on(ours.rig, points, list(odd.values()))
         print(line(f"armsight ({ours.rig.left.model}, {len(ours.pairs)} pairs fitted)", len(odd), h))
         gain = [100 * (1 - getattr(h, key) / best[key]) for key in ("epipolar_rms_px", "rigid_rms_m")]

@@ -8,10 +8,10 @@ Render the motion of a plate with three discs, cover one disc for a while, and f
 
     $ python examples/03_follow_a_plate.py
 
-The first run on a computer compiles for a minute or two. The plate is ``examples/plate.toml``; ``armsight body draw``
-prints it to scale.
+The plate is ``examples/plate.toml``; ``armsight body draw`` prints it to scale.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -76,4 +76,4 @@ def plot(found: list[tuple[float, float, float]]) -> None:
 
 
 if __name__ == "__main__":
-    plot(main(Path(__file__).resolve().parent))
+    plot(main(Path(sys.argv[0]).resolve().parent))

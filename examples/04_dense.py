@@ -7,8 +7,6 @@ Render a box in front of a wall, match the pair of images, and locate the box, w
 .. code-block:: console
 
     $ python examples/04_dense.py
-
-The first run on a computer compiles for half a minute.
 """
 
 import numpy as np

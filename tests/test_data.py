@@ -11,7 +11,7 @@ from strategies import ordinary_rig
 def test_records_print_as_one_line():
     rig = ordinary_rig("brown5")
     shot = Shot("000", np.zeros((480, 640), np.uint8), None, 0.25)
-    assert repr(shot) == "Shot(name='000', left=<480 x 640 uint8>, right=None, t_s=0.25, problem=None)"
+    assert repr(shot) == "Shot(name='000', left=<480 x 640 uint8>, right=None, t_s=0.25, problem=None, encoded=None)"
     assert repr(Body("plate", ("A", "B"), np.eye(3)[:2])) == (
         "Body(name='plate', point_names=('A', 'B'), points=<2 x 3 float64>)"
     )

@@ -94,3 +94,8 @@ def test_every_example_has_a_number_and_a_check():
 @pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_it_runs_and_what_it_prints_is_right(path, tmp_path, capsys):
     CHECKS[path.name[:2]](runpy.run_path(str(path))["main"], tmp_path, capsys)
+
+
+def test_examples_run_where_a_script_has_no_file_of_its_own():
+    """The gallery runs their text: ``__file__`` does not exist there."""
+    assert [path.name for path in FOLDER.glob("*.py") if "__file__" in path.read_text(encoding="utf-8")] == []

@@ -78,6 +78,8 @@ class Shot(Record):
         right: the same of the right camera.
         t_s: time of the grab, s, on the source's clock; None where it has none.
         problem: why the shot cannot be used; None when it can.
+        encoded: both images as the cameras delivered them, each the bytes of a JPEG or PNG file; None where they were
+            delivered as pixels, or are not kept.
     """
 
     name: str
@@ -85,6 +87,7 @@ class Shot(Record):
     right: Image | None
     t_s: float | None = None
     problem: str | None = None
+    encoded: tuple[bytes, bytes] | None = None
 
     def image(self, side: Side) -> Image | None:
         """Return the image of one side."""
@@ -264,9 +267,9 @@ class JointCommand(Record):
     """Where the joints are to be, as a board takes it.
 
     Attributes:
-        q_ref: (6,) joint angles to be at when ``duration_s`` has passed, rad.
-        qd_ref: (6,) speeds to have there, rad/s.
-        gravity_duty: (6,) duty that compensates the gravity load, -1 to 1.
+        q_ref: (n,) joint angles to be at when ``duration_s`` has passed, rad.
+        qd_ref: (n,) speeds to have there, rad/s.
+        gravity_duty: (n,) duty that compensates the gravity load, -1 to 1.
         duration_s: usually the time until the next command; a whole number of the board's ticks.
     """
 
@@ -282,7 +285,7 @@ class JointStates(Record):
 
     Attributes:
         t_s: (N,) times on the board's clock, s.
-        q: (N, 6) measured joint angles, rad.
+        q: (N, n) measured joint angles, rad.
     """
 
     t_s: Array

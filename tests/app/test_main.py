@@ -73,6 +73,7 @@ def test_errors_are_red_on_a_terminal_without_no_color():
         ("pyarrow", ("demo",), "run"),
         ("serial", ("board", "monitor", "--board", "serial:/dev/none"), "board"),
         ("unicorn", ("board", "monitor", "--board", "emulated:unicorn"), "board"),
+        ("distributed", ("batch", "measure", "*.bag", "-o", "out"), "batch"),
         ("yaml", ("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "b.yaml"), "formats"),
         ("yaml", ("rig", "import", "rig.json", "--format", "kalibr", "-o", "a.json"), "formats"),
     ],

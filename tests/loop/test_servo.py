@@ -1,5 +1,7 @@
 """The loop closed on vision: what it gains, that it does not swing, its limits, and what it does when vision is lost."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, worn
@@ -7,6 +9,7 @@ from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, wor
 from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.estimators import ESTIMATORS, Delay, Mounting
+from armsight.loop.health import Trust
 from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, LoopTiming, Mode, PoseServo
 from armsight.robot.trajectories import point_to_point
 
@@ -186,3 +189,50 @@ def test_singular_poses_do_not_make_it_wild(q):
 def test_times_must_be_positive():
     with pytest.raises(InputError, match=r"latency_s is -0\.1; it must be a positive number of seconds"):
         LoopTiming(0.016, 0.016, -0.1)
+
+
+def test_what_must_not_be_trusted_is_taken_back_and_what_is_doubted_is_held():
+    workcell = workcell_of(25, 60)
+    servo = PoseServo(ARM, timing(60))
+    still = point_to_point(ARM, MIDDLE, MIDDLE + 1e-9)
+    follow(workcell, still, servo, 2.0)
+    closed = servo.step(servo.aim(still, 1.0), workcell.estimator)
+    held = servo.step(servo.aim(still, 1.0), workcell.estimator, Trust.DOUBTED)
+    assert held.mode is Mode.HELD
+    assert np.abs(held.correction - closed.correction).max() < 1e-12
+    assert np.abs(held.correction).max() > 1e-3
+    for _ in range(60):
+        back = servo.step(servo.aim(still, 1.0), workcell.estimator, Trust.NONE)
+    assert back.mode is Mode.DISTRUSTED
+    assert np.abs(back.correction).max() < 1e-12
+    assert servo.step(servo.aim(still, 1.0), workcell.estimator).mode is Mode.VISION
+
+
+def test_the_correction_displaces_the_tool_by_no_more_than_its_bound(monkeypatch):
+    monkeypatch.setattr("armsight.loop.servo.MAX_CORRECTION_M", 0.01)
+
+    class Misled:
+        """An estimator that has the tool half a metre from where it is."""
+
+        def __init__(self, estimator):
+            self._estimator = estimator
+
+        def estimate(self):
+            there = self._estimator.estimate()
+            T = there.T_base_tool.copy()
+            T[:3, 3] += [0.5, 0.0, 0.0]
+            return replace(there, T_base_tool=T)
+
+        def tool(self, q, qd, *, pressed=False):
+            return self._estimator.tool(q, qd, pressed=pressed)
+
+    workcell = workcell_of(26, 60)
+    servo = PoseServo(ARM, timing(60))
+    still = point_to_point(ARM, MIDDLE, MIDDLE + 1e-9)
+    limited = set()
+    for _ in range(200):
+        step = servo.step(servo.aim(still, 1.0), Misled(workcell.estimator))
+        limited |= set(step.limited)
+        assert np.linalg.norm(ARM.jacobian(MIDDLE)[:3] @ step.correction) < 0.01001
+        workcell.advance(step.command, 16)
+    assert "tool: largest correction" in limited

@@ -13,7 +13,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 
-MASS_KG, GRAVITY = np.array([1.0, 0.6, 0.4, 0.3, 0.2, 0.3]), 9.81
+MASS_KG, GRAVITY = np.array([1.0, 0.6, 0.4, 0.3, 0.2, 0.3, 0.2]), 9.81
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,12 @@ class Worn:
         out = np.zeros_like(q)
         for n, angles in enumerate(q):
             T = self.nominal.links(angles)
-            for i in range(6):
+            for i in range(q.shape[1]):
                 z, at = T[i, :3, 2], T[i, :3, 3]
                 force = np.array([0, 0, -GRAVITY])
-                out[n, i] = sum(m * z @ np.cross(T[j + 1, :3, 3] - at, force) for j, m in enumerate(MASS_KG) if j >= i)
+                out[n, i] = sum(
+                    m * z @ np.cross(T[j + 1, :3, 3] - at, force) for j, m in enumerate(MASS_KG[: q.shape[1]]) if j >= i
+                )
         return out
 
     def T_rig_body(self, q, approach):
@@ -69,14 +71,15 @@ def worn(seed, nominal=None, *, waves=2, backlash=True, compliance=True):
     """
     rng = np.random.default_rng(seed)
     nominal = nominal or open_arm("six_r")
-    free = np.array([1, 1, 1, 1, 1, 0.0])
-    inner = np.array([0, 1, 1, 1, 1, 0.0])
+    n = nominal.joints
+    free = np.append(np.ones(n - 1), 0.0)
+    inner = free * np.append(0.0, np.ones(n - 1))
     true = replace(
         nominal,
-        a=nominal.a + rng.normal(0, 1e-3, 6) * free,
-        d=nominal.d + rng.normal(0, 1e-3, 6) * inner,
-        alpha=nominal.alpha + rng.normal(0, np.deg2rad(0.3), 6) * free,
-        offset=nominal.offset + rng.normal(0, np.deg2rad(0.5), 6) * inner,
+        a=nominal.a + rng.normal(0, 1e-3, n) * free,
+        d=nominal.d + rng.normal(0, 1e-3, n) * inner,
+        alpha=nominal.alpha + rng.normal(0, np.deg2rad(0.3), n) * free,
+        offset=nominal.offset + rng.normal(0, np.deg2rad(0.5), n) * inner,
     )
     harmonic = np.arange(1, waves + 1)
     size = np.deg2rad(0.05) / harmonic[None, :, None]
@@ -84,10 +87,10 @@ def worn(seed, nominal=None, *, waves=2, backlash=True, compliance=True):
     return Worn(
         nominal,
         true,
-        rng.uniform(*np.deg2rad([0.1, 0.3]), 6) * backlash,
-        rng.uniform(0.5, 1.5, 6) * np.deg2rad(0.1) / 3.0 * compliance,
-        rng.normal(0, 5e-4, 6),
-        rng.normal(0, 1, (6, waves, 2)) * size if waves else np.zeros((6, 0, 2)),
+        rng.uniform(*np.deg2rad([0.1, 0.3]), n) * backlash,
+        rng.uniform(0.5, 1.5, n) * np.deg2rad(0.1) / 3.0 * compliance,
+        rng.normal(0, 5e-4, n),
+        rng.normal(0, 1, (n, waves, 2)) * size if waves else np.zeros((n, 0, 2)),
         T_rig_base,
         exp_se3(np.array([0.02, -0.01, 0.05, 0.1, 0.2, -0.3])),
     )
@@ -95,8 +98,8 @@ def worn(seed, nominal=None, *, waves=2, backlash=True, compliance=True):
 
 def poses(arm, n, rng, half=0.9):
     """Readings about home, and directions of approach."""
-    q = arm.home + rng.uniform(-half, half, (n, 6))
-    return np.clip(q, arm.q_min, arm.q_max), rng.choice([-1.0, 1.0], (n, 6))
+    q = arm.home + rng.uniform(-half, half, (n, arm.joints))
+    return np.clip(q, arm.q_min, arm.q_max), rng.choice([-1.0, 1.0], q.shape)
 
 
 def distance_m(model, x, truth, q, approach):

@@ -8,6 +8,7 @@ import numpy as np
 
 from armsight.geometry.pose import exp_se3
 from armsight.robot.arm import Arm
+from armsight.robot.kinematics.table import BEND, KIND
 from armsight.robot.models import MODELS
 
 
@@ -31,9 +32,9 @@ def plain(name, a, d, alpha, **more):
         np.array(a),
         np.array(d),
         np.deg2rad(alpha),
-        np.full(6, -2 * np.pi),
-        np.full(6, 2 * np.pi),
-        *np.full((3, 6), 1.0),
+        np.full(len(a), -2 * np.pi),
+        np.full(len(a), 2 * np.pi),
+        *np.full((3, len(a)), 1.0),
         **more,
     )
 
@@ -70,13 +71,22 @@ IDENTIFIED = [
 ]
 
 #: Arms whose inverse is a closed form.
+CLOSED = {name: arm for name, arm in MODELS.items() if arm.joints == 6 and arm.table[KIND]}
 EXACT = [
-    *MODELS.values(),
+    *CLOSED.values(),
     CRAIG,
     TO_AND_FRO,
     *(odd(MODELS[name], f"odd_{name}", i) for i, name in enumerate(("six_r", "ur10", "puma560"))),
 ]
 ALL = [*EXACT, *IDENTIFIED, GENERAL]
+#: Four joints: turning base, two parallel axes, a wrist across them.
+FOUR = plain("four", [0.02, 0.3, 0.25, 0.0], [0.2, 0.03, 0.0, 0.1], [90, 0, 90, 0])
+#: A PUMA 560 whose third motor turns its forearm against the ground: J3' = J3 + J2.
+COUPLED = dataclasses.replace(
+    MODELS["puma560"], name="coupled", coupling=np.eye(6) + np.eye(6)[2][:, None] * np.eye(6)[1]
+)
+#: Arms of other than six joints.
+OTHERS = [arm for arm in MODELS.values() if arm.joints != 6]
 
 
 def names(arms):
@@ -100,10 +110,10 @@ def _shift(x, z):
 
 
 def frames(arm, q):
-    """Frame 0, links 1 to 6 and the tool, as products of 4x4 matrices straight from the convention's definition."""
+    """Frame 0, links 1 to n and the tool, as products of 4x4 matrices straight from the convention's definition."""
     out = [arm.T_base_0]
-    for i in range(6):
-        joint = _rz(arm.direction[i] * q[i] + arm.offset[i]) @ _shift(0, arm.d[i])
+    for i in range(arm.joints):
+        joint = _rz(arm.direction[i] * (arm.coupling @ q)[i] + arm.offset[i]) @ _shift(0, arm.d[i])
         side = _shift(arm.a[i], 0) @ _rx(arm.alpha[i])
         out.append(out[-1] @ (joint @ side if arm.convention == "standard" else side @ joint))
     return np.stack([*out, out[-1] @ arm.T_flange_tool])
@@ -134,7 +144,7 @@ def near_singular(arm, n, rng):
     which = rng.integers(1, 8, n)
     half = rng.integers(0, 2, (n, 2)) * np.pi
     theta[:, 4] = np.where(which & 1, half[:, 0] + by[:, 0], theta[:, 4])
-    theta[:, 2] = np.where(which & 2, half[:, 1] - arm._closed[88] + by[:, 1], theta[:, 2])
+    theta[:, 2] = np.where(which & 2, half[:, 1] - arm._closed[BEND] + by[:, 1], theta[:, 2])
     q = (theta - theta_offset) * way
     for k in np.flatnonzero(which & 4):
         q[k, 1] = over_axis1(arm, q[k]) + by[k, 2]

@@ -3,8 +3,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
+from armsight.vision import posefit
 from armsight.vision.bundle import CAUCHY_SCALE, BundleModel, BundleState, Observations, minimise
 from armsight.vision.posefit import PixelObservations, fit_pose
+from asserts import assert_jacobian
 from strategies import ordinary_rig
 from views import pixels, seen, somewhere
 
@@ -119,3 +121,21 @@ def test_too_few_observations_determine_no_pose_or_keep_to_the_data():
     two = observations.select(np.arange(len(observations.uv)) < 2)
     fit = fit_pose(rig.cameras, rig.T_left_right, points, two, T_true, robust=False)
     assert fit is None or np.linalg.matrix_rank(fit.information) <= 4
+
+
+@pytest.mark.parametrize("model", ["brown4", "brown5", "brown8", "fisheye"])
+def test_derivatives_by_pose_and_rig_are_those_of_finite_differences(model):
+    rig, points, T, observations, _ = shot(model, 4)
+    W, by_pose, by_rig = posefit.whitened(rig.cameras, rig.T_left_right, points, observations, T)
+    assert np.einsum("nji,njk->nik", W, W) == pytest.approx(np.linalg.inv(observations.cov_uv), rel=1e-12)
+
+    def projected(rig_, T_):
+        uv = np.empty((len(observations.uv), 2))
+        for side, T_camera_body in enumerate((T_, inverse(rig_.T_left_right) @ T_)):
+            rows = observations.camera == side
+            uv[rows] = rig_.cameras[side].project(transform(T_camera_body, points[observations.point[rows]]))
+        return np.einsum("nij,nj->ni", W, uv).ravel()
+
+    assert_jacobian(by_pose, lambda xi: projected(rig, T @ exp_se3(xi)), np.zeros(6), 1e-4)
+    scale = np.maximum(np.abs(np.r_[rig.left.parameters, rig.right.parameters, np.ones(6)]), 0.1)
+    assert_jacobian(by_rig, lambda delta: projected(rig.perturbed(delta), T), np.zeros(len(scale)), 1e-4 * scale)

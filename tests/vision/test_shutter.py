@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from armsight.data import Body, Correspondences, Missed, PoseEstimate
-from armsight.geometry.pose import inverse, pose, transform
+from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.vision.shutter import Shutters, TimedShot, estimate_shutters, measure_moving
+from armsight.vision.shutter import (
+    Motion,
+    Shutters,
+    TimedShot,
+    estimate_shutters,
+    measure_moving,
+    measure_with_motion,
+)
 
 SKEW_S, READOUT_S, SIGMA_PX, RATE_HZ = 5e-3, 14e-3, 0.1, 30.0
 RIG = replace(example_rig((1280, 720), 900.0), sigma_px=0.0)
@@ -121,6 +128,31 @@ def test_moved_to_one_time_a_moving_body_is_measured_as_by_synchronised_cameras(
     unsure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.diag([1e-6, 0.0])))
     sure = measure_moving(RIG, BODY, apart[0], replace(found, cov=np.zeros((2, 2))))
     assert all(np.trace(a.cov[:3, :3]) > np.trace(b.cov[:3, :3]) for (a, _), (b, _) in zip(unsure, sure, strict=True))
+
+
+def test_a_shot_alone_is_measured_with_a_motion_that_is_known_otherwise():
+    """Monte Carlo over shots whose skew varies and whose velocity is known with an error."""
+    speed, jitter_s, sigma = 0.4, 1e-3, np.repeat([0.01, 0.02], 3)
+    shutters = Shutters(SKEW_S, READOUT_S, np.zeros((2, 2)), jitter_s)
+    nees, gaps, blind, rng = [], [], [], np.random.default_rng(20)
+    for seed in range(6):
+        shots, truth = recorded(seed, speed, stamped_s=jitter_s)
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 6)
+        for shot, T in zip(shots, truth, strict=True):
+            before, after = (at(shot.t_s + dt, speed, phase)[0] for dt in (-0.01, 0.01))
+            back, on = (log_se3(inverse(T) @ there) for there in (before, after))
+            twist = (on - back) / 0.02 + sigma * rng.normal(size=6)
+            motion = Motion(twist, (on + back) / 1e-4, np.diag(sigma**2), True)
+            found = measure_with_motion(RIG, BODY, replace(shot, apart_s=0.0), motion, shutters)
+            assert isinstance(found, PoseEstimate)
+            gap = log_se3(inverse(found.T_left_body) @ T)
+            nees.append(gap @ np.linalg.solve(found.cov, gap))
+            gaps.append(gap[:3])
+            still = measure_with_motion(RIG, BODY, shot, motion, NOTHING)
+            assert isinstance(still, PoseEstimate)
+            blind.append(log_se3(inverse(still.T_left_body) @ T)[:3])
+    assert 4.8 < np.mean(nees) < 7.5
+    assert np.mean(np.square(gaps)) < np.mean(np.square(blind)) / 25
 
 
 def test_skew_that_varies_is_followed_from_shot_to_shot():

@@ -25,11 +25,15 @@ SECTIONS: dict[str, dict[str, str]] = {
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
         "cameras": "List the attached cameras and their modes.",
         "record": "Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.",
-        "rig": "Show a rig file, import a rig of another program, or export one.",
+        "rig": "Show a rig file, import a rig of another program, export one, or update one from what a run saw.",
     },
     "Measure": {
         "measure": "Measure the pose of a target in the left camera's frame, with its uncertainty.",
+        "handeye": "Calibrate hand and eye from your own data: robot poses, and images or poses of a target.",
         "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
+        "replay": "Measure and estimate again what was recorded, also with another rig, body, arm or estimator.",
+        "export": "Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.",
+        "batch": "Measure many recordings, on all cores or on a cluster; started again it goes on where it was.",
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
     "Operate an arm": {

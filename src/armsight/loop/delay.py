@@ -59,7 +59,7 @@ def estimate_delay(
         InputError: too few measurements, or readings that do not cover them.
         CalibrationError: the motion does not determine the delay.
     """
-    t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), 6), "states.q")
+    t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), None), "states.q")
     stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])
     if len(stamps) < MIN_MEASUREMENTS or not (np.diff(stamps) > 0).all():
         raise InputError(
@@ -100,7 +100,7 @@ def _coarse(arm: Arm, t: Array, q: Array, measurements: Sequence[PoseMeasurement
     seen = _rotation_angles(np.array([pose_measurement.T_base_tool for pose_measurement in measurements]))
     cost = np.empty(len(lags))
     for n, lag in enumerate(lags):
-        at = np.stack([np.interp(stamps - lag, t, q[:, i]) for i in range(6)], axis=1)
+        at = np.stack([np.interp(stamps - lag, t, q[:, i]) for i in range(q.shape[1])], axis=1)
         cost[n] = np.square(_rotation_angles(arm.forward(at)) - seen).sum()
     best = int(np.clip(np.argmin(cost), 1, len(lags) - 2))
     before, here, after = cost[best - 1 : best + 2]

@@ -1,7 +1,7 @@
 """The outer loop: corrects the joints' commands until the tool, as vision measures it, follows its reference.
 
 In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
-The command is the motion's joints plus a correction c (6,), with the motion's speeds fed forward. While the arm moves, c
+The command is the motion's joints plus a correction c (n,), with the motion's speeds fed forward. While the arm moves, c
 is the joint error, by the estimator's model, that must be made up for at the next pose to be reached; at rest, c integrates
 the tool's error itself. Tool errors become joint errors through the Jacobian, except in directions in which the arm is near
 a singularity. Gain, its margin, and what happens when vision is lost: docs/concepts/loop.md.
@@ -21,6 +21,7 @@ from armsight.data import Array, JointCommand, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
+from armsight.loop.health.record import Trust
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.lookahead import behind
@@ -41,8 +42,10 @@ FOLLOW_S = 0.08
 #: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), and fully
 #: from that.
 UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
-#: The correction is at most this, rad: an arm that needs more is not the arm of the table.
+#: The correction is at most this, rad, and displaces the tool by at most so much from where the potentiometers alone would
+#: bring it, m: an arm that needs more is not the arm of the table.
 MAX_CORRECTION_RAD = np.deg2rad(5.0)
+MAX_CORRECTION_M = 0.02
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
@@ -53,6 +56,8 @@ class Mode(Enum):
     VISION = "vision"
     BRIDGED = "bridged: no measurement lately, the potentiometers carry on with what was learned"
     POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
+    HELD = "held: vision contradicts what was learned; the correction stays until the cause is known"
+    DISTRUSTED = "potentiometers alone: what vision measures is wrong, the correction is taken back"
 
 
 @dataclass(frozen=True)
@@ -102,11 +107,11 @@ class Aim(Record):
         goal: the joints now, as the motion has them.
         ahead: those a period from now.
         Ts_base_tool: (2, 4, 4) where they put the tool.
-        duty: (6,) that holds the arm against gravity ahead.
-        jacobian: (6, 6) at the goal.
-        U: (6, 6) of its singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
-        s: (6,).
-        Vt: (6, 6).
+        duty: (n,) that holds the arm against gravity ahead.
+        jacobian: (6, n) at the goal.
+        U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
+        s: (k,).
+        Vt: (k, n).
     """
 
     goal: Joints
@@ -126,7 +131,7 @@ class ServoStep(Record):
     Attributes:
         command: what the board is to be sent.
         mode: what the loop is closed on.
-        correction: (6,) what is added to the motion's joints, rad.
+        correction: (n,) what is added to the motion's joints, rad.
         error: (6,) from the estimated tool to its reference now, [m; rad] in base axes.
         limited: what kept a joint from being corrected further, one text each.
     """
@@ -150,7 +155,7 @@ class PoseServo:
         self.timing = timing
         self._arm, self._scale = arm, np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])
         self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
-        self._correction = np.zeros(6)
+        self._correction = np.zeros(arm.joints)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
 
@@ -160,28 +165,29 @@ class PoseServo:
         Args:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
-            gravity: returns the duty (6,) that holds the arm against gravity at joint angles (6,), passed on.
+            gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
         """
         ahead = motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
-        duty = checked(gravity(ahead.q), (6,), "gravity")
+        duty = checked(gravity(ahead.q), (self._arm.joints,), "gravity")
         jacobian = self._arm.jacobian(goal.q)
-        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None])
+        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None], full_matrices=False)
         return Aim(goal, ahead, self._arm.forward(np.stack([goal.q, ahead.q])), duty, jacobian, U, s, Vt)
 
-    def step(self, aim: Aim, estimator: Estimator) -> ServoStep:
+    def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
         """Make the next command.
 
         Args:
             aim: its reference, of this period.
             estimator: where the tool is.
+            trust: how far what the estimator took from vision may be relied on.
         """
         estimate = estimator.estimate()
         error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
-        mode = self._mode(estimate)
+        mode = self._mode(estimate, trust)
         resting = self._resting(estimate, aim)
-        change = np.zeros(6)
-        if mode is not Mode.POTENTIOMETERS:
+        change = -self._correction if mode is Mode.DISTRUSTED else np.zeros(self._arm.joints)
+        if mode in (Mode.VISION, Mode.BRIDGED):
             last, following = self._missing(estimator, aim)
             push = following - last
             if mode is Mode.VISION:
@@ -191,8 +197,10 @@ class PoseServo:
             change += self._crossing(estimator, aim, error)
         return self._command(aim, change, mode, error)
 
-    def _mode(self, estimate: ArmEstimate) -> Mode:
+    def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
         """Return what may close the loop."""
+        if trust is not Trust.FULL:
+            return Mode.HELD if trust is Trust.DOUBTED else Mode.DISTRUSTED
         cov = estimate.cov_own[:3, :3]
         # The greatest variance is not above the sum of three; only where that is too much is it worth looking for.
         sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
@@ -209,7 +217,7 @@ class PoseServo:
         return behind(aim.Ts_base_tool, estimator.tool(q + self._correction, qd))
 
     def _joints(self, aim: Aim, error: Array) -> Array:
-        """Return the joint angles (6,) that make up for an error of the tool (6,).
+        """Return the joint angles (n,) that make up for an error of the tool (6,).
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
         """
@@ -217,11 +225,11 @@ class PoseServo:
         return np.asarray((able / np.maximum(aim.s, UNCORRECTED_BELOW) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
-        """Return a step (6,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
+        """Return a step (n,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
         self._lasting += self.timing.gain * (error - self._lasting)
         requested = self._joints(aim, self._lasting)
         worth = np.abs(requested) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
-        sides = np.stack([np.zeros(6), np.where(worth, np.sign(requested), 0.0)])
+        sides = np.stack([np.zeros_like(requested), np.where(worth, np.sign(requested), 0.0)])
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
@@ -240,6 +248,9 @@ class PoseServo:
         step = ahead.q - aim.goal.q
         most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
         wished = _within(-MAX_CORRECTION_RAD, self._correction + _within(-most, change, most), MAX_CORRECTION_RAD)
+        displaced_m = float(np.linalg.norm(aim.jacobian[:3] @ wished))
+        if displaced_m > MAX_CORRECTION_M:
+            wished *= MAX_CORRECTION_M / displaced_m
         q_ref = _within(arm.q_min, ahead.q + wished, arm.q_max)
         held = q_ref != ahead.q + wished
         correction = q_ref - ahead.q
@@ -247,8 +258,9 @@ class PoseServo:
         self._correction, self._goal = correction, ahead
         far = np.abs(wished) >= MAX_CORRECTION_RAD
         said: tuple[str, ...] = ()
-        if held.any() or far.any():
+        if held.any() or far.any() or displaced_m > MAX_CORRECTION_M:
             said = (
+                *(("tool: largest correction",) if displaced_m > MAX_CORRECTION_M else ()),
                 *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
                 *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(far)),
             )

@@ -1,10 +1,11 @@
 """Open an arm: by the name of a built-in model, from a .toml file, or from a .urdf file.
 
-A .toml file is one of two. It holds a table as data sheets print it, six rows with each number's unit in its name::
+A .toml file is one of two. It holds a table as data sheets print it, a row for each of four to seven joints, with each
+number's unit in its name::
 
     name = "rokae"
     convention = "modified"        # or "standard"
-    [[joint]]                      # six of them
+    [[joint]]                      # four to seven of them
     a_mm = 85.0                    # or a_m; 0 where it is not given
     d_mm = 0.0                     # or d_m
     alpha_deg = -90.0              # or alpha_rad
@@ -13,6 +14,10 @@ A .toml file is one of two. It holds a table as data sheets print it, six rows w
     min_deg = -170.0               # or min_rad; limits where they are known
     max_deg = 170.0
     name = "shoulder"
+
+Where one motor moves several joints, ``coupling`` at the top has a row for each joint: what each motor's angle adds to it.
+``coupling = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]]`` is J3' = J3 + J2 for four joints; min and max are
+those of the motors.
 
 Or it is a corrected.toml, as ``armsight identify`` writes it: the identified table with Hayati's angles beta, base and
 body. An :class:`Arm` has no room for the error sources beyond the table (gains, waves, backlash, compliance), so the
@@ -36,6 +41,7 @@ from armsight.files import read_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.robot.arm import Arm
+from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.robot.models import MODELS
 from armsight.robot.urdf import parse_urdf, read_urdf
 from armsight.robot.urdf_write import urdf_text
@@ -104,16 +110,14 @@ def read_arm_toml(path: str | Path) -> Arm:
     if "identified" in given:
         return _identified(path, given)
     rows = given.pop("joint", None)
-    if not isinstance(rows, list) or len(rows) != 6 or not all(isinstance(row, dict) for row in rows):
-        raise InputError(
-            f"{path}: six [[joint]] tables are needed, there are {len(rows) if isinstance(rows, list) else 0}"
-        )
+    rows = joint_rows(path, rows)
     name, convention = given.pop("name", Path(path).stem), given.pop("convention", None)
     if convention not in ("standard", "modified"):
         raise InputError(f'{path}: convention = "standard" or "modified" is needed, got {convention!r}')
-    source = given.pop("source", str(path))
+    source, coupling = given.pop("source", str(path)), given.pop("coupling", None)
     if given:
-        raise InputError(f"{path}: unknown key {next(iter(given))!r}; known are name, convention, source, joint")
+        known = "name, convention, source, coupling, joint"
+        raise InputError(f"{path}: unknown key {next(iter(given))!r}; known are {known}")
     read = [_row(f"{path}: joint {i + 1}", row) for i, row in enumerate(rows)]
     at = {key: np.array([row[key] for row in read]) for key in (*_NUMBERS, "direction")}
     return Arm(
@@ -123,15 +127,41 @@ def read_arm_toml(path: str | Path) -> Arm:
         alpha=at["alpha"],
         q_min=at["min"],
         q_max=at["max"],
-        qd_max=np.full(6, _SPEED),
-        qdd_max=np.full(6, _ACCELERATION),
-        qddd_max=np.full(6, _JERK),
+        qd_max=np.full(len(rows), _SPEED),
+        qdd_max=np.full(len(rows), _ACCELERATION),
+        qddd_max=np.full(len(rows), _JERK),
         offset=at["offset"],
         direction=at["direction"],
         convention="standard" if convention == "standard" else "modified",
+        coupling=np.eye(len(rows)) if coupling is None else _matrix(path, coupling, len(rows)),
         joint_names=tuple(str(row["name"] or f"joint{i + 1}") for i, row in enumerate(read)),
         source=str(source),
     )
+
+
+def joint_rows(path: str | Path, rows: object) -> list[dict[str, Any]]:
+    """Return the [[joint]] tables of an arm's file.
+
+    Raises:
+        InputError: there are too few or too many.
+    """
+    there = rows if isinstance(rows, list) and all(isinstance(row, dict) for row in rows) else []
+    if not FEWEST_JOINTS <= len(there) <= MOST_JOINTS:
+        raise InputError(
+            f"{path}: {FEWEST_JOINTS} to {MOST_JOINTS} [[joint]] tables are needed, there are {len(there)}"
+        )
+    return there
+
+
+def _matrix(path: str | Path, given: object, joints: int) -> Array:
+    """Return a coupling (n, n)."""
+    try:
+        matrix = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
+        raise InputError(f"{path}: coupling must be {joints} rows of {joints} numbers, one row for each joint")
+    return matrix
 
 
 def _row(where: str, row: dict[str, Any]) -> dict[str, Any]:
@@ -176,14 +206,13 @@ def _identified(path: str | Path, given: dict[str, Any]) -> Arm:
 
 
 def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Array]:
-    """Return the arm of a parsed corrected.toml without Hayati's angles, and these angles (6,), rad.
+    """Return the arm of a parsed corrected.toml without Hayati's angles, and these angles (n,), rad.
 
     Raises:
         InputError: something is missing, or no number; the message names it.
     """
     rows = given.get("joint")
-    if not isinstance(rows, list) or len(rows) != 6 or not all(isinstance(row, dict) for row in rows):
-        raise InputError(f"{path}: six [[joint]] tables are needed")
+    rows = joint_rows(path, rows)
     at = {column: joint_numbers(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
     limits = {key: joint_numbers(path, rows, f"{key}_{unit}") for key, unit in LIMITS.items()}
     convention = given.get("convention")
@@ -200,6 +229,7 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
         T_base_0=file_transform(path, given, "T_base_0"),
         T_flange_tool=file_transform(path, given, "T_flange_body"),
         joint_names=tuple(str(row.get("name", f"joint{i + 1}")) for i, row in enumerate(rows)),
+        coupling=np.eye(len(rows)) if "coupling" not in given else _matrix(path, given["coupling"], len(rows)),
         source=f"identified: {path}",
         **limits,
     )
@@ -207,12 +237,12 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
 
 
 def joint_numbers(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:
-    """Return a number (6,) that every [[joint]] of a corrected.toml has.
+    """Return a number (n,) that every [[joint]] of a corrected.toml has.
 
     Raises:
         InputError: it is missing, or no number.
     """
-    out = np.empty(6)
+    out = np.empty(len(rows))
     for i, row in enumerate(rows):
         value = row.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
@@ -239,10 +269,10 @@ def file_transform(path: str | Path, given: dict[str, Any], name: str) -> Array:
 
 
 def tilted_urdf(arm: Arm, beta: Array) -> str:
-    """Return an arm as URDF text, with Hayati's angles beta (6,), rad, about y after each row of its table, exactly."""
+    """Return an arm as URDF text, with Hayati's angles beta (n,), rad, about y after each row of its table, exactly."""
     robot = ET.fromstring(urdf_text(arm))
     modified = arm.convention == "modified"
-    for i in range(6):
+    for i in range(arm.joints):
         joint = i if modified else i + 1  # the URDF joint whose origin holds row i's angles
         if beta[i] == 0.0:
             continue

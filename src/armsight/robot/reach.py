@@ -32,8 +32,9 @@ class Reach(NamedTuple):
 def reach(arm: Arm) -> Reach:
     """Find the extremes by improving the best of seeded random joint angles."""
     axis, foot = arm.T_base_0[:3, 2], arm.T_base_0[:3, 3]
+    axis = -axis if axis[2] < 0 else axis  # up, whichever way the table has it
     across = np.eye(3) - np.outer(axis, axis)
-    q = np.random.default_rng(0).uniform(arm.q_min, arm.q_max, (POSES, 6))
+    q = np.random.default_rng(0).uniform(arm.q_min, arm.q_max, (POSES, arm.joints))
     p_base = arm.forward(q)[:, :3, 3]
     heights = p_base @ axis
 

@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE
+from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE, WIDTH
+
+#: Columns of a row after its joint angles, and where they stand counted from its end.
+ROW_END = WIDTH - POSITION
+_POSITION, _ANGLE, _CONFIGURATION, _STATE = (column - WIDTH for column in (POSITION, ANGLE, CONFIGURATION, STATE))
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Nearest(Record):
     1 mm of position counts as much as 1 mrad of orientation.
 
     Attributes:
-        q: (6,) joint angles, rad.
+        q: (n,) joint angles, rad.
         T_base_tool: (4, 4) where they bring the tool, m.
         off_m: how far that is from the requested position, m.
         off_rad: how far it is rotated from the requested orientation, rad.
@@ -59,7 +63,8 @@ class Solutions:
     is the quick way to make a record.
 
     Attributes:
-        rows: (N, 13) a row for each solution; ``kinematics.inverse`` names the columns, the properties return them.
+        rows: (N, n + 7) a row for each solution: its joint angles, then the columns that ``kinematics.inverse`` names; the
+            properties return them.
         reason: what is special about the result: "singular: ...", "outside limits: ...", "unreachable: ..."; None
             where nothing does.
         find_nearest: how to find ``nearest``; None where a solution is within limits.
@@ -84,38 +89,38 @@ class Solutions:
 
     @property
     def q(self) -> Array:
-        """(N, 6) joint angles, rad, moved by whole revolutions into the joint's limits where that can be."""
-        return self.rows[:, :POSITION]
+        """(N, n) joint angles, rad, moved by whole revolutions into the joint's limits where that can be."""
+        return self.rows[:, :_POSITION]
 
     @property
     def residual_m(self) -> Array:
         """(N,) distance of the tool from the requested position, m."""
-        return self.rows[:, POSITION]
+        return self.rows[:, _POSITION]
 
     @property
     def residual_rad(self) -> Array:
         """(N,) angle between the tool and the requested orientation, rad."""
-        return self.rows[:, ANGLE]
+        return self.rows[:, _ANGLE]
 
     @property
     def signs(self) -> Array:
         """(N, 3) shoulder, elbow, wrist as +-1 (front, up, noflip: +1); 0 where the arm has no such structure."""
-        return self.rows[:, CONFIGURATION:STATE]
+        return self.rows[:, _CONFIGURATION:_STATE]
 
     @property
     def within_limits(self) -> NDArray[np.bool_]:
         """(N,) whether every joint is within its limits."""
-        return np.asarray(self.rows[:, STATE] < OUTSIDE)
+        return np.asarray(self.rows[:, _STATE] < OUTSIDE)
 
     @property
     def singular(self) -> NDArray[np.bool_]:
         """(N,) whether a joint is not determined, or two solutions are one."""
-        return np.asarray(self.rows[:, STATE] % OUTSIDE > 0)
+        return np.asarray(self.rows[:, _STATE] % OUTSIDE > 0)
 
     @property
     def best(self) -> Array | None:
-        """(6,) the first solution, rad, if it is within limits; else None, for then none is."""
-        return self.rows[0, :POSITION] if len(self.rows) and self.rows[0, STATE] < OUTSIDE else None
+        """(n,) the first solution, rad, if it is within limits; else None, for then none is."""
+        return self.rows[0, :_POSITION] if len(self.rows) and self.rows[0, _STATE] < OUTSIDE else None
 
     @property
     def configurations(self) -> tuple[Configuration | None, ...]:
@@ -137,7 +142,7 @@ class ManySolutions(Record):
 
     Attributes:
         count: (N,) how many solutions each pose has.
-        q: (N, M, 6) joint angles, rad, those within limits first.
+        q: (N, M, n) joint angles, rad, those within limits first.
         residual_m: (N, M) as in :class:`Solutions`.
         residual_rad: (N, M) likewise.
         within_limits: (N, M) likewise.
@@ -152,3 +157,29 @@ class ManySolutions(Record):
     within_limits: NDArray[np.bool_]
     singular: NDArray[np.bool_]
     signs: Array
+
+    @staticmethod
+    def of(counts: Ids, rows: Array) -> ManySolutions:
+        """Return the solutions of counts (N,) and rows (N, M, n + 6): those of :class:`Solutions`, without the key."""
+        joints = rows.shape[2] - ROW_END + 1
+        there = np.arange(rows.shape[1]) < counts[:, None]
+        by = rows[:, :, joints:]
+        state = by[:, :, STATE - POSITION]
+        return ManySolutions(
+            counts,
+            rows[:, :, :joints],
+            by[:, :, 0],
+            by[:, :, ANGLE - POSITION],
+            (state < OUTSIDE) & there,
+            state % OUTSIDE > 0,
+            by[:, :, CONFIGURATION - POSITION : STATE - POSITION],
+        )
+
+
+def many_solutions(found: list[Array], joints: int) -> ManySolutions:
+    """Return the solutions of many poses from the rows of each."""
+    most = max((len(rows) for rows in found), default=0)
+    out = np.zeros((len(found), most, joints + ROW_END - 1))
+    for k, rows in enumerate(found):
+        out[k, : len(rows)] = rows[:, :-1]
+    return ManySolutions.of(np.array([len(rows) for rows in found], dtype=np.int64), out)

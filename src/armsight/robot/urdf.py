@@ -1,6 +1,7 @@
 """Read an arm from URDF, the XML in which ROS describes robots (wiki.ros.org/urdf/XML).
 
-In: a URDF file with six revolute joints in a row, and fixed ones anywhere; an error names any other joint that moves.
+In: a URDF file with four to seven revolute joints in a row, and fixed ones anywhere; an error names any other joint that
+moves.
 Masses and shapes are ignored. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where
 that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf_write`.
 
@@ -25,7 +26,7 @@ from armsight.files import read_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.table import exact_cos_sin
+from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS, exact_cos_sin
 
 #: What an arm is given where its URDF has no accelerations and jerks: full speed in 0.25 s, full acceleration in 0.1 s.
 TO_SPEED_S, TO_ACCELERATION_S = 0.25, 0.1
@@ -37,6 +38,8 @@ FAR = 1e6
 #: Random poses at which the table is compared with the chain.
 PROBES = 16
 _MOVING = ("revolute", "continuous", "prismatic", "floating", "planar")
+#: A last joint of such a name is a gripper's.
+_GRIPPERS = ("grip", "jaw", "finger")
 
 
 class _Joint(NamedTuple):
@@ -61,7 +64,7 @@ def read_urdf(path: str | Path, *, tool_link: str | None = None) -> Arm:
         The arm, with a standard table.
 
     Raises:
-        InputError: unreadable, malformed, no chain of six revolute joints, or one that no table holds exactly.
+        InputError: unreadable, malformed, no chain of four to seven revolute joints, or one that no table holds exactly.
     """
     return parse_urdf(read_text(path), path, tool_link=tool_link)
 
@@ -99,11 +102,11 @@ def _joint(path: str | Path, element: ET.Element) -> _Joint:
         links.append(link)
     origin = element.find("origin")
     xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
-    T = pose(_rotation(rpy), xyz)
+    T = pose(rotation_of(rpy), xyz)
     return _Joint(name, kind, links[0], links[1], T, element)
 
 
-def _rotation(rpy: Array) -> Array:
+def rotation_of(rpy: Array) -> Array:
     """Return the rotation of URDF's roll, pitch, yaw, exact at multiples of 90 degrees."""
     (cx, cy, cz), (sx, sy, sz) = exact_cos_sin(rpy)
     Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1.0]])
@@ -156,25 +159,69 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
                 f"{path}: link {joint.child!r} hangs on two joints, {above[joint.child].name!r} and {joint.name!r}"
             )
         above[joint.child] = joint
+    parents = {joint.parent for joint in joints}
+    ends = {link: list(_up(path, link, above)) for link in above if link not in parents or link == tool_link}
+    if tool_link is not None:
+        return _chain_to(path, ends, tool_link)
+    _reject_others(path, joints)
+    revolute = [joint.name for joint in joints if joint.kind == "revolute"]
+    if not FEWEST_JOINTS <= len(revolute) <= MOST_JOINTS:
+        many = f"{len(revolute)} revolute joints ({', '.join(revolute)})"
+        raise InputError(
+            f"{path}: {many}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}: say which link is the tool"
+        )
+    whole = {link: chain for link, chain in ends.items() if _turning(chain) == len(revolute)}
+    if not whole:
+        raise InputError(
+            f"{path}: the {len(revolute)} revolute joints do not follow one another; only serial arms are read here: say "
+            "which link is the tool"
+        )
+    if len(whole) > 1:
+        raise InputError(f"{path}: several links end the chain ({', '.join(whole)}); say which one is the tool")
+    chain = next(iter(whole.values()))
+    last = next(joint.name for joint in chain if joint.kind == "revolute")
+    if any(word in last.lower() for word in _GRIPPERS):
+        others = ", ".join(link for link, others in ends.items() if FEWEST_JOINTS <= _turning(others) < len(revolute))
+        raise InputError(
+            f"{path}: joint {last!r} is a gripper's by its name, not the arm's; say which link is the tool "
+            f"({others or chain[0].child} is there)"
+        )
+    return chain[::-1]
+
+
+def _turning(chain: list[_Joint]) -> int:
+    """Return how many joints of a chain are revolute."""
+    return sum(joint.kind == "revolute" for joint in chain)
+
+
+def _reject_others(path: str | Path, joints: list[_Joint]) -> None:
+    """Reject joints that move otherwise than an arm's here.
+
+    Raises:
+        InputError: there is one; the message names it.
+    """
     unsupported = [j for j in joints if j.kind in _MOVING[1:] or j.element.find("mimic") is not None]
     if unsupported:
         named = ", ".join(f"{j.name!r} is {'a mimic' if j.kind == 'revolute' else j.kind}" for j in unsupported)
-        raise InputError(f"{path}: only arms of six revolute joints are read here; {named}")
-    revolute = [joint.name for joint in joints if joint.kind == "revolute"]
-    if len(revolute) != 6:
-        raise InputError(f"{path}: {len(revolute)} revolute joints ({', '.join(revolute)}); an arm here has six")
-    parents = {joint.parent for joint in joints}
-    ends = {link: list(_up(path, link, above)) for link in above if link not in parents or link == tool_link}
-    whole = {link: chain for link, chain in ends.items() if sum(joint.kind == "revolute" for joint in chain) == 6}
-    if tool_link is not None and tool_link not in whole:
         raise InputError(
-            f"{path}: link {tool_link!r} is not behind all six joints; these are: {', '.join(whole) or 'none'}"
+            f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints are read here; {named}"
         )
-    if not whole:
-        raise InputError(f"{path}: the six revolute joints do not follow one another; only serial arms are read here")
-    if tool_link is None and len(whole) > 1:
-        raise InputError(f"{path}: several links end the chain ({', '.join(whole)}); say which one is the tool")
-    chain = whole[tool_link or next(iter(whole))]
+
+
+def _chain_to(path: str | Path, ends: dict[str, list[_Joint]], tool_link: str) -> list[_Joint]:
+    """Return the joints from the base to the tool; joints beside this chain, such as a gripper's, do not count.
+
+    Raises:
+        InputError: there is no such link, or too few or too many joints before it.
+    """
+    chain = ends.get(tool_link, [])
+    if not FEWEST_JOINTS <= _turning(chain) <= MOST_JOINTS:
+        whole = [link for link, others in ends.items() if FEWEST_JOINTS <= _turning(others) <= MOST_JOINTS]
+        raise InputError(
+            f"{path}: link {tool_link!r} is not behind {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints; these are: "
+            f"{', '.join(whole) or 'none'}"
+        )
+    _reject_others(path, chain)
     return chain[::-1]
 
 
@@ -207,7 +254,14 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
     extra = robot.find("armsight")
     limits = [_limits(f"{path}: joint {joint.name!r}", joint.element) for joint in revolute]
     q_min, q_max, qd, qdd, qddd = (np.array(column) for column in zip(*limits, strict=True))
-    home = np.zeros(6) if extra is None else _home(f"{path}: <armsight>", extra)
+    joints = len(revolute)
+    home = np.zeros(joints) if extra is None else _written(f"{path}: <armsight>", extra, "home_rad", joints)
+    matrix = extra is not None and extra.get("coupling") is not None
+    coupling = (
+        _written(f"{path}: <armsight>", extra, "coupling", joints**2)
+        if extra is not None and matrix
+        else np.eye(joints)
+    )
     try:
         arm = Arm(
             name=robot.get("name", "") or Path(path).stem,
@@ -225,6 +279,7 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
             T_base_0=rows.T_base_0,
             T_flange_tool=rows.T_flange_tool,
             joint_names=tuple(joint.name for joint in revolute),
+            coupling=coupling.reshape(joints, joints),
             source=(extra.get("source", "") if extra is not None else "") or f"URDF {Path(path).name}",
         )
     except InputError as error:
@@ -233,16 +288,16 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
     return arm
 
 
-def _home(where: str, element: ET.Element) -> Array:
-    """Read the home pose."""
-    text = element.get("home_rad", "")
+def _written(where: str, element: ET.Element, key: str, count: int) -> Array:
+    """Read so many numbers of an attribute that :mod:`armsight.robot.urdf_write` writes."""
+    text = element.get(key, "")
     try:
-        home = np.array([float(word) for word in text.split()])
+        values = np.array([float(word) for word in text.split()])
     except ValueError:
-        home = np.zeros(0)
-    if home.shape != (6,) or not np.isfinite(home).all():
-        raise InputError(f'{where}: home_rad="{text}" must be six numbers')
-    return home
+        values = np.zeros(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise InputError(f'{where}: {key}="{text}" must be {count} numbers')
+    return values
 
 
 def _limits(where: str, element: ET.Element) -> tuple[float, float, float, float, float]:
@@ -304,8 +359,8 @@ def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: 
 
     Args:
         where: what to name in an error.
-        names: six names of the joints.
-        links: seven: the joints and the end.
+        names: n names of the joints.
+        links: n + 1: the joints and the end.
         first_fixed: (4, 4) the first fixed joint after the last revolute one: the flange, where it can be row 6.
 
     Raises:
@@ -313,7 +368,7 @@ def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: 
     """
     size_m = float(sum(np.linalg.norm(link.T_before[:3, 3]) for link in links)) + EXACT
     upright = [_upright(link.axis) for link in links]
-    between = [np.linalg.inv(upright[i][0]) @ links[i + 1].T_before @ upright[i + 1][0] for i in range(5)]
+    between = [np.linalg.inv(upright[i][0]) @ links[i + 1].T_before @ upright[i + 1][0] for i in range(len(links) - 2)]
     steps = []
     for i, C in enumerate(between):
         steps.append(decompose(C))
@@ -323,19 +378,19 @@ def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: 
                 f"{where}: the axes of joints {names[i]!r} and {names[i + 1]!r} are {apart:.2g} deg from parallel, "
                 "which no table holds sensibly; were angles rounded? write pi/2 as 1.5707963267948966"
             )
-    after = np.linalg.inv(upright[5][0])
+    after = np.linalg.inv(upright[-2][0])
     last = decompose(after @ first_fixed)
     if abs(last.e) > EXACT or abs(last.gamma) > EXACT:
         last = Decomposition(0, 0, 0, 0, 0, 0)
     steps.append(last)
-    carried = [0.0, *(step.gamma for step in steps[:5])], [0.0, *(step.e for step in steps[:5])]
-    flange = after @ links[6].T_before
+    carried = [0.0, *(step.gamma for step in steps[:-1])], [0.0, *(step.e for step in steps[:-1])]
+    flange = after @ links[-1].T_before
     return TableRows(
         np.array([step.a for step in steps]),
         np.array([step.d for step in steps]) + carried[1],
         np.array([step.alpha for step in steps]),
         _wrapped(np.array([step.beta for step in steps]) + carried[0]),
-        np.array([way for _, way in upright[:6]]),
+        np.array([way for _, way in upright[:-1]]),
         links[0].T_before @ upright[0][0],
         np.linalg.inv(_motion(last)) @ flange,
     )
@@ -348,9 +403,9 @@ def check_same(where: str, arm: Arm, links: list[ChainLink]) -> None:
         InputError: they differ by more than rounding.
     """
     rng = np.random.default_rng(0)
-    for q in rng.uniform(-np.pi, np.pi, (PROBES, 6)):
+    for q in rng.uniform(-np.pi, np.pi, (PROBES, arm.joints)):
         T = np.eye(4)
-        for link, angle in zip(links, [*q, 0.0], strict=True):
+        for link, angle in zip(links, [*(arm.coupling @ q), 0.0], strict=True):
             T = T @ link.T_before @ pose(exp_so3(link.axis * angle), np.zeros(3))
         off = float(np.abs(arm.forward(q) - T).max())
         if off > EXACT:

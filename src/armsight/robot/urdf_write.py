@@ -2,7 +2,7 @@
 
 A link's frame sits at its joint and rotates with it, so that joint i + 1 stands at Rz(offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i)
 of link i, which is what a URDF origin holds without loss. Accelerations and jerks stand in ``limit`` as URDF 1.2 has them;
-the home pose and the source stand in an element ``armsight`` that other programs ignore.
+the home pose, the source and what couples motors stand in an element ``armsight`` that other programs ignore.
 
 An arm's table says nothing of shapes, masses and motors, and programs such as MuJoCo and Gazebo need them. So each link is
 a solid bar from its joint to the next, with a drum at the joint: both as visuals, and as mass and inertia. The greatest
@@ -36,18 +36,22 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def urdf_text(arm: Arm) -> str:
     """Return an arm as URDF text."""
     robot = ET.Element("robot", name=arm.name)
-    ET.SubElement(robot, "armsight", home_rad=_numbers(arm.home), source=arm.source)
-    names = ["base", *(f"link{i}" for i in range(1, 7)), "flange", "tool"]
+    extra = ET.SubElement(robot, "armsight", home_rad=_numbers(arm.home), source=arm.source)
+    n = arm.joints
+    if (arm.coupling != np.eye(n)).any():
+        extra.set("coupling", _numbers(arm.coupling.ravel()))
+        robot.append(ET.Comment(" the joints here are behind the motors' coupling; limits are the motors' own "))
+    names = ["base", *(f"link{i + 1}" for i in range(n)), "flange", "tool"]
     robot.append(ET.Comment(" masses, inertias, efforts and shapes are stand-ins: the arm's table does not have them "))
-    origins = [_origin(arm, i)[0] for i in range(8)]
+    origins = [_origin(arm, i)[0] for i in range(n + 2)]
     radii = _radii(origins)
     for i, name in enumerate(names):
         link = ET.SubElement(robot, "link", name=name)
-        if i < 7:
+        if i <= n:
             _solid(link, origins[i], radii[i], moves=i > 0)
     efforts = _efforts(origins, radii)
-    for i in range(8):
-        fixed = i >= 6
+    for i in range(n + 2):
+        fixed = i >= n
         name = f"{names[i]}-{names[i + 1]}" if fixed else arm.joint_names[i]
         joint = ET.SubElement(robot, "joint", name=name, type="fixed" if fixed else "revolute")
         ET.SubElement(joint, "parent", link=names[i])
@@ -72,10 +76,10 @@ def urdf_text(arm: Arm) -> str:
 
 
 def _radii(origins: list[Array]) -> list[float]:
-    """Return the radius of the bar of each link from the base to link 6, m."""
+    """Return the radius of the bar of each link from the base to the last, m."""
     length = float(sum(np.linalg.norm(origin) for origin in origins))
     first = float(np.clip(_RADIUS * length, _THINNEST_M, _THICKEST_M))
-    return [first * _TAPER**i for i in range(7)]
+    return [first * _TAPER**i for i in range(len(origins) - 1)]
 
 
 def _mass(origin: Array, radius: float) -> float:
@@ -86,9 +90,9 @@ def _mass(origin: Array, radius: float) -> float:
 def _efforts(origins: list[Array], radii: list[float]) -> list[float]:
     """Return the greatest effort of each joint, N m."""
     efforts = []
-    for joint in range(6):
+    for joint in range(len(radii) - 1):
         reach = torque = 0.0
-        for i in range(joint + 1, 7):
+        for i in range(joint + 1, len(radii)):
             length = float(np.linalg.norm(origins[i]))
             torque += _mass(origins[i], radii[i]) * _GRAVITY_M_S2 * (reach + length / 2)
             reach += length
@@ -136,11 +140,11 @@ def write_urdf(arm: Arm, path: str | Path) -> None:
 
 def _origin(arm: Arm, i: int) -> tuple[Array, Array]:
     """Return xyz, m, and roll, pitch, yaw in URDF's order, rad, of joint ``i`` of the written chain."""
-    if i in (0, 7):
+    if i in (0, arm.joints + 1):
         T = arm.T_base_0 if i == 0 else arm.T_flange_tool
         if i == 0 and arm.convention == "modified":
             T = T @ _step(0.0, 0.0, arm.a[0], arm.alpha[0])
-        return T[:3, 3], _roll_pitch_yaw(T[:3, :3])
+        return T[:3, 3], roll_pitch_yaw(T[:3, :3])
     a, alpha = (
         (arm.a, arm.alpha) if arm.convention == "standard" else (np.append(x[1:], 0.0) for x in (arm.a, arm.alpha))
     )
@@ -156,7 +160,7 @@ def _step(offset: float, d: float, a: float, alpha: float) -> Array:
     return pose(R, np.array([a * cz, a * sz, d]))
 
 
-def _roll_pitch_yaw(R: Array) -> Array:
+def roll_pitch_yaw(R: Array) -> Array:
     """Return URDF's roll, pitch, yaw, rad, of a rotation (3, 3): R = Rz(yaw) Ry(pitch) Rx(roll), at any pitch."""
     yaw = np.arctan2(R[1, 0], R[0, 0])
     s, c = np.sin(yaw), np.cos(yaw)

@@ -11,6 +11,7 @@ Kannala-Brandt's. A camera may have its own ``image_size_px``.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,33 +40,40 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
         raise InputError(f"{path}: not a file of cameras: {error}") from None
     if not isinstance(document, dict) or not all(isinstance(document.get(side), dict) for side in SIDES):
         raise InputError(f'{path}: expected an object with "left" and "right", each with "K" and "distortion"')
-    left, right = (_camera(path, document, side) for side in SIDES)
+    size = document.get("image_size_px")
+    left, right = (camera_of(path, {"image_size_px": size, **document[side]}, f"camera {side}") for side in SIDES)
     return left, right
 
 
-def _camera(path: str | Path, document: dict[str, Any], side: str) -> Camera:
-    """Build one camera from its entry."""
-    entry = document[side]
+def camera_of(path: str | Path, entry: Mapping[str, Any], name: str = "the camera") -> Camera:
+    """Build a camera from its entry: K, distortion, image_size_px, and distortion_model where it is a fisheye.
+
+    Args:
+        path: the file, for messages.
+        entry: the entry.
+        name: of the camera, for messages.
+
+    Raises:
+        InputError: the file, the camera and what is wrong.
+    """
     try:
         K = checked(entry["K"], (3, 3), "K")
         distortion = checked(entry["distortion"], (None,), "distortion")
-        width, height = (int(n) for n in entry.get("image_size_px", document.get("image_size_px")))
+        width, height = (int(n) for n in entry["image_size_px"])
     except KeyError as error:
-        raise InputError(f"{path}: camera {side} has no {error.args[0]!r}") from None
+        raise InputError(f"{path}: {name} has no {error.args[0]!r}") from None
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f'{path}: camera {side} needs "image_size_px": [width, height]') from None
+        raise InputError(f'{path}: {name} needs "image_size_px": [width, height]') from None
     except InputError as error:
-        raise InputError(f"{path}: camera {side}: {error}") from None
+        raise InputError(f"{path}: {name}: {error}") from None
     if abs(K[0, 1]) > 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
-        raise InputError(
-            f"{path}: camera {side}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not modelled"
-        )
+        raise InputError(f"{path}: {name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not modelled")
     model = _MODELS.get(len(distortion))
     if str(entry.get("distortion_model", "")).startswith("fisheye"):
         model = "fisheye" if len(distortion) == 4 else None
     if model is None:
-        raise InputError(f"{path}: camera {side}: {len(distortion)} distortion coefficients; known are 0, 4, 5 and 8")
+        raise InputError(f"{path}: {name}: {len(distortion)} distortion coefficients; known are 0, 4, 5 and 8")
     try:
         return Camera((width, height), model, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), distortion)
     except InputError as error:
-        raise InputError(f"{path}: camera {side}: {error}") from None
+        raise InputError(f"{path}: {name}: {error}") from None

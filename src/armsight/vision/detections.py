@@ -9,12 +9,13 @@ image where two bodies of the same kind are in view. Any other columns are ignor
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from armsight.data import SIDES, Array, Body, Ids, Record
+from armsight.data import SIDES, Array, Body, Correspondences, Ids, Record
 from armsight.errors import InputError
 from armsight.files import read_table
 
@@ -31,11 +32,15 @@ class SeenShot(Record):
         name: the shot.
         ids: per camera (N,) rows of the body's points, in the file's order; one may stand more than once.
         uv: per camera (N, 2) raw pixels.
+        t_s: its time, s; None where it has none.
+        problem: why the shot cannot be used; None when it can.
     """
 
     name: str
     ids: tuple[Ids, Ids]
     uv: tuple[Array, Array]
+    t_s: float | None = None
+    problem: str | None = None
 
 
 def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
@@ -89,6 +94,41 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
         )
         for name, (ids, uv) in shots.items()
     ]
+
+
+def detections_text(shots: Iterable[tuple[str, float | None, Correspondences]], body: Body) -> str:
+    """Return detections as the text of such a file.
+
+    Args:
+        shots: name, time, s, or None, and what both cameras saw, of each shot.
+        body: names the points.
+    """
+    lines = [",".join((*COLUMNS, "t_s"))]
+    for name, t_s, seen in shots:
+        time = "" if t_s is None else f"{t_s:.6f}"
+        for side, camera in enumerate(SIDES):
+            for row in np.flatnonzero(seen.seen[:, side]):
+                u, v = seen.uv[row, side]
+                lines.append(f"{name},{camera},{body.point_names[seen.ids[row]]},{u:.4f},{v:.4f},{time}")
+    return "\n".join(lines) + "\n"
+
+
+def detection_times(path: str | Path) -> dict[str, float]:
+    """Return the times of the shots of a file of detections that has the column ``t_s``, by their names; else nothing.
+
+    Raises:
+        InputError: a time is no number.
+    """
+    rows = read_table(path)
+    header = [name.strip() for name in rows[0]] if rows else []
+    if "t_s" not in header or "shot" not in header:
+        return {}
+    shot, at = header.index("shot"), header.index("t_s")
+    return {
+        row[shot].strip(): _number(row[at].strip(), path, number, "t_s")
+        for number, row in enumerate(rows[1:], start=2)
+        if len(row) == len(header) and row[at].strip()
+    }
 
 
 def _number(text: str, path: str | Path, line: int, column: str) -> float:

@@ -113,6 +113,8 @@ def _exchanged(rig: StereoRig, body: Body, left: Detections, right: Detections) 
 
 def measure_seen(rig: StereoRig, body: Body, shot: SeenShot) -> PoseEstimate | Missed:
     """Measure a body from detections of a file; where a name occurs twice, use the body with most detections."""
+    if shot.problem is not None:
+        return Missed(shot.problem)
     seen = plain(shot)
     if seen is None:
         bodies = instances(body.points, rig.cameras, rig.T_left_right, shot, candidates(body.points, rig.cameras, shot))

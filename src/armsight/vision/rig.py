@@ -187,6 +187,10 @@ class StereoRig(Record):
         Raises:
             InputError: the file cannot be written.
         """
+        write_text(path, self.to_text())
+
+    def to_text(self) -> str:
+        """Return the rig as the JSON of a rig file."""
         cameras = {
             side: {
                 "image_size_px": list(camera.image_size_px),
@@ -208,7 +212,7 @@ class StereoRig(Record):
         }
         if self.shutters is not None:
             document["shutters"] = self.shutters.to_json()
-        write_text(path, json.dumps(document, indent=1) + "\n")
+        return json.dumps(document, indent=1) + "\n"
 
     @staticmethod
     def load(path: str | Path) -> StereoRig:
@@ -217,7 +221,16 @@ class StereoRig(Record):
         Raises:
             InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
         """
-        document = _document(path)
+        return StereoRig.from_text(read_text(path), path)
+
+    @staticmethod
+    def from_text(text: str, path: str | Path) -> StereoRig:
+        """Return the rig of a rig file's text; ``path`` is where it comes from, for messages.
+
+        Raises:
+            InputError: not a rig, of a newer version, or inconsistent; the message names the file.
+        """
+        document = _document(text, path)
         try:
             left, right = (_camera(document[side]) for side in ("left", "right"))
             count = left.parameters.size + right.parameters.size + 6
@@ -257,10 +270,10 @@ def _check_covariance(cov: Array, names: tuple[str, ...]) -> None:
         )
 
 
-def _document(path: str | Path) -> dict[str, Any]:
-    """Read the JSON object of a rig file of a version this program knows."""
+def _document(text: str, path: str | Path) -> dict[str, Any]:
+    """Return the JSON object of a rig file of a version this program knows."""
     try:
-        document = json.loads(read_text(path))
+        document = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}); expected a rig file") from None
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, thousands of brackets

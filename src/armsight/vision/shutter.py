@@ -329,10 +329,8 @@ def aligned(rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Sh
         for k, motion in enumerate(moving):
             if motion is None or jitter2 == 0:
                 continue
-            exposed = _exposed(rig, observed[k], apart[k], theta)
-            score, H, _, _ = _linear(rig, body, observed[k], Ts[k], motion, exposed, 1, 1.0)
-            variances[k] = jitter2 / (1.0 + jitter2 * H[0, 0])
-            apart[k] = stamped[k] + variances[k] * (score[0] + H[0, 0] * (apart[k] - stamped[k]))
+            last = (stamped[k], apart[k])
+            apart[k], variances[k] = _own_skew(rig, body, observed[k], Ts[k], motion, last, theta, jitter2)
         moved = [
             _at_one_time(rig, body, o, T, motion, _exposed(rig, o, a, theta)[0])
             for o, T, motion, a in zip(observed, Ts, moving, apart, strict=True)
@@ -372,15 +370,69 @@ def measure_moving(
     Raises:
         InputError: the times do not rise.
     """
-    results: list[tuple[PoseEstimate | Missed, bool]] = []
-    for shot, alignment in zip(shots, aligned(rig, body, shots, shutters), strict=True):
-        seen = at_one_time(rig, body, shot.seen, alignment, shutters)
-        result = locate(rig, body, triangulate(rig, body, gate(rig, body, seen)))
-        if isinstance(result, PoseEstimate) and alignment.motion is not None:
-            extra = _by_timing(rig, body, shot.seen, result.T_left_body, alignment, shutters)
-            result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
-        results.append((result, alignment.motion is not None))
-    return results
+    return [
+        (_measured(rig, body, shot.seen, alignment, shutters), alignment.motion is not None)
+        for shot, alignment in zip(shots, aligned(rig, body, shots, shutters), strict=True)
+    ]
+
+
+def measure_with_motion(
+    rig: StereoRig, body: Body, shot: TimedShot, motion: Motion, shutters: Shutters
+) -> PoseEstimate | Missed:
+    """Measure one shot of a body whose motion is known otherwise, such as from an arm's joints.
+
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        shot: of the body.
+        motion: of the body at the shot's time.
+        shutters: when the cameras expose.
+
+    Returns:
+        The pose at the shot's time, with the covariance of shutters and motion in its own, or why there is none.
+    """
+    observed = PixelObservations.of(shot.seen, rig.sigma_px)
+    jitter2 = shutters.jitter_s**2
+    T, apart, variance = shot.T_left_body, shot.apart_s, jitter2
+    theta = np.array([shutters.skew_s, shutters.readout_s])
+    for _ in range(2):
+        if jitter2 > 0:
+            apart, variance = _own_skew(rig, body, observed, T, motion, (shot.apart_s, apart), theta, jitter2)
+        now = _at_one_time(rig, body, observed, T, motion, _exposed(rig, observed, apart, theta)[0])
+        fit = fit_pose(rig.cameras, rig.T_left_right, body.points, now, T, robust=True)
+        if fit is None:
+            return Missed("its detections do not fit the body at one time")
+        T = fit.T_left_body
+    return _measured(rig, body, shot.seen, Alignment(T, motion, apart, variance), shutters)
+
+
+def _own_skew(
+    rig: StereoRig,
+    body: Body,
+    o: PixelObservations,
+    T: Array,
+    motion: Motion,
+    apart_s: tuple[float, float],
+    theta: Array,
+    jitter2: float,
+) -> tuple[float, float]:
+    """Return a shot's own skew beyond the mean, s, and its variance, s^2; ``apart_s`` is the stamped one and the last."""
+    stamped, last = apart_s
+    score, H, _, _ = _linear(rig, body, o, T, motion, _exposed(rig, o, last, theta), 1, 1.0)
+    variance = jitter2 / (1.0 + jitter2 * H[0, 0])
+    return stamped + variance * (score[0] + H[0, 0] * (last - stamped)), variance
+
+
+def _measured(
+    rig: StereoRig, body: Body, seen: Correspondences, alignment: Alignment, shutters: Shutters
+) -> PoseEstimate | Missed:
+    """Locate a body by correspondences that are moved to the shot's time; the covariance holds that of the timing."""
+    moved = at_one_time(rig, body, seen, alignment, shutters)
+    result = locate(rig, body, triangulate(rig, body, gate(rig, body, moved)))
+    if isinstance(result, PoseEstimate) and alignment.motion is not None:
+        extra = _by_timing(rig, body, seen, result.T_left_body, alignment, shutters)
+        result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
+    return result
 
 
 def _by_timing(

@@ -120,6 +120,12 @@ def test_the_csv_says_the_same(measured):
                 assert float(row[f"cov_{i}{j}"]) == cov[i, j]
         sigmas = [float(row[f"sigma_{a}"]) for a in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")]
         assert sigmas == pytest.approx(np.sqrt(np.diag(cov)), rel=1e-15)
+        shares = [np.array(record[f"covariance_{share}"]) for share in ("precision", "calibration")]
+        assert sum(shares) == pytest.approx(cov, abs=1e-15)
+        for share, part in zip(("precision", "calibration"), shares, strict=True):
+            assert (np.linalg.eigvalsh(part) > -1e-9 * np.trace(part)).all()
+            assert float(row[f"sigma_{share}_z_m"]) == pytest.approx(np.sqrt(part[2, 2]), rel=1e-12)
+            assert float(row[f"sigma_{share}_rz_rad"]) == pytest.approx(np.sqrt(part[5, 5]), rel=1e-12)
         assert float(row["residual_rms_m"]) == record["residual_rms_m"]
         assert float(row["reprojection_rms_px"]) == record["reprojection_rms_px"]
         assert int(row["points"]) == len(record["points_m"])

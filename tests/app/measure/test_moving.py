@@ -51,7 +51,17 @@ def test_the_skew_is_noted_found_and_used(late, armsight, tmp_path):
     start = ("measure", folder / "rig.json", *TARGET, "--source", folder / "left", "--json")
     as_it_is = armsight(*start)
     assert "do not expose at one time: skew 5." in as_it_is.err or "do not expose at one time: skew 4.9" in as_it_is.err
-    found = armsight(*start, "--skew", "find", "-o", tmp_path / "poses.csv", "--view", tmp_path / "view")
+    found = armsight(
+        *start,
+        "--skew",
+        "find",
+        "-o",
+        tmp_path / "poses.csv",
+        "--view",
+        tmp_path / "view",
+        "--save-rig",
+        tmp_path / "rig2.json",
+    )
     given = armsight(*start, "--skew", "5ms")
     assert rms_mm(found, truth) < rms_mm(as_it_is, truth, code=3) / 5
     assert rms_mm(given, truth) < rms_mm(as_it_is, truth, code=3) / 5
@@ -60,6 +70,11 @@ def test_the_skew_is_noted_found_and_used(late, armsight, tmp_path):
     assert all(r["shutters"]["covariance_s2"][0][0] == 0 for r in given.lines)
     with open(tmp_path / "poses.csv", newline="", encoding="utf-8") as file:
         assert all(abs(float(row["skew_s"]) - SKEW_S) < 2e-4 for row in csv.DictReader(file))
+    again = armsight("measure", tmp_path / "rig2.json", *start[2:])
+    assert again.lines == found.lines
+    rejected = armsight(*start, "--save-rig", tmp_path / "rig3.json")
+    assert_rejected(rejected, "give --skew find")
+    assert not (tmp_path / "rig3.json").exists()
 
 
 def test_the_shutters_of_the_rig_are_used_for_recordings_only(late, armsight, tmp_path):

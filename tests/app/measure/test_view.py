@@ -182,7 +182,9 @@ def test_the_header_says_what_was_measured_and_how_it_was_found():
     assert second.startswith(f"x {x:.3f} +- {sigma:.3f}, y ")
     assert " mm; rz " in second
     assert second.endswith(" deg")
-    assert f"reprojection {result.reprojection_rms_px:.3f} px RMS, misfit 1.0, 3 points" == third
+    noise = 1e3 * np.sqrt(np.trace(result.cov_noise[:3, :3]))
+    assert third.startswith(f"precision {noise:.3f} mm, calibration ")
+    assert third.endswith(f" mm; reprojection {result.reprojection_rms_px:.3f} px RMS, misfit 1.0, 3 points")
     assert header(ShotPose("a", None, "gone")) == ["shot a"]
 
 

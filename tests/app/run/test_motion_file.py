@@ -14,7 +14,7 @@ ARM = open_arm("six_r")
 def test_the_default_motion_goes_from_home_to_five_poses_and_back_and_along_a_line_and_a_circle():
     plan = read_motions(ARM)
     kinds = [motion.kind for motion in plan.motions]
-    assert kinds[:6] == ["joints"] * 5 + ["home"]
+    assert kinds[:6] == ["joints"] * 6
     assert "line" in kinds
     assert "circle" in kinds
     q = plan.start

@@ -17,7 +17,7 @@ from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import experiment
 from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import run_experiment
-from armsight.app.run.loop import PERIOD_S, Loop, beside, steady
+from armsight.app.run.loop import PERIOD_S, SIMULATED_SEARCH_S, Loop, beside, steady
 from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
@@ -30,7 +30,7 @@ from armsight.robot.trajectories import point_to_point
 
 ARM = open_arm("six_r")
 #: A rig of which nothing is known, so that nothing can be tested.
-UNKNOWN = SimpleNamespace(cov=np.zeros((30, 30)))
+UNKNOWN = SimpleNamespace(cov=np.zeros((30, 30)), shutters=None)
 
 
 class Standing:
@@ -59,7 +59,7 @@ class Blind:
 
     rig, way = UNKNOWN, "followed"
 
-    def measure(self, shot, expected=None):
+    def measure(self, shot, expected=None, twist=None):
         return Missed("nothing is seen")
 
 
@@ -116,7 +116,7 @@ def test_the_arm_is_stopped_whatever_ends_the_run(monkeypatch, error):
         stand(loop, 0.1)
         raise error
 
-    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target, apart_s: Blind())
     monkeypatch.setattr(experiment, "_require_seen", fails)
     plan = read_motions(ARM)
     if isinstance(error, ArmsightError | KeyboardInterrupt):
@@ -198,7 +198,7 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     board = Standing()
     slow = SimpleNamespace(rig=UNKNOWN, way="followed")
 
-    def measure(shot, expected=None):
+    def measure(shot, expected=None, twist=None):
         sent = len(board.sent)
         while len(board.sent) < sent + 20:
             time.sleep(0.001)
@@ -219,6 +219,24 @@ def test_an_image_that_takes_long_does_not_keep_the_loop_waiting():
     assert board.t_s > 1.02
 
 
+def test_a_search_takes_its_time_in_a_simulation_too_and_commands_continue():
+    board = Standing()
+    searching = SimpleNamespace(
+        rig=UNKNOWN, way="lost", measure=lambda shot, expected=None, twist=None: Missed("searched in vain")
+    )
+    loop = Loop.open(setup(board), searching, Log(), KalmanEstimator(ARM, delay=Delay(0.02, 0.02)))
+    board.enable()
+    stand(loop, 0.5)
+    assert len(board.sent) == pytest.approx(0.5 / PERIOD_S, abs=2)
+    taken = np.array([t_s for _, t_s, _ in loop.log.poses])
+    assert np.diff(taken).min() >= SIMULATED_SEARCH_S  # the next shot is the newest after the search
+    assert 5 <= len(taken) <= 8
+    searching.way = "followed"
+    before = len(taken)
+    stand(loop, 0.5)
+    assert len(loop.log.poses) - before == pytest.approx(30, abs=2)
+
+
 def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatch):
     board = Standing()
 
@@ -234,7 +252,7 @@ def test_ctrl_c_again_while_the_arm_is_being_stopped_stops_it_no_less(monkeypatc
         send(command)
 
     monkeypatch.setattr(board, "send", sent)
-    monkeypatch.setattr(experiment, "Follower", lambda rig, target: Blind())
+    monkeypatch.setattr(experiment, "Follower", lambda rig, target, apart_s: Blind())
     monkeypatch.setattr(experiment, "_require_seen", fails)
     outcome = run_experiment(setup(board), None, read_motions(ARM), ARM.home[None], progress=lambda line: None)
     assert outcome.interrupted

@@ -8,22 +8,13 @@ from arm_rig import ARM, MIDDLE, loads, product, sampled, small
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import (
-    BACKLASH,
-    BASIS,
-    COMPLIANCE,
-    FLOAT,
-    LINEARITY,
-    POSE,
-    READING,
-    REST,
-    SIZE,
-    Prior,
-)
+from armsight.loop.estimators.armerror import BASIS, Prior, layout
 from armsight.loop.estimators.errormodel import ErrorModel, ErrorState, chi_square
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.models import MODELS
 from asserts import numeric_jacobian
+
+_, LINEARITY, BACKLASH, FLOAT, COMPLIANCE, REST, READING, POSE, _, SIZE = layout(6)
 
 ODD = dataclasses.replace(
     MODELS["puma560"],
@@ -38,7 +29,7 @@ ARMS = [*MODELS.values(), ODD]
 
 
 def evaluated(arm, x, q, unseen):
-    T, H = np.empty((4, 4)), np.empty((6, SIZE))
+    T, H = np.empty((4, 4)), np.empty((6, len(x)))
     armerror.pose_and_derivative(arm.table, x, q, unseen, T, H)
     return T, H
 
@@ -46,18 +37,19 @@ def evaluated(arm, x, q, unseen):
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
 def test_without_errors_it_is_the_arm(arm):
     rng = np.random.default_rng(0)
-    for q in rng.uniform(-2, 2, (10, 6)):
-        T, _ = evaluated(arm, np.zeros(SIZE), q, np.ones((3, 6)))
+    for q in rng.uniform(-2, 2, (10, arm.joints)):
+        T, _ = evaluated(arm, np.zeros(layout(arm.joints).size), q, np.ones((3, arm.joints)))
         assert np.abs(T - arm.forward(q)).max() < 1e-14 * np.abs(T).max() + 1e-15
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
 def test_the_derivative_is_exact_where_nothing_is_off(arm):
     rng = np.random.default_rng(1)
-    q, unseen = rng.uniform(-2, 2, 6), rng.uniform(-1, 1, (3, 6))
-    T, H = evaluated(arm, np.zeros(SIZE), q, unseen)
+    q, unseen = rng.uniform(-2, 2, arm.joints), rng.uniform(-1, 1, (3, arm.joints))
+    still = np.zeros(layout(arm.joints).size)
+    T, H = evaluated(arm, still, q, unseen)
     back = inverse(T)
-    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(arm, x, q, unseen)[0]), np.zeros(SIZE), 1e-3)
+    numeric = numeric_jacobian(lambda x: log_se3(back @ evaluated(arm, x, q, unseen)[0]), still, 1e-3)
     # A difference over 1e-3 of numbers rounded at 1e-16 times the reach, and step^4 of what is cut off: 1e-12.
     assert np.abs(H - numeric).max() < 3e-12
 

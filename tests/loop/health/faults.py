@@ -6,13 +6,15 @@ Used by the tests beside it and by benchmarks/health.py.
 from dataclasses import replace
 
 import numpy as np
-from arm_rig import ARM, legs, mounts, run, small, worn
+from arm_rig import ARM, MIDDLE, Workcell, distance_mm, legs, mounts, run, small, worn
 
-from armsight.data import Body, Correspondences, Points, PoseEstimate
+from armsight.data import Body, Correspondences, JointCommand, Points, PoseEstimate
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
 from armsight.loop.health import HealthMonitor
+from armsight.loop.servo import LoopTiming, PoseServo
+from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
 from armsight.sim.workcell.body import body_target
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
@@ -75,8 +77,9 @@ LEARNED_S, AT_S = 5.0, 6.5
 class Moved:
     """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
 
-    def __init__(self, estimator, T_base_rig, motion):
+    def __init__(self, estimator, T_base_rig, motion, slip=None):
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
+        self.slip = slip  # of the body on the tool (6,), [m; rad]
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
         self.found_s = None
 
@@ -86,6 +89,12 @@ class Moved:
     def track(self, t_s):
         return self.estimator.track(t_s)
 
+    def estimate(self):
+        return self.estimator.estimate()
+
+    def tool(self, q, qd, *, pressed=False):
+        return self.estimator.tool(q, qd, pressed=pressed)
+
     def vision(self, measurement):
         t_s, T = measurement.t_s, self.T_base_rig
         if t_s >= LEARNED_S and self.estimator.on_innovation is None:
@@ -93,16 +102,73 @@ class Moved:
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
-        outcome = self.estimator.vision(measurement)
+            if self.slip is not None:
+                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
+        outcome = self.estimator.vision(self.monitor.widened(measurement))
+        self.monitor.work()
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s
         return outcome
 
 
-def watched_arm(seed, motion, seconds=9.0):
-    """Run an arm with errors; return the estimator with its monitor."""
+def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, seconds=24.0):
+    """A closed loop between poses, its rig moved at AT_S; return time, s, and distance of the true tool, mm, of each 16 ms.
+
+    Args:
+        seed: of the arm.
+        motion: of the rig.
+        closes: whether the loop is closed; else the potentiometers alone bring the tool there.
+        seconds: duration.
+    """
+    rng = np.random.default_rng(seed)
+    true, said = mounts(rng)
+    mount = true, Mounting(true[0], true[1], said.cov)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 2e-4)), true[0], motion)
+    workcell = Workcell(rng, worn(rng), moved, mount=mount)
+    workcell.advance(None, 300)
+    servo, goals = PoseServo(ARM, LoopTiming(0.016, 1 / 60, 0.061)), [MIDDLE]
+    rows = []
+    while workcell.t_s < seconds:
+        goals.append(MIDDLE + np.radians(18.0) * rng.uniform(-1, 1, 6))
+        way, begin_s = point_to_point(ARM, goals[-2], goals[-1]), workcell.t_s
+        while workcell.t_s < begin_s + way.duration_s + 1.0:
+            t_s = workcell.t_s - begin_s
+            trust = moved.monitor.trust
+            step = servo.step(servo.aim(way, t_s), moved, trust)
+            ahead = way.at(t_s + 0.016)
+            alone = JointCommand(ahead.q, ahead.qd, np.zeros(6), 0.016)
+            T = workcell.advance(step.command if closes else alone, 16)[-1]
+            off = distance_mm(T, ARM.forward(way.at(workcell.t_s - begin_s).q))
+            rows.append((workcell.t_s, float(off), t_s > way.duration_s + 0.5, step.mode))
+    return rows
+
+
+class SlippingArm:
+    """An arm of which one potentiometer slips on its shaft, by so much, or whose backlash grows, at AT_S."""
+
+    def __init__(self, arm, joint, slip_rad, more_rad):
+        self.arm, self.joint, self.slip_rad, self.more_rad = arm, joint, slip_rad, more_rad
+
+    def tool(self, shaft):
+        at = round(AT_S / 1e-3)
+        before = self.arm.tool(shaft[:at])
+        self.arm.backlash = self.arm.backlash + np.eye(6)[self.joint] * self.more_rad
+        beyond = self.slip_rad * np.eye(6)[self.joint]
+        zeros, self.arm.linearity = self.arm.linearity, lambda q: zeros(q) + beyond
+        return np.concatenate([before, self.arm.tool(shaft[at:])])
+
+
+def watched_arm(seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0):
+    """Run an arm with errors; return the estimator with its monitor.
+
+    The faults, at AT_S: a motion of the rig, a slip of the body on the tool (6,), [m; rad], a slip of a joint's
+    potentiometer or more backlash of it, rad.
+    """
     rng = np.random.default_rng(seed)
     mount = mounts(rng)
-    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion)
-    run(rng, moved, worn(rng), legs(rng, seconds), mount=mount)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion, slip)
+    arm = worn(rng)
+    if slip_rad or more_rad:
+        arm = SlippingArm(arm, joint, slip_rad, more_rad)
+    run(rng, moved, arm, legs(rng, seconds), mount=mount)
     return moved

@@ -65,7 +65,7 @@ def test_the_estimate_is_what_dense_least_squares_gives():
         watch.take(estimate, t)
     watch._close_stay()
     found, size = watch._estimated(watch._test), watch._size
-    sums, L, F = watch._test, watch._prior, watch._by_fault
+    sums, L, F = watch._test, watch.prior, watch._by_fault
     wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1]) ** 2.0)
     prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 6))], [np.zeros((6, size)), wide]]))
     G = np.hstack([np.eye(size), F])

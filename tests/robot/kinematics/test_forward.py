@@ -13,18 +13,19 @@ from armsight.robot.kinematics.chain import angle_of, sincos
 from asserts import numeric_jacobian
 from strategies import vectors
 
-every = pytest.mark.parametrize("arm", arms.ALL, ids=arms.names(arms.ALL))
+EVERY = [*arms.ALL, *arms.OTHERS, arms.FOUR, arms.COUPLED]
+every = pytest.mark.parametrize("arm", EVERY, ids=arms.names(EVERY))
 #: Rounding of some hundred products and sums of numbers below 4 (m or 1).
 ROUNDING = 1e-14
 
 
-def draw(seed, n=50):
-    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, 6))
+def draw(seed, n=50, joints=6):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, joints))
 
 
 @every
 def test_forward_and_links_are_the_products_of_the_table(arm):
-    for q in draw(1):
+    for q in draw(1, joints=arm.joints):
         expected = arms.frames(arm, q)
         np.testing.assert_allclose(arm.forward(q), expected[-1], rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(arm.links(q), expected, rtol=0, atol=ROUNDING)
@@ -46,17 +47,17 @@ def test_forward_holds_for_any_angles(arm, q):
 @every
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 33])
 def test_a_batch_is_its_single_calls(arm, n):
-    q = draw(2, n)
+    q = draw(2, n, arm.joints)
     single = np.array([arm.forward(row) for row in q]).reshape(n, 4, 4)
     np.testing.assert_allclose(arm.forward(q), single, rtol=0, atol=ROUNDING)
     for frame in ("base", "tool"):
-        single = np.array([arm.jacobian(row, frame) for row in q]).reshape(n, 6, 6)
+        single = np.array([arm.jacobian(row, frame) for row in q]).reshape(n, 6, arm.joints)
         np.testing.assert_array_equal(arm.jacobian(q, frame), single)
 
 
 @every
 def test_jacobian_is_the_derivative_of_forward(arm):
-    for q in draw(3, 10):
+    for q in draw(3, 10, arm.joints):
         T = arms.forward(arm, q)
 
         def moved(p, T=T):
@@ -73,7 +74,7 @@ def test_jacobian_is_the_derivative_of_forward(arm):
 @every
 @pytest.mark.parametrize("frame", ["base", "tool"])
 def test_jacobian_rate_is_its_derivative_by_time(arm, frame):
-    for q, qd in zip(draw(4, 10), draw(5, 10), strict=True):
+    for q, qd in zip(draw(4, 10, arm.joints), draw(5, 10, arm.joints), strict=True):
         expected = numeric_jacobian(lambda t, q=q, qd=qd: arm.jacobian(q + t[0] * qd, frame), np.zeros(1), 3e-4)[..., 0]
         # Richardson's error: step^4 times the fifth derivative, below (6 pi)^5 x 3 m.
         np.testing.assert_allclose(arm.jacobian_rate(q, qd, frame), expected, rtol=0, atol=1e-8)
@@ -81,7 +82,7 @@ def test_jacobian_rate_is_its_derivative_by_time(arm, frame):
 
 @every
 def test_manipulability_is_the_volume_of_the_velocity_ellipsoid(arm):
-    q = draw(6, 20)
+    q = draw(6, 20, arm.joints)
     expected = [np.prod(np.linalg.svd(J)[1]) for J in arm.jacobian(q)]
     np.testing.assert_allclose(arm.manipulability(q), expected, rtol=0, atol=1e-13)
     assert arm.manipulability(q[0]) == arm.manipulability(q)[0]

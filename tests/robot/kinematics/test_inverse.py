@@ -75,7 +75,7 @@ def test_any_pose_is_answered(arm, p, phi):
     check(arm, T, arm.inverse(T))
 
 
-@pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
+@pytest.mark.parametrize("arm", [*arms.CLOSED.values()], ids=[*arms.CLOSED])
 def test_configurations_are_all_different_and_right(arm):
     for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
         answer = arm.inverse(arm.forward(q))
@@ -241,7 +241,7 @@ def test_a_pose_inside_the_shoulders_offset_is_out_of_reach():
     assert 0 < answer.nearest.off_m < 0.06
 
 
-@pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
+@pytest.mark.parametrize("arm", [*arms.CLOSED.values()], ids=[*arms.CLOSED])
 def test_the_nearest_pose_is_no_worse_than_any_tried(arm):
     rng = np.random.default_rng(12)
     tried = arm.forward(rng.uniform(arm.q_min, arm.q_max, (20_000, 6)))

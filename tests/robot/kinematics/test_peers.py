@@ -7,9 +7,7 @@ import numpy as np
 import peers
 import pytest
 
-from armsight.robot.models import MODELS
-
-models = pytest.mark.parametrize("arm", [*MODELS.values()], ids=[*MODELS])
+models = pytest.mark.parametrize("arm", [*arms.CLOSED.values()], ids=[*arms.CLOSED])
 
 
 def draw(seed, n):

@@ -35,7 +35,7 @@ def test_a_motion_keeps_every_limit_and_arrives_at_rest(name):
     arm = MODELS[name]
     rng = np.random.default_rng(4)
     for _ in range(5):
-        a, b = rng.uniform(arm.q_min, arm.q_max, (2, 6))
+        a, b = rng.uniform(arm.q_min, arm.q_max, (2, arm.joints))
         motion = point_to_point(arm, a, b)
         within(arm, motion)
         for t, q in ((0.0, a), (motion.duration_s, b), (-1.0, a), (motion.duration_s + 9.0, b)):

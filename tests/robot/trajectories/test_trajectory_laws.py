@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arm_motions import ordinary, start, within
+from arm_motions import START_DEG, ordinary, start, within
 
 from armsight.errors import InputError
 from armsight.robot.models import MODELS
@@ -11,7 +11,7 @@ from armsight.robot.trajectories import TRAJECTORIES
 MEMBERS = list(TRAJECTORIES)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", START_DEG)
 @pytest.mark.parametrize("member", MEMBERS)
 def test_limits_hold_from_the_start_to_rest(member, name):
     arm, motion = MODELS[name], ordinary(member, name)

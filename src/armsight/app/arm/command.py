@@ -35,7 +35,7 @@ def _arm_argument(command: Callable[..., Any]) -> Callable[..., Any]:
 def command() -> None:
     """Print an arm's table and kinematics: mm and degrees here, m and rad in --json.
 
-    ARM is a name that `armsight arm list` prints, or a .toml or .urdf file of six revolute joints.
+    ARM is a name that `armsight arm list` prints, or a .toml or .urdf file of four to seven revolute joints.
     """
 
 
@@ -71,10 +71,10 @@ def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: boo
 
 @command.command(context_settings=_NUMBERS)
 @_arm_argument
-@click.argument("angles", nargs=-1, metavar="Q1 .. Q6")
+@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
 def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
-    """Print the pose of the tool at six joint angles, in degrees.
+    """Print the pose of the tool at joint angles, in degrees.
 
     Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
     """
@@ -98,10 +98,10 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
 
 @command.command(context_settings=_NUMBERS)
 @_arm_argument
-@click.argument("angles", nargs=-1, metavar="Q1 .. Q6")
+@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
 def jacobian(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
-    """Print the Jacobian of the tool's point in base axes at six joint angles, in degrees."""
+    """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
 
@@ -155,6 +155,51 @@ def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     click.echo(str(output))
 
 
+@command.command()
+@_arm_argument
+@click.argument("file", metavar="FILE")
+@click.option(
+    "-o",
+    "--output",
+    metavar="OUT",
+    type=click.Path(path_type=Path),
+    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it.",
+)
+@_JSON
+def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, as_json: bool) -> None:
+    """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
+
+    FILE is the calibration of a Universal Robots arm or of an xArm (.yaml), a corrected.toml of `armsight identify`, or
+    another arm's file.
+    """
+    from armsight.app.arm import description
+    from armsight.robot.arm_file import open_arm
+    from armsight.robot.calibration_file import difference, read_calibration, write_calibration
+    from armsight.robot.urdf_write import write_urdf
+
+    if output is not None:
+        if output.suffix not in (".urdf", ".yaml"):
+            raise InputError(f"{output}: an arm is written as .urdf or .yaml")
+        check_writable(output, apart_from=(arm_name, file))
+    nominal = open_arm(arm_name, tool_link=tool_link)
+    yaml = file.lower().endswith((".yaml", ".yml"))
+    arm = read_calibration(file, nominal) if yaml else open_arm(file)
+    left = (0.0, 0.0)
+    if output is not None and output.suffix == ".yaml":
+        left = write_calibration(arm, nominal, output)
+    elif output is not None:
+        write_urdf(arm, output)
+    if max(left) > 1e-9:
+        click.echo(
+            f"note: {output} has no place for the flange's {1e3 * left[0]:.3f} mm and {math.degrees(left[1]):.3f} deg off "
+            "the last joint's axis: give them to the tool",
+            err=True,
+        )
+    found = difference(nominal, arm)
+    answer = description.difference_json if as_json else description.difference_text
+    click.echo(json.dumps(answer(nominal, arm, found)) if as_json else answer(nominal, arm, found))
+
+
 def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:
     """Return texts none of which was meant as an option."""
     for text in texts:
@@ -175,14 +220,15 @@ def _number(text: str, name: str) -> float:
 
 
 def _joints(arm: Arm, texts: tuple[str, ...]) -> Array:
-    """Read six joint angles in degrees, and say on stderr which are beyond the limits."""
+    """Read joint angles in degrees, and say on stderr which are beyond the limits."""
     import numpy as np
 
     from armsight.app.arm import description
     from armsight.robot.kinematics.chain import MOST_RADIANS
 
-    if len(_no_options(texts)) != 6:
-        raise InputError(f"{arm.name} has six joints; {len(texts)} angles were given, in degrees: q1 q2 q3 q4 q5 q6")
+    if len(_no_options(texts)) != arm.joints:
+        want = " ".join(f"q{i + 1}" for i in range(arm.joints))
+        raise InputError(f"{arm.name} has {arm.joints} joints; {len(texts)} angles were given, in degrees: {want}")
     degrees = np.array([_number(text, f"q{i + 1}") for i, text in enumerate(texts)])
     most = np.floor(np.degrees(MOST_RADIANS))
     if np.abs(degrees).max() > most:

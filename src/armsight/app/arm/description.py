@@ -1,6 +1,6 @@
 """What ``armsight arm`` answers, as JSON objects (units in the keys) and as text (mm and degrees).
 
-In: an arm, joint angles (6,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
+In: an arm, joint angles (n,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
 NAME_json and a function NAME_text of the same records.
 
 Angles of a rotation are Euler angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x). Robot
@@ -18,6 +18,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm import Arm
+from armsight.robot.calibration_file import Difference
 from armsight.robot.reach import reach
 from armsight.robot.solutions import Solutions
 
@@ -52,12 +53,13 @@ def show_json(arm: Arm) -> dict[str, Any]:
             "qddd_max_rad_s3": arm.qddd_max[i],
             "home_rad": arm.home[i],
         }
-        for i in range(6)
+        for i in range(arm.joints)
     ]
     return {
         "arm": arm.name,
         "convention": arm.convention,
         "joints": joints,
+        "coupling": arm.coupling.tolist(),
         "T_base_0": arm.T_base_0.tolist(),
         "T_flange_tool": arm.T_flange_tool.tolist(),
         "T_base_tool_home": arm.forward(arm.home).tolist(),
@@ -79,7 +81,7 @@ def show_text(arm: Arm) -> str:
             *(_short(deg(x)) for x in (arm.q_min[i], arm.q_max[i], arm.qd_max[i], arm.qdd_max[i], arm.qddd_max[i])),
             _short(deg(arm.home[i])),
         )
-        for i in range(6)
+        for i in range(arm.joints)
     ]
     extent = reach(arm)
     lines = [f"{arm.name}: {arm.convention} Denavit-Hartenberg table; angles in deg, speeds in deg/s, deg/s^2, deg/s^3"]
@@ -87,6 +89,7 @@ def show_text(arm: Arm) -> str:
     for name, T in (("T_base_0", arm.T_base_0), ("T_flange_tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             lines.append(f"{name}: {_pose_text(T)}")
+    lines += _coupling(arm)
     lines.append(f"tool at home: {_pose_text(arm.forward(arm.home))}")
     lines.append(
         f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
@@ -95,8 +98,18 @@ def show_text(arm: Arm) -> str:
     return "\n".join([*lines, f"source: {arm.source}"])
 
 
+def _coupling(arm: Arm) -> list[str]:
+    """Return which joints more than one motor moves, as lines."""
+    lines = []
+    for name, row, one in zip(arm.joint_names, arm.coupling, np.eye(arm.joints), strict=True):
+        if (row != one).any():
+            parts = [f"{factor:+g} {other}" for factor, other in zip(row, arm.joint_names, strict=True) if factor]
+            lines.append(f"coupling: the angle of {name} is that of the motors {' '.join(parts)}")
+    return lines
+
+
 def forward_json(arm: Arm, q: Array, T: Array) -> dict[str, Any]:
-    """Return the pose T (4, 4) of the tool in the base at joint angles (6,), rad."""
+    """Return the pose T (4, 4) of the tool in the base at joint angles (n,), rad."""
     return {
         "arm": arm.name,
         **_angles_json(q),
@@ -111,7 +124,7 @@ def forward_text(T: Array) -> str:
 
 
 def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
-    """Return the Jacobian in base axes at joint angles (6,), rad."""
+    """Return the Jacobian in base axes at joint angles (n,), rad."""
     return {
         "arm": arm.name,
         **_angles_json(q),
@@ -122,7 +135,7 @@ def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
 
 
 def jacobian_text(arm: Arm, q: Array) -> str:
-    """Return the Jacobian in base axes at joint angles (6,), rad, as lines."""
+    """Return the Jacobian in base axes at joint angles (n,), rad, as lines."""
     lines = ["J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint", *_matrix(arm.jacobian(q))]
     return "\n".join([*lines, f"manipulability: {float(arm.manipulability(q)):.6g} (0 is singular)"])
 
@@ -168,7 +181,7 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
         for i, configuration in enumerate(found.configurations)
     ]
     if rows:
-        lines += _table((("", *(f"q{i}" for i in range(1, 7)), "configuration", ""), *rows))
+        lines += _table((("", *(f"q{i + 1}" for i in range(arm.joints)), "configuration", ""), *rows))
     if found.reason is not None:
         lines.append(found.reason)
     if (nearest := found.nearest) is not None:
@@ -180,12 +193,52 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
     return "\n".join(lines)
 
 
+def difference_json(nominal: Arm, arm: Arm, found: Difference) -> dict[str, Any]:
+    """Return how far an arm puts its tool from where the nominal one does, and the changes of its table."""
+    changes = {name: getattr(found, name) for name in ("a_m", "d_m", "alpha_rad", "offset_rad")}
+    return {
+        "nominal": nominal.name,
+        "arm": arm.name,
+        "tool_apart_mean_m": found.mean_m,
+        "tool_apart_max_m": found.most_m,
+        "tool_rotated_mean_rad": found.mean_rad,
+        "tool_rotated_max_rad": found.most_rad,
+        "changes": {name: [None if np.isnan(v) else v for v in values.tolist()] for name, values in changes.items()},
+    }
+
+
+def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
+    """Return the same as lines."""
+    rows = [
+        (
+            nominal.joint_names[i],
+            *(_change(1e3 * x) for x in (found.a_m[i], found.d_m[i])),
+            *(_change(np.degrees(x)) for x in (found.alpha_rad[i], found.offset_rad[i])),
+        )
+        for i in range(nominal.joints)
+    ]
+    lines = [
+        f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, "
+        f"{1e3 * found.most_m:.3f} mm at most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, "
+        f"{np.degrees(found.most_rad):.3f} deg at most",
+        "(the same joint angles and base; poses all over the joint limits)",
+        *_table((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
+    ]
+    if np.isnan(found.a_m).any():
+        lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
+    return "\n".join(lines)
+
+
+def _change(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:+.4f}"
+
+
 def beyond(arm: Arm, q: Array) -> list[str]:
-    """Return which of the joint angles (6,), rad, are beyond the arm's limits, as text."""
+    """Return which of the joint angles (n,), rad, are beyond the arm's limits, as text."""
     return [
         f"{arm.joint_names[i]} at {np.degrees(q[i]):.3f} deg is outside its limits "
         f"{np.degrees(arm.q_min[i]):.3f} to {np.degrees(arm.q_max[i]):.3f} deg"
-        for i in range(6)
+        for i in range(arm.joints)
         if not arm.q_min[i] <= q[i] <= arm.q_max[i]
     ]
 

@@ -36,17 +36,17 @@ def write_arm_figure(arm: Arm, path: Path) -> None:
 
 
 def skeleton(arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Return the arm as a line through its joints and links (K, 3), m, and its frames (8, 4, 4), at joint angles (6,)."""
+    """Return the arm as a line through its joints and links (K, 3), m, and its frames (n + 2, 4, 4), at angles (n,)."""
     Ts = arm.links(q)
     points = [np.zeros(3), Ts[0, :3, 3]]
-    for i in range(6):
+    for i in range(arm.joints):
         before, after = Ts[i], Ts[i + 1]
         if arm.convention == "standard":  # along the joint's axis, then along the link
             points.append(before[:3, 3] + arm.d[i] * before[:3, 2])
         else:
             points.append(after[:3, 3] - arm.d[i] * after[:3, 2])
         points.append(after[:3, 3])
-    points.append(Ts[7, :3, 3])
+    points.append(Ts[-1, :3, 3])
     return np.array(points), Ts
 
 
@@ -60,7 +60,7 @@ def _figure(arm: Arm) -> Figure:
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0))
     space: Any = figure.add_subplot(grid[:, 0], projection="3d")
     space.plot(*points.T, color=INK, lw=3.5, solid_capstyle="round", solid_joinstyle="round")
-    space.scatter(*origins[:7].T, color=ORANGE, s=26, depthshade=False, zorder=5)
+    space.scatter(*origins[:-1].T, color=ORANGE, s=26, depthshade=False, zorder=5)
     for T, origin in zip(Ts, origins, strict=True):
         for axis, colour in enumerate(AXES):
             space.plot(*np.array([origin, origin + size * T[:3, axis]]).T, color=colour, lw=1.6)
@@ -87,7 +87,7 @@ def _view(axes: Any, title: str, across: int, up: int, points: Array, Ts: Array,
         for axis, colour in enumerate(AXES):
             line = np.array([1e3 * T[:3, 3], 1e3 * T[:3, 3] + size * T[:3, axis]])
             axes.plot(line[:, across], line[:, up], color=colour, lw=1.3)
-    axes.plot(1e3 * Ts[:7, across, 3], 1e3 * Ts[:7, up, 3], "o", color=ORANGE, ms=4)
+    axes.plot(1e3 * Ts[:-1, across, 3], 1e3 * Ts[:-1, up, 3], "o", color=ORANGE, ms=4)
     axes.axhline(0, color=MUTED, lw=0.5, zorder=0)
     axes.axvline(0, color=MUTED, lw=0.5, zorder=0)
     axes.set_aspect("equal", adjustable="datalim")
@@ -99,7 +99,7 @@ def _view(axes: Any, title: str, across: int, up: int, points: Array, Ts: Array,
 def _names(origins: Array, size: float) -> list[tuple[str, Array]]:
     """Return a label and a position (3,), mm, for each group of frames at about one position."""
     labels: list[tuple[list[str], Array]] = []
-    for name, origin in zip(["0", *"123456", "tool"], origins, strict=True):
+    for name, origin in zip(["0", *(str(i) for i in range(1, len(origins) - 1)), "tool"], origins, strict=True):
         for names, position in labels:
             if np.linalg.norm(position - origin) < 0.3 * size:
                 names.append(name)

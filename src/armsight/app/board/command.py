@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.robot.boards.serial import BAUD
+from armsight.errors import InputError
 
 if TYPE_CHECKING:
     from armsight.robot.boards.board import Board
+    from armsight.robot.boards.contract import MotionBoard
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _DEFAULT = "emulated:unicorn"
@@ -24,9 +25,9 @@ _WATCH_S = 2.0
 def _board(action: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options that name a board."""
     baud = click.option(
-        "--baud", type=click.IntRange(min=1), default=BAUD, show_default=True, help="Baud rate of a serial port."
+        "--baud", type=click.IntRange(min=1), help="Baud rate of a port; by default the one of its kind of board."
     )
-    what = "emulated:unicorn, emulated:qemu, emulated:host or serial:PORT."
+    what = "emulated:unicorn, emulated:qemu, emulated:host, serial:PORT, feetech:PORT or ar4:PORT."
     return click.option("--board", "name", default=_DEFAULT, show_default=True, metavar="BOARD", help=what)(
         baud(action)
     )
@@ -43,7 +44,8 @@ def command() -> None:
     """Build and flash the arm's firmware, watch a board, tune its gains, test it.
 
     BOARD is emulated:unicorn (needs nothing but pip), emulated:qemu (needs qemu-system-arm), emulated:host (the same code
-    without an ARM processor), or serial:PORT such as serial:/dev/ttyACM0.
+    without an ARM processor), or serial:PORT such as serial:/dev/ttyACM0. Arms with a controller of their own are
+    feetech:PORT (SO-100, SO-101) and ar4:PORT (AR4); what they cannot do is rejected.
     """
 
 
@@ -93,23 +95,34 @@ def flash_(name: str, programmer: str | None, output: Path, compiler: str | None
     click.echo(json.dumps(answer) if as_json else f"{built.image} is on the board, written by {used}")
 
 
+_calibration = click.option(
+    "--calibration",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048.",
+)
+
+
 @command.command()
 @_board
+@_calibration
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
 @click.option("--every", type=click.FloatRange(min=0.01), default=0.5, show_default=True, help="Seconds between lines.")
 @_JSON
-def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: bool) -> None:
+def monitor(
+    name: str, baud: int | None, calibration: Path | None, seconds: float | None, every: float, as_json: bool
+) -> None:
     """Print a board's state and angles, line by line, until Ctrl-C; with --json one object per line.
 
     Nothing is commanded: the drives stay as they are.
     """
     from armsight.app.board import text
-    from armsight.robot.boards.opening import SERIAL
+    from armsight.robot.boards.opening import is_real
 
-    if seconds is None and not name.startswith(SERIAL):
+    if seconds is None and not is_real(name):
         seconds = _WATCH_S
-    with _open(name, baud) as board:
-        click.echo(text.welcome_text(board.welcome), err=True)
+    with _open_any(name, baud, calibration) as board:
+        click.echo(text.welcome_text(board), err=True)
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)
@@ -124,7 +137,7 @@ def monitor(name: str, baud: int, seconds: float | None, every: float, as_json: 
 )
 @click.option("--store", is_flag=True, help="Keep them over a restart too; only with the drives off.")
 @_JSON
-def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
+def gains(name: str, baud: int | None, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
     """Print the gains of all joints; with --set change them first.
 
     Changes are taken all at once, also in motion, without a jump of the duty; one that is out of range changes nothing.
@@ -155,7 +168,7 @@ def gains(name: str, baud: int, changes: tuple[str, ...], store: bool, as_json: 
 @_board
 @click.option("--drives", is_flag=True, help="Let a real board move its arm, by less than 3 degrees.")
 @_JSON
-def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
+def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
     """Run the scenario set on a board: motion, a bad wire, a silent host, bad sensors, emergency stop, new gains.
 
     A real board's drives are never switched on without --drives: then it runs only what is safe at rest. Exit code 1 where
@@ -165,6 +178,7 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
     from armsight.app.board.selftest import selftest
     from armsight.app.progress import steps
     from armsight.robot.boards.opening import SERIAL
+    from armsight.robot.boards.serial import BAUD
 
     if name.startswith(SERIAL):
         moves = (
@@ -174,7 +188,7 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
         )
         click.echo(f"{name}: {moves}", err=True)
     with steps() as progress:
-        result = selftest(name, drives=drives, baud=baud, progress=progress)
+        result = selftest(name, drives=drives, baud=BAUD if baud is None else baud, progress=progress)
     click.echo(json.dumps(result.record()) if as_json else text.selftest_text(result))
     for scenario, found in result.scenarios.items():
         for problem in found.problems:
@@ -182,9 +196,174 @@ def selftest_(name: str, baud: int, drives: bool, as_json: bool) -> int:
     return 0 if result.passed else 1
 
 
-def _open(name: str, baud: int) -> Board:
-    """Open a board; an emulated one has six free joints at its motors."""
+@command.command()
+@_board
+@click.option(
+    "--at-once", type=click.Choice(["1", "2", "3", "6"]), default="6", show_default=True, help="Joints at a time."
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@_JSON
+def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) -> None:
+    """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0."""
+    import numpy as np
+
+    from armsight.robot.boards.ar4.board import Ar4Board
+
+    with _open_any(name, baud) as board:
+        if not isinstance(board, Ar4Board):
+            raise InputError(f"{name} has no limit switches to be homed at; its sensors are absolute")
+        if not yes:
+            click.confirm(
+                "the arm will move to the ends of all joints: is everything out of its reach?", abort=True, err=True
+            )
+        board.home(at_once=int(at_once))
+        q = board.receive().q[-1]
+    degrees = [round(float(each), 3) for each in np.degrees(q)]
+    click.echo(json.dumps({"q_rad": [round(float(each), 6) for each in q]}) if as_json else f"homed, at {degrees} deg")
+
+
+@command.command()
+@_board
+@_JSON
+def clear(name: str, baud: int | None, as_json: bool) -> None:
+    """Reset the emergency stop and the faults whose causes are gone; the drives stay as they are."""
+    from armsight.robot.boards.codes import BoardState, Command
+
+    with _open_any(name, baud) as board:
+        if name.startswith("ar4:") or board.status.state is BoardState.STOPPED:
+            board.confirm(board.command(Command.CLEAR_STOP))
+        board.confirm(board.command(Command.CLEAR_FAULTS))
+        board.receive(0.05)
+        status = board.status
+    faults = "; ".join(map(str, status.faults))
+    click.echo(
+        json.dumps({"state": status.state.name, "faults": [each.fault.name for each in status.faults]})
+        if as_json
+        else f"{status.state.name}: {faults or 'no fault'}"
+    )
+
+
+@command.command()
+@_board
+@_JSON
+def release(name: str, baud: int | None, as_json: bool) -> None:
+    """Switch the drives off: the arm sinks, support it."""
+    from armsight.robot.boards.codes import Command
+
+    with _open_any(name, baud) as board:
+        board.confirm(board.command(Command.DISABLE))
+        board.receive(0.05)
+        state = board.status.state.name
+    click.echo(json.dumps({"state": state}) if as_json else state)
+
+
+@command.command()
+@_board
+@_calibration
+@click.option(
+    "--identified", metavar="ARM", help="Correct by what `armsight identify` found; with --arm, the arm it began with."
+)
+@click.option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
+@click.option(
+    "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
+)
+@click.option("--restore", metavar="FILE", type=click.Path(path_type=Path), help="Write back what --keep has kept.")
+@click.option(
+    "--keep",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    default=Path("old_offsets.json"),
+    show_default=True,
+    help="New file for the offsets as they were.",
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@_JSON
+def offsets(
+    name: str,
+    baud: int | None,
+    calibration: Path | None,
+    identified: str | None,
+    nominal: str | None,
+    further: str | None,
+    restore: Path | None,
+    keep: Path,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Print the homing offsets of a servo bus (register 31), or correct them, after asking.
+
+    The old offsets are kept in a file first. LeRobot's calibration, where given, gets the same new offsets. The torque must
+    be off (`armsight board release`).
+    """
+    import numpy as np
+
+    from armsight.app.board import offsets as changed
+    from armsight.robot.arm_file import open_arm
+    from armsight.robot.boards.feetech.board import FeetechBoard
+
+    given = [each for each in (identified, further, restore) if each is not None]
+    if len(given) > 1 or (identified is None) != (nominal is None):
+        raise InputError("give one of --identified ARM with --arm ARM, --further DEG,... and --restore FILE")
+    angles = None if further is None else changed.parsed_degrees(further)
+    if identified is not None and nominal is not None:
+        angles = changed.further_of(open_arm(identified), open_arm(nominal))
+    if not name.startswith("feetech:"):
+        raise InputError(f"{name} has no homing offsets in its servos; feetech:PORT has")
+    with _open_any(name, baud, calibration) as board:
+        assert isinstance(board, FeetechBoard)
+        if restore is not None:
+            changes = changed.restored_changes(board, restore)
+        else:
+            none = np.zeros(board.abilities.joints)
+            changes = changed.planned_changes(board, none if angles is None else angles)
+        if given:
+            if not yes:
+                click.echo(changed.changes_text(changes), err=True)
+                click.confirm("write the new offsets to the servos?", abort=True, err=True)
+            changed.apply(board, changes, keep, calibration)
+    click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
+    if given:
+        click.echo(f"written; the old offsets are in {keep}", err=True)
+
+
+@command.command()
+@click.argument("arm", type=click.Choice(["so101", "ar4"]))
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
+@_JSON
+def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
+    """Emulate an arm with its controller at a port of this computer, until Ctrl-C: to try everything without an arm.
+
+    so101 is a servo bus with backlash and droop, for feetech:PORT; ar4 a Teensy with backlash and a homing that is off.
+    """
+    import threading
+
+    from armsight.robot.boards.ar4 import board as ar4
+    from armsight.robot.boards.feetech import bus as feetech
+    from armsight.sim.boards.ar4 import Ar4Teensy
+    from armsight.sim.boards.device import serve
+    from armsight.sim.boards.so101 import So101Bus
+
+    kind, device, baud = (
+        ("feetech", So101Bus.made(), feetech.BAUD) if arm == "so101" else ("ar4", Ar4Teensy(), ar4.BAUD)
+    )
+    with serve(device, baud) as port:
+        click.echo(json.dumps({"board": f"{kind}:{port.name}"}) if as_json else f"{kind}:{port.name}")
+        threading.Event().wait(seconds)
+
+
+def _open(name: str, baud: int | None) -> Board:
+    """Open a board with our firmware; an emulated one has six free joints at its motors."""
     from armsight.robot.boards.opening import SERIAL, open_board
+    from armsight.robot.boards.serial import BAUD
     from armsight.sim.joints import JointPlant
 
-    return open_board(name, None if name.startswith(SERIAL) else JointPlant(), baud=baud)
+    plant = None if name.startswith(SERIAL) else JointPlant()
+    return open_board(name, plant, baud=BAUD if baud is None else baud)
+
+
+def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> MotionBoard:
+    """Open any board; an emulated one has six free joints at its motors."""
+    from armsight.robot.boards.opening import is_real, open_motion_board
+    from armsight.sim.joints import JointPlant
+
+    return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,10 +20,9 @@ from armsight.data import Array, JointStates
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.firmware.elf import read_elf
-from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource
 from armsight.robot.boards.configuration import GAIN_RANGES, JOINTS, Configuration
-from armsight.robot.boards.reports import Welcome
+from armsight.robot.boards.contract import MotionBoard
 
 _SOURCES = {
     ConfigSource.NEWEST: "its newest configuration",
@@ -54,24 +54,27 @@ def built_text(built: Built) -> str:
     return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in built.pieces])
 
 
-def welcome_text(welcome: Welcome) -> str:
-    """Return a board's name, firmware and configuration in a line."""
-    return (
-        f"board {welcome.board}, firmware {welcome.firmware}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud,"
-        f" runs on {_SOURCES[welcome.config_source]}"
-    )
+def welcome_text(board: MotionBoard) -> str:
+    """Return a board's name, firmware and configuration, or what it cannot do, in a line."""
+    welcome = board.welcome
+    text = f"board {welcome.board}, firmware {welcome.firmware}"
+    if welcome.config_source is None:
+        return "; ".join([f"{text}, {welcome.baud} baud", *board.abilities.missing])
+    source = _SOURCES[welcome.config_source]
+    return f"{text}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud, runs on {source}"
 
 
-def status_json(board: Board, states: JointStates) -> dict[str, Any]:
+def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:
     """Return a board's state, faults, newest angles and counters as JSON has them, SI units."""
-    status = board.status
+    status, celsius = board.status, board.joints.temperature_c
     return {
         "t_s": round(status.t_s, 3),
         "state": status.state.name,
         "faults": [{"fault": f.fault.name, "joint": None if f.joint is None else f.joint + 1} for f in status.faults],
         "q_rad": [round(float(q), 5) for q in states.q[-1]] if len(states.q) else None,
         "duty": [round(float(duty), 4) for duty in board.joints.duty],
-        "supply_v": status.supply_v,
+        "supply_v": None if math.isnan(status.supply_v) else round(status.supply_v, 3),
+        "temperature_c": None if celsius is None else [float(each) for each in celsius],
         "readings": len(states.t_s),
         "crc_errors": status.crc_errors,
         "lost_bytes": status.lost_bytes,
@@ -80,13 +83,17 @@ def status_json(board: Board, states: JointStates) -> dict[str, Any]:
     }
 
 
-def status_text(board: Board, states: JointStates) -> str:
+def status_text(board: MotionBoard, states: JointStates) -> str:
     """Return a board's state, newest angles and faults in a line."""
     status = board.status
     faults = ", ".join(f.fault.name + ("" if f.joint is None else f" joint {f.joint + 1}") for f in status.faults)
     angles = " ".join(f"{np.degrees(q):7.2f}" for q in states.q[-1]) + " deg" if len(states.q) else "no readings"
     state = STATE_TEXTS[status.state].split(":")[0]
-    line = f"{status.t_s:8.2f} s  {state:14} {angles}  {status.supply_v:5.2f} V"
+    line = f"{status.t_s:8.2f} s  {state:14} {angles}"
+    if not math.isnan(status.supply_v):
+        line += f"  {status.supply_v:5.2f} V"
+    if (celsius := board.joints.temperature_c) is not None:
+        line += f"  {celsius.max():.0f} deg C"
     return f"{line}  {faults}" if faults else line
 
 

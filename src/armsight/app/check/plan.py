@@ -160,7 +160,7 @@ def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> Trajectory:
 
 
 def _start(arm: Arm, plan: CheckPlan, p_base: Array) -> Array:
-    """Return joint angles (6,), rad, at a position (3,), base, m, in the configuration of the poses."""
+    """Return joint angles (n,), rad, at a position (3,), base, m, in the configuration of the poses."""
     found = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], p_base), near=plan.q[0]).best
     if found is None:
         raise InputError("the circle is out of reach")
@@ -173,7 +173,7 @@ def _numbers(values: Array) -> str:
 
 
 def _joints(name: str, q: Array) -> str:
-    """Return a motion to joint angles (6,), rad."""
+    """Return a motion to joint angles (n,), rad."""
     return f'\n[[motion]]\nkind = "joints"\nname = "{name}"\nq_deg = {_numbers(np.degrees(q))}\n'
 
 
@@ -213,7 +213,7 @@ def plan_csv(plan: CheckPlan) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     names = [f"command_{n}" for n in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
-    writer.writerow(["pose", *(f"q{i}_rad" for i in range(1, 7)), *names])
+    writer.writerow(["pose", *(f"q{i + 1}_rad" for i in range(plan.q.shape[1])), *names])
     for name, q, T in zip(plan.names, plan.q, plan.Ts_base_tool, strict=True):
         writer.writerow([name, *(f"{v:.9f}" for v in (*q, *T[:3, 3], *quaternion_wxyz(T[:3, :3])))])
     return out.getvalue()

@@ -75,7 +75,7 @@ class Reversal(NamedTuple):
     """Joints reverse on the circle.
 
     Attributes:
-        joints: their numbers, 1 to 6.
+        joints: their numbers, from 1.
         way: 1 counter-clockwise, -1 clockwise.
         p: (3,) where the tool is commanded then, base, m.
     """

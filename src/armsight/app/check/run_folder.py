@@ -31,6 +31,7 @@ from armsight.files import read_table, read_text
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
+from armsight.robot.kinematics.table import MOST_JOINTS
 
 #: A rest is evaluated over its last part, this long, s: longer averages more shots, and more of the settling.
 WINDOW_S = 0.3
@@ -53,7 +54,7 @@ _MOVES_RAD = float(np.radians(0.5))
 #: Joints that reverse within this share of the circle's time do so together.
 _NEAR = 0.015
 #: Columns of joints.csv in version 1 of a run's folder -> their present names; both are read.
-_VERSION_1 = {f"q{joint}_wanted_rad": f"q{joint}_ref_rad" for joint in range(1, 7)}
+_VERSION_1 = {f"q{joint}_wanted_rad": f"q{joint}_ref_rad" for joint in range(1, MOST_JOINTS + 1)}
 _SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 
 
@@ -425,7 +426,8 @@ def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
         return []
     table = read_table(file)
     header = [_VERSION_1.get(name, name) for name in table[0]] if table else []
-    names = ["t_s", *(f"q{joint}_ref_rad" for joint in range(1, 7))]
+    joints = sum(name.startswith("q") and name.endswith("_ref_rad") for name in header)
+    names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(joints or 6))]
     try:
         at = [header.index(name) for name in names]
         values = np.array([[float(row[k]) for k in at] for row in table[1:]])
@@ -435,11 +437,13 @@ def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
     for segment in circle:
         angle = _angle_of(segment)
         rows = values[(values[:, 0] > segment.reference.t_s[0]) & (values[:, 0] < segment.reference.t_s[-1])]
-        for t_s, joints in _together(rows):
+        for t_s, reversed_joints in _together(rows):
             here = float(np.interp(t_s, segment.reference.t_s, angle)) - angle[-1] / 2
             if abs(here) <= np.pi:
                 reversals.append(
-                    Reversal(joints, float(np.sign(angle[-1])), segment.reference.at(np.array([t_s]))[0, :3, 3])
+                    Reversal(
+                        reversed_joints, float(np.sign(angle[-1])), segment.reference.at(np.array([t_s]))[0, :3, 3]
+                    )
                 )
     return reversals
 
@@ -447,9 +451,11 @@ def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
 def _together(rows: Array) -> list[tuple[float, tuple[int, ...]]]:
     """Return (time, joints) of every reversal, s; joints that reverse at about the same time are one.
 
-    ``rows``: (N, 7) times, s, and commanded joint angles, rad.
+    ``rows``: (N, n + 1) times, s, and commanded joint angles, rad.
     """
-    each = sorted((t_s, joint) for joint in range(1, 7) for t_s in _reversal_times(rows[:, 0], rows[:, joint]))
+    each = sorted(
+        (t_s, joint) for joint in range(1, rows.shape[1]) for t_s in _reversal_times(rows[:, 0], rows[:, joint])
+    )
     near = _NEAR * float(np.ptp(rows[:, 0])) if len(rows) else 0.0
     found: list[tuple[float, tuple[int, ...]]] = []
     for t_s, joint in each:

@@ -6,6 +6,7 @@ the cameras' images, and runs the board's firmware under emulation; the cameras 
 
 from __future__ import annotations
 
+import contextlib
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,6 +22,8 @@ from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, MotionPlan, read_motions
 from armsight.app.run.setup import setup_of
 from armsight.app.run.summary import RunSummary
+from armsight.app.stream.datum import Published
+from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.files import write_text
@@ -88,7 +91,12 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         poses = np.vstack([workcell.model.home, workcell.poses])
         targets = handeye_poses(workcell.model, poses, handeyes, demo.seed)
         setup = setup_of(workcell)
-        outcome = run_experiment(setup, calibration.rig, plan, targets, progress=progress, cover=workcell.cover)
+        texts = properties(calibration.rig, workcell.body_text, setup.arm, command="demo")
+        published = Published(calibration.rig, setup.target.body, setup.arm, texts)
+        with contextlib.closing(LazyMcap(demo.folder, published, progress)) as file:
+            outcome = run_experiment(
+                setup, calibration.rig, plan, targets, progress=progress, cover=workcell.cover, publisher=file
+            )
         studies: list[Study] = []
         try:
             studies = _studies(demo, workcell, calibration, outcome, plan, study_shots, progress)
@@ -96,7 +104,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
         progress("plotting")
-        properties = {
+        of_run = {
             "seed": demo.seed,
             "arm": demo.arm,
             "nominal_arm": demo.nominal_arm_name or workcell.model.name,
@@ -108,7 +116,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         with ThreadPoolExecutor(1) as beside:
             overview = beside.submit(workcell.picture)
             finished = Finished(
-                workcell.model, calibration.rig, outcome, plan, truth, properties, began, studies, overview.result
+                workcell.model, calibration.rig, outcome, plan, truth, of_run, began, studies, overview.result
             )
             return finish(finished, demo.folder)
 

@@ -262,17 +262,19 @@ def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult
     log = Log()
     loop = Loop.open(
         setup,
-        Follower(rig, setup.target),
+        Follower(rig, setup.target, setup.sync_s),
         log,
         KalmanEstimator(setup.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
     )
     loop.mounting = outcome.handeye.mounting
     servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     kinds = [motion.kind for motion in plan.motions]
-    first = kinds.index("home") + 1 if "home" in kinds else 0
+    first = max(kinds.index("line") - 1, 0)  # the motion to its start
     last = kinds.index("circle") + 1
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
-    drive(loop, part, closed_on(servo, setup.gravity), closed=True, progress=lambda line: None)
+    drive(
+        loop, part, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=lambda line: None
+    )
     loop.close_record()
     truth, mounting = workcell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body

@@ -176,8 +176,8 @@ def plan_json(plan: Plan) -> dict[str, list[float]]:
 def plan_csv(plan: Plan) -> str:
     """Return the poses as CSV: joint angles, and the direction of approach of each."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*(f"q{i}_rad" for i in range(1, 7)), *(f"approach{i}" for i in range(1, 7)), "sigma_after_mm"])
+    writer, joints = csv.writer(out, lineterminator="\n"), range(plan.q.shape[1])
+    writer.writerow([*(f"q{i + 1}_rad" for i in joints), *(f"approach{i + 1}" for i in joints), "sigma_after_mm"])
     for q, side, sigma in zip(plan.q, plan.approach, plan.sigma_m[1:], strict=True):
         writer.writerow([*(f"{v:.6f}" for v in q), *(f"{v:.0f}" for v in side), f"{1e3 * sigma:.4f}"])
     return out.getvalue()

@@ -373,7 +373,7 @@ def _ranges_title(found: Identified) -> str:
 def _ripples(run: Identification) -> list[str]:
     """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
     found, lines = run.found, []
-    for i in range(6):
+    for i in range(found.model.arm.joints):
         rows = [k for k, p in enumerate(found.model.parameters) if p.kind == "ripple" and p.joint == i]
         rows = [k for k in rows if found.solution.free[k]]
         if rows:

@@ -21,14 +21,31 @@ from armsight.errors import InputError
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images.")
 @click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
-@click.option("--detections", metavar="D.csv", type=click.Path(path_type=Path), help="Detections instead of images.")
+@click.option(
+    "--detections",
+    metavar="D.csv",
+    type=click.Path(path_type=Path),
+    help="Detections instead of images; bag:FILE for tags in a bag.",
+)
 @click.option(
     "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
 )
 @click.option(
     "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
 )
+@click.option(
+    "--save-rig",
+    metavar="RIG2.json",
+    type=click.Path(path_type=Path),
+    help="Write the rig with the skew and readout found.",
+)
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+)
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(
@@ -40,16 +57,19 @@ def command(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
+    stream: tuple[str, ...],
     view_dir: Path | None,
     as_json: bool,
 ) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.
 
-    Give the images as --left and --right, as --source, or what was detected in them as --detections. A shot that cannot
-    be read or does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles
-    about z, y and x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict
-    the rig or the body file, and the poses must not be trusted.
+    Give the images as --left and --right, as --source, or what was detected in them as --detections. RIG.json may also be
+    bag:FILE, a recording that holds the camera_info of a stereo pair. A shot that cannot be read or does not show the
+    target gives a line with the reason, and the run continues. rz, ry, rx are the angles about z, y and x, in this order
+    (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict the rig or the body file, and
+    the poses must not be trusted.
 
     With --skew or --readout, or where the rig file has them, a moving body's detections are moved to the time of the shot
     by its own motion, which the recording's other shots show.
@@ -69,7 +89,9 @@ def command(
         detections=detections,
         skew=skew,
         readout=readout,
+        save_rig=save_rig,
         output=output,
+        streams=stream,
         view_dir=view_dir,
         as_json=as_json,
     )

@@ -270,7 +270,11 @@ def header(shot: ShotPose) -> list[str]:
     position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov)[:3]))
     rotation = _pairs(ANGLES, shot.euler_zyx_deg, angle_sigmas_deg(shot))
     count, dropped = len(shot.points_m), len(shot.dropped)
-    fit = f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {count} points"
+    _, precision, calibration = (1e3 * sigma for sigma in shot.position_sigmas_m)
+    fit = (
+        f"precision {precision:.3f} mm, calibration {calibration:.3f} mm; "
+        f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {count} points"
+    )
     return [
         ", ".join(first),
         f"{position} mm; {rotation} deg{SINGULAR if shot.pitch_singular else ''}",

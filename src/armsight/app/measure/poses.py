@@ -3,7 +3,9 @@
 In: what vision measured in a shot. Out: a :class:`ShotPose`. All is in the left camera's frame. ``covariance`` is that of
 [translation m; rotation rad] along the axes of the left camera (the true pose is the estimate rotated by the rotation
 vector about the body's origin, and shifted); ``covariance_body`` is the same along the body's axes, as
-docs/concepts/conventions.md defines it (perturbation on the right).
+docs/concepts/conventions.md defines it (perturbation on the right). ``covariance`` is the sum of two shares:
+``covariance_precision`` differs from shot to shot (noise of the images), ``covariance_calibration`` is common to all shots
+of a rig: no mean over shots lowers it.
 
 ``euler_zyx_deg`` are the angles about z, y and x, in this order: R = R_z R_y R_x. ROS lists the same three angles the other
 way round, as roll (about x), pitch, yaw (about z).
@@ -28,6 +30,7 @@ from armsight.vision.rig import Shutters
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 #: Names of the three angles for people: about z, y, x.
 ANGLES = ("rz", "ry", "rx")
+_AXES = (*(f"{axis}_m" for axis in "xyz"), *(f"r{axis}_rad" for axis in "xyz"))
 CSV_COLUMNS = (
     "shot",
     "status",
@@ -36,14 +39,14 @@ CSV_COLUMNS = (
     *(f"{axis}_m" for axis in "xyz"),
     *(f"q{axis}" for axis in "wxyz"),
     *(f"euler_{axis}_deg" for axis in "zyx"),
-    *(f"sigma_{axis}_m" for axis in "xyz"),
-    *(f"sigma_r{axis}_rad" for axis in "xyz"),
+    *(f"sigma_{axis}" for axis in _AXES),
     "residual_rms_m",
     "reprojection_rms_px",
     "misfit",
     "points",
     "dropped",
     *(f"cov_{i}{j}" for i, j in UPPER),
+    *(f"sigma_{share}_{axis}" for share in ("precision", "calibration") for axis in _AXES),
 )
 
 SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
@@ -62,6 +65,7 @@ class ShotPose(Record):
         euler_zyx_deg: (3,) the same as angles about z, y, x, degrees.
         pitch_singular: whether the angle about y is +-90 degrees: then only those about z and x together are determined.
         cov: (6, 6) covariance [m; rad] along the left camera's axes.
+        cov_precision: (6, 6) the share of ``cov`` that differs from shot to shot; the rest is the calibration's.
         cov_body: (6, 6) covariance [m; rad] along the body's axes.
         residual_rms_m: RMS distance of the points from the body's, m; None where it is not known.
         reprojection_rms_px: RMS reprojection error, px.
@@ -83,6 +87,7 @@ class ShotPose(Record):
     euler_zyx_deg: Array = field(default_factory=lambda: np.full(3, np.nan))
     pitch_singular: bool = False
     cov: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    cov_precision: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     cov_body: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     residual_rms_m: float | None = None
     reprojection_rms_px: float = math.nan
@@ -100,6 +105,18 @@ class ShotPose(Record):
         return self.reason is None
 
     @property
+    def cov_calibration(self) -> Array:
+        """(6, 6) the share of ``cov`` that is common to all shots of the rig."""
+        return self.cov - self.cov_precision
+
+    @property
+    def position_sigmas_m(self) -> tuple[float, float, float]:
+        """Sigmas of the position in space (roots of the traces), m: in all, precision, calibration."""
+        traces = (float(np.trace(cov[:3, :3])) for cov in (self.cov, self.cov_precision, self.cov_calibration))
+        total, precision, calibration = (math.sqrt(max(trace, 0.0)) for trace in traces)
+        return total, precision, calibration
+
+    @property
     def status(self) -> str:
         """Status as JSON and CSV have it: ok or missed."""
         return "ok" if self.ok else "missed"
@@ -114,6 +131,8 @@ class ShotPose(Record):
                 "euler_zyx_deg": self.euler_zyx_deg.tolist(),
                 "pitch_singular": self.pitch_singular,
                 "covariance": self.cov.tolist(),
+                "covariance_precision": self.cov_precision.tolist(),
+                "covariance_calibration": self.cov_calibration.tolist(),
                 "covariance_body": self.cov_body.tolist(),
                 "residual_rms_m": self.residual_rms_m,
                 "reprojection_rms_px": self.reprojection_rms_px,
@@ -151,6 +170,7 @@ def shot_pose(name: str, t_s: float | None, body: Body, result: PoseEstimate | M
         np.degrees(angles),
         singular,
         left_axes(T, result.cov),
+        left_axes(T, result.cov_noise),
         result.cov,
         result.residual_rms_m if math.isfinite(result.residual_rms_m) else None,
         result.reprojection_rms_px,
@@ -184,6 +204,8 @@ def csv_text(poses: Sequence[ShotPose]) -> str:
             row += np.sqrt(np.diag(p.cov)).tolist()
             row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
             row += [float(p.cov[i, j]) for i, j in UPPER]
+            for share in (p.cov_precision, p.cov_calibration):
+                row += np.sqrt(np.maximum(np.diag(share), 0.0)).tolist()
         if p.shutters is not None:
             row += [""] * (len(CSV_COLUMNS) - len(row))
             row += [p.shutters.skew_s, p.shutters.readout_s, *p.shutters.sigmas.tolist()]

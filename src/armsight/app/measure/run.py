@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +19,13 @@ from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
+from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
-from armsight.vision.detections import read_detections
+from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -31,12 +33,18 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
-from armsight.vision.sources import PairsSource, Source, open_source
+from armsight.vision.sources import PairsSource, Source, notes_of, open_source
+from armsight.vision.sources.bag import BagSource
+from armsight.vision.sources.bag.camera_info import open_rig
+from armsight.vision.sources.bag.tags import read_tags
+from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource
 from armsight.vision.sources.video import VideoSource
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
+#: A shot that is younger by its own stamp was stamped by a live camera, s.
+_LIVE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,9 @@ def measure_shots(
     detections: Path | None,
     skew: str | None,
     readout: str | None,
+    save_rig: Path | None,
     output: Path | None,
+    streams: Sequence[str],
     view_dir: Path | None,
     as_json: bool,
 ) -> tuple[HealthFinding, ...]:
@@ -77,7 +87,9 @@ def measure_shots(
         detections: a file of detections, where there are no images.
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
+        save_rig: file for the rig with the skew and readout that were found or given.
         output: CSV file of the poses.
+        streams: what to publish each pose to.
         view_dir: folder for pictures.
         as_json: whether each line is a JSON object.
 
@@ -90,7 +102,11 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
-    stereo = StereoRig.load(rig)
+    if save_rig is not None:
+        if requested is None:
+            raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
+        check_writable(save_rig, apart_from=(rig, target, output))
+    stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
         check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
@@ -104,14 +120,14 @@ def measure_shots(
     skewed: list[HealthFinding] = []
     with contextlib.ExitStack() as stack:
         if detections is not None:
-            body = open_body(target)
-            shots = read_detections(detections, body)
-            results = ((Shot(s.name, None, None), measure_seen(stereo, body, s), None, None) for s in shots)
+            body, shots = _detected(detections, target)
+            results = ((Shot(s.name, None, None, s.t_s), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
             opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
+            _say(notes_of(opened))
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
@@ -137,13 +153,17 @@ def measure_shots(
         if output is not None:
             stack.callback(_write, output, records)
         monitor = HealthMonitor(stereo, body, _SYNC_S)
+        publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(results, total, body, records, as_json, view, monitor)
+            _run(results, total, body, records, as_json, view, monitor, publisher)
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
+    moved = next((r.shutters for r in records if r.shutters is not None), None)
+    if save_rig is not None and moved is not None:
+        replace(stereo, shutters=moved).save(save_rig)
     health = monitor.findings()
     if skewed and any(each.cause == "rig" for each in health):
         # Of a moving body a skew looks like cameras that moved against each other.
@@ -163,11 +183,43 @@ def _opened(left: str | None, right: str | None, source: str | None) -> Source:
     return PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
 
 
+def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot]]:
+    """Return the body, and what was detected of it: from a table, or from a recording of tags, bag:FILE."""
+    if not str(detections).startswith("bag:"):
+        body = open_body(target)
+        return body, read_detections(detections, body)
+    tagged = open_body(target) if target.lower().endswith(".csv") else open_target(target)
+    shots, notes = read_tags(str(detections), tagged)
+    _say(notes)
+    return tagged if isinstance(tagged, Body) else tagged.body, shots
+
+
+def _say(notes: Iterable[str]) -> None:
+    """Print notes on stderr."""
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+
+
+def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
+    """Open the streams of the command line."""
+    if not specs:
+        return Fanout()
+    from armsight.app.stream.streams import open_streams
+
+    return open_streams(specs, Published(rig, body), lambda line: click.echo(line, err=True))
+
+
+def _arrival_s(shot: Shot) -> float | None:
+    """Return the time by the clock of live cameras, s; None where the shot is of a recording."""
+    now = time.monotonic()
+    return now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
+
+
 def _timed(source: Source) -> bool:
     """Whether a source is a recording whose shots have times."""
     if isinstance(source, StoredSource):
         return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource)
+    return isinstance(source, VideoSource | BagSource | LeRobotSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
@@ -227,6 +279,7 @@ def _run(
     as_json: bool,
     view: PictureFolder | None,
     monitor: HealthMonitor,
+    publisher: Publisher,
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it."""
     with bar("measuring", total) as advance:
@@ -236,6 +289,7 @@ def _run(
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
             records.append(record)
+            publisher.put(ShotDatum(shot, result, _arrival_s(shot)))
             click.echo(json.dumps(record.to_json()) if as_json else _line(record))
             if view is not None:
                 view.add(shot, result, record)
@@ -264,8 +318,10 @@ def _line(record: ShotPose) -> str:
     note += f", misfit {record.misfit:.1f}" if record.misfit > 1 else ""
     note += f", {record.jump}" if record.jump else ""
     singular = SINGULAR if record.pitch_singular else ""
+    _, precision, calibration = (1e3 * sigma for sigma in record.position_sigmas_m)
     return (
-        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}, {len(record.points_m)} points{note}"
+        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}; precision {precision:.3f} mm, "
+        f"calibration {calibration:.3f} mm; {len(record.points_m)} points{note}"
     )
 
 

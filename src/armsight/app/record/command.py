@@ -5,10 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from armsight.errors import ArmsightError
+
+if TYPE_CHECKING:
+    from armsight.data import Shot
 
 
 @click.command("record")
@@ -31,16 +35,34 @@ def command(
       url:URL_LEFT,URL_RIGHT              MJPEG over HTTP, or RTSP
       video:LEFT.mp4,RIGHT.mp4            or one side-by-side file
       folder:DIR                          or just DIR
+      bag:FILE[,left=TOPIC,right=TOPIC]   a ROS or Foxglove recording
+      lerobot:DIR[,left=KEY,right=KEY]    a LeRobot dataset
 
-    Ctrl-C stops the recording; what was stored until then is complete and readable.
+    Beside the images the folder has run.mcap, which Foxglove, Lichtblick and rerun open. Ctrl-C stops the recording; what
+    was stored until then is complete and readable.
     """  # noqa: D301 - click reads the backspace character
     from armsight.app.progress import bar
     from armsight.app.record.recording import record, unused_folder
-    from armsight.vision.sources import open_source
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.mcap_file import LazyMcap, properties
+    from armsight.vision.sources import notes_of, open_source
 
     unused_folder(output)
-    with contextlib.closing(open_source(source)) as opened, bar("recording shots", shots) as advance:
-        result = record(opened, output, shots=shots, seconds=seconds, on_shot=lambda _: advance())
+    with contextlib.ExitStack() as stack:
+        opened = stack.enter_context(contextlib.closing(open_source(source)))
+        for note in notes_of(opened):
+            click.echo(f"note: {note}", err=True)
+        published = Published(properties=properties(None, None, command="record", source=source))
+        file = stack.enter_context(
+            contextlib.closing(LazyMcap(output.expanduser(), published, lambda line: click.echo(line, err=True)))
+        )
+        advance = stack.enter_context(bar("recording shots", shots))
+
+        def stored_one(shot: Shot) -> None:
+            file.put_shot(shot)
+            advance()
+
+        result = record(opened, output, shots=shots, seconds=seconds, on_shot=stored_one)
     if as_json:
         keys = {"directory": str(result.directory), "shots": result.shots, "problems": result.problems}
         click.echo(json.dumps({**keys, "stopped": result.stopped}))

@@ -12,7 +12,7 @@ import io
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -60,7 +60,7 @@ def record(
         directory: a new or empty folder.
         shots: stop after this many, those with a problem included; None is no limit.
         seconds: stop at this age of the first shot, s, by the shots' own time, or by the clock for a source without one.
-        on_shot: called after each shot is stored.
+        on_shot: called after each shot is stored; its ``encoded`` are the files, unless the cameras delivered others.
 
     Returns:
         How much is stored. An interrupt, a full disk or a failing camera raises no exception: ``stopped`` has it.
@@ -82,7 +82,7 @@ def record(
             if seconds is not None and _age_s(shot, first, started_s) >= seconds:
                 break
             with uninterrupted() as came:  # no shot is stored in part
-                writer.add(shot)
+                shot = writer.add(shot)
             if came:
                 raise KeyboardInterrupt
             if on_shot is not None:
@@ -141,14 +141,18 @@ class ShotFolder:
         self.shots = 0
         self.problems = 0
 
-    def add(self, shot: Shot) -> None:
+    def add(self, shot: Shot) -> Shot:
         """Store one shot, completely or not at all.
+
+        Returns:
+            The shot with its files' bytes, unless it has those of the cameras.
 
         Raises:
             InputError: it cannot be written, the disk is full.
         """
         index = self._opened()
         files: list[Path] = []
+        encoded: list[bytes] = []
         try:
             if shot.problem is None:
                 for side in SIDES:
@@ -156,6 +160,7 @@ class ShotFolder:
                     _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
                     with replacing(files[-1], "wb") as file:
                         file.write(data)
+                    encoded.append(data.tobytes())
             names = [file.name for file in files] or ["", ""]
             t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
             self._append(index, [shot.name, t_s, *names, " ".join((shot.problem or "").split())])
@@ -167,6 +172,7 @@ class ShotFolder:
         self._whole = os.fstat(index).st_size
         self.shots += 1
         self.problems += shot.problem is not None
+        return shot if shot.encoded is not None or not encoded else replace(shot, encoded=(encoded[0], encoded[1]))
 
     def close(self) -> None:
         """Close the index, and remove it if it names no shot."""

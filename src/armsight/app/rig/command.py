@@ -1,4 +1,4 @@
-"""``armsight rig``: show a rig file, and convert rigs from and to other programs' formats."""
+"""``armsight rig``: show a rig file, convert rigs from and to other programs' formats, update one from a run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FORMAT = click.option("--format", "name", required=True, type=click.Choice(list
 
 @click.group("rig")
 def command() -> None:
-    """Show a rig file, import a rig of another program, or export one.
+    """Show a rig file, import a rig of another program, export one, or update one from what a run saw.
 
     Files of each format, in this order: opencv: intrinsics.yml extrinsics.yml (or one file with both); ros: left.yaml
     right.yaml (camera_info); kalibr: camchain.yaml.
@@ -99,6 +99,30 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
         click.echo(f"note: not in the {name} format: {what}", err=True)
     answer = {"rig": path, "format": name, "files": paths, "lost": lost, "rectification_alpha": alpha}
     click.echo(json.dumps(answer) if as_json else " ".join(paths))
+
+
+@command.command("update")
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
+@click.option(
+    "--since",
+    type=float,
+    metavar="S",
+    help="Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
+)
+@click.option("--report", type=click.Path(path_type=Path), metavar="DIR", help="Folder for a page: old rig beside new.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def update_(run: Path, output: str, since: float | None, report: Path | None, as_json: bool) -> None:
+    """Estimate the relative pose of a run's cameras again, from the body that the run saw: without a board.
+
+    RUN is the folder of armsight run or armsight demo. The body's file gives the scale; the calibration stays the prior of
+    lenses and baseline. Rejected where the shots say too little.
+    """
+    from armsight.app.rig.update import lines, update
+
+    check_writable(output, apart_from=(run / "rig.json", run / "body.toml", run / "detections.csv"))
+    answer = update(run, Path(output), since, report)
+    click.echo(json.dumps(answer) if as_json else "\n".join(lines(answer)))
 
 
 def _image_size(text: str) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import numpy as np
 from armsight.app.run.controllers import Planned, Sweep
 from armsight.app.run.loop import Loop
 from armsight.app.run.record import RunSegment
-from armsight.data import Array, JointStates, PoseEstimate, Record, Shot
+from armsight.data import Array, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
@@ -27,6 +27,8 @@ from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
+from armsight.vision.rig import Shutters
+from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
 
 Progress = Callable[[str], None]
 #: How long the arm stands before it is measured, and the least duration of the measurement, s.
@@ -36,6 +38,8 @@ DELAY_REST_S = 1.0  # before and after the sweep
 SWEEP_S, SWEEP_SHOTS = 4.0, MIN_MEASUREMENTS + 6
 #: In the sweep the joints stay on one side of their backlash, so their errors change little beyond what can be learned.
 STEADY = Prior(rest_rad=float(np.deg2rad(0.02)), rest_travel_rad=0.5, flip_rad=0.0, flip_float_rad=0.0)
+#: Skew and readout that count as found: so many sigmas from zero, and so many seconds (skew; readout).
+_SHUTTER_SIGMAS, _SHUTTER_LEAST_S = 6.0, np.array([2e-4, 1e-3])
 _SAMPLES = 50  # candidates for each pose
 _NEAR = np.radians(70.0)  # a joint that rotated further has changed to another configuration of the arm
 
@@ -57,13 +61,13 @@ def calibrated(target_spec: str, shots: Iterable[Shot], progress: Progress) -> C
 
 
 def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
-    """Sample joint angles (count, 6), rad, that show the body from many sides, near given ones at which it is in view.
+    """Sample joint angles (count, n), rad, that show the body from many sides, near given ones at which it is in view.
 
     They are in the order of a short way: from the first of ``around`` always on to the nearest.
 
     Args:
         arm: the nominal arm.
-        around: (M, 6) joint angles at which the body is in view, rad.
+        around: (M, n) joint angles at which the body is in view, rad.
         count: how many.
         seed: of the samples.
 
@@ -103,10 +107,10 @@ class HandEyeRun(Record):
             a real arm defines its base only to within its own errors. So their covariance is zero here; how well the arm
             agrees with them is in ``found``.
         found: the hand-eye calibration.
-        q: (N, 6) potentiometer readings at rest at each pose that was used, rad.
+        q: (N, n) potentiometer readings at rest at each pose that was used, rad.
         Ts_left_body: (N, 4, 4) measured poses of the body in the left camera's frame.
         covs: (N, 6, 6) their covariances, right tangents [m; rad].
-        approach: (N, 6) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
+        approach: (N, n) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
         missed: poses at which the body was not measured, and why.
     """
 
@@ -127,9 +131,9 @@ def find_mounting(
     Args:
         loop: runs the motions.
         arm: the nominal arm.
-        q_start: (6,) joint angles at which the arm stands, rad.
-        targets: (N, 6) joint angles to visit, rad.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        q_start: (n,) joint angles at which the arm stands, rad.
+        targets: (N, n) joint angles to visit, rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
         progress: called with a line about what is being done.
 
     Raises:
@@ -176,14 +180,14 @@ def find_mounting(
 
 
 def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: Callable[[Array], Array]) -> Delay:
-    """Sweep the joints back and forth about a pose and estimate the delay of the cameras' time stamps.
+    """Sweep the joints back and forth about a pose; estimate the delay of the cameras' time stamps, and their shutters.
 
     Args:
-        loop: runs the motions; its mounting is known.
+        loop: runs the motions; its mounting is known, its shutters and its delay are set.
         arm: the nominal arm.
-        q_start: (6,) joint angles at which the arm stands, rad.
-        q_middle: (6,) joint angles about which to sweep, rad; the arm stands there afterwards.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        q_start: (n,) joint angles at which the arm stands, rad.
+        q_middle: (n,) joint angles about which to sweep, rad; the arm stands there afterwards.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
 
     Raises:
         CalibrationError: the sweep does not determine the delay.
@@ -196,22 +200,59 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     poses_before = len(loop.log.poses)
     controller = Planned(sweep, loop.t_s, gravity)
     loop.run(controller, sweep.duration_s, RunSegment("calibration", "sweep", "joints", False, trajectory=sweep))
-    assert loop.mounting is not None
-    seen = [
-        loop.mounting.pose_measurement(p, t) for _, t, p in loop.log.poses[poses_before:] if isinstance(p, PoseEstimate)
-    ]
+    shots = [(t, p) for _, t, p in loop.log.poses[poses_before:] if isinstance(p, PoseEstimate)]
     loop.run(controller, DELAY_REST_S, RunSegment("calibration", "", "", False), watch=False)
     states = JointStates(
         np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])
     )
     newest = states.t_s > states.t_s[-1] - sweep.duration_s - 2 * DELAY_REST_S
     swept = JointStates(states.t_s[newest], states.q[newest])
-    if len(seen) < MIN_MEASUREMENTS:
+    if len(shots) < MIN_MEASUREMENTS:
         raise CalibrationError(
-            f"the body was seen {len(seen)} times in {sweep.duration_s:.1f} s of sweep, {MIN_MEASUREMENTS} times at "
+            f"the body was seen {len(shots)} times in {sweep.duration_s:.1f} s of sweep, {MIN_MEASUREMENTS} times at "
             "least are needed to estimate the delay of the images: are the cameras slower than "
             f"{loop.setup.rate_hz:g} Hz, or is the body "
             "out of view near the end of the first motion?"
         )
-    sync_s = loop.setup.sync_s
-    return loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))
+    shutters, shots = loop.compute(lambda: _at_one_time(loop, shots))
+    assert loop.mounting is not None
+    seen = [loop.mounting.pose_measurement(pose, t) for t, pose in shots]
+    sync_s = loop.setup.sync_s if shutters is None else 0.0  # what is not known of the shutters is in the covariances
+    delay = loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))
+    loop.shutters, loop.delay_s = shutters, delay.delay_s
+    if shutters is not None:
+        loop.follower.expose_apart(float(np.hypot(shutters.skew_s, shutters.jitter_s)))
+    return delay
+
+
+def _at_one_time(
+    loop: Loop, shots: list[tuple[float, PoseEstimate]]
+) -> tuple[Shutters | None, list[tuple[float, PoseEstimate]]]:
+    """Return when the cameras expose, and the poses of a sweep with what they saw moved to one time.
+
+    Args:
+        loop: its shutters are taken where they are known; else they are found, if the sweep shows any.
+        shots: time, s, and pose of each shot of the sweep.
+
+    Returns:
+        None and the poses as they are where the cameras expose at one time.
+    """
+    rig, body = loop.follower.rig, loop.setup.target.body
+    timed = [TimedShot(t, pose.points.seen, pose.T_left_body) for t, pose in shots]
+    shutters = loop.shutters or _visible(estimate_shutters(rig, body, timed, readout=True))
+    shutters = shutters or _visible(estimate_shutters(rig, body, timed))
+    if shutters is None:
+        return None, shots
+    moved = measure_moving(rig, body, timed, shutters)
+    return shutters, [
+        (t, pose) for (t, _), (pose, _) in zip(shots, moved, strict=True) if isinstance(pose, PoseEstimate)
+    ]
+
+
+def _visible(found: Shutters | Missed) -> Shutters | None:
+    """Return shutters that differ from simultaneous ones by more than chance, and by enough to matter."""
+    if isinstance(found, Missed):
+        return None
+    parameters = np.array([found.skew_s, found.readout_s])
+    shown = np.abs(parameters) > np.maximum(_SHUTTER_SIGMAS * found.sigmas, _SHUTTER_LEAST_S)
+    return found if shown.any() else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
 
 _HANDEYE_POSES = 30
+_POSES = "poses:"
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,9 @@ class RunPlan:
     Attributes:
         rig: the calibrated cameras.
         motions: the motions.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
+        streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.
     """
 
@@ -42,6 +45,7 @@ class RunPlan:
     motions: MotionPlan
     targets: Array
     close_loop: bool
+    streams: tuple[str, ...]
     began: float
 
 
@@ -56,7 +60,14 @@ class RunPlan:
     "--board",
     "board_spec",
     required=True,
-    help="The controller: serial:PORT (docs/howto/board.md); emulated: with sim:.",
+    help="The controller: serial:PORT, feetech:PORT, ar4:PORT (docs/howto/board.md); emulated: with sim:; poses:FILE"
+    " where another program moves the arm and logs its angles.",
+)
+@click.option(
+    "--calibration",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048.",
 )
 @click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
@@ -84,7 +95,13 @@ class RunPlan:
     type=click.FloatRange(min=0.0, max=1_000.0),
     default=0.1,
     show_default=True,
-    help="Sigma of the time between the two exposures of a shot, ms; sim: knows its own.",
+    help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
+)
+@click.option(
+    "--stream",
+    multiple=True,
+    metavar="STREAM",
+    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
 )
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
@@ -100,12 +117,14 @@ class RunPlan:
 def command(
     source_spec: str,
     board_spec: str,
+    calibration: Path | None,
     rig_path: Path,
     target_spec: str,
     arm_spec: str,
     motion: Path | None,
     rate: float,
     sync_ms: float,
+    stream: tuple[str, ...],
     open_loop: bool,
     output: Path,
     as_json: bool,
@@ -114,7 +133,18 @@ def command(
 
     The arm moves on its own: hand-eye poses around those of the motion, a sweep, the motions twice. Keep the emergency stop
     at hand. Ctrl-C stops the arm first and then saves what was measured.
+
+    With --board poses:FILE nothing is commanded: FILE is a CSV of joint angles (q1_deg ..) that another program logged, by
+    name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
+    if board_spec.startswith(_POSES):
+        if motion is not None or open_loop:
+            raise InputError(f"--board {board_spec} commands no motion: leave out --motion and --open-loop")
+        _run_logged(
+            source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
+        )
+        return
+
     import numpy as np
 
     from armsight.app.progress import steps
@@ -144,8 +174,8 @@ def command(
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
-    plan = RunPlan(rig, motions, targets, not open_loop, time.perf_counter())
-    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms)
+    plan = RunPlan(rig, motions, targets, not open_loop, stream, time.perf_counter())
+    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration)
     with steps() as progress:
         progress("opening the devices")
         with open_devices(devices) as setup:
@@ -155,7 +185,7 @@ def command(
                 write_text(output / name, text)
             rig.save(output / "rig.json")
             try:
-                summary = _run(setup, plan, output, progress)
+                summary = _run(setup, plan, output, files["body.toml"], progress)
             except KeyboardInterrupt:
                 click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
                 raise
@@ -164,6 +194,38 @@ def command(
     else:
         print_summary(summary, output)
     if summary.health:
+        click.get_current_context().exit(UNTRUSTED)
+
+
+def _run_logged(
+    source_spec: str, path: Path, rig_path: Path, target_spec: str, arm_spec: str, output: Path, as_json: bool
+) -> None:
+    """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
+    import contextlib
+
+    from armsight.app.messages import colour, weak
+    from armsight.app.progress import steps
+    from armsight.app.report.page import writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.run.angles import read_angles
+    from armsight.app.run.logged import run_logged, summary_lines, write_logged
+    from armsight.robot.arm_file import open_arm
+    from armsight.vision.markers.targets import open_target
+    from armsight.vision.rig import StereoRig
+    from armsight.vision.sources import open_source
+
+    require_matplotlib()
+    arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
+    angles = read_angles(path, arm)
+    folder = writable_folder(output, "no run")
+    with contextlib.closing(open_source(source_spec)) as source, steps() as progress:
+        result = run_logged(source, rig, target, arm, angles, progress)
+        progress("writing and plotting")
+        summary = write_logged(folder, result, {"arm": arm_spec, "board": f"{_POSES}{path}"})
+    click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, folder)))
+    for line in result.weak:
+        click.echo(weak(line), err=True, color=colour())
+    if result.weak:
         click.get_current_context().exit(UNTRUSTED)
 
 
@@ -183,12 +245,32 @@ def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
         ) from None
 
 
-def _run(setup: Setup, plan: RunPlan, output: Path, progress: Progress) -> RunSummary:
+def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Progress) -> RunSummary:
     """Run and write; raises what ended the run early after everything is written."""
     from armsight.app.run.experiment import run_experiment
     from armsight.app.run.folder import Finished, finish
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.mcap_file import LazyMcap, properties
+    from armsight.app.stream.sink import Fanout
+    from armsight.app.stream.streams import open_streams
 
-    outcome = run_experiment(setup, plan.rig, plan.motions, plan.targets, progress=progress, close_loop=plan.close_loop)
+    def say(line: str) -> None:
+        click.echo(line, err=True)
+
+    texts = properties(plan.rig, body_text, setup.arm, command="run")
+    published = Published(plan.rig, setup.target.body, setup.arm, texts)
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(contextlib.closing(LazyMcap(output, published, say)))
+        streams = stack.enter_context(contextlib.closing(open_streams(plan.streams, published, say)))
+        outcome = run_experiment(
+            setup,
+            plan.rig,
+            plan.motions,
+            plan.targets,
+            progress=progress,
+            close_loop=plan.close_loop,
+            publisher=Fanout((file, streams)),
+        )
     progress("writing and plotting")
-    properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, properties, plan.began, [], None), output)
+    of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, of_run, plan.began, [], None), output)

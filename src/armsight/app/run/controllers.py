@@ -16,6 +16,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunSegment
 from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
+from armsight.loop.health import Trust
 from armsight.loop.servo import Aim, PoseServo
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Tabled, Trajectory
@@ -30,7 +31,7 @@ class Planned:
     Args:
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
     """
 
     def __init__(self, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]) -> None:
@@ -56,7 +57,7 @@ class Sweep:
 
     Args:
         arm: the nominal arm, its base upright.
-        q_middle: (6,) joint angles about which they move, rad; the trajectory begins and ends there.
+        q_middle: (n,) joint angles about which they move, rad; the trajectory begins and ends there.
         reach_rad: amplitude, rad.
         duration_s: duration, s.
     """
@@ -85,15 +86,27 @@ class Closed:
 
     Args:
         servo: the outer loop; one for all motions, as its correction continues from one to the next.
+        trust: returns how far vision may be relied on.
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
     """
 
     def __init__(
-        self, servo: PoseServo, trajectory: Trajectory, start_s: float, gravity: Callable[[Array], Array]
+        self,
+        servo: PoseServo,
+        trust: Callable[[], Trust],
+        trajectory: Trajectory,
+        start_s: float,
+        gravity: Callable[[Array], Array],
     ) -> None:
-        self._servo, self._trajectory, self._start_s, self._gravity = servo, trajectory, start_s, gravity
+        self._servo, self._trust, self._trajectory, self._start_s, self._gravity = (
+            servo,
+            trust,
+            trajectory,
+            start_s,
+            gravity,
+        )
         self._aim: Aim | None = None
 
     def prepare(self, t_s: float) -> None:
@@ -103,7 +116,7 @@ class Closed:
     def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return the corrected reference of the joints, and its basis: vision, bridged, planned."""
         assert self._aim is not None
-        step = self._servo.step(self._aim, estimator)
+        step = self._servo.step(self._aim, estimator, self._trust())
         return step.command, step.mode.name.lower()
 
 
@@ -151,6 +164,6 @@ def planned(gravity: Callable[[Array], Array]) -> Control:
     return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
 
 
-def closed_on(servo: PoseServo, gravity: Callable[[Array], Array]) -> Control:
-    """Return the control that follows the plan with the loop closed on vision."""
-    return lambda trajectory, start_s: Closed(servo, trajectory, start_s, gravity)
+def closed_on(servo: PoseServo, trust: Callable[[], Trust], gravity: Callable[[Array], Array]) -> Control:
+    """Return the control that follows the plan with the loop closed on vision, as far as that may be relied on."""
+    return lambda trajectory, start_s: Closed(servo, trust, trajectory, start_s, gravity)

@@ -21,17 +21,19 @@ from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, estimator_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
 from armsight.loop.health.fixed import BaseMotion
 from armsight.loop.servo import LoopTiming, PoseServo
-from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
+from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
 
 #: Largest difference of the joints from the start of the motion before anything moves, rad.
 START_RAD = float(np.radians(2.0))
@@ -41,7 +43,7 @@ _STEP_S = 0.05
 _CHECKED = 200  # joint angles along a motion that are checked
 
 
-def enable(board: Board) -> None:
+def enable(board: MotionBoard) -> None:
     """Switch the drives on; an arm that is held since an earlier host went silent is taken over in its position.
 
     Raises:
@@ -70,7 +72,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
     Args:
         setup: the arm and its board.
         plan: the motions.
-        targets: (N, 6) further joint angles of the run, rad.
+        targets: (N, n) further joint angles of the run, rad.
 
     Raises:
         ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
@@ -91,14 +93,13 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
 
 
 def passed(way: Trajectory) -> Array:
-    """Return joint angles (N, 6) that a motion passes, rad."""
+    """Return joint angles (N, n) that a motion passes, rad."""
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
 def _require_range(setup: Setup, q: Array) -> None:
-    """Reject joint angles (N, 6), rad, beyond the board's own limits: it would stop the joint on the way."""
-    config = setup.board.configuration()["joint"]
-    low, high = config["soft_min_rad"].astype(float), config["soft_max_rad"].astype(float)
+    """Reject joint angles (N, n), rad, beyond the board's own limits: it would stop the joint on the way."""
+    low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
     if beyond.max() > 1e-3:
         joint = int(beyond.argmax())
@@ -131,6 +132,7 @@ class RunResult:
         log: everything that was measured and commanded.
         handeye: the hand-eye calibration; None before it was made.
         delay: delay of the cameras' time stamps.
+        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
         open_s: begin and end of the pass with potentiometers alone, board's clock, s; None before.
         closed_s: begin and end of the pass with the loop closed.
         covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
@@ -146,6 +148,7 @@ class RunResult:
     log: Log = field(default_factory=Log)
     handeye: HandEyeRun | None = None
     delay: Delay = _UNKNOWN_DELAY
+    shutters: Shutters | None = None
     open_s: tuple[float, float] | None = None
     closed_s: tuple[float, float] | None = None
     covered_s: tuple[float, float] | None = None
@@ -177,6 +180,7 @@ def run_experiment(
     cover: Callable[[float, float], None] | None = None,
     close_loop: bool = True,
     begun: Callable[[Loop], None] = lambda loop: None,
+    publisher: Publisher | None = None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -184,18 +188,19 @@ def run_experiment(
         setup: the devices.
         rig: the calibrated cameras.
         plan: the motions; the arm stands at their start.
-        targets: (N, 6) joint angles of the hand-eye poses, rad.
+        targets: (N, n) joint angles of the hand-eye poses, rad.
         progress: called with a line about what is being done.
         cover: hides the body from one time to another, board's clock, s; None where that is not possible.
         close_loop: whether the motions are made a second time with the loop closed.
         begun: called with the loop before the drives are switched on.
+        publisher: is given everything that is measured; it returns at once.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun)
+        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun, publisher or Fanout())
     return outcome
 
 
@@ -209,15 +214,18 @@ def _run(
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
     begun: Callable[[Loop], None],
+    publisher: Publisher,
 ) -> None:
     """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
     try:
         progress("preparing to follow the body")
-        follower = Follower(rig, setup.target)
+        follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        loop = Loop.open(setup, follower, outcome.log, KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY))
+        first = KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY)
+        publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
+        loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
         enable(setup.board)
         _require_seen(loop, setup, plan)
@@ -271,6 +279,7 @@ def _prepare(
     progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
     outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
+    outcome.shutters = loop.shutters
     back = point_to_point(arm, middle, plan.start)
     there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
     loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))
@@ -314,7 +323,7 @@ def _passes(
     servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     begin = loop.t_s
     try:
-        drive(loop, plan, closed_on(servo, setup.gravity), closed=True, progress=progress)
+        drive(loop, plan, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=progress)
     finally:
         outcome.closed_s = (begin, loop.t_s)
 

@@ -33,23 +33,26 @@ from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import MotionPlan
-from armsight.app.run.record import RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
+from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, RunReport, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
-from armsight.data import Array, Image, Missed, PoseEstimate, Shot
+from armsight.app.stream.mcap_file import RUN_MCAP
+from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
+from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.health import health_lines
 from armsight.robot.arm import Arm
+from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 
 
 def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
-    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, 6), rad."""
+    """Return the columns of joints.csv: times (N,), s, measured and reference angles (N, n), rad."""
     named: dict[str, Any] = {"t_s": np.round(t_s, 6)}
-    for joint in range(6):
+    for joint in range(q.shape[1]):
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], 9)
         named[f"q{joint + 1}_ref_rad"] = np.round(q_ref[:, joint], 9)
     return named
@@ -72,12 +75,12 @@ def write_handeye(folder: Path, run: HandEyeRun) -> None:
     write_text(folder / "handeye.json", json.dumps(calibration, indent=1) + "\n")
     T = run.Ts_left_body
     covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
-    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(6)}
+    named = {f"q{i + 1}_rad": run.q[:, i] for i in range(run.q.shape[1])}
     named |= {f"{axis}_m": T[:, i, 3] for i, axis in enumerate("xyz")}
     quaternions = np.array([quaternion_wxyz(one[:3, :3]) for one in T])
     named |= {f"q{axis}": quaternions[:, i] for i, axis in enumerate("wxyz")}
     named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
-    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(6)}
+    named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(run.q.shape[1])}
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
     writer.writerow(named)
@@ -126,8 +129,17 @@ _TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "reference")
 #: Those of runs of version 1.
 _OLD_TRACKS, _OLD_FIGURES = ("wanted",), ("cell",)
 _SHOTS = "shots"
+#: File of the detections of a run, for `armsight rig update`: at most so many shots, whose poses differ by so much, m, rad.
+DETECTIONS, _MOST_SHOTS, _DIFFERENT = "detections.csv", 400, 0.01
 #: Basis of a command -> its text in run.log.
-_BASED = {"planned": "as planned", "vision": "on vision", "bridged": "on the model while vision was missing"}
+_BASED = {
+    "planned": "as planned",
+    "vision": "on vision",
+    "bridged": "on the model while vision was missing",
+    "potentiometers": "with the last correction, vision lost",
+    "held": "with the correction held, as vision contradicted what was learned",
+    "distrusted": "on the potentiometers alone, as vision was wrong",
+}
 
 
 @dataclass(frozen=True)
@@ -209,6 +221,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
     outcome, wall_s = finished.outcome, _wall_s(finished)
     with _as_much_as_fits() as keep:
         keep(write_text, folder / "poses.csv", csv_text(_shot_poses(finished)))
+        keep(write_text, folder / DETECTIONS, detections_text(_drawn_shots(outcome.log), outcome.body))
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
@@ -216,6 +229,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
+        if outcome.shutters is not None:
+            keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.moved)
         keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
@@ -270,7 +285,7 @@ def make_room(folder: Path) -> None:
     writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*NAMES, "pose", "workcell", *_OLD_FIGURES)]
     names += [f"{name}.{kind}" for name in (*_TRACKS, *_OLD_TRACKS, "joints") for kind in ("csv", "parquet")]
-    names += [PAGE, "run.log", "poses.csv", "handeye.json", "handeye_poses.csv"]
+    names += [PAGE, "run.log", "poses.csv", DETECTIONS, "handeye.json", "handeye_poses.csv", RUN_MCAP]
     try:
         if (folder / _SHOTS).is_dir():
             shutil.rmtree(folder / _SHOTS)
@@ -290,6 +305,19 @@ def _shot_poses(finished: Finished) -> list[ShotPose]:
     """Return what vision measured shot by shot, in the left camera's frame, as ``measure`` writes it."""
     body = finished.outcome.body
     return [shot_pose(name, float(t), body, result) for name, t, result in finished.outcome.log.poses]
+
+
+def _drawn_shots(log: Log) -> list[tuple[str, float | None, Correspondences]]:
+    """Return name, time and detections of shots whose poses differ: others say little more about the cameras."""
+    kept: list[tuple[str, float | None, Correspondences]] = []
+    last: Array | None = None
+    for name, t_s, pose in log.poses:
+        if not isinstance(pose, PoseEstimate):
+            continue
+        if last is None or np.abs(log_se3(inverse(last) @ pose.T_left_body)).max() > _DIFFERENT:
+            last = pose.T_left_body
+            kept.append((name, t_s if np.isfinite(t_s) else None, pose.points.seen))
+    return kept[:: -(-len(kept) // _MOST_SHOTS) or 1]
 
 
 def _picture(finished: Finished) -> Image | None:
@@ -316,6 +344,11 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         f"delay of the images, by a sweep: {1e3 * outcome.delay.delay_s:.2f} ms, sigma {1e3 * outcome.delay.sigma_s:.2f} ms"
         if outcome.delay_found
         else f"the delay of the images was not measured: {1e3 * outcome.delay.delay_s:g} ms assumed",
+        *(
+            []
+            if outcome.shutters is None
+            else [f"exposures: {outcome.shutters}; detections were moved to one time by the motion of the arm"]
+        ),
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.rejected} rejected by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} {_BASED.get(mode, f'on {mode}')}" for mode, count in modes.most_common()),

@@ -24,13 +24,19 @@ import numpy as np
 
 from armsight.app.run.record import Log, RunSegment, Skew, ToolTrack
 from armsight.app.run.setup import Setup
+from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
+from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
+from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower
+from armsight.vision.rig import Shutters
+from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
 #: How long one thread may hold the interpreter lock, s. An iteration of the loop takes the lock back about twelve times;
 #: with Python's default of 5 ms it would last longer than a board waits for commands.
@@ -146,11 +152,17 @@ PERIOD_S = 0.004
 STALLED_S = 0.5
 #: Upper bound of the time to search an image for the body, on a computer under load, s.
 SEARCH_S = 2.0
+#: What a search of two images takes in a simulation, s: on hardware it takes 0.02 to 0.06 and commands continue beside it
+#: (:class:`Watch`); so they do in lock-step, where no time passes during a computation.
+SIMULATED_SEARCH_S = 0.06
 #: Lag of the fused track, s: by then the pose measurements before and after a time have arrived, even where the body was
 #: hidden for half a second. The loop does not wait for them: it uses the live track.
 RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # interval of the fused track that is noted at once: cheaper than every iteration
 _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was sent: cheaper still
+#: The motion of the body about an exposure is a cubic through the live estimates so near to it, s, which are among the
+#: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
+_MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
 
@@ -180,22 +192,32 @@ class Loop:
 
     Attributes:
         mounting: poses of cameras and body on the arm; None before they are known: then the estimator has the joints alone.
+        delay_s: delay of the images, s; None before it was measured.
+        shutters: when the cameras expose, where they do not at one time: from the rig file, or found by the sweep. Once the
+            delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
         on_period: called in every period before its command; what it raises ends the motion.
         segment: the entry of the log of what is running, with its begin; None before the first.
         t_s: time of the newest reading, board's clock, s.
+        publisher: is given every batch of readings, and every shot after the command that follows from it was sent.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
         self.board, self.setup, self.follower = setup.board, setup, follower
         self.estimator, self.log = estimator, log
         self.mounting: Mounting | None = None
+        self.delay_s: float | None = None
+        self.shutters: Shutters | None = follower.rig.shutters
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
         self.on_period: Callable[[], None] = lambda: None
         self.segment: RunSegment | None = None
         self.t_s = 0.0
+        self.publisher: Publisher = Fanout()
+        self._datum: ShotDatum | None = None
+        self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
+        self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
@@ -204,18 +226,29 @@ class Loop:
         self._noted: list[Interval] = []
         self._first = 0
         self._watch = Watch(self._measured, PERIOD_S)
-        self._expected: Array | None = None  # predicted pose of a lost body in the shot that is measured
+        # Of a lost body in the shot that is measured: its predicted pose and its velocity.
+        self._expected: Array | None = None
+        self._twist: Array | None = None
+        self._search: tuple[Shot, PoseEstimate | Missed, float] | None = None  # in lock-step; and when it will be over
         # Of the host's clock, s: when the next iteration is due, and when the measurement of the newest shot began.
         self._due = self._taken_s = 0.0
 
     @classmethod
-    def open(cls, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> Loop:
-        """Return a loop that has received the first joint reading; arguments as for the class.
+    def open(
+        cls,
+        setup: Setup,
+        follower: Follower,
+        log: Log,
+        estimator: KalmanEstimator,
+        publisher: Publisher | None = None,
+    ) -> Loop:
+        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher.
 
         Raises:
             DeviceError: the board sends none.
         """
         loop = cls(setup, follower, log, estimator)
+        loop.publisher = publisher or Fanout()
         while not log.joints:
             loop.pass_time(PERIOD_S)
         return loop
@@ -233,6 +266,7 @@ class Loop:
                     t_s, pose = seen.popleft()
                     estimator.vision(mounting.pose_measurement(pose, t_s))
 
+        self.publisher.put(EventDatum(self.t_s, estimator_event(estimator, anew=True)))
         received = list(self.log.joints)
         self.compute(lambda: learn(received))
         learn(self.log.joints[len(received) :])  # what arrived meanwhile
@@ -267,7 +301,9 @@ class Loop:
             self.setup.clock.heard(self.t_s)
         self.log.joints.append(states)
         self.estimator.joints(states)
-        self.log.live.append(self.estimator.estimate())
+        estimate = self.estimator.estimate()
+        self.log.live.append(estimate)
+        self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
         self._record()
 
     def _record(self) -> None:
@@ -309,37 +345,108 @@ class Loop:
         Returns:
             The shot, when its measurement began (host's clock, s), and the result.
         """
-        if self.setup.clock is None:
-            newest = self._newest()
-            measured = None if newest is None else (newest, self._measured(newest))
-        else:
-            measured = self._watch.take(self._newest)
-        if measured is not None or self._watch.busy:
+        measured = self._in_lock_step() if self.setup.clock is None else self._watch.take(self._newest)
+        if measured is not None or self._watch.busy or self._search is not None:
             self._shot_s = self.t_s
         if measured is None:
             return None
         shot, result = measured
+        outcome, T_base_tool, suspected = None, None, None
         if shot.t_s is None:
             result = Missed("the shot has no time")
         elif isinstance(result, PoseEstimate):
-            result = self._skew.widened(self.health.measured(result, shot.t_s), shot.t_s)
+            result = self._at_one_time(result, shot.t_s)
+        if isinstance(result, PoseEstimate) and shot.t_s is not None:
+            result = self.health.received(result, shot.t_s)
             if self.mounting is not None:
-                measurement = self.health.widened(self.mounting.pose_measurement(result, shot.t_s))
-                self.log.outcomes.append(self.estimator.vision(measurement))
+                plain = self.mounting.pose_measurement(result, shot.t_s)
+                measurement = self.health.widened(plain)
+                if measurement is not plain and self.health.moved is not None:
+                    suspected = self.health.moved.suspected
+                outcome, T_base_tool = self.estimator.vision(measurement), measurement.T_base_tool
+                self.log.outcomes.append(outcome)
         self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
+        self._datum = ShotDatum(
+            shot,
+            result,
+            self.t_s,
+            self.setup.sync_s,
+            None if outcome is None else outcome.value,
+            None if self.mounting is None else self.mounting.T_base_rig,
+            T_base_tool,
+            suspected,
+        )
         return shot, self._taken_s, result
 
+    def _at_one_time(self, result: PoseEstimate, t_s: float) -> PoseEstimate | Missed:
+        """Move what the cameras saw at several times to the time of a shot, s; what is not known of the skew widens it."""
+        motion = None if self.shutters is None else self._motion(t_s)
+        if self.shutters is None or motion is None:
+            return self._skew.widened(result, t_s)
+        seen = TimedShot(t_s, result.points.seen, result.T_left_body)
+        return measure_with_motion(self.follower.rig, self.setup.target.body, seen, motion, self.shutters)
+
+    def _motion(self, t_s: float) -> Motion | None:
+        """Return the motion of the body about the exposure of a shot that is stamped ``t_s``; None where it is unknown."""
+        if self.mounting is None or self.delay_s is None:
+            return None
+        exposed_s = t_s - self.delay_s
+        near = [live for live in self.log.live[-_MOTION_NEWEST:] if abs(live.t_s - exposed_s) <= _MOTION_S]
+        if len(near) < 8:
+            return None
+        tau = np.array([live.t_s for live in near]) - exposed_s
+        Ts = np.array([live.T_base_tool for live in near]) @ self.mounting.T_tool_body
+        xi = log_se3(inverse(Ts[np.argmin(np.abs(tau))]) @ Ts)
+        X = (tau[:, None] / _MOTION_S) ** np.arange(4)
+        fit = np.linalg.pinv(X) / (_MOTION_S ** np.arange(4))[:, None]
+        _, twist, half, _ = fit @ xi
+        scatter = xi - X @ (np.linalg.pinv(X) @ xi)
+        variance = (scatter**2).sum(axis=0) / (len(near) - 4) / _SCATTER_SHARE**2
+        return Motion(twist, 2.0 * half, np.diag(variance) * float(fit[1] @ fit[1]), True)
+
+    def _publish(self) -> None:
+        """Publish the shot that was measured in this iteration, and before it a mounting that is new."""
+        if self._datum is None:
+            return
+        mounting = self.mounting
+        if mounting is not None and mounting is not self._known:
+            self._known = mounting
+            self.publisher.put(EventDatum(self.t_s, mounting_event(mounting)))
+        self.publisher.put(self._datum)
+        self._datum = None
+
+    def _in_lock_step(self) -> tuple[Shot, PoseEstimate | Missed] | None:
+        """Measure the newest shot of a simulation; the result of a search is returned ``SIMULATED_SEARCH_S`` later."""
+        if self._search is None:
+            shot = self._newest()
+            if shot is None:
+                return None
+            result = self._measured(shot)
+            if self.follower.way == "followed":
+                return shot, result
+            self._search = shot, result, self.t_s + SIMULATED_SEARCH_S
+        shot, result, over_s = self._search
+        if self.t_s < over_s:
+            return None
+        self._search = None
+        return shot, result
+
     def _measured(self, shot: Shot) -> PoseEstimate | Missed:
-        return self.follower.measure(shot, self._expected)
+        return self.follower.measure(shot, self._expected, self._twist)
 
     def _newest(self) -> Shot | None:
         """Return the newest shot, if there is one, with its time on the board's clock."""
         shot, clock = self.setup.poll(), self.setup.clock
         self._taken_s = time.perf_counter()
-        self._expected = None
+        self._expected = self._twist = None
+        shot = shot if shot is None or clock is None else clock.on_board(shot)
+        if shot is not None and shot.t_s is not None:
+            shot = replace(shot, t_s=self._frames.time(shot.t_s))
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
-        return shot if shot is None or clock is None else clock.on_board(shot)
+            motion = None if shot.t_s is None else self._motion(shot.t_s)
+            self._twist = None if motion is None else motion.twist
+        return shot
 
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
         """Let a controller command the joints for some time.
@@ -372,6 +479,7 @@ class Loop:
         begin_s = self.t_s
         self.segment = replace(segment, begin_s=begin_s)
         self._watch.forget()
+        self._search = None
         try:
             while not over():
                 self.pass_time(self._rest_of_period())
@@ -385,11 +493,14 @@ class Loop:
                 self.board.send(command)
                 self.log.commands.append((self.t_s, command))
                 self.log.modes.append(mode)
+                self._publish()
                 if measured is not None:
                     shot, began, result = measured
                     if self.mounting is not None:  # before, no command depended on images
-                        self.log.latency_s.append(time.perf_counter() - began)
+                        times_s = self.log.latency_s if self.follower.way == "followed" else self.log.search_s
+                        times_s.append(time.perf_counter() - began)
                     self.on_shot(shot, result)
+                    self.health.work()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
@@ -416,7 +527,7 @@ class Loop:
     def _at_rest(self, duration_s: float) -> JointCommand:
         """Return the command to be at rest at the reference of the newest command."""
         newest = self.log.commands[-1][1]
-        return JointCommand(newest.q_ref, np.zeros(6), newest.gravity_duty, duration_s)
+        return JointCommand(newest.q_ref, np.zeros_like(newest.q_ref), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:
         """Raise a DeviceError if the board no longer follows commands."""

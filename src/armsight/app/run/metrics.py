@@ -93,10 +93,11 @@ class TrackMetrics:
 
 @dataclass(frozen=True)
 class Spread:
-    """Percentiles of values: median, 99th, maximum; in their unit."""
+    """Percentiles of values: median, 99th, 99.9th, maximum; in their unit."""
 
     p50: float
     p99: float
+    p999: float
     max: float
 
 
@@ -123,11 +124,12 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
 
 
 def rest_errors(run: RunData, truth: ToolTrack) -> dict[str, float]:
-    """Return the RMS distance of the tool from its reference in the last fifth of a second of each rest, m."""
+    """Return the RMS distance of the tool from its reference over the last fifth of a second of each rest as long, m."""
     found = {}
     for segment in run.segments:
         rows = (run.reference.t_s > segment.end_s - _SETTLED_S) & (run.reference.t_s <= segment.end_s)
-        if segment.phase == "rest" and segment.motion and rows.any():
+        long = segment.end_s - segment.begin_s >= _SETTLED_S - 1e-6
+        if segment.phase == "rest" and segment.motion and long and rows.any():
             off = truth.at(run.reference.t_s[rows])[:, :3, 3] - run.reference.Ts_base_tool[rows, :3, 3]
             found[segment.motion] = float(np.sqrt((off**2).sum(axis=1).mean()))
     return found
@@ -148,7 +150,7 @@ def path_errors(run: RunData, truth: ToolTrack) -> dict[str, tuple[Array, Array]
 
 
 def partly_uncorrected(arm: Arm, q: Array) -> bool:
-    """Return whether the servo corrects the tool only in part at joint angles (6,), rad, as the arm is nearly singular.
+    """Return whether the servo corrects the tool only in part at joint angles (n,), rad, as the arm is nearly singular.
 
     That is where the least singular value of the Jacobian (linear rows divided by the arm's size) is below
     ``CORRECTED_ABOVE``, a tuning of the servo: from there on it reduces its correction in that direction. Rests there are
@@ -179,6 +181,6 @@ def rms(values: Array) -> float:
 
 
 def spread(values: Array) -> Spread:
-    """Return median, 99th percentile and maximum."""
-    p50, p99 = np.percentile(values, [50, 99])
-    return Spread(float(p50), float(p99), float(np.max(values)))
+    """Return median, 99th and 99.9th percentile and maximum."""
+    p50, p99, p999 = np.percentile(values, [50, 99, 99.9])
+    return Spread(float(p50), float(p99), float(p999), float(np.max(values)))

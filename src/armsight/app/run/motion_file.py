@@ -61,7 +61,7 @@ class MotionPlan(Record):
     """The motions of a run.
 
     Attributes:
-        start: (6,) joint angles before the first, rad.
+        start: (n,) joint angles before the first, rad.
         motions: one after the other, each from where the one before ends.
     """
 
@@ -84,7 +84,7 @@ def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
         document = tomllib.loads(read_text(path))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not TOML: {error}") from None
-    start = _numbers(f"{path}", document.pop("start_deg", np.degrees(arm.home).tolist()), "start_deg", 6)
+    start = _numbers(f"{path}", document.pop("start_deg", np.degrees(arm.home).tolist()), "start_deg", arm.joints)
     entries = document.pop("motion", None)
     if document:
         raise InputError(f"{path}: unknown key {next(iter(document))!r}; known are start_deg and [[motion]]")
@@ -131,7 +131,7 @@ def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[s
 def _planned(
     where: str, kind: str, arm: Arm, q: Array, values: dict[str, Array], duration_s: float | None
 ) -> Trajectory:
-    """Plan a motion of a kind from joint angles q (6,), rad."""
+    """Plan a motion of a kind from joint angles q (n,), rad."""
     if kind in ("joints", "home"):
         goal = arm.home if kind == "home" else np.radians(values["q_deg"])
         return point_to_point(arm, q, goal, duration_s=duration_s)

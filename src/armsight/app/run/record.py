@@ -254,7 +254,8 @@ class Log:
         outcomes: what the estimator did with each pose measurement: used, or rejected for which reason.
         commands: time and content of each command.
         modes: the basis of each command: planned, vision, bridged.
-        latency_s: computing time from an image to the command that depends on it, image by image, s.
+        latency_s: computing time from an image in which the body was followed to the command that depends on it, s.
+        search_s: the same of images in which the body was searched; commands continued meanwhile.
         segments: motions and rests with their times.
     """
 
@@ -266,6 +267,7 @@ class Log:
     commands: list[tuple[float, JointCommand]] = field(default_factory=list)
     modes: list[str] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
+    search_s: list[float] = field(default_factory=list)
     segments: list[RunSegment] = field(default_factory=list)
 
 
@@ -275,8 +277,8 @@ class RunData(Record):
 
     Attributes:
         t_s: (N,) times of the potentiometers' readings, s.
-        q: (N, 6) joint angles from the potentiometers, rad.
-        q_ref: (N, 6) reference joint angles, rad; NaN where nothing was planned.
+        q: (N, n) joint angles from the potentiometers, rad.
+        q_ref: (N, n) reference joint angles, rad; NaN where nothing was planned.
         potentiometers: tool track by the nominal arm's forward kinematics of ``q``.
         vision: tool track measured by vision, one row a shot.
         fused: estimated tool track, smoothed, with vision before and after each time.
@@ -284,7 +286,8 @@ class RunData(Record):
         reference: reference tool track, at the times something was planned.
         truth: true tool track; None for a real arm.
         segments: motions and rests with their times.
-        latency_s: computing time from each image to the command that depends on it, s.
+        latency_s: computing time from each image in which the body was followed to the command that depends on it, s.
+        search_s: the same of the images in which it was searched.
         modes: (M,) basis of each command.
         missed: number of shots that gave no pose.
         rejected: number of pose measurements that the estimator rejected.
@@ -303,6 +306,7 @@ class RunData(Record):
     truth: ToolTrack | None
     segments: tuple[RunSegment, ...]
     latency_s: Array
+    search_s: Array
     modes: NDArray[np.str_]
     missed: int
     rejected: int
@@ -360,6 +364,7 @@ def assembled(
         None if truth is None else named.track(*truth),
         tuple(log.segments),
         np.array(log.latency_s),
+        np.array(log.search_s),
         np.array(log.modes),
         len(log.poses) - len(seen),
         sum(outcome in (Outcome.OUTLIER, Outcome.TOO_LATE) for outcome in log.outcomes),
@@ -386,7 +391,7 @@ def _mistimed(seen: list[PoseMeasurement], delay: Delay) -> Array:
 
 
 def joints_of(log: Log) -> tuple[Array, Array, Array]:
-    """Return the times (N,) of a log's readings, s, the joints (N, 6), and their reference, rad; NaN where none is."""
+    """Return the times (N,) of a log's readings, s, the joints (N, n), and their reference, rad; NaN where none is."""
     t_s = np.concatenate([s.t_s for s in log.joints])
     q = np.concatenate([s.q for s in log.joints])
     q_ref = np.full_like(q, np.nan)

@@ -34,15 +34,20 @@ _POINTS = 4000  # of a line in a figure: more cannot be seen
 
 
 def joints_figure(run: RunData) -> Figure:
-    """Plot the six joint angles over time: potentiometers and reference."""
-    figure = new_figure(6.2)
+    """Plot the joint angles over time: potentiometers and reference."""
+    joints = run.q.shape[1]
+    down = (joints + 1) // 2
+    figure = new_figure(0.2 + 2.0 * down)
     rows = _thinned(len(run.t_s))
-    for joint, plot in enumerate(figure.subplots(3, 2, sharex=True).T.flat):
+    plots = figure.subplots(down, 2, sharex=True).T.ravel()
+    for plot in plots[joints:]:
+        plot.set_visible(False)
+    for joint, plot in enumerate(plots[:joints]):
         plot.plot(run.t_s[rows], _DEG * run.q_ref[rows, joint], color=ORANGE, lw=2.4, label="reference")
         plot.plot(run.t_s[rows], _DEG * run.q[rows, joint], color=BLUE, lw=0.9, label="potentiometer")
         plot.set_ylabel(f"joint {joint + 1}, deg")
-        _shade(plot, run, named=joint in (0, 3))
-        if joint in (2, 5):
+        _shade(plot, run, named=joint in (0, down))
+        if joint in (down - 1, joints - 1):
             plot.set_xlabel("time, s")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=7, ncols=2, loc="outside upper left")
     return figure
@@ -414,7 +419,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
         ),
         "motion": (
             "Joint angles and tool path",
-            shown("joints", "The six joint angles over time, potentiometers and reference; shaded: the arm rests.")
+            shown("joints", "The joint angles over time, potentiometers and reference; shaded: the arm rests.")
             + shown("path", "The tool's path: from potentiometers, from vision, from both fused, and the truth."),
         ),
         "errors": (
@@ -429,7 +434,8 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
             "Latency",
             shown(
                 "latency",
-                "Computing time from a decoded image to its command; decoding and the camera's own delay are not in it.",
+                "Computing time from a decoded image to its command while the body is followed; decoding and the camera's "
+                "own delay are not in it, nor are searches of a lost body, beside which commands continue.",
             ),
         ),
         "studies": (

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +20,8 @@ import numpy as np
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.robot.arm import Arm
-from armsight.robot.boards.board import Board
-from armsight.robot.boards.opening import EMULATED, emulator_name, open_board
+from armsight.robot.boards.contract import MotionBoard
+from armsight.robot.boards.opening import EMULATED, emulator_name, open_motion_board
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources import Source, open_source
 
@@ -91,7 +92,7 @@ class Setup:
         board: the controller board of its joints, drives off.
         poll: returns the newest shot not returned yet, or None.
         target: the body on the tool.
-        gravity: returns the duty (6,) that compensates the gravity torque at joint angles (6,), rad; zeros where it is
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad; zeros where it is
             unknown.
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
@@ -100,7 +101,7 @@ class Setup:
     """
 
     arm: Arm
-    board: Board
+    board: MotionBoard
     poll: Callable[[], Shot | None]
     target: Composite
     gravity: Callable[[Array], Array]
@@ -193,6 +194,7 @@ class Devices:
         target: the body on the tool.
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
+        calibration: LeRobot's calibration file of a servo bus; None without.
     """
 
     source: str
@@ -201,6 +203,16 @@ class Devices:
     target: Composite
     rate_hz: float
     sync_s: float
+    calibration: Path | None = None
+
+
+def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
+    """Raise an InputError if a board drives another number of joints than the arm has."""
+    if board.abilities.joints != len(arm.a):
+        raise InputError(
+            f"--board {name} has {board.abilities.joints} joints, --arm {arm.name} {len(arm.a)}: give the arm that is at"
+            " the board (armsight arm list)"
+        )
 
 
 @contextlib.contextmanager
@@ -210,7 +222,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
     if source.startswith(_SIM) != board.startswith(EMULATED):
         raise InputError(
             f"--source {source} --board {board}: {_SIM} and {EMULATED} are one workcell and go together; real ones are "
-            "usb:0,1 and serial:/dev/ttyACM0"
+            "usb:0,1 and serial:/dev/ttyACM0, feetech:PORT or ar4:PORT"
         )
     with contextlib.ExitStack() as stack:
         if source.startswith(_SIM):
@@ -223,7 +235,8 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             )
             yield replace(setup_of(workcell), target=devices.target)
             return
-        opened = stack.enter_context(open_board(board))
+        opened = stack.enter_context(open_motion_board(board, calibration=devices.calibration))
+        require_joints(opened, board, devices.arm)
         shots = LiveShots(open_source(source))
         stack.callback(shots.close)
         shots.start()
@@ -232,7 +245,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             opened,
             shots.poll,
             devices.target,
-            lambda q: np.zeros(6),
+            np.zeros_like,
             devices.rate_hz,
             devices.sync_s,
             HostClock(),

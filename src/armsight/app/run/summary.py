@@ -35,6 +35,7 @@ from armsight.app.run.record import RunData, ToolTrack
 from armsight.files import finite_json
 from armsight.loop.health import HealthFinding, health_lines
 from armsight.robot.arm import Arm
+from armsight.vision.rig import Shutters
 
 #: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.
 VERSION = 2
@@ -111,9 +112,11 @@ class RunSummary:
         occlusion: errors while the body was hidden; None where it was not, or without a truth.
         passes: errors with potentiometers alone and with the loop closed; None where not both were made.
         singular_rests: names of the rests at which the servo corrects only in part.
-        latency: computing time from image to command, s; None without images.
+        latency: computing time from image to command while the body is followed, s; None without images.
+        search: the same where the body was searched, and commands continued meanwhile, s; None without a search.
         handeye: the hand-eye calibration; None where the run ended before it.
         delay_s: delay of the cameras' time stamps, s, and its sigma, s.
+        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
         shots: numbers of shots.
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
@@ -127,8 +130,10 @@ class RunSummary:
     passes: tuple[PassErrors, PassErrors] | None = None
     singular_rests: tuple[str, ...] = ()
     latency: Spread | None = None
+    search: Spread | None = None
     handeye: HandEyeSummary | None = None
     delay_s: tuple[float, float] | None = None
+    shutters: Shutters | None = None
     shots: ShotCounts | None = None
     studies: Sequence[Study] = ()
     health: Sequence[HealthFinding] = ()
@@ -146,10 +151,14 @@ class RunSummary:
             found["closed_loop"] = _passes_json(self.passes, self.singular_rests)
         if self.latency is not None:
             found["latency_s"] = asdict(self.latency)
+        if self.search is not None:
+            found["search_s"] = asdict(self.search)
         if self.handeye is not None:
             found["handeye"] = asdict(self.handeye)
         if self.delay_s is not None:
             found["camera_delay_s"] = {"value": self.delay_s[0], "sigma": self.delay_s[1]}
+        if self.shutters is not None:
+            found["shutters"] = self.shutters.to_json()
         if self.shots is not None:
             found["shots"] = asdict(self.shots)
         if self.handeye is not None:
@@ -240,8 +249,10 @@ def summary_of(
         passes,
         singular_rests,
         spread(run.latency_s) if len(run.latency_s) else None,
+        spread(run.search_s) if len(run.search_s) else None,
         HandEyeSummary(*result.handeye.found.held_out.rms(), len(result.handeye.q)),
         (result.delay.delay_s, result.delay.sigma_s),
+        result.shutters,
         ShotCounts(len(run.vision), run.missed, run.rejected, run.reopened, run.misfit_max),
         studies,
         result.health,
@@ -362,7 +373,12 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
         )
     if (t := summary.latency) is not None:
         lines.append(
-            f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, longest {1e3 * t.max:.1f} ms"
+            f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, p99.9 {1e3 * t.p999:.2f} ms, "
+            f"longest {1e3 * t.max:.1f} ms while the body is followed"
+        )
+    if (t := summary.search) is not None:
+        lines.append(
+            f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms; commands continue meanwhile"
         )
     if (shots := summary.shots) is not None:
         lines.append(

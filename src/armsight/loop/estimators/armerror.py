@@ -2,7 +2,7 @@
 
 The true pose is modelled as
 
-    T_base_tool = T_base_0 E_0 A_1(q_1 + d_1) E_1 ... A_6(q_6 + d_6) E_6 T_6_tool exp(x)
+    T_base_tool = T_base_0 E_0 A_1(q_1 + d_1) E_1 ... A_n(q_n + d_n) E_n T_n_tool exp(x)
 
 with E_i = exp(e_i) a small motion of every link's frame (lengths, twists and zeros that differ from the table, and how the
 arm stands and holds its tool), d_i the error of its potentiometer
@@ -19,29 +19,71 @@ right tangent of the pose; a small motion E of an inner frame comes out as Ad(T_
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from armsight.data import Array
+from armsight.data import Array, Ids
 from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, after, after_link, after_rotation, first_frame, sincos
+from armsight.robot.kinematics.table import TOOL
 
 #: Harmonics of a potentiometer's linearity: an eccentric wiper makes the first, its bow the second.
 HARMONICS = 3
 #: Functions of one joint's linearity.
 BASIS = 1 + 2 * HARMONICS
-#: Where each part begins in the vector: the seven frames' tangents, linearity, backlash (two widths), compliance, rest,
-#: readings' noise, x, delay.
-LINKS, LINEARITY = 0, 42
-BACKLASH = LINEARITY + 6 * BASIS
-FLOAT, COMPLIANCE, REST, READING, POSE, DELAY = (BACKLASH + 6 * n for n in range(1, 7))
-SIZE = DELAY + 1
-#: Zeros of the joints: the rotation about z of the frame before each.
-ZEROS = np.arange(6) * 6 + 5
 #: The trace of a rotation by 3 rad.
 _MIN_TRACE = 1.0 + 2.0 * math.cos(3.0)
+
+
+class Layout(NamedTuple):
+    """Where each part begins in the vector of an arm of n joints.
+
+    Attributes:
+        joints: n.
+        linearity: of n times BASIS; before it stand the tangents of n + 1 frames.
+        backlash: its width as far as friction decides on the side, and the next where gravity and inertia do.
+        floats: see ``backlash``.
+        compliance: of each joint, and so are the next two.
+        rest: what else a joint is off.
+        reading: noise that smoothing left in the readings.
+        pose: what no joint explains, six numbers.
+        delay: of the camera, the last.
+        size: of the vector.
+    """
+
+    joints: int
+    linearity: int
+    backlash: int
+    floats: int
+    compliance: int
+    rest: int
+    reading: int
+    pose: int
+    delay: int
+    size: int
+
+    @property
+    def zeros(self) -> Ids:
+        """Zeros of the joints (n,): the rotation about z of the frame before each."""
+        return np.arange(self.joints) * 6 + 5
+
+    @property
+    def noise(self) -> slice:
+        """Of the vector the noise that smoothing left in the readings (n,)."""
+        return slice(self.reading, self.pose)
+
+
+@functools.cache
+def layout(joints: int) -> Layout:
+    """Return the layout of the vector of an arm of so many joints."""
+    linearity = 6 * (joints + 1)
+    backlash = linearity + joints * BASIS
+    floats, compliance, rest, reading, pose = (backlash + joints * n for n in range(1, 6))
+    return Layout(joints, linearity, backlash, floats, compliance, rest, reading, pose, pose + 6, pose + 7)
 
 
 @dataclass(frozen=True)
@@ -93,25 +135,25 @@ class Prior:
     pose_travel_rad: float = 1.0
     reading_rad: float = float(np.deg2rad(0.02))
 
-    def sigmas(self, sigma_delay_s: float) -> Array:
-        """Return the standard deviations (SIZE,) of the vector."""
-        links = np.tile(np.repeat([self.link_m, self.link_rad], 3), (7, 1))
+    def sigmas(self, sigma_delay_s: float, joints: int = 6) -> Array:
+        """Return the standard deviations (size,) of the vector of an arm of so many joints."""
+        links = np.tile(np.repeat([self.link_m, self.link_rad], 3), (joints + 1, 1))
         stand = np.repeat([self.stand_m, self.stand_rad], 3)
-        links[[0, 6]] = np.hypot(links[[0, 6]], stand)
-        links = links.ravel()
-        links[ZEROS] = np.hypot(links[ZEROS], self.zero_rad)
+        links[[0, -1]] = np.hypot(links[[0, -1]], stand)
+        links, zeros = links.ravel(), layout(joints).zeros
+        links[zeros] = np.hypot(links[zeros], self.zero_rad)
         harmonics = np.repeat(self.harmonic_rad / np.arange(1, HARMONICS + 1) ** 1.5, 2)
-        linearity = np.tile(np.append(self.gain, harmonics), 6)
+        linearity = np.tile(np.append(self.gain, harmonics), joints)
         # What is left of the readings' noise depends on the readings at hand.
-        joints = np.repeat([self.backlash_rad, self.float_rad, self.compliance, self.rest_rad, 0.0], 6)
+        each = np.repeat([self.backlash_rad, self.float_rad, self.compliance, self.rest_rad, 0.0], joints)
         rest = np.repeat([self.pose_m, self.pose_rad], 3)
-        return np.concatenate([links, linearity, joints, rest, [sigma_delay_s]])
+        return np.concatenate([links, linearity, each, rest, [sigma_delay_s]])
 
 
 @kernel
 def _small_motions(x: Array, motions: Array) -> None:
-    """Write exp of the seven tangents at the head of x into motions (7 * 12,), row by row; angles below 0.3 rad."""
-    for i in range(7):
+    """Write exp of the tangents (6,) at the head of x into motions (K * 12,), row by row; angles below 0.3 rad."""
+    for i in range(motions.shape[0] // 12):
         rx, ry, rz, a, b, c = x[6 * i], x[6 * i + 1], x[6 * i + 2], x[6 * i + 3], x[6 * i + 4], x[6 * i + 5]
         u = a * a + b * b + c * c
         f, g = 1 - u / 6 + u * u / 120, 0.5 - u / 24 + u * u / 720  # sin(t)/t and (1 - cos t)/t^2, t^2 = u
@@ -130,19 +172,20 @@ def _small_motions(x: Array, motions: Array) -> None:
 
 @kernel
 def _loads(table: Array, q: Array, g: Array) -> None:
-    """Write the gravity torques (6,) about the joints of unit loads spread over the links beyond them, m."""
-    axes = np.empty((7, 6))
+    """Write the gravity torques (n,) about the joints of unit loads spread over the links beyond them, m."""
+    joints = q.shape[0]
+    axes = np.empty((joints + 1, 6))
     F = first_frame(table)
-    for i in range(6):
+    for i in range(joints):
         axes[i] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_rotation(table, i, c, s, F))
-    F = after(table, 48, F)
-    axes[6] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
+    F = after(table, TOOL, F)
+    axes[joints] = np.array([F[6], F[7], F[8], F[9], F[10], F[11]])
     x = y = 0.0
-    for i in range(5, -1, -1):
+    for i in range(joints - 1, -1, -1):
         x, y = x + axes[i + 1, 3], y + axes[i + 1, 4]
-        n = 6 - i
+        n = joints - i
         # z . (p x -up) = z_y p_x - z_x p_y, p the mean of the frames beyond, seen from the axis
         torque = axes[i, 1] * (x / n - axes[i, 3]) - axes[i, 0] * (y / n - axes[i, 4])
         g[i] = table[6 * i + 5] * torque
@@ -150,23 +193,27 @@ def _loads(table: Array, q: Array, g: Array) -> None:
 
 @kernel("const f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]")
 def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
-    """Write the derivative (6, SIZE) of what the joints are beyond their readings by the vector x, the zeros left out.
+    """Write the derivative (n, size) of what the joints are beyond their readings by the vector x, the zeros left out.
 
-    What is unseen (3, 6) is that of ``readings.Smoothed``: the two sides of the backlash, the lever of inertia.
+    What is unseen (3, n) is that of ``readings.Smoothed``: the two sides of the backlash, the lever of inertia.
     """
-    g = np.empty(6)
+    joints = q.shape[0]
+    g = np.empty(joints)
     _loads(table, q, g)
     B[:] = 0.0
-    for i in range(6):
-        at = LINEARITY + BASIS * i
+    linearity = 6 * (joints + 1)
+    backlash = linearity + BASIS * joints
+    for i in range(joints):
+        at = linearity + BASIS * i
         B[i, at] = q[i]
         s, c = sincos(q[i])
         sk, ck = s, c
         for k in range(HARMONICS):
             B[i, at + 1 + 2 * k], B[i, at + 2 + 2 * k] = sk, ck
             sk, ck = sk * c + ck * s, ck * c - sk * s
-        B[i, BACKLASH + i], B[i, FLOAT + i] = -0.5 * unseen[0, i], -0.5 * unseen[1, i]
-        B[i, COMPLIANCE + i], B[i, REST + i], B[i, READING + i] = g[i] + unseen[2, i], 1.0, 1.0
+        k = backlash + i
+        B[i, k], B[i, k + joints] = -0.5 * unseen[0, i], -0.5 * unseen[1, i]
+        B[i, k + 2 * joints], B[i, k + 3 * joints], B[i, k + 4 * joints] = g[i] + unseen[2, i], 1.0, 1.0
 
 
 @kernel
@@ -188,36 +235,40 @@ def _adjoint(F: Frame, G: Frame, out: Array) -> None:
 
 @kernel("const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Array, H: Array) -> None:
-    """Write the tool's pose (4, 4) at readings q (6,), unseen (3, 6), and its derivative (6, SIZE) by the vector x.
+    """Write the tool's pose (4, 4) at readings q (n,), unseen (3, n), and its derivative (6, size) by the vector x.
 
     The column of the delay stays zero: the delay changes no pose, only its time.
     """
-    motions, B = np.empty(84), np.empty((6, SIZE))
+    joints, size = q.shape[0], x.shape[0]
+    linearity, pose = 6 * (joints + 1), size - 7
+    backlash = linearity + BASIS * joints
+    motions, B = np.empty(12 * (joints + 1)), np.empty((joints, size))
     _small_motions(x, motions)
     offsets_by(table, q, unseen, B)
     F = after(motions, 0, first_frame(table))
     frames = [F]
-    for i in range(6):
+    for i in range(joints):
         angle = q[i]
-        for k in range(LINEARITY, POSE):
+        for k in range(linearity, pose):
             angle += B[i, k] * x[k]
         s, c = sincos(table[6 * i + 5] * angle + table[6 * i + 4])
         F = after(motions, 12 * (i + 1), after_link(table, i, after_rotation(table, i, c, s, F)))
         frames.append(F)
-    F = after(table, 48, F)
+    F = after(table, TOOL, F)
     for row in range(6):
         H[row, :] = 0.0
-        H[row, POSE + row] = 1.0
-    for i in range(7):
+        H[row, pose + row] = 1.0
+    for i in range(joints + 1):
         _adjoint(F, frames[i], H[:, 6 * i : 6 * i + 6])
-    for i in range(6):
+    for i in range(joints):
         for row in range(6):
             J = table[6 * i + 5] * H[row, 6 * i + 5]
-            for k in range(LINEARITY + BASIS * i, LINEARITY + BASIS * (i + 1)):
+            for k in range(linearity + BASIS * i, linearity + BASIS * (i + 1)):
                 H[row, k] = J * B[i, k]
-            for k in (BACKLASH + i, FLOAT + i, COMPLIANCE + i, REST + i, READING + i):
+            for part in range(5):
+                k = backlash + part * joints + i
                 H[row, k] = J * B[i, k]
-    _store_moved(F, x[POSE : POSE + 6], T)
+    _store_moved(F, x[pose : pose + 6], T)
 
 
 @kernel
@@ -274,6 +325,6 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
 
 @kernel("const f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]")
 def poses_and_derivatives(table: Array, x: Array, q: Array, unseen: Array, Ts: Array, Hs: Array) -> None:
-    """Write the same for readings q (N, 6), unseen (N, 3, 6) and vectors x (N, SIZE) into (N, 4, 4) and (N, 6, SIZE)."""
+    """Write the same for readings q (N, n), unseen (N, 3, n) and vectors x (N, size) into (N, 4, 4) and (N, 6, size)."""
     for n in range(len(q)):
         pose_and_derivative(table, x[n], q[n], unseen[n], Ts[n], Hs[n])

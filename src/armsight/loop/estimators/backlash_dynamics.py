@@ -22,6 +22,7 @@ from armsight.kernels import kernel
 from armsight.loop.estimators.parabola import fit, span, window
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
+from armsight.robot.kinematics.table import rows_of
 
 GRAVITY_M_S2 = 9.81
 #: Friction of a link's bearing over the greatest torque that gravity and acceleration need: typical of rolling bearings.
@@ -45,33 +46,34 @@ def rods(arm: Arm) -> Array:
     Two points at the half-length's root third move as a rod does. Masses are of 1 kg/m. A last link without length is
     a disc as long as it is thick.
     """
-    rows, points = arm.table[:36].reshape(6, 6), []
+    rows, points, last = rows_of(arm.table), [], arm.joints - 1
     for i, (a, d) in enumerate(rows[:, :2]):
         for along in (-1, 1):
             u = 0.5 + along / np.sqrt(12)
             points += [(i, 0.5 * abs(d), 0.0, 0.0, (u - 1) * d), (i, 0.5 * abs(a), u * a, 0.0, 0.0)]
     tip = arm.T_flange_tool[:3, 3]
-    c, s = rows[5, 2:4]
-    tip = np.array([rows[5, 0] + tip[0], c * tip[1] - s * tip[2], s * tip[1] + c * tip[2]])
-    points.append((5, float(np.linalg.norm(arm.T_flange_tool[:3, 3])), *(0.5 * tip)))
+    c, s = rows[last, 2:4]
+    tip = np.array([rows[last, 0] + tip[0], c * tip[1] - s * tip[2], s * tip[1] + c * tip[2]])
+    points.append((last, float(np.linalg.norm(arm.T_flange_tool[:3, 3])), *(0.5 * tip)))
     points = [point for point in points if point[1] > 0.0]
-    if points[-1][0] != 5:
-        points.append((5, _thickness(arm), 0.0, 0.0, 0.0))
+    if points[-1][0] != last:
+        points.append((last, _thickness(arm), 0.0, 0.0, 0.0))
     return np.array(points)
 
 
 def masses(arm: Arm) -> tuple[Array, Array]:
-    """Return the points (K, 5) that stand for an arm's links, and what each joint has beside them (3, 6).
+    """Return the points (K, 5) that stand for an arm's links, and what each joint has beside them (3, n).
 
     That is the inertia of what rotates about its own axis, kg m^2, its bearing's friction, N m, both of rods of 1 kg/m, and
     by what a torque of theirs is to be multiplied to become the lever of a unit load, 1/N.
     """
     points = rods(arm)
-    beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(6)])
+    beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(arm.joints)])
     own = beyond * 0.5 * _thickness(arm) ** 2
-    M, tau, gravity, inertia = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6), np.zeros(6)
-    rng, still = np.random.default_rng(0), np.zeros(6)
-    for q in rng.uniform(arm.q_min, arm.q_max, (_POSES, 6)):
+    n = arm.joints
+    M, tau, gravity, inertia = np.empty((n, n)), np.empty((2, n)), np.zeros(n), np.zeros(n)
+    rng, still = np.random.default_rng(0), np.zeros(n)
+    for q in rng.uniform(arm.q_min, arm.q_max, (_POSES, n)):
         _dynamics(arm.table, points, own, q, still, still, M, tau)
         gravity, inertia = np.maximum(gravity, np.abs(tau[0])), np.maximum(inertia, np.diag(M))
     return points, np.stack([own, BEARING * (gravity + inertia * arm.qdd_max), 1 / (beyond * GRAVITY_M_S2)])
@@ -79,22 +81,23 @@ def masses(arm: Arm) -> tuple[Array, Array]:
 
 def _thickness(arm: Arm) -> float:
     """Return how thick the rods are that stand for an arm's links, m."""
-    return float(_THICK * np.abs(arm.table[:36].reshape(6, 6)[:, :2]).sum())
+    return float(_THICK * np.abs(rows_of(arm.table)[:, :2]).sum())
 
 
 @kernel("const f8[::1], f8[:, ::1], f8[::1], const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1]")
 def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd: Array, M: Array, tau: Array) -> None:
-    """Write the inertia (6, 6) of the links, and the torques that they need against gravity and to move so, (2, 6).
+    """Write the inertia (n, n) of the links, and the torques that they need against gravity and to move so, (2, n).
 
     Speeds and accelerations go out from the base, link by link (Siciliano et al., "Robotics", 2009, section 7.5.2).
     """
-    axes, J = np.empty((6, 6)), np.empty((6, 3))
+    joints = q.shape[0]
+    axes, J = np.empty((joints, 6)), np.empty((joints, 3))
     M[:], tau[:] = 0.0, 0.0
     wx = wy = wz = bx = by = bz = ax = ay = az = (
         0.0  # angular velocity, its rate, and the acceleration of the axis' point
     )
     F, n = first_frame(table), 0
-    for i in range(6):
+    for i in range(joints):
         way = table[6 * i + 5]
         zx, zy, zz = way * F[6], way * F[7], way * F[8]
         ox, oy, oz = F[9], F[10], F[11]
@@ -124,7 +127,7 @@ def _dynamics(table: Array, points: Array, own: Array, q: Array, qd: Array, qdd:
         F = after_link(table, i, F)
         fx, fy, fz = _beyond(wx, wy, wz, bx, by, bz, F[9] - ox, F[10] - oy, F[11] - oz)
         ax, ay, az = ax + fx, ay + fy, az + fz
-    for j in range(6):
+    for j in range(joints):
         M[j, j] += own[j]
         tau[1, j] += own[j] * qdd[j]
         for k in range(j):
@@ -156,35 +159,37 @@ def _step(
     speed: Array,
     lever: Array,
 ) -> None:
-    """Step links in half their backlash by a time dt: position and speed (6,) off their shafts, rad, rad/s; write levers.
+    """Step links in half their backlash by a time dt: position and speed (n,) off their shafts, rad, rad/s; write levers.
 
-    The shafts' motion (3, 6) is angles, speeds and accelerations.
+    The shafts' motion (3, n) is angles, speeds and accelerations.
     """
-    M, tau, b = np.empty((6, 6)), np.empty((2, 6)), np.empty(6)
+    joints = half.shape[0]
+    M, tau, b = np.empty((joints, joints)), np.empty((2, joints)), np.empty(joints)
     _dynamics(table, points, beside[0], motion[0], motion[1], motion[2], M, tau)
-    for i in range(6):
+    for i in range(joints):
         slip = min(max((motion[1, i] + speed[i]) / _SLOW_RAD_S, -1.0), 1.0)
         lever[i] = -tau[1, i] * beside[2, i]
         b[i] = -dt * (tau[0, i] + tau[1, i] + beside[1, i] * slip)
-        for j in range(6):
+        for j in range(joints):
             b[i] += M[i, j] * speed[j]
     for _ in range(_SWEEPS):
-        for i in range(6):
+        for i in range(joints):
             x = b[i]
-            for j in range(6):
+            for j in range(joints):
                 if j != i:
                     x -= M[i, j] * speed[j]
             speed[i] = min(max(x / M[i, i], (-half[i] - position[i]) / dt), (half[i] - position[i]) / dt)
-    for i in range(6):
+    for i in range(joints):
         position[i] += dt * speed[i]
 
 
 @kernel("const f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1]")
 def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> None:
-    """Write 1 where the bearing of a link holds it against gravity at angles q (6,), else 0, to out (6,)."""
-    M, tau, none = np.empty((6, 6)), np.empty((2, 6)), np.zeros(6)
+    """Write 1 where the bearing of a link holds it against gravity at angles q (n,), else 0, to out (n,)."""
+    joints = q.shape[0]
+    M, tau, none = np.empty((joints, joints)), np.empty((2, joints)), np.zeros(joints)
     _dynamics(table, points, beside[0], q, none, none, M, tau)
-    for i in range(6):
+    for i in range(joints):
         out[i] = 1.0 if abs(tau[0, i]) <= beside[1, i] else 0.0
 
 
@@ -206,21 +211,22 @@ def float_on(
 
     Args:
         t: (N,) times of the readings, s.
-        q: (N, 6) readings, rad.
-        memory: (N, 4, 6) to be written: position and speed in half gaps, how far the links have come in that, and lever
+        q: (N, n) readings, rad.
+        memory: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
             of the torque of inertia, m.
         first: first row there is.
         begin: first row to be written.
         end: the row after the last.
         table: of the arm.
         points: what stands for its links (K, 5).
-        beside: what each joint has beside them (3, 6).
+        beside: what each joint has beside them (3, n).
         still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
             it is while its shaft creeps.
-        gap: (6,) the backlash, rad.
+        gap: (n,) the backlash, rad.
     """
-    motion, position, speed, half = np.empty((3, 6)), np.empty(6), np.empty(6), 0.5 * gap
-    free, stood, was = np.empty(6), False, np.empty(6)
+    joints = gap.shape[0]
+    motion, position, speed, half = np.empty((3, joints)), np.empty(joints), np.empty(joints), 0.5 * gap
+    free, stood, was = np.empty(joints), False, np.empty(joints)
     begin = max(begin, first + 1)
     for k in range(begin - 1, end):
         was[:] = motion[0]
@@ -236,7 +242,7 @@ def float_on(
         before, now = memory[k - 1], memory[k]
         position[:], speed[:] = before[0] * half, before[1] * half
         if stands:
-            for i in range(6):
+            for i in range(joints):
                 position[i] = min(max(position[i] - free[i] * (motion[0, i] - was[i]), -half[i]), half[i])
             speed[:], now[3] = 0.0, 0.0
         else:

@@ -19,15 +19,14 @@ from scipy.special import chdtri
 
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import BACKLASH, DELAY, FLOAT, POSE, REST, SIZE, ZEROS, Prior
+from armsight.loop.estimators.armerror import Prior
 from armsight.loop.estimators.errormodel import (
     LEARNING,
-    NOISE,
-    OPENED,
     ErrorModel,
     ErrorState,
     Propagation,
     chi_square,
+    opened,
     symmetric,
 )
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
@@ -47,11 +46,6 @@ MAX_WAITING = 16
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
-#: Of the vector the whole widths (6,) of the backlash, whatever decides on the side.
-WIDTHS = np.eye(SIZE)[BACKLASH : BACKLASH + 6] + np.eye(SIZE)[FLOAT : FLOAT + 6]
-#: The diagonal of a covariance, and the rows of what is forgotten: the rest, the readings' noise and the pose.
-#: They stand side by side.
-DIAGONAL, FORGETS = np.diag_indices(SIZE), slice(REST, POSE + 6)
 #: Covariances below this (of m, rad: 1e-20 of each) are set to zero: forgotten ones would decay to numbers so small that a
 #: processor takes a hundred times as long for each (denormals).
 _NOTHING = 1e-40
@@ -76,9 +70,17 @@ class KalmanEstimator:
         self._arm, self._prior, self._delay, self._learns_delay = arm, prior or Prior(), delay, learns_delay
         self._readings = Readings(self._prior.reading_rad, arm)
         self._model = ErrorModel(arm, self._prior, delay.sigma_s)
-        none, ones = np.zeros((1, 6)), np.ones((1, 6))
-        nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, 6)), none, np.zeros((1, 2, 6)))
-        self._states = [ErrorState(-np.inf, np.zeros(SIZE), np.diag(self._model.sigmas**2), nowhere, None)]
+        joints = arm.joints
+        none, ones = np.zeros((1, joints)), np.ones((1, joints))
+        nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, joints)), none, np.zeros((1, 2, joints)))
+        at = self._at = self._model.layout
+        # The whole widths (n,) of the backlash, whatever decides on the side; the rows of what is forgotten: the rest, the
+        # readings' noise and the pose, which stand side by side; and the diagonal of a covariance.
+        whole = np.eye(at.size)
+        self._widths = whole[at.backlash : at.floats] + whole[at.floats : at.compliance]
+        self._forgets, self._diagonal = slice(at.rest, at.delay), np.diag_indices(at.size)
+        self._opened = opened(joints)
+        self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
         self.on_innovation: Callable[[Innovation], None] | None = None
         self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
@@ -86,6 +88,16 @@ class KalmanEstimator:
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
         self._here: tuple[ErrorState, Smoothed, Propagation] | None = None
         self._newest: ArmEstimate | None = None
+
+    @property
+    def sigmas(self) -> Array:
+        """(K,) standard deviations of the state before anything was measured."""
+        return self._model.sigmas
+
+    @property
+    def settings(self) -> tuple[Prior, Delay, bool]:
+        """Prior, delay and whether the delay is corrected: what it was made with."""
+        return self._prior, self._delay, self._learns_delay
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -179,7 +191,7 @@ class KalmanEstimator:
         return blended(self._model, self._readings, parts)
 
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
-        """Return T_base_tool if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now."""
+        """Return T_base_tool if the potentiometers read q (N, n) moving at qd (N, n), by what is known now."""
         state, now, step = self._now()
         unseen = np.repeat(now.unseen, len(q), axis=0)
         moves = np.abs(qd) > MOVES_RAD_S
@@ -187,32 +199,36 @@ class KalmanEstimator:
         if pressed:
             unseen[:, 1] = np.where(moves & self._readings.loose(now.q[0]), np.sign(qd), now.unseen[:, 1])
         x = state.x * step.kept
-        x[:, NOISE] = 0.0  # noise of what was read, not of what might be
+        x[:, self._at.noise] = 0.0  # noise of what was read, not of what might be
         return self._model.poses(x, q, unseen)[0]
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
         state, now, step = self._now()
         x, P = state.x * step.kept[0], state.P * np.outer(step.kept[0], step.kept[0]) + np.diag(step.added[0])
-        by = np.empty((6, SIZE))
+        by = np.empty((self._at.joints, self._at.size))
         armerror.offsets_by(self._arm.table, now.q[0], now.unseen[0], by)
-        by[np.arange(6), ZEROS] = self._arm.direction
-        by[:, NOISE] = 0.0  # of the arm, not of the moment
+        by[np.arange(self._at.joints), self._at.zeros] = self._arm.direction
+        by[:, self._at.noise] = 0.0  # of the arm, not of the moment
         sigma = np.sqrt(np.diag(P))
         return Learned(
             by @ x,
             np.sqrt(np.einsum("ij,jk,ik->i", by, P, by)),
-            WIDTHS @ x,
-            np.sqrt(np.diag(WIDTHS @ P @ WIDTHS.T)),
+            self._widths @ x,
+            np.sqrt(np.diag(self._widths @ P @ self._widths.T)),
             now.unseen[0, 0],
-            replace(self._delay, delay_s=self._delay.delay_s + float(x[DELAY]), sigma_s=float(sigma[DELAY])),
+            replace(
+                self._delay,
+                delay_s=self._delay.delay_s + float(x[self._at.delay]),
+                sigma_s=float(sigma[self._at.delay]),
+            ),
         )
 
     def _backlash(self) -> Array:
-        """Return the backlash (6,) to use, rad: learned and typical (GAP_RAD), weighted by how well it is known."""
+        """Return the backlash (n,) to use, rad: learned and typical (GAP_RAD), weighted by how well it is known."""
         state = self._states[-1]
-        known = 1 - np.diag(WIDTHS @ state.P @ WIDTHS.T) / (WIDTHS @ self._model.sigmas**2)
-        return np.asarray(known * (WIDTHS @ state.x) + (1 - known) * GAP_RAD)
+        known = 1 - np.diag(self._widths @ state.P @ self._widths.T) / (self._widths @ self._model.sigmas**2)
+        return np.asarray(known * (self._widths @ state.x) + (1 - known) * GAP_RAD)
 
     @staticmethod
     def _after(state: ErrorState, pose_measurement: PoseMeasurement) -> bool:
@@ -221,7 +237,7 @@ class KalmanEstimator:
 
     def _seen_s(self, pose_measurement: PoseMeasurement, state: ErrorState) -> float:
         """Return the time of a measurement, s, by a state's estimate of the delay."""
-        return pose_measurement.t_s - self._delay.delay_s - float(state.x[DELAY])
+        return pose_measurement.t_s - self._delay.delay_s - float(state.x[self._at.delay])
 
     def _take(
         self,
@@ -234,9 +250,9 @@ class KalmanEstimator:
         joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         x, P = before.x * step.kept[0], before.P.copy()
-        P[FORGETS] *= step.kept[0, FORGETS, None]
-        P[:, FORGETS] *= step.kept[0, FORGETS]
-        P[DIAGONAL] += step.added[0]
+        P[self._forgets] *= step.kept[0, self._forgets, None]
+        P[:, self._forgets] *= step.kept[0, self._forgets]
+        P[self._diagonal] += step.added[0]
         P[np.abs(P) < _NOTHING] = 0.0
         z, H, R = first = self._innovation(x, joints, pose_measurement)
         PHt = P @ H.T
@@ -245,11 +261,13 @@ class KalmanEstimator:
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 report(
-                    Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((SIZE, 6)), outcome)
+                    Innovation(
+                        t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((self._at.size, 6)), outcome
+                    )
                 )
             return None, outcome
         if outcome is Outcome.REOPENED:
-            P[DIAGONAL] += OPENED
+            P[self._diagonal] += self._opened
             PHt = P @ H.T
         x, P, K = self._update(x, P, joints, pose_measurement, first, PHt)
         if report is not None:
@@ -257,11 +275,11 @@ class KalmanEstimator:
         return ErrorState(t_s, x, P, joints, pose_measurement), outcome
 
     def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
-        """Return the innovation (6,) of a measurement, the model's derivative (6, SIZE) by x, and the noise (6, 6)."""
+        """Return the innovation (6,) of a measurement, the model's derivative (6, size) by x, and the noise (6, 6)."""
         Ts, Hs = self._model.poses(x[None], joints.q, joints.unseen)
         H = Hs[0]
-        velocity = (H[:, ZEROS] * self._arm.direction) @ joints.qd[0]
-        H[:, DELAY] = -velocity  # measured earlier by so much, the tool had not moved as far
+        velocity = (H[:, self._at.zeros] * self._arm.direction) @ joints.qd[0]
+        H[:, self._at.delay] = -velocity  # measured earlier by so much, the tool had not moved as far
         R = pose_measurement.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
         z = np.empty(6)
         armerror.tangent(Ts[0], pose_measurement.T_base_tool, z)
@@ -286,21 +304,21 @@ class KalmanEstimator:
             first: innovation, derivative and noise at x.
             PHt: the product of P and the derivative's transpose.
         """
-        (z, H, R), change = first, np.zeros(SIZE)
+        (z, H, R), change = first, np.zeros(self._at.size)
         for left in range(ITERATIONS, 0, -1):
             K = np.linalg.solve(H @ PHt + R, PHt.T).T
             if not self._learns_delay:
-                K[DELAY] = 0.0
+                K[self._at.delay] = 0.0
             last, change = change, K @ z
             if left == 1 or np.abs(change - last).max() < SETTLED:
                 break
             z, H, R = self._innovation(x + change, joints, pose_measurement)
             # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
-            z += H[:, :DELAY] @ change[:DELAY]
+            z += H[:, : self._at.delay] @ change[: self._at.delay]
             PHt = P @ H.T
         P -= K @ PHt.T
         if not self._learns_delay:  # its row is as it was, its column is right
-            P[DELAY] = P[:, DELAY]
+            P[self._at.delay] = P[:, self._at.delay]
         symmetric(P)
         return x + change, P, np.asarray(K)
 

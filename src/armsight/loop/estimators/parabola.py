@@ -1,4 +1,4 @@
-"""Parabolas through readings of six joints around a time: angles, speeds and accelerations.
+"""Parabolas through readings of joints around a time: angles, speeds and accelerations.
 
 Local polynomial fit (Savitzky and Golay, Anal. Chem. 36, 1964), for readings at any times.
 """
@@ -38,7 +38,7 @@ def window(t: Array, first: int, count: int, at: float, length: float) -> tuple[
 
 @kernel
 def fit(t: Array, q: Array, low: int, high: int, at: float, motion: Array) -> float:
-    """Lay parabolas through rows low to high of q (N, 6); write angles, speeds, accelerations at a time to motion (3, 6).
+    """Lay parabolas through rows low to high of q (N, n); write angles, speeds, accelerations at a time to motion (3, n).
 
     Returns:
         What is left of a reading's variance in the angles.
@@ -61,7 +61,7 @@ def fit(t: Array, q: Array, low: int, high: int, at: float, motion: Array) -> fl
         value = scale * (a + (b + c * u) * u)
         slope = scale * (b + (d + e * u) * u)
         bend = 2 * scale * (c + (e + f * u) * u)
-        for i in range(6):
+        for i in range(q.shape[1]):
             motion[0, i] += value * q[k, i]
             motion[1, i] += slope * q[k, i]
             motion[2, i] += bend * q[k, i]

@@ -56,15 +56,15 @@ class Smoothed(NamedTuple):
     """The joints at (N,) times.
 
     Attributes:
-        q: (N, 6) angles, rad.
-        qd: (N, 6) speeds, rad/s.
-        variance: (N, 6) what is left of a reading's variance.
-        lasts_s: (N, 6) how long what is left of the noise lasts, s: the time constant of its correlation.
-        unseen: (N, 3, 6) what the links' angles beyond their shafts depend on. First the side of the backlash if friction
+        q: (N, n) angles, rad.
+        qd: (N, n) speeds, rad/s.
+        variance: (N, n) what is left of a reading's variance.
+        lasts_s: (N, n) how long what is left of the noise lasts, s: the time constant of its correlation.
+        unseen: (N, 3, n) what the links' angles beyond their shafts depend on. First the side of the backlash if friction
             decides on it, -1 to 1: 1 when the joint came up from below; then if gravity and inertia do; then the lever of
             what inertia does to a unit load, m.
-        travel: (N, 6) how far the joint has moved in all, rad.
-        flips: (N, 2, 6) how far the two sides have moved in all.
+        travel: (N, n) how far the joint has moved in all, rad.
+        flips: (N, 2, n) how far the two sides have moved in all.
     """
 
     q: Array
@@ -78,13 +78,13 @@ class Smoothed(NamedTuple):
 
 @kernel
 def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
-    """Write travel, flips, side, and the position behind the dead zone, of rows begin to end into memory (N, 8, 6)."""
-    motion = np.empty((3, 6))
+    """Write travel, flips, side, and the position behind the dead zone, of rows begin to end into memory (N, 8, n)."""
+    motion = np.empty((3, q.shape[1]))
     angles = motion[0]
     for k in range(begin, end):
         low, high = window(t, first, k - first + 1, t[k], SPAN_S)
         fit(t, q, low, high, t[k], motion)
-        for i in range(6):
+        for i in range(q.shape[1]):
             if k == first:
                 memory[k, :3, i] = 0.0
                 memory[k, 3, i] = angles[i]
@@ -102,13 +102,13 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 def _rest(
     t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array
 ) -> None:
-    """Replace fitted angles (6,) by the means of rows low to high for joints that stand still meanwhile.
+    """Replace fitted angles (n,) by the means of rows low to high for joints that stand still meanwhile.
 
     Also for joints that drift a little, as far as the rows lie around the time: there drift does not move the mean.
     """
     half, n = (high - low + 1) // 2, high - low + 1
     aside = abs(2 * at - t[low] - t[high]) / (t[high] - t[low])
-    for i in range(6):
+    for i in range(q.shape[1]):
         early = late = 0.0
         for k in range(half):
             early += q[low + k, i]
@@ -142,7 +142,7 @@ def _smooth(
     flips: Array,
 ) -> bool:
     """Write the joints at times (N,) into the parts of a :class:`Smoothed`; return whether all are within those kept."""
-    motion, newest = np.empty((3, 6)), t[first + count - 1]
+    motion, newest = np.empty((3, q.shape[1])), t[first + count - 1]
     for n in range(len(at)):
         if not t[first] <= at[n] <= newest:
             return False
@@ -156,7 +156,7 @@ def _smooth(
         # The correlation's integral over all lags is, of any weights w that sum to one, the period over the sum of w^2.
         lasts[n] = 0.5 * max(period, _MIN_PERIOD_S) / variance[n]
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
-        for i in range(6):
+        for i in range(q.shape[1]):
             unseen[n, 0, i], unseen[n, 1, i], unseen[n, 2, i] = memory[k, 2, i], -memory[k, 4, i], memory[k, 7, i]
             travel[n, i] = memory[k, 0, i]
             flips[n, 0, i], flips[n, 1, i] = memory[k, 1, i], memory[k, 6, i]
@@ -192,7 +192,7 @@ def _rising(t: Array, q: Array, begin: int, end: int, before: float) -> bool:
         if not before < t[k] < np.inf:
             return False
         before = t[k]
-        for i in range(6):
+        for i in range(q.shape[1]):
             if not abs(q[k, i]) < np.inf:
                 return False
     return True
@@ -209,9 +209,13 @@ class Readings:
     def __init__(self, sigma_rad: float, arm: Arm) -> None:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
-        self._gap, self._sigma = np.full(6, GAP_RAD), sigma_rad
+        self._gap, self._sigma, self._joints = np.full(arm.joints, GAP_RAD), sigma_rad, arm.joints
         # Beside each reading: travel, flips, side, position behind the dead zone; then what ``backlash_dynamics`` writes.
-        self._t, self._q, self._memory = np.empty(_ROWS), np.empty((_ROWS, 6)), np.zeros((_ROWS, 8, 6))
+        self._t, self._q, self._memory = (
+            np.empty(_ROWS),
+            np.empty((_ROWS, arm.joints)),
+            np.zeros((_ROWS, 8, arm.joints)),
+        )
         self._first = self._count = self._settled = 0
         self._gone_s = -np.inf
         # The variance that a parabola leaves of its slope at its end is 192/(N SPAN^2).
@@ -230,13 +234,13 @@ class Readings:
         return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
 
     def loose(self, q: Array) -> NDArray[np.bool_]:
-        """Return which links (6,) stay where they are in their backlash, unloaded by gravity, at angles (6,), rad."""
-        out = np.empty(6)
+        """Return which links (n,) stay where they are in their backlash, unloaded by gravity, at angles (n,), rad."""
+        out = np.empty(self._joints)
         loose(self._table, self._points, self._beside, q, out)
         return out > 0.0
 
     def set_backlash(self, width_rad: Array) -> None:
-        """Set the width of each joint's backlash (6,), rad, for the readings from here on."""
+        """Set the width of each joint's backlash (n,), rad, for the readings from here on."""
         self._gap = np.maximum(width_rad, MIN_GAP_RAD)
 
     def add(self, states: JointStates) -> None:
@@ -246,9 +250,9 @@ class Readings:
             InputError: wrong shapes, NaN, or times that do not rise.
         """
         t, q = np.asarray(states.t_s, dtype=float), np.asarray(states.q, dtype=float)
-        if t.ndim != 1 or q.shape != (len(t), 6):
+        if t.ndim != 1 or q.shape != (len(t), self._joints):
             checked(t, (None,), "JointStates.t_s")
-            checked(q, (len(t), 6), "JointStates.q")
+            checked(q, (len(t), self._joints), "JointStates.q")
         half = _ROWS // 2
         for part in range(0, len(t), half):
             self._append(t[part : part + half], q[part : part + half])
@@ -265,7 +269,7 @@ class Readings:
         self._t[begin:end], self._q[begin:end] = t, q
         if not _rising(self._t, self._q, begin, end, before):
             checked(t, (None,), "JointStates.t_s")
-            checked(q, (len(t), 6), "JointStates.q")
+            checked(q, (len(t), self._joints), "JointStates.q")
             raise InputError("potentiometer readings must come in order of time; the times given do not rise")
         self._count += len(t)
         # Only the very first row starts the hysteresis; later ones carry on from the row before.
@@ -285,7 +289,8 @@ class Readings:
         """
         oldest, newest = self.span_s
         at, n = np.array(t_s, dtype=float), len(t_s)
-        shapes = (6,), (6,), (6,), (6,), (3, 6), (6,), (2, 6)
+        j = self._joints
+        shapes = (j,), (j,), (j,), (j,), (3, j), (j,), (2, j)
         joints = Smoothed(*(np.empty((n, *shape)) for shape in shapes))
         kept = (self._t, self._q, self._memory, self._first, self._count)
         if not _smooth(*kept, at, self._sigma, *joints):

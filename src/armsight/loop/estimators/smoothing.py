@@ -14,9 +14,7 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.estimators.armerror import SIZE
 from armsight.loop.estimators.errormodel import (
-    NOISE,
     ErrorModel,
     ErrorState,
     Propagation,
@@ -129,8 +127,9 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Tr
     travel, flips = _come(after, joints, rows)
     back = model.carried(t_s - after.t_s[rows], -travel, -flips, after.variance[rows], joints)
     x, x_after = before.x[rows] * ahead.kept, after.x[rows] * back.kept
-    noise, bridge = bridged(before.x[rows], after.x[rows], ahead, back)
-    x[:, NOISE] = x_after[:, NOISE] = noise
+    at = model.layout.noise
+    noise, bridge = bridged(at, before.x[rows], after.x[rows], ahead, back)
+    x[:, at] = x_after[:, at] = noise
     Ts, Hs = model.poses(x, joints.q, joints.unseen)
     Ts_after, _ = model.poses(x_after, joints.q, joints.unseen)
     share = _share(t_s, joints, before, after, rows)
@@ -139,8 +138,8 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Tr
     edges = np.searchsorted(rows, np.arange(len(parts) + 1)).tolist()
     for k, part in enumerate(parts):
         some = slice(edges[k], edges[k + 1])
-        H = Hs[some].reshape(-1, SIZE)
-        first, last = ((H @ P).reshape(-1, 6, SIZE) for P in (before.P[k], after.P[k]))
+        H = Hs[some].reshape(-1, Hs.shape[2])
+        first, last = ((H @ P).reshape(-1, 6, Hs.shape[2]) for P in (before.P[k], after.P[k]))
         own[some] = (first + share[some, None, None] * (last - first)) @ transposed[some]
         common[some] = shared(None if part.after is None else part.after.pose_measurement, Ts[some])
     own += (Hs * bridge[:, None, :]) @ transposed
@@ -148,7 +147,7 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Tr
 
 
 class _Ends(NamedTuple):
-    """The ends of K intervals: times (K,), states (K, SIZE), covariances, travel, flips (K, 2, 6), variances (K, 6)."""
+    """The ends of K intervals: times (K,), states (K, size), covariances, travel, flips (K, 2, n), variances (K, n)."""
 
     t_s: Array
     x: Array
@@ -172,7 +171,7 @@ def _far(joints: Smoothed) -> tuple[Array, Array, Array]:
 
 
 def _come(ends: _Ends, joints: Smoothed, rows: Ids) -> tuple[Array, Array]:
-    """Return how far joints (N, 6) and sides (N, 2, 6) had come since the ends of their rows (N,)."""
+    """Return how far joints (N, n) and sides (N, 2, n) had come since the ends of their rows (N,)."""
     return joints.travel - ends.travel[rows], joints.flips - ends.flips[rows]
 
 

@@ -20,6 +20,8 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.handeye.handeye import Eye, HandEye, Poses, calibrate_handeye, covariances, residuals
+from armsight.loop.handeye.noise import STRUCTURES
+from armsight.loop.handeye.structured import StructuredHandEye, calibrate_structured
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
 MAX_POSES = 600
@@ -137,6 +139,70 @@ def calibrate_streams(
     cov = _block_covariance(hand, t_eye, B, offset, h)
     held = replace(h, cov=cov[:12, :12])
     return StreamHandEye(held, offset, float(np.sqrt(cov[12, 12])), int(h.used.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredStreams(Record):
+    """A hand-eye calibration of two streams whose noise has a structure.
+
+    Attributes:
+        handeye: the calibration; its rows are those of the eye's poses that were used, in the order of time.
+        offset_s: to be added to the eye's times to give the hand's; sigma_offset_s its sigma.
+        t_s: (M,) the eye's times of these rows, s, on the eye's clock.
+        A: (M, 4, 4) the flange at these times.
+        B: (M, 4, 4) the body as seen.
+    """
+
+    handeye: StructuredHandEye
+    offset_s: float
+    sigma_offset_s: float
+    t_s: Array
+    A: Array
+    B: Array
+
+
+def calibrate_structured_streams(
+    hand: PoseStream,
+    eye_stream: PoseStream,
+    *,
+    eye: Eye = "to_hand",
+    centre: ArrayLike = (0.0, 0.0, 0.0),
+    scale: bool = False,
+    progress: Callable[[str], None] = lambda line: None,
+) -> StructuredStreams:
+    """Find the mounting, the time offset and the structure of the noise of two streams.
+
+    Args:
+        hand: T_base_flange over time.
+        eye_stream: T_rig_body over time, on another clock.
+        eye: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
+        centre: (3,) the middle of the body's points, body frame, m.
+        scale: whether the size of the target may be wrong.
+        progress: called with the name of each step as it begins.
+
+    Raises:
+        CalibrationError: the streams do not overlap, nothing rotates, or the motions leave a direction open.
+    """
+    progress("time offset")
+    offset = coarse_offset(hand, eye_stream)
+    rows = np.linspace(0, len(eye_stream.t_s) - 1, min(MAX_POSES, len(eye_stream.t_s))).astype(int)
+    for structures in (("robot and camera",), ("robot and camera",), tuple(STRUCTURES)):
+        t_eye, B = eye_stream.t_s[rows], eye_stream.Ts[rows]
+        A, good = hand.at(t_eye + offset)
+        early, first = hand.at(t_eye + offset - SPEED_S / 2)
+        late, last = hand.at(t_eye + offset + SPEED_S / 2)
+        good &= first & last
+        if good.sum() < 20:
+            raise CalibrationError(f"the streams overlap in {int(good.sum())} poses only; 20 and more are needed")
+        poses = Poses(
+            A[good], B[good], np.zeros((int(good.sum()), 6, 6)), eye == "in_hand", np.asarray(centre, dtype=float)
+        )
+        speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
+        found = calibrate_structured(
+            poses, t_s=t_eye[good], speed=speed, scale=scale, structures=structures, progress=progress
+        )
+        offset += found.step_s
+    return StructuredStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
 
 
 def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from armsight.data import Body, PoseEstimate
-from armsight.loop.estimators import KalmanEstimator, PoseMeasurement
-from armsight.loop.estimators.armerror import SIZE
+from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
+from armsight.loop.estimators.armerror import layout
+from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.health.host import HostWatch
+from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import RigWatch
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
+
+#: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
+DOUBT_S = 2.0
 
 
 class HealthMonitor:
@@ -25,7 +32,32 @@ class HealthMonitor:
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
         self._rig = RigWatch(rig, body, sync_s) if rig.cov.any() else None
+        self._host = HostWatch()
         self._fixed: FixedWatch | None = None
+        self._closure: ClosureWatch | None = None
+        self._suspected = np.zeros((6, 6))  # what the newest tested shot adds to the covariance of a pose
+        self._newest_s, self._doubted_s = 0.0, -np.inf
+        self._poses: list[tuple[PoseEstimate, float | None]] = []
+        self._innovations: list[Innovation] = []
+
+    def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
+        """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
+
+        What is suspected is that of the shots before.
+        """
+        self._poses.append((pose, t_s))
+        return replace(pose, cov=pose.cov + self._suspected) if self._suspected.any() else pose
+
+    def work(self) -> None:
+        """Make the tests of everything that was received since the last call."""
+        for pose, t_s in self._poses:
+            self._take(pose, t_s)
+        self._poses.clear()
+        if self._fixed is not None and self._closure is not None:
+            for innovation in self._innovations:
+                self._fixed.take(innovation)
+                self._closure.take(innovation)
+            self._innovations.clear()
 
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
@@ -34,19 +66,42 @@ class HealthMonitor:
             pose: as it was measured.
             t_s: time of its shot, s; None where it has none.
         """
-        if self._rig is None:
-            return pose
-        suspected = self._rig.take(pose, t_s)
-        return replace(pose, cov=pose.cov + suspected) if suspected.any() else pose
+        self._take(pose, t_s)
+        return replace(pose, cov=pose.cov + self._suspected) if self._suspected.any() else pose
+
+    def _take(self, pose: PoseEstimate, t_s: float | None) -> None:
+        """Test a measured pose."""
+        if t_s is not None:
+            self._host.take(pose, t_s)
+        if self._rig is not None:
+            self._suspected = self._rig.take(pose, t_s)
 
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
-        """Watch from now on whether the rig stands still in the base of an arm, by what an estimator makes of the poses."""
-        self._fixed = FixedWatch(arm.T_base_0, SIZE)
-        estimator.on_innovation = self._fixed.take
+        """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
+        self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
+        self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
+        self._innovations = []
+        estimator.on_innovation = self._note
+
+    def _note(self, innovation: Innovation) -> None:
+        """Keep what became of a measurement for the tests; a contradiction counts at once."""
+        self._innovations.append(innovation)
+        self._newest_s = innovation.t_s
+        if innovation.outcome is Outcome.REOPENED:
+            self._doubted_s = innovation.t_s
+
+    @property
+    def trust(self) -> Trust:
+        """How far a loop may rely on the measured poses now."""
+        if self.moved is not None or (self._rig is not None and self._rig.suspected is not None):
+            return Trust.NONE
+        return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
 
     @property
     def moved(self) -> BaseMotion | None:
-        """The motion of the rig against the base that was found; None where none was."""
+        """The motion of the rig against the base, or of the body on the tool, that was found; None where none was."""
+        if self._closure is not None and self._closure.change is not None:
+            return self._closure.change.motion
         return None if self._fixed is None else self._fixed.moved
 
     def widened(self, measurement: PoseMeasurement) -> PoseMeasurement:
@@ -58,5 +113,8 @@ class HealthMonitor:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
-        watches = (self._rig, self._fixed)
-        return tuple(found for watch in watches if watch is not None for found in watch.findings())
+        self.work()
+        slow = () if self._closure is None else self._closure.findings()
+        # The closure knows more causes than the innovations within a second, and sizes them better.
+        fast = () if self._fixed is None or slow else self._fixed.findings()
+        return (*(() if self._rig is None else self._rig.findings()), *slow, *fast, *self._host.findings())

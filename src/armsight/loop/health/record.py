@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from enum import Enum
 from typing import Any, Literal
 
 from scipy.special import chdtri
 
 #: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
-#: time: shots that are not of one time; estimator: measurements that contradict what it had learned, without another cause.
-Cause = Literal["rig", "body", "fixed", "time", "estimator"]
+#: time: shots that are not of one time; joint: a potentiometer that slipped, backlash that grew; estimator: measurements
+#: that contradict what it had learned, without another cause; host: images that are delivered twice.
+Cause = Literal["rig", "body", "fixed", "time", "joint", "estimator", "host"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
+
+
+class Trust(Enum):
+    """How far a loop may rely on the poses that vision measures."""
+
+    FULL = "nothing is suspected"
+    DOUBTED = "measured poses contradict what was learned, and the cause is not known yet"
+    NONE = "what vision measures is wrong: the cameras, the rig or the body moved"
 
 
 @dataclass(frozen=True)
@@ -20,7 +30,7 @@ class HealthFinding:
     """Something that no longer holds, and because of which results must not be trusted.
 
     Attributes:
-        cause: what is wrong: rig, body, fixed, time, estimator.
+        cause: what is wrong: rig, body, fixed, time, joint, estimator, host.
         what: what was found, one sentence.
         since_s: since when, s on the clock of the shots; None where the shots have no times.
         size: by how much, in ``unit``.

@@ -16,6 +16,7 @@ baseline have the same effect: which of them is wrong cannot be distinguished.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,14 +51,14 @@ _ROTATIONS, _SCALED = slice(2, 5), 5
 _ALARM = alarm_limit(6, 1.0 / TEST_S)
 
 
-class _Sums:
+class ResidualSums:
     """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
 
     def __init__(self, size: int, begin_s: float) -> None:
         self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
         self.begin_s = begin_s
 
-    def add(self, other: _Sums, weight: float) -> None:
+    def add(self, other: ResidualSums, weight: float) -> None:
         """Add another's."""
         self.H += weight * other.H
         self.b += weight * other.b
@@ -98,6 +99,7 @@ class RigWatch:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
 
     Attributes:
+        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body.
         suspected: the change that the newest test found: significant, and moving the pose by more than its sigma; or None.
     """
 
@@ -106,21 +108,21 @@ class RigWatch:
         self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
         count, shape = rig.parameter_count, 3 * len(self._points)
         self._size = count + 1 + shape
-        self._prior = np.zeros((self._size, self._size))
+        self.prior = np.zeros((self._size, self._size))
         values, vectors = np.linalg.eigh(rig.cov)
-        self._prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
+        self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
         rest = np.arange(count, self._size)
-        self._prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
+        self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
-        self._stay: _Sums | None = None
+        self._stay: ResidualSums | None = None
         self._stay_shots, self._shots = 0, 0
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
         self._began: Array | None = None
         self._effect = (np.zeros((3, 6)), 0.0)
-        self._test, self._window = _Sums(self._size, 0.0), _Sums(self._size, 0.0)
-        self._history: deque[_Sums] = deque(maxlen=_KEPT)
+        self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
+        self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
         self._alarmed = False
         self.suspected: RigChange | None = None
@@ -151,7 +153,25 @@ class RigWatch:
         shift = by_fault @ self.suspected.f
         return np.asarray(np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T)
 
-    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[_Sums, Array] | None:
+    def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
+        """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
+        self._test = ResidualSums(self._size, 0.0)
+        stays, began = 0, None
+        for k, estimate in enumerate(estimates):
+            found = self._residuals(estimate, float(k))
+            if found is None:
+                continue
+            if began is None or _differ(began, estimate.T_left_body):
+                self._close_stay()
+                self._stay, self._stay_shots, began = ResidualSums(self._size, float(k)), 0, estimate.T_left_body
+                stays += 1
+            assert self._stay is not None
+            self._stay.add(found[0], 1.0)
+            self._stay_shots += 1
+        self._close_stay()
+        return self._test, stays
+
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array] | None:
         """Return the sums of one shot, its pose eliminated, and the derivative (6, 6) of the pose by the six numbers."""
         seen, rig, points = estimate.points.seen, self._rig, self._body.points
         good = np.zeros(len(points), bool)
@@ -183,7 +203,7 @@ class RigWatch:
         along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
         # The skew, of variance 1, is eliminated (Sherman and Morrison).
         whole = rest.T @ rest - np.outer(along, along) / (1.0 + k2)
-        sums = _Sums(self._size, now_s)
+        sums = ResidualSums(self._size, now_s)
         sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
         return sums, -gain[:, :-1] @ self._by_fault
 
@@ -197,11 +217,11 @@ class RigWatch:
         shift = before[:3, :3].T @ (T[:3, 3] - before[:3, 3])
         return np.asarray(np.concatenate([shift, rotation]) * (self._sync_s / (now_s - before_s)))
 
-    def _sum(self, sums: _Sums, T: Array, now_s: float) -> None:
+    def _sum(self, sums: ResidualSums, T: Array, now_s: float) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         if self._stay is None or self._began is None or _differ(self._began, T):
             self._close_stay()
-            self._stay, self._stay_shots, self._began = _Sums(self._size, now_s), 0, T
+            self._stay, self._stay_shots, self._began = ResidualSums(self._size, now_s), 0, T
         self._stay.add(sums, 1.0)
         self._stay_shots += 1
         begin_s = self._test.begin_s if self._test.freedom else self._stay.begin_s
@@ -227,7 +247,7 @@ class RigWatch:
         for name in ("H", "b", "square", "freedom"):
             setattr(self._window, name, weight * getattr(self._window, name))
         self._window.add(self._test, 1.0)
-        self._test = _Sums(self._size, 0.0)
+        self._test = ResidualSums(self._size, 0.0)
         change = self._estimated(self._window)
         alarm = change.chi_square > _ALARM and self._matters(change, slice(0, 6))
         self.suspected = change if alarm else None
@@ -239,9 +259,9 @@ class RigWatch:
         shift = by_fault[:, part] @ change.f[part]
         return float(shift @ shift) > variance
 
-    def _estimated(self, sums: _Sums) -> RigChange:
+    def _estimated(self, sums: ResidualSums) -> RigChange:
         """Return the six numbers from sums, everything else eliminated."""
-        L, F = self._prior, self._by_fault * _WIDE
+        L, F = self.prior, self._by_fault * _WIDE
         LH = L.T @ sums.H
         inner = cho_factor(LH @ L + np.eye(self._size))
         across, right = LH @ F, L.T @ sums.b
@@ -263,8 +283,8 @@ class RigWatch:
 
         It is the beginning that leaves least unexplained: with the six numbers zero before it, and estimated after it.
         """
-        after, found, least = _Sums(self._size, 0.0), None, np.inf
-        before = _Sums(self._size, 0.0)
+        after, found, least = ResidualSums(self._size, 0.0), None, np.inf
+        before = ResidualSums(self._size, 0.0)
         for sums in self._history:
             before.add(sums, 1.0)
         for sums in reversed(self._history):
@@ -295,12 +315,19 @@ class RigWatch:
         return tuple(found)
 
 
+def free_directions(rig: StereoRig) -> Array:
+    """Return (P, 5) of a rig's parameters: translation of the right camera across the baseline (2), its rotation (3)."""
+    free, begin = np.zeros((rig.parameter_count, 5)), rig.parameter_count - 6
+    baseline = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
+    free[begin : begin + 3, :2] = np.linalg.svd(baseline[None])[2][1:].T
+    free[begin + 3 :, 2:] = np.eye(3)
+    return free
+
+
 def _fault_directions(rig: StereoRig, size: int) -> Array:
     """Return (size, 6) what a unit of each of the six numbers changes of the parameters."""
-    by_fault, begin = np.zeros((size, 6)), rig.parameter_count - 6
-    baseline = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
-    by_fault[begin : begin + 3, :2] = np.linalg.svd(baseline[None])[2][1:].T
-    by_fault[begin + 3 : begin + 6, _ROTATIONS] = np.eye(3)
+    by_fault = np.zeros((size, 6))
+    by_fault[: rig.parameter_count, :5] = free_directions(rig)
     by_fault[rig.parameter_count, _SCALED] = 1.0
     return by_fault
 

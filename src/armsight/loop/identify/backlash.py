@@ -76,7 +76,7 @@ def joint_backlashes(found: Identified, measured: Measured) -> tuple[JointBackla
     if found.joint_sigma_rad.any():
         weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
         scatter = _Scatter(joint_noise(found.model, found.solution, weighted, measured), weighted)
-    return tuple(_of_joint(i, found, measured, phi, scatter) for i in range(6))
+    return tuple(_of_joint(i, found, measured, phi, scatter) for i in range(found.model.arm.joints))
 
 
 def _of_joint(joint: int, found: Identified, measured: Measured, phi: Array, scatter: _Scatter | None) -> JointBacklash:

@@ -65,7 +65,7 @@ class Corrected(Record):
         return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)))
 
     def joint_corrections(self, q: Array, approach: Array | None = None) -> Array:
-        """Return what the error sources add to readings q (N, 6), (N, 6), rad: curves, backlash and compliance.
+        """Return what the error sources add to readings q (N, n), (N, n), rad: curves, backlash and compliance.
 
         Beyond the readings that were seen (``model.q_seen``) a sensor's curve fades to its mean over them.
         """
@@ -73,16 +73,16 @@ class Corrected(Record):
         return np.asarray(self.model.arm.direction * theta - q)
 
     def forward(self, q: Array, approach: Array | None = None) -> Array:
-        """Return T_base_body (N, 4, 4) at readings q (N, 6), rad; ``approach`` (N, 6) as in :class:`Measured`."""
+        """Return T_base_body (N, 4, 4) at readings q (N, n), rad; ``approach`` (N, n) as in :class:`Measured`."""
         return self.model.tool_in_base(self.x, q, approach)
 
     def readings(self, T_base_body: Array, near: Array, approach: Array | None = None) -> Array | None:
-        """Return the readings (6,), rad, at which the body is at a pose, nearest to ``near``; None out of reach.
+        """Return the readings (n,), rad, at which the body is at a pose, nearest to ``near``; None out of reach.
 
         Args:
             T_base_body: (4, 4) where the body shall be.
-            near: (6,) readings to start from.
-            approach: (6,) from which sides the joints will come.
+            near: (n,) readings to start from.
+            approach: (n,) from which sides the joints will come.
         """
         q, side = np.array(near, float), None if approach is None else approach[None]
         for _ in range(STEPS):
@@ -95,10 +95,10 @@ class Corrected(Record):
         return None
 
     def _jacobian(self, q: Array, side: Array | None, T: Array) -> Array:
-        """Return the derivative (6, 6) of the right tangent by the readings, by differences over 1e-6 rad."""
+        """Return the derivative (6, n) of the right tangent by the readings, by differences over 1e-6 rad."""
         h = 1e-6
-        many = np.repeat(q[None], 6, axis=0) + h * np.eye(6)
-        sides = None if side is None else np.repeat(side, 6, axis=0)
+        many = np.repeat(q[None], len(q), axis=0) + h * np.eye(len(q))
+        sides = None if side is None else np.repeat(side, len(q), axis=0)
         return np.asarray(log_se3(inverse(T) @ self.forward(many, sides)).T / h)
 
     def save(self, path: str | Path) -> None:
@@ -143,6 +143,8 @@ def table_text(arm: Corrected) -> str:
         *_transform("T_flange_body", model.T_6_body(x)),
         f"up_base = [{', '.join(repr(float(v)) for v in model.up_base)}]",
     ]
+    if (model.arm.coupling != np.eye(model.arm.joints)).any():
+        lines.append(f"coupling = {model.arm.coupling.tolist()!r}")
     if model.q_seen is not None:
         lines += [
             "# A sensor's curve (gain, wave, ripple) holds from seen_min_rad to seen_max_rad of its joint.",
@@ -225,7 +227,7 @@ def open_corrected(path: str | Path) -> Corrected:
 
 def _error_sources(path: str | Path, given: dict[str, Any]) -> tuple[tuple[Feature, ...], Array]:
     """Return the F error sources of a parsed corrected.toml, and their coefficients and sigmas (2, F)."""
-    known = {f.name: f for f in all_features(True, (*RIPPLES, *FAST))}
+    known = {f.name: f for f in all_features(len(given["joint"]), True, (*RIPPLES, *FAST))}
     features, values = [], []
     for row in given.get("error_source", given.get("cause", [])):
         name = str(row.get("name"))

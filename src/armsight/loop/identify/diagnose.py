@@ -42,7 +42,7 @@ CLEAR = 2.0
 ALIKE_M, ALIKE_RAD = 1e-6, np.deg2rad(0.01)
 #: A scale off by more than this is a unit.
 SCALE_OFF = 0.2
-#: Rotations off by more than this, rad, are not of this arm: twice the prior of zeros and twists of all six joints.
+#: Rotations off by more than this, rad, are not of this arm: twice the prior of zeros and twists of six joints.
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, and those that every order and sign is tried on.
 POSES, FEW = 80, 24
@@ -54,7 +54,6 @@ _ANGLES = (
 #: Orders whose signs are tried, best first.
 MAX_JOINT_ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
-_GIVEN = tuple(range(6))
 
 
 class Off(NamedTuple):
@@ -83,8 +82,8 @@ class Mistakes(NamedTuple):
     @property
     def number(self) -> int:
         """How many mistakes these are: signs, a frame, and exchanges of two columns that make the order."""
-        cycles = {frozenset(_cycle(self.joint_order, i)) for i in _GIVEN}
-        return self.signs.count(-1) + self.left + 6 - len(cycles)
+        cycles = {frozenset(_cycle(self.joint_order, i)) for i in range(len(self.signs))}
+        return self.signs.count(-1) + self.left + len(self.signs) - len(cycles)
 
     @property
     def text(self) -> str:
@@ -92,10 +91,11 @@ class Mistakes(NamedTuple):
         texts = [
             "two of the instrument's axes are exchanged, or one has the wrong sign (its frame is left-handed)"
         ] * self.left
-        if self.joint_order != _GIVEN:
+        given = range(len(self.signs))
+        if self.joint_order != tuple(given):
             texts.append("the joints' order is " + ", ".join(f"q{i + 1}" for i in self.joint_order))
         if -1 in self.signs:
-            texts.append("the sign is wrong of joint " + ", ".join(str(i + 1) for i in _GIVEN if self.signs[i] < 0))
+            texts.append("the sign is wrong of joint " + ", ".join(str(i + 1) for i in given if self.signs[i] < 0))
         return " and ".join(texts)
 
 
@@ -113,8 +113,13 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     Raises:
         InputError: with the unit, the order, the signs, the frame or the reading of angles that fit, or that none does.
     """
+    if measured.q.shape[1] != arm.joints:
+        raise InputError(
+            f"these data have {measured.q.shape[1]} joint angles a row, {arm.name} has {arm.joints} joints: is it the "
+            "right model? a gripper's angle is none of the arm's: leave it out"
+        )
     if np.abs(measured.q).max() > chain.MOST_RADIANS:
-        row, joint = divmod(int(np.argmax(np.abs(measured.q))), 6)
+        row, joint = divmod(int(np.argmax(np.abs(measured.q))), measured.q.shape[1])
         raise InputError(
             f"joint {joint + 1} of row {row + 1} is at {measured.q[row, joint]:g} rad, further than any joint rotates: are "
             "the angles in degrees? name the columns q1_deg .. q6_deg"
@@ -134,7 +139,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
 
 
 def misfit(arm: Arm, q: Array, p_rig: Array) -> Off:
-    """Return how far points (N, K, 3) are off an arm at q (N, 6), with base and tool free, in frames of either hand."""
+    """Return how far points (N, K, 3) are off an arm at q (N, n), with base and tool free, in frames of either hand."""
     T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
     R, o = T[:, :3, :3], T[:, :3, 3]
     M, _, t = linear_placement(R, o, p_rig)
@@ -187,8 +192,10 @@ def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str | None:
     other = next((m for m in alike if m.left != best.left and m.number <= best.number + 1), None)
     if other is not None:
         text += f"; these data fit as well, and do not show which is true, if {other.text}"
-    flipped = [tuple(-s if i == j else s for i, s in enumerate(best.signs)) for j in _GIVEN]
-    either = [str(j + 1) for j in _GIVEN if any(m[:3] == (best.joint_order, flipped[j], best.left) for m in alike)]
+    flipped = [tuple(-s if i == j else s for i, s in enumerate(best.signs)) for j in range(arm.joints)]
+    either = [
+        str(j + 1) for j in range(arm.joints) if any(m[:3] == (best.joint_order, flipped[j], best.left) for m in alike)
+    ]
     return text + (f"; they do not show whether the sign of joint {', '.join(either)} is right" if either else "")
 
 
@@ -203,10 +210,11 @@ def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
     Signs in the given order and every order with the given signs are tried, then both together where neither fits.
     """
     few = np.linspace(0, len(q) - 1, min(FEW, len(q))).astype(int)
-    signs = list(itertools.product((1, -1), repeat=6))
-    tried = _tried(arm, q[few], p[few], ((_GIVEN, s) for s in signs))
+    given = tuple(range(arm.joints))
+    signs = list(itertools.product((1, -1), repeat=arm.joints))
+    tried = _tried(arm, q[few], p[few], ((given, s) for s in signs))
     joint_orders = sorted(
-        _tried(arm, q[few], p[few], ((o, signs[0]) for o in itertools.permutations(_GIVEN))), key=lambda m: m.off
+        _tried(arm, q[few], p[few], ((o, signs[0]) for o in itertools.permutations(given))), key=lambda m: m.off
     )
     found = _fitting(arm, q, p, [*tried, *joint_orders], limit)
     if not found:
@@ -260,7 +268,7 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Array) -> None:
 
 
 def rotation_misfit(arm: Arm, q: Array, R_rig_body: Array) -> float:
-    """Return how far rotations (N, 3, 3) are off an arm at q (N, 6), with base and tool free: the median angle, rad."""
+    """Return how far rotations (N, 3, 3) are off an arm at q (N, n), with base and tool free: the median angle, rad."""
     A = arm.forward(q)
     B = np.tile(np.eye(4), (len(q), 1, 1))
     B[:, :3, :3] = R_rig_body
@@ -284,7 +292,7 @@ def _reading(arm: Arm, q: Array, angles_deg: Array, off: float, given: str) -> s
 def _signs_by_rotations(arm: Arm, q: Array, p: Array, R: Array, off: float) -> str | None:
     """Return the fewest signs that make the rotations fit where the positions fit with either sign, or None."""
     near = CLEAR * max(misfit(arm, q, p).right, ALIKE_M)
-    ways = _tried(arm, q, p, ((_GIVEN, s) for s in itertools.product((1, -1), repeat=6)))
+    ways = _tried(arm, q, p, ((tuple(range(arm.joints)), s) for s in itertools.product((1, -1), repeat=arm.joints)))
     fits = {m: rotation_misfit(arm, q * m.signs, R) for m in ways if not m.left and m.off < near}
     best = max(min(fits.values(), default=np.inf), ALIKE_RAD)
     if best > min(off / BETTER, BAD_RAD):

@@ -17,7 +17,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, prior_sigma
-from armsight.loop.identify.joint_noise import NO_CHANCE, JointNoise, joint_noise, with_joint_noise
+from armsight.loop.identify.joint_noise import JointNoise, joint_noise, no_noise, with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import PLENTY, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
@@ -50,7 +50,7 @@ class Identified(Record):
         steps: of the forward selection.
         singular_values: of the Jacobian of the observable parameters, in units of prior sigmas.
         prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
-        joint_sigma_rad: (6,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not
+        joint_sigma_rad: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not
             known, because the joints' and the instrument's share cannot be separated then.
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
             sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
@@ -194,7 +194,7 @@ def _everything(
     noise = geometric.noise
     whole = geometric
     scaled = prior
-    weighted, scatter = measured, NO_CHANCE
+    weighted, scatter = measured, no_noise(model.arm.joints)
     for _ in range(ROUNDS if measured.cov is not None else 2):
         seen = observed(model, start.x, weighted, prior, noise)
         whole = fit(model, whole.x, weighted, seen.possible, scaled, noise=noise)

@@ -32,9 +32,9 @@ class JointNoise(NamedTuple):
     """What is off by chance.
 
     Attributes:
-        sigma_rad: (6,) of each joint.
-        off_rad: (N, 6) by how much each joint was off at each pose, as far as the residuals show it.
-        sigma_off_rad: (N, 6) their sigmas.
+        sigma_rad: (n,) of each joint.
+        off_rad: (N, n) by how much each joint was off at each pose, as far as the residuals show it.
+        sigma_off_rad: (N, n) their sigmas.
     """
 
     sigma_rad: Array
@@ -42,8 +42,9 @@ class JointNoise(NamedTuple):
     sigma_off_rad: Array
 
 
-#: Where the instrument's covariance is unknown.
-NO_CHANCE = JointNoise(np.zeros(6), np.zeros((0, 6)), np.zeros((0, 6)))
+def no_noise(joints: int) -> JointNoise:
+    """Return what is said of so many joints where the instrument's covariance is unknown."""
+    return JointNoise(np.zeros(joints), np.zeros((0, joints)), np.zeros((0, joints)))
 
 
 def joint_noise(model: Model, solution: Solution, weighted: Measured, measured: Measured) -> JointNoise:
@@ -64,20 +65,21 @@ def joint_noise(model: Model, solution: Solution, weighted: Measured, measured: 
     B = np.concatenate(
         [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2
     )
-    measured = with_joint_noise(model, solution.x, measured, np.zeros(6))
+    measured = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
     axes = np.arange(e.shape[1]) // 3  # the residual noise of position (0) and of rotation (1): one variance each
     if not model.full:
         axes[:] = 0
-    variance = np.concatenate([np.full(6, START_RAD**2), np.where(axes == 0, START_M, START_RAD) ** 2])
+    joints = model.arm.joints
+    variance = np.concatenate([np.full(joints, START_RAD**2), np.where(axes == 0, START_M, START_RAD) ** 2])
     used = solution.used
     for _ in range(STEPS):
         mean, spread = _expected(e, B, variance, measured)
         second = (mean**2 / share + spread)[used].mean(axis=0)
         variance = second
         for k in np.unique(axes):
-            variance[6:][axes == k] = second[6:][axes == k].mean()
+            variance[joints:][axes == k] = second[joints:][axes == k].mean()
     mean, spread = _expected(e, B, variance, measured)
-    return JointNoise(np.sqrt(variance[:6]), mean[:, :6], np.sqrt(spread[:, :6]))
+    return JointNoise(np.sqrt(variance[:joints]), mean[:, :joints], np.sqrt(spread[:, :joints]))
 
 
 def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
@@ -98,8 +100,8 @@ def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Arra
 
 
 def _of_sides(model: Model, x: Array, phi: Array) -> Array:
-    """Return the variance (N, 6), rad^2, of joints in backlash that gravity closes: 1 - mean^2 of a side of +-1."""
-    out = np.zeros((len(phi), 6))
+    """Return the variance (N, n), rad^2, of joints in backlash that gravity closes: 1 - mean^2 of a side of +-1."""
+    out = np.zeros((len(phi), model.arm.joints))
     for k, f in enumerate(model.features):
         if f.kind == "gravity_backlash":
             half = 0.5 * x[model.sources_at + k]
@@ -108,7 +110,7 @@ def _of_sides(model: Model, x: Array, phi: Array) -> Array:
 
 
 def by_joints(model: Model, J: Array) -> Array:
-    """Return the derivative (N, M, 6) by the joints' angles, from that by all parameters (N, M, P)."""
+    """Return the derivative (N, M, n) by the joints' angles, from that by all parameters (N, M, P)."""
     return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.sources_at : len(chain.COLUMNS)])
 
 

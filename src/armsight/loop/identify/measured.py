@@ -23,12 +23,12 @@ class Measured(Record):
     """Joint angles, and where the tool was measured at them.
 
     Attributes:
-        q: (N, 6) joint angles as the joints' sensors read them, rad.
+        q: (N, n) joint angles as the joints' sensors read them, rad.
         p_rig: (N, K, 3) tracked points, m; K is 1 with full poses (the body's origin).
         R_rig_body: (N, 3, 3) rotation of the body in the rig, with full poses; None with points only.
         cov: (N, M, M) covariance of what was seen; None where not known. Points: M = 3 K, along the rig's axes, m^2. Poses:
             M = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
-        approach: (N, 6) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
+        approach: (N, n) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
             None where nothing is known.
     """
 
@@ -44,7 +44,7 @@ class Measured(Record):
         Raises:
             InputError: shapes that do not belong together, or NaN.
         """
-        n = len(checked(self.q, (None, 6), "q"))
+        n = len(checked(self.q, (None, None), "q"))
         k = checked(self.p_rig, (n, None, 3), "p_rig").shape[1]
         if self.R_rig_body is not None:
             checked(self.R_rig_body, (n, 3, 3), "R_rig_body")
@@ -53,7 +53,7 @@ class Measured(Record):
         if self.cov is not None:
             checked(self.cov, (n, self.size, self.size), "cov")
         if self.approach is not None:
-            checked(self.approach, (n, 6), "approach")
+            checked(self.approach, self.q.shape, "approach")
         super().__post_init__()
 
     def __len__(self) -> int:

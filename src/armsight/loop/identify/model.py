@@ -1,8 +1,8 @@
 """The model that identification fits: an arm with everything that can be off about it, as one vector of parameters.
 
 The vector x (P,) holds, in this order: the base in the rig (translation along the rig's axes; rotation about them, from a
-start), the tool's points or the body in frame 6, the 30 numbers of the table, and one coefficient per error source beyond
-the table.
+start), the tool's points or the body in the last frame, the 30 numbers of the table, and one coefficient per error source
+beyond the table.
 
 The file in order: forward kinematics of an arm that deviates from its table, with derivatives (:class:`TableMotion`); the
 error sources of single joints (:class:`Feature`); the vector and its predictions (:class:`Model`).
@@ -39,7 +39,7 @@ from armsight.geometry.rotation import exp_so3, log_so3, skew
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 
-#: Columns of a table of lengths and angles, (6, 5).
+#: Columns of a table of lengths and angles, (n, 5).
 COLUMNS = ("offset", "d", "a", "alpha", "beta")
 OFFSET, D, A, ALPHA, BETA = range(5)
 _STANDARD = (OFFSET, D, A, ALPHA, BETA)
@@ -53,10 +53,10 @@ class TableMotion(NamedTuple):
     """Pose of an arm's last frame, and the axes along or about which each number of the table moves it.
 
     Attributes:
-        R: (N, 3, 3) rotation of frame 6 in the rig.
-        o: (N, 3) origin of frame 6 in the rig, m.
-        axis: (6, 5, N, 3) unit axes that each number rotates about or translates along, rig.
-        through: (6, 5, N, 3) points on those axes, rig, m.
+        R: (N, 3, 3) rotation of the last frame in the rig.
+        o: (N, 3) origin of the last frame in the rig, m.
+        axis: (n, 5, N, 3) unit axes that each number rotates about or translates along, rig.
+        through: (n, 5, N, 3) points on those axes, rig, m.
     """
 
     R: Array
@@ -66,24 +66,25 @@ class TableMotion(NamedTuple):
 
 
 def nominal_table(arm: Arm) -> Array:
-    """Return the table (6, 5) of an arm, by COLUMNS."""
-    return np.stack([arm.offset, arm.d, arm.a, arm.alpha, np.zeros(6)], axis=1)
+    """Return the table (n, 5) of an arm, by COLUMNS."""
+    return np.stack([arm.offset, arm.d, arm.a, arm.alpha, np.zeros(arm.joints)], axis=1)
 
 
 def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
     """Move a frame along the chain, and note the axis of every number of the table.
 
     Args:
-        table: (6, 5) by COLUMNS, m and rad.
-        theta: (N, 6) rotation of each joint without its offset, rad.
+        table: (n, 5) by COLUMNS, m and rad.
+        theta: (N, n) rotation of each joint without its offset, rad.
         modified: whether the table follows the modified convention.
         R_rig_0: (3, 3) rotation of frame 0 in the rig.
         o_rig_0: (3,) origin of frame 0 in the rig, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
-    axis, through = np.empty((6, 5, n, 3)), np.empty((6, 5, n, 3))
-    for i in range(6):
+    joints = len(table)
+    axis, through = np.empty((joints, 5, n, 3)), np.empty((joints, 5, n, 3))
+    for i in range(joints):
         for column in _MODIFIED if modified else _STANDARD:
             k = _AXIS[column]
             axis[i, column], through[i, column] = R[:, :, k], o
@@ -106,14 +107,14 @@ def _rotate(R: Array, k: int, angle: Array) -> None:
 
 
 def point_derivative(m: TableMotion, p: Array) -> Array:
-    """Return the derivative (6, 5, N, 3) of points p (N, 3), rig, by every number of the table."""
+    """Return the derivative (n, 5, N, 3) of points p (N, 3), rig, by every number of the table."""
     out = np.cross(m.axis, p - m.through)
     out[:, _SHIFTS] = m.axis[:, _SHIFTS]
     return out
 
 
 def rotation_derivative(m: TableMotion) -> Array:
-    """Return the derivative (6, 5, N, 3) of frame 6's rotation, as a rotation vector in the rig's axes."""
+    """Return the derivative (n, 5, N, 3) of the last frame's rotation, as a rotation vector in the rig's axes."""
     out = m.axis.copy()
     out[:, _SHIFTS] = 0.0
     return out
@@ -144,7 +145,7 @@ class Feature(NamedTuple):
     Attributes:
         name: of the coefficient.
         kind: "gain", "wave", "ripple", "backlash", "gravity_backlash" or "compliance".
-        joint: 0 to 5.
+        joint: from 0.
         unit: of the coefficient.
         detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose gravity loads the gear; (0, 0)
             elsewhere.
@@ -157,15 +158,16 @@ class Feature(NamedTuple):
     detail: tuple[int, int] = (0, 0)
 
 
-def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
+def all_features(joints: int, backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
     """Return every error source.
 
     Args:
+        joints: how many joints the arm has.
         backlash: include backlash that friction holds, which needs known directions of approach.
         ripples: harmonics beyond WAVES.
     """
     found = []
-    for i in range(6):
+    for i in range(joints):
         found.append(Feature(f"gain{i + 1}", "gain", i, "rad/rad"))
         for n in (*WAVES, *ripples):
             kind = "wave" if n in WAVES else "ripple"
@@ -173,7 +175,7 @@ def all_features(backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...
         if backlash:
             found.append(Feature(f"backlash{i + 1}", "backlash", i, "rad"))
         found.append(Feature(f"gravity_backlash{i + 1}", "gravity_backlash", i, "rad"))
-        found += [Feature(f"compliance{i + 1}_{j + 1}", "compliance", i, "rad/m", (j, 0)) for j in range(i, 6)]
+        found += [Feature(f"compliance{i + 1}_{j + 1}", "compliance", i, "rad/m", (j, 0)) for j in range(i, joints)]
     return tuple(found)
 
 
@@ -191,10 +193,10 @@ def values(
     Args:
         arm: the nominal arm, whose links give the levers of gravity.
         features: F of them.
-        q: (N, 6) joint angles, rad.
-        approach: (N, 6) directions of approach, or None.
+        q: (N, n) joint angles, rad.
+        approach: (N, n) directions of approach, or None.
         up_base: (3,) unit vector against gravity, base.
-        q_seen: (6, 2) least and greatest reading of each joint that the sensors' curves were fitted to, rad, beyond which
+        q_seen: (n, 2) least and greatest reading of each joint that the sensors' curves were fitted to, rad, beyond which
             they fade to their means over that range; None: they never do.
         fade_rad: how far beyond it they have faded, rad.
 
@@ -203,7 +205,7 @@ def values(
     """
     out = np.zeros((len(q), len(features)))
     by_gravity = any(f.kind in ("compliance", "gravity_backlash") for f in features)
-    levers = _levers(arm, q, up_base) if by_gravity else np.zeros((len(q), 6, 6))
+    levers = _levers(arm, q, up_base) if by_gravity else np.zeros((len(q), arm.joints, arm.joints))
     for k, f in enumerate(features):
         if f.kind in SENSOR:
             out[:, k] = _curve(f, q[:, f.joint], None if q_seen is None else q_seen[f.joint], fade_rad)
@@ -259,10 +261,10 @@ def _side(lever: Array, approach: Array | None, joint: int) -> Array:
 
 
 def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
-    """Return z_i . (L_j x g) (N, 6, 6) for unit gravity g: lever of link j about joint i, m, signed by its direction."""
+    """Return z_i . (L_j x g) (N, n, n) for unit gravity g: lever of link j about joint i, m, signed by its direction."""
     T = arm.T_base_0
     modified = arm.convention == "modified"
-    m = motion(nominal_table(arm), arm.direction * q, modified, T[:3, :3], T[:3, 3])
+    m = motion(nominal_table(arm), arm.direction * (q @ arm.coupling.T), modified, T[:3, :3], T[:3, 3])
     z, at = m.axis[:, OFFSET], np.concatenate([m.through[:, OFFSET], m.o[None]])
     pull = np.cross(at[1:] - at[:-1], -up_base)  # link j goes from axis j to axis j + 1
     return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
@@ -285,7 +287,7 @@ class Parameter:
         name: such as "a2", "offset3", "gain1", "tool1_x".
         kind: "base", "tool", a column of the table, or a feature's kind.
         unit: "m", "rad", "rad/rad" (of a scale) or "rad/m".
-        joint: 0 to 5; -1 for base and tool.
+        joint: from 0; -1 for base and tool.
     """
 
     name: str
@@ -304,9 +306,9 @@ class Model(Record):
         full: whether full poses are measured.
         features: the error sources beyond the table.
         R_start: (3, 3) rotation of the base in the rig that the base's rotation parameters start from.
-        R_tool: (3, 3) rotation of the body in frame 6 that the tool's rotation parameters start from, with full poses.
-        up_base: (3,) unit vector against gravity, base.
-        q_seen: (6, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves
+        R_tool: (3, 3) rotation of the body in the last frame that the tool's rotation parameters start from, with full
+        poses. up_base: (3,) unit vector against gravity, base.
+        q_seen: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves
             fade; None before the fit is done, and of an arm whose file does not say it.
         fade_rad: how far beyond them the curves have faded, rad.
     """
@@ -325,11 +327,11 @@ class Model(Record):
     def of(arm: Arm, measured: Measured, *, backlash: bool) -> Model:
         """Return the model that fits what was measured."""
         numbers = len(measured) * measured.size
-        fast = all_features(backlash, (*RIPPLES, *FAST) if numbers >= ENOUGH else ())
+        fast = all_features(arm.joints, backlash, (*RIPPLES, *FAST) if numbers >= ENOUGH else ())
         model = Model(arm, measured.points, measured.R_rig_body is not None, fast)
         if numbers < PLENTY * len(model.parameters):
             return model
-        return model.with_features(all_features(backlash, RIPPLES))
+        return model.with_features(all_features(arm.joints, backlash, RIPPLES))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -339,7 +341,7 @@ class Model(Record):
             found += [Parameter(f"tool{k + 1}_{axis}", "tool", "m", -1) for axis in "xyz"]
         if self.full:
             found += [Parameter(f"tool1_r{axis}", "tool", "rad", -1) for axis in "xyz"]
-        for i in range(6):
+        for i in range(self.arm.joints):
             for c, column in enumerate(COLUMNS):
                 found.append(Parameter(f"{column}{i + 1}", column, "m" if c in _LENGTHS else "rad", i))
         found += [Parameter(f.name, f.kind, f.unit, f.joint) for f in self.features]
@@ -363,17 +365,17 @@ class Model(Record):
     @property
     def sources_at(self) -> int:
         """Where the features' coefficients begin."""
-        return self.table_at + 30
+        return self.table_at + len(COLUMNS) * self.arm.joints
 
     def nominal(self) -> Array:
-        """Return the vector of the nominal arm, its base at the rig and its tool at frame 6."""
+        """Return the vector of the nominal arm, its base at the rig and its tool at the last frame."""
         x = np.zeros(len(self.parameters))
         x[self.table_at : self.sources_at] = nominal_table(self.arm).ravel()
         return x
 
     def table(self, x: Array) -> Array:
-        """Return the table (6, 5) of a vector, by ``COLUMNS``."""
-        return x[self.table_at : self.sources_at].reshape(6, 5)
+        """Return the table (n, 5) of a vector, by ``COLUMNS``."""
+        return x[self.table_at : self.sources_at].reshape(-1, len(COLUMNS))
 
     def T_rig_base(self, x: Array) -> Array:
         """Return the base (4, 4) in the rig."""
@@ -382,11 +384,11 @@ class Model(Record):
         return T
 
     def tool_points(self, x: Array) -> Array:
-        """Return the tracked points (K, 3) in frame 6."""
+        """Return the tracked points (K, 3) in the last frame."""
         return x[self.tool_at : self.tool_at + 3 * self.points].reshape(-1, 3)
 
     def T_6_body(self, x: Array) -> Array:
-        """Return the body (4, 4) in frame 6; its rotation is that of frame 6 where only points are measured."""
+        """Return the body (4, 4) in the last frame; its rotation is that frame's where only points are measured."""
         T = np.eye(4)
         T[:3, 3] = self.tool_points(x)[0]
         if self.full:
@@ -394,7 +396,7 @@ class Model(Record):
         return T
 
     def with_seen(self, q: Array) -> Model:
-        """Return the model whose sensors' curves fade beyond the readings (N, 6), rad, of the poses fitted."""
+        """Return the model whose sensors' curves fade beyond the readings (N, n), rad, of the poses fitted."""
         return replace(self, q_seen=np.stack([q.min(axis=0), q.max(axis=0)], axis=1))
 
     def with_features(self, features: tuple[Feature, ...]) -> Model:
@@ -406,15 +408,22 @@ class Model(Record):
         return values(self.arm, self.features, q, approach, self.up_base, self.q_seen, self.fade_rad)
 
     def theta(self, x: Array, q: Array, phi: Array) -> Array:
-        """Return the joints' rotations without their offsets (N, 6), rad; ``phi`` is :meth:`feature_values`."""
-        out = self.arm.direction * q
+        """Return the joints' rotations without their offsets (N, n), rad; ``phi`` is :meth:`feature_values`."""
+        out = self.arm.direction * (q @ self.arm.coupling.T)
         for k, f in enumerate(self.features):
             if x[self.sources_at + k] != 0.0:
-                out[:, f.joint] += self.arm.direction[f.joint] * x[self.sources_at + k] * phi[:, k]
+                off = x[self.sources_at + k] * phi[:, k]
+                for i in np.flatnonzero(self.arm.coupling[:, f.joint]):
+                    out[:, i] += self.arm.coupling[i, f.joint] * self.arm.direction[i] * off
         return np.asarray(out)
 
+    def _by_source(self, turned: Array, phi: Array) -> Array:
+        """Return what the coefficients move (N, 3, F), from what rotations of the joints move, (n, N, 3)."""
+        by_motor = np.einsum("ij,i,inx->jnx", self.arm.coupling, self.arm.direction, turned)
+        return np.asarray((by_motor[[f.joint for f in self.features]] * phi.T[..., None]).transpose(1, 2, 0))
+
     def motion(self, x: Array, q: Array, phi: Array) -> TableMotion:
-        """Return frame 6 in the rig, and how it moves."""
+        """Return the last frame in the rig, and how it moves."""
         T = self.T_rig_base(x) @ self.arm.T_base_0
         modified = self.arm.convention == "modified"
         return motion(self.table(x), self.theta(x, q, phi), modified, T[:3, :3], T[:3, 3])
@@ -438,18 +447,15 @@ class Model(Record):
         e = self._residuals(m, x, measured)
         t, n, at = self.tool_points(x), len(measured), self.table_at
         J = np.zeros((n, measured.size, len(self.parameters)))
-        joints = [f.joint for f in self.features]
-        direction = self.arm.direction[joints].astype(int)
         for k in range(self.points):
             rows, p = slice(3 * k, 3 * k + 3), m.o + m.R @ t[k]
             J[:, rows, 0:3] = np.eye(3)
             J[:, rows, 3:6] = -skew(p - x[:3]) @ left_jacobian(x[3:6])
             J[:, rows, self.tool_at + 3 * k : self.tool_at + 3 * k + 3] = m.R
             table = point_derivative(m, p)
-            J[:, rows, at : self.sources_at] = table.reshape(30, n, 3).transpose(1, 2, 0)
+            J[:, rows, at : self.sources_at] = table.reshape(-1, n, 3).transpose(1, 2, 0)
             if self.features:
-                moved = table[joints, OFFSET] * (direction[:, None] * phi.T)[..., None]
-                J[:, rows, self.sources_at :] = moved.transpose(1, 2, 0)
+                J[:, rows, self.sources_at :] = self._by_source(table[:, OFFSET], phi)
         if measured.R_rig_body is not None:
             self._rotation_rows(m, x, measured, phi, e, J)
         return e, J
@@ -457,24 +463,21 @@ class Model(Record):
     def _rotation_rows(self, m: TableMotion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:
         """Fill in the derivative of full poses: position residuals in the body's axes, and rotation residuals."""
         assert measured.R_rig_body is not None  # for the type checker: the caller has looked
-        n, at, joints = len(measured), self.table_at, [f.joint for f in self.features]
+        n, at = len(measured), self.table_at
         J[:, :3] = measured.R_rig_body.swapaxes(1, 2) @ J[:, :3]
         R_hat = m.R @ self.T_6_body(x)[:3, :3]
         to_log = (np.eye(3) + 0.5 * skew(e[:, 3:]) + _second(e[:, 3:])) @ R_hat.swapaxes(1, 2)
         by_rotation = rotation_derivative(m)
         W = np.zeros((n, 3, J.shape[2]))
         W[:, :, 3:6] = left_jacobian(x[3:6])
-        W[:, :, at : self.sources_at] = by_rotation.reshape(30, n, 3).transpose(1, 2, 0)
+        W[:, :, at : self.sources_at] = by_rotation.reshape(-1, n, 3).transpose(1, 2, 0)
         if self.features:
-            direction = self.arm.direction[joints]
-            W[:, :, self.sources_at :] = (
-                by_rotation[joints, OFFSET] * (direction[:, None] * phi.T)[..., None]
-            ).transpose(1, 2, 0)
+            W[:, :, self.sources_at :] = self._by_source(by_rotation[:, OFFSET], phi)
         J[:, 3:] = to_log @ W
         J[:, 3:, at - 3 : at] = (to_log @ R_hat) @ left_jacobian(-x[at - 3 : at])
 
     def tool_in_base(self, x: Array, q: Array, approach: Array | None) -> Array:
-        """Return T_base_body (N, 4, 4) at joint angles (N, 6) read by the sensors."""
+        """Return T_base_body (N, 4, 4) at joint angles (N, n) read by the sensors."""
         m = self.motion(x, q, self.feature_values(q, approach))
         T = np.zeros((len(q), 4, 4))
         T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = m.R, m.o, 1.0

@@ -161,8 +161,8 @@ def _ties_anywhere(
 ) -> dict[int, list[int]]:
     """Return the ties that poses over the whole range would not resolve."""
     rng = np.random.default_rng(0)
-    q = rng.uniform(np.maximum(model.arm.q_min, -np.pi), np.minimum(model.arm.q_max, np.pi), (PROBES, 6))
-    approach = rng.choice([-1.0, 1.0], (PROBES, 6))
+    q = rng.uniform(np.maximum(model.arm.q_min, -np.pi), np.minimum(model.arm.q_max, np.pi), (PROBES, model.arm.joints))
+    approach = rng.choice([-1.0, 1.0], q.shape)
     m = model.motion(x, q, model.feature_values(q, approach))
     p = m.o[:, None] + (m.R @ model.tool_points(x).T).swapaxes(1, 2)
     R = m.R @ model.T_6_body(x)[:3, :3] if measured.R_rig_body is not None else None

@@ -34,7 +34,7 @@ _BATCH = 250
 #: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
 LEVELS, SWEEPS, MIN_GAIN = 7, 3, 0.01
 
-#: Returns the whitened Jacobians (N, M, F) of poses q (N, 6) approached from sides (N, 6), and which of them are allowed.
+#: Returns the whitened Jacobians (N, M, F) of poses q (N, J) approached from sides (N, J), and which of them are allowed.
 #: Those of poses that are not allowed do not count, except the first.
 Information = Callable[[Array, Array], tuple[Array, Mask]]
 
@@ -95,11 +95,11 @@ def exchanged(
     limits: tuple[Array, Array],
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return poses (n, 6) and sides (n, 6) that together lower the error more than those given.
+    """Return poses (n, J) and sides (n, J) that together lower the error more than those given.
 
     Args:
-        q: (n, 6) joint angles to start from, rad.
-        approach: (n, 6) sides.
+        q: (n, J) joint angles to start from, rad.
+        approach: (n, J) sides.
         information: of poses, and which are allowed.
         P: (F, F) covariance before.
         requested: (3 K, F) derivative of K positions, whose error is to be low.
@@ -132,7 +132,7 @@ def _best(
 ) -> tuple[Array, Array, Array]:
     """Return the best pose that changes of one joint after the other lead to, its sides, and its Jacobian."""
     low, high = limits
-    for joint in rng.permutation(6):
+    for joint in rng.permutation(len(q)):
         step = (high[joint] - low[joint]) / (LEVELS - 1)
         levels = np.clip(low[joint] + step * (np.arange(LEVELS) + rng.uniform(-0.5, 0.5)), low[joint], high[joint])
         tried, sides = np.tile(q, (2 * LEVELS + 1, 1)), np.tile(approach, (2 * LEVELS + 1, 1))
@@ -167,8 +167,8 @@ class Plan(Record):
     """The poses to measure next, best first.
 
     Attributes:
-        q: (n, 6) joint angles, rad.
-        approach: (n, 6) from which side to come to each.
+        q: (n, J) joint angles, rad.
+        approach: (n, J) from which side to come to each.
         sigma_m: (n + 1,) predicted RMS position error over the workspace, m, before and after each pose.
         random_sigma_m: (n + 1,) the same for random poses.
     """
@@ -310,7 +310,7 @@ def _candidates(scene: PlanningScene, rng: np.random.Generator) -> tuple[Array, 
     """
     angles, sides, found = [], [], 0
     for _ in range(SAMPLING_ROUNDS):
-        q = rng.uniform(*scene.limits, (4 * CANDIDATES, 6))
+        q = rng.uniform(*scene.limits, (4 * CANDIDATES, len(scene.limits[0])))
         approach = rng.choice([-1.0, 1.0], q.shape)
         rows = np.flatnonzero(scene.allowed(q, approach))[: CANDIDATES - found]
         angles.append(q[rows])
@@ -323,7 +323,7 @@ def _candidates(scene: PlanningScene, rng: np.random.Generator) -> tuple[Array, 
 
 
 def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
-    """Return which joint angles (N, 6) keep the arm above the base's plane and apart from itself.
+    """Return which joint angles (N, J) keep the arm above the base's plane and apart from itself.
 
     Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
     """
@@ -337,7 +337,7 @@ def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
 
 
 def _segments_apart(o: Array) -> Mask:
-    """Return whether the base's column and the links (N, 8, 3) from the elbow on stay apart, at steps along them."""
+    """Return whether the base's column and the links (N, J + 2, 3) from the elbow on stay apart, at steps along them."""
     steps = np.linspace(0, 1, 9)[:, None]
 
     def line(i: int, points: Array) -> Array:
@@ -357,7 +357,7 @@ def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Ar
     Few poses cannot select among them, but a curve stays unknown where it is not measured, so poses must be spread.
     """
     backlash = any(f.kind == "backlash" for f in model.features)
-    whole = model.with_features(all_features(backlash, (*RIPPLES, *FAST)))
+    whole = model.with_features(all_features(model.arm.joints, backlash, (*RIPPLES, *FAST)))
     known = dict(zip(model.names, zip(x, prior, strict=True), strict=True))
     both = np.array([known.get(p.name, (0.0, SIGMA[p.kind])) for p in whole.parameters])
     return whole, both[:, 0], both[:, 1]

@@ -20,15 +20,18 @@ from armsight.errors import InputError
 from armsight.files import read_columns, read_table
 from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.measured import Measured
+from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+#: The joints that a file may have.
+_JOINTS = range(1, MOST_JOINTS + 1)
 #: The names that ``columns`` may say the file's own for.
 COLUMNS = (
-    *(f"q{i}_{unit}" for i in range(1, 7) for unit in ("rad", "deg")),
+    *(f"q{i}_{unit}" for i in _JOINTS for unit in ("rad", "deg")),
     *("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "rx_deg", "ry_deg", "rz_deg"),
     *(f"p{k}_{axis}_{unit}" for k in range(1, 10) for axis in "xyz" for unit in ("mm", "m")),
     *(f"cov_{i}{j}" for i, j in _UPPER),
-    *(f"approach{i}" for i in range(1, 7)),
+    *(f"approach{i}" for i in _JOINTS),
 )
 
 
@@ -94,12 +97,13 @@ def _twice(header: list[str]) -> str:
 
 def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) -> list[str]:
     """Return the columns to read."""
-    requested = _alternative(
-        path, columns, [[f"q{i}_{unit}" for i in range(1, 7)] for unit in ("rad", "deg")], "joint angles"
-    )
-    seventh = next((name for name in ("q7_rad", "q7_deg") if name in columns), None)
-    if seventh is not None:
-        raise InputError(f"{path}: line 1: column {seventh}: arms of six joints are identified, this one has more")
+    beyond = next((f"q{k}_{unit}" for k in range(8, 10) for unit in ("rad", "deg") if f"q{k}_{unit}" in columns), None)
+    if beyond is not None:
+        raise InputError(f"{path}: line 1: column {beyond}: an arm here has at most {MOST_JOINTS} joints")
+    angles = {unit: [i for i in _JOINTS if f"q{i}_{unit}" in columns] for unit in ("rad", "deg")}
+    joints = max(FEWEST_JOINTS, *(max(there, default=0) for there in angles.values()))
+    ways = [[f"q{i + 1}_{unit}" for i in range(joints)] for unit in angles]
+    requested = _alternative(path, columns, ways, "joint angles")
     poses = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
     if "qw" in columns:
         requested += _alternative(path, columns, [poses], "full poses")
@@ -113,7 +117,9 @@ def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) 
         if rotation is not None:
             requested += _alternative(path, columns, [["rx_deg", "ry_deg", "rz_deg"]], "angles")
     if "approach1" in columns:
-        requested += _alternative(path, columns, [[f"approach{i}" for i in range(1, 7)]], "directions of approach")
+        requested += _alternative(
+            path, columns, [[f"approach{i + 1}" for i in range(joints)]], "directions of approach"
+        )
     missing = [name for name in requested if name not in columns]
     if missing:
         raise InputError(f"{path}: line 1: column {missing[0]} is missing")
@@ -170,8 +176,9 @@ def _number(path: str | Path, line: int, name: str, row: list[str], at: int) -> 
 def _measured(path: str | Path, at: dict[str, Array], rotation: str | None) -> Measured:
     """Assemble the columns, in SI units."""
     unit = "rad" if "q1_rad" in at else "deg"
-    q = np.stack([at[f"q{i}_{unit}"] for i in range(1, 7)], axis=1) * (1.0 if unit == "rad" else np.pi / 180)
-    approach = np.stack([at[f"approach{i}"] for i in range(1, 7)], axis=1) if "approach1" in at else None
+    joints = [i for i in _JOINTS if f"q{i}_{unit}" in at]
+    q = np.stack([at[f"q{i}_{unit}"] for i in joints], axis=1) * (1.0 if unit == "rad" else np.pi / 180)
+    approach = np.stack([at[f"approach{i}"] for i in joints], axis=1) if "approach1" in at else None
     if approach is not None and not np.isin(approach, (-1, 0, 1)).all():
         raise InputError(f"{path}: a direction of approach must be 1 (the angle grew), -1 (it fell) or 0 (not known)")
     if "qw" in at:

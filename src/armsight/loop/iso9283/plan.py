@@ -37,7 +37,7 @@ class CheckPlan(NamedTuple):
     Attributes:
         names: of the poses.
         Ts_base_tool: (N, 4, 4).
-        q: (N, 6) joint angles, rad.
+        q: (N, n) joint angles, rad.
         side_m: of the cube.
         centre: (3,) of the cube, base, m.
     """
@@ -107,7 +107,7 @@ def _centres(arm: Arm, p_home: Array) -> Array:
 
 
 def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]]) -> Iterator[Array]:
-    """Yield joint angles (N, 6) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
+    """Yield joint angles (N, n) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
 
     NaN where a pose is not reached in it, not clear or not allowed.
     """
@@ -116,7 +116,7 @@ def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]])
     may = allowed(Ts)
     first = arm.inverse(Ts[0], near=arm.home)
     for signs, start in zip(first.signs, first.q, strict=True):
-        q = np.full((len(Ts), 6), np.nan)
+        q = np.full((len(Ts), arm.joints), np.nan)
         if not may[0] or np.any((start < low) | (start > high)):
             continue
         for k in np.flatnonzero(may):

@@ -30,6 +30,7 @@ from armsight.robot.boards.configuration import (
     check_configuration,
     check_gains,
 )
+from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome, joints_of, status_of, welcome_of
 from armsight.robot.boards.wire import Message, Wire
@@ -214,11 +215,13 @@ class Board:
         session: the conversation over it, open.
 
     Attributes:
+        abilities: what it can do.
         welcome: who it is.
     """
 
     def __init__(self, link: Link, session: Session) -> None:
         self._link, self._session = link, session
+        self.abilities = Abilities(JOINTS, session.ticks_per_s)
         self.welcome: Welcome = session.welcome
         # The board may remember commands of an earlier host: ours are newer than all of them.
         self._sequence = max(session.status.acknowledged_sequence, session.status.rejected_sequence)
@@ -339,6 +342,11 @@ class Board:
         taken = self._session.take_angles()
         t_s = np.array([t for t, _ in taken])
         return JointStates(t_s, np.array([q for _, q in taken], dtype=float).reshape(-1, JOINTS))
+
+    def soft_limits(self) -> tuple[Array, Array]:
+        """Return the soft limits (6,) of its configuration, rad."""
+        joints = self.configuration()["joint"]
+        return joints["soft_min_rad"].astype(float), joints["soft_max_rad"].astype(float)
 
     def configuration(self) -> Configuration:
         """Return the configuration in use, to be changed and given to :meth:`store`."""

@@ -39,6 +39,17 @@ class Fault(IntEnum):
     CONFIG = 14
 
 
+class Alarm(IntEnum):
+    """What went wrong by the word of a controller that is not our firmware; no number of it is a :class:`Fault`'s."""
+
+    VOLTAGE = 101
+    ANGLE_SENSOR = 102
+    OVERHEAT = 103
+    OVERCURRENT = 104
+    OVERLOAD = 105
+    EMERGENCY_STOP = 106
+
+
 class Rejection(IntEnum):
     """Why a command was not acknowledged."""
 
@@ -114,6 +125,14 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.TICK_OVERRUN: "tick overrun: the control loop took longer than its period",
     Fault.WATCHDOG: "restarted by the watchdog",
     Fault.CONFIG: "no valid configuration: factory values are in use",
+}
+ALARM_TEXTS: Mapping[Alarm, str] = {
+    Alarm.VOLTAGE: "supply outside the servo's limits",
+    Alarm.ANGLE_SENSOR: "angle sensor broken",
+    Alarm.OVERHEAT: "too hot: let it cool down",
+    Alarm.OVERCURRENT: "current too high",
+    Alarm.OVERLOAD: "overload: the servo has switched its torque down; take the load off, then enable again",
+    Alarm.EMERGENCY_STOP: "the emergency stop was pressed",
 }
 REJECTION_TEXTS: Mapping[Rejection, str] = {
     Rejection.NONE: "acknowledged",

@@ -1,6 +1,8 @@
-"""Open a board by its name: ``emulated:unicorn``, ``emulated:qemu``, ``emulated:host`` or ``serial:PORT``.
+"""Open a board by its name: ``emulated:NAME``, ``serial:PORT``, ``feetech:PORT`` or ``ar4:PORT``.
 
-Here is the registry of the emulators that run the firmware.
+Here is the registry of the emulators that run our firmware, and of the arms that keep their own controller.
+:func:`open_board` opens a board with our firmware, whose gains and configuration can be changed;
+:func:`open_motion_board` any that moves an arm.
 """
 
 from __future__ import annotations
@@ -10,9 +12,16 @@ from pathlib import Path
 
 from armsight import firmware
 from armsight.errors import InputError
+from armsight.robot.boards.ar4 import board as ar4_board
+from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.configuration import Configuration, lab_configuration
+from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.feetech import bus as feetech_bus
+from armsight.robot.boards.feetech.board import FeetechBoard
+from armsight.robot.boards.feetech.bus import ServoBus
+from armsight.robot.boards.feetech.calibration import read_calibration
 from armsight.robot.boards.host import HostEmulator
 from armsight.robot.boards.link import Emulator, Plant
 from armsight.robot.boards.qemu import QemuEmulator
@@ -45,12 +54,66 @@ def open_emulator(name: str, image: Path | None = None) -> Emulator:
 
 
 EMULATED, SERIAL = "emulated:", "serial:"
+FEETECH, AR4 = "feetech:", "ar4:"
+#: Kinds of boards with a controller of their own -> what follows.
+OWN_CONTROLLERS: Mapping[str, str] = {FEETECH: "PORT", AR4: "PORT (ar4:PORT,mk2 for another model than mk3)"}
+
+
+def is_real(name: str) -> bool:
+    """Return whether a board of this name is at a port: time passes by itself."""
+    return name.startswith((SERIAL, *OWN_CONTROLLERS))
+
+
+def open_motion_board(
+    name: str,
+    plant: Plant | None = None,
+    *,
+    config: Configuration | None = None,
+    baud: int | None = None,
+    calibration: Path | None = None,
+) -> MotionBoard:
+    """Open any board that moves an arm.
+
+    Args:
+        name: see the module; ``ar4:PORT,mk2`` names another model than mk3.
+        plant: the arm at an emulated board's motors.
+        config: of an emulated board; the lab's without.
+        baud: of a port; the kind's own without.
+        calibration: LeRobot's calibration file, of a servo bus only.
+
+    Raises:
+        InputError: there is no such kind of board, or it needs no calibration.
+        DeviceError: it does not answer, or is of another kind.
+    """
+    if calibration is not None and not name.startswith(FEETECH):
+        raise InputError(f"{name} needs no --calibration: that is LeRobot's file, of {FEETECH}PORT")
+    if name.startswith(FEETECH):
+        servos = None if calibration is None else read_calibration(calibration)
+        return FeetechBoard.connect(open_bus(name, baud), servos)
+    if name.startswith(AR4):
+        port, _, model = name.removeprefix(AR4).partition(",")
+        link = SerialLink.open(port, ar4_board.BAUD if baud is None else baud)
+        return Ar4Board.connect(link, name=port, model=model or "mk3")
+    return open_board(name, plant, config=config, baud=BAUD if baud is None else baud)
+
+
+def open_bus(name: str, baud: int | None = None) -> ServoBus:
+    """Open the servo bus of ``feetech:PORT``; nothing is asked yet.
+
+    Raises:
+        InputError: it is no such name.
+        DeviceError: the port cannot be opened.
+    """
+    if not name.startswith(FEETECH):
+        raise InputError(f"{name} is no servo bus; {FEETECH}PORT is needed, such as feetech:/dev/ttyACM0")
+    port, baud = name.removeprefix(FEETECH), feetech_bus.BAUD if baud is None else baud
+    return ServoBus(SerialLink.open(port, baud), port, baud)
 
 
 def open_board(
     name: str, plant: Plant | None = None, *, config: Configuration | None = None, baud: int = BAUD
 ) -> Board:
-    """Open a board; the time of an emulated one passes in ``receive`` only.
+    """Open a board with our firmware; the time of an emulated one passes in ``receive`` only.
 
     Args:
         name: see the module.
@@ -59,7 +122,7 @@ def open_board(
         baud: of a serial port.
 
     Raises:
-        InputError: there is no such kind of board, or an emulated one has no plant.
+        InputError: there is no such kind of board, it has another controller, or an emulated one has no plant.
         DeviceError: it does not answer, or is of another version.
     """
     if name.startswith(SERIAL):
@@ -77,10 +140,15 @@ def emulator_name(name: str) -> str:
     Raises:
         InputError: there is no such board; the message names those there are.
     """
+    if name.startswith(tuple(OWN_CONTROLLERS)):
+        raise InputError(
+            f"{name} keeps its own controller: it has no gains, no configuration and no self-test of armsight's firmware"
+        )
     emulator = name.removeprefix(EMULATED)
     if not name.startswith(EMULATED) or emulator not in EMULATORS:
         known = ", ".join(f"{EMULATED}{each}" for each in EMULATORS)
-        raise InputError(f"no board {name!r}; there are {known} and {SERIAL}PORT, such as serial:/dev/ttyACM0")
+        own = " and ".join(f"{kind}{follows}" for kind, follows in OWN_CONTROLLERS.items())
+        raise InputError(f"no board {name!r}; there are {known}, {SERIAL}PORT, such as serial:/dev/ttyACM0, {own}")
     return emulator
 
 

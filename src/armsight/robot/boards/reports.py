@@ -7,7 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.robot.boards.codes import FAULT_TEXTS, BoardState, ConfigSource, Fault, Limited, Rejection, faults_in
+from armsight.robot.boards.codes import (
+    ALARM_TEXTS,
+    FAULT_TEXTS,
+    Alarm,
+    BoardState,
+    ConfigSource,
+    Fault,
+    Limited,
+    Rejection,
+    faults_in,
+)
 from armsight.robot.boards.wire import Message
 
 _NO_JOINT = 255
@@ -20,16 +30,16 @@ class Welcome:
     Attributes:
         board: its name.
         firmware: its firmware's version.
-        ticks_per_s: how many ticks its clock has a second.
+        ticks_per_s: how many ticks its clock has a second; 0 where it has none and the host stamps its readings.
         baud: bits a second on its wire.
-        config_source: where its configuration came from.
+        config_source: where its configuration came from; None where it has none of ours.
     """
 
     board: str
     firmware: str
     ticks_per_s: int
     baud: int
-    config_source: ConfigSource
+    config_source: ConfigSource | None
 
 
 @dataclass(frozen=True)
@@ -38,15 +48,15 @@ class JointFault:
 
     Attributes:
         fault: which.
-        joint: of which joint, 0 to 5; None where it belongs to none.
+        joint: of which joint, from 0; None where it belongs to none.
     """
 
-    fault: Fault
+    fault: Fault | Alarm
     joint: int | None = None
 
     def __str__(self) -> str:
         where = "" if self.joint is None else f"joint {self.joint + 1}: "
-        return where + FAULT_TEXTS[self.fault]
+        return where + (ALARM_TEXTS[self.fault] if isinstance(self.fault, Alarm) else FAULT_TEXTS[self.fault])
 
 
 @dataclass(frozen=True)
@@ -101,11 +111,12 @@ class JointReport(Record):
 
     Attributes:
         t_s: when, s on the board's clock.
-        speed_rad_s: (6,) measured speeds, filtered.
-        reference_rad: (6,) where the joints are to be.
-        reference_rad_s: (6,) how fast they are to move.
-        duty: (6,) to the motors, -1 to 1.
+        speed_rad_s: (n,) measured speeds, filtered.
+        reference_rad: (n,) where the joints are to be.
+        reference_rad_s: (n,) how fast they are to move.
+        duty: (n,) to the motors, -1 to 1.
         limited: what holds each joint back without being a fault.
+        temperature_c: (n,) of the motors, degrees Celsius; None where nothing measures it.
     """
 
     t_s: float
@@ -114,6 +125,39 @@ class JointReport(Record):
     reference_rad_s: Array
     duty: Array
     limited: tuple[Limited, ...]
+    temperature_c: Array | None = None
+
+
+def plain_status(
+    t_s: float, state: BoardState, faults: tuple[JointFault, ...], supply_v: float, sent: int
+) -> BoardStatus:
+    """Return the status of a controller that keeps none of our firmware's counts.
+
+    Args:
+        t_s: when, s.
+        state: of its drives.
+        faults: all that stand.
+        supply_v: motor supply, V; NaN where nobody measures it.
+        sent: commands sent, which count as acknowledged.
+    """
+    return BoardStatus(
+        t_s=t_s,
+        state=state,
+        faults=faults,
+        first_fault=faults[0] if faults else None,
+        acknowledged_sequence=sent,
+        acknowledged_count=sent,
+        rejected_sequence=0,
+        rejected_count=0,
+        rejection=Rejection.NONE,
+        supply_v=supply_v,
+        crc_errors=0,
+        lost_bytes=0,
+        overrun_bytes=0,
+        stale_commands=0,
+        lost_messages=0,
+        config_stored=0,
+    )
 
 
 def welcome_of(message: Message) -> Welcome:

@@ -1,6 +1,6 @@
 """Forward kinematics of a packed table: tool and link frames, the geometric Jacobian and its rate, one or many at once.
 
-In: a table (96,) packed by :func:`armsight.robot.kinematics.table.packed` and joint angles, rad. Out: poses in the base
+In: a table (102,) packed by :func:`armsight.robot.kinematics.table.packed` and joint angles, rad. Out: poses in the base
 frame, m, and Jacobians. Three parts: sine, cosine and angle without calls into the system's library; one configuration;
 a batch of eight configurations.
 
@@ -8,7 +8,9 @@ A frame is carried as twelve numbers: the columns x, y, z of its rotation and it
 column i is [z_i x (p_tool - p_i); z_i] (Siciliano et al., "Robotics", 2009, section 3.1.3). Its rate follows from its
 own columns: d(J_i)/d(q_j) is z_j x J_i for j <= i and z_i x Jv_j for j > i (Bruyninckx and De Schutter, 1996).
 
-A batch array holds number i of configuration k at index ``8 * i + k``: angles, sines and cosines (48,), frames (96,) as
+How many joints an arm has stands in its table. Six, the usual number, has loops of its own: the compiler unrolls them.
+
+A batch array holds number i of configuration k at index ``8 * i + k``: angles, sines and cosines (8 n,), frames (96,) as
 the twelve numbers above. The compiler makes vector instructions of the loops over k. The count n of configurations in use
 is a variable on purpose: a loop whose length is known is unrolled instead.
 """
@@ -19,7 +21,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.kernels import kernel
-from armsight.robot.kinematics.table import TOOL
+from armsight.robot.kinematics.table import BASE, JOINTS, MODIFIED, MOST_JOINTS, TOOL
 
 Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
@@ -28,7 +30,7 @@ GOOD, NOT_FINITE, NOT_RADIANS = 0, 1, 2
 #: No joint rotates further than this, rad; an angle beyond it is most likely in degrees.
 MOST_RADIANS = 20.0
 #: Configurations in a batch, and the size of forward_batch's workspace.
-BATCH, BATCH_WORK = 8, 240
+BATCH, BATCH_WORK = 8, 3 * 8 * MOST_JOINTS + 96
 
 #: 2 / pi, and pi / 2 in three parts of which the first two have zeros for their last bits, so that the product with a
 #: small whole number is exact (Cody and Waite, "Software Manual for the Elementary Functions", 1980).
@@ -101,9 +103,9 @@ def angle_of_each(y: Array, x: Array, angles: Array, n: int) -> None:
 
 @kernel("f8[::1]", fastmath={"contract", "nsz"})
 def validity(q: Array) -> int:
-    """Return whether joint angles (6,) are finite and can be radians: GOOD, NOT_FINITE or NOT_RADIANS."""
+    """Return whether joint angles (n,) are finite and can be radians: GOOD, NOT_FINITE or NOT_RADIANS."""
     largest = 0.0
-    for i in range(6):
+    for i in range(q.shape[0]):
         if not abs(q[i]) < np.inf:
             return NOT_FINITE
         largest = max(largest, abs(q[i]))
@@ -113,8 +115,9 @@ def validity(q: Array) -> int:
 @kernel(fastmath={"contract", "nsz"})
 def first_frame(table: Array) -> Frame:
     """Return frame 0 in the base."""
-    t = table
-    return (t[36], t[40], t[44], t[37], t[41], t[45], t[38], t[42], t[46], t[39], t[43], t[47])
+    t, k = table, BASE
+    xx, xy, xz, yx, yy, yz = t[k], t[k + 4], t[k + 8], t[k + 1], t[k + 5], t[k + 9]
+    return (xx, xy, xz, yx, yy, yz, t[k + 2], t[k + 6], t[k + 10], t[k + 3], t[k + 7], t[k + 11])
 
 
 @kernel(fastmath={"contract", "nsz"})
@@ -214,56 +217,63 @@ def store(F: Frame, T: Array) -> None:
     T[0, 3], T[1, 3], T[2, 3], T[3, 3] = F[9], F[10], F[11], 1.0
 
 
-@kernel(fastmath={"contract", "nsz"})
-def tool_frame(table: Array, q: Array) -> Frame:
-    """Return the tool's frame at joint angles (6,)."""
+@kernel(fastmath={"contract", "nsz"}, forceinline=True)
+def _tool_frame(table: Array, q: Array, joints: int) -> Frame:
+    """Return the tool's frame at so many joint angles."""
     F = first_frame(table)
-    for i in range(6):
+    for i in range(joints):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_rotation(table, i, c, s, F))
     return after(table, TOOL, F)
 
 
+@kernel(fastmath={"contract", "nsz"})
+def tool_six(table: Array, q: Array) -> Frame:
+    """Return the tool's frame at joint angles (6,)."""
+    return _tool_frame(table, q, 6)
+
+
+@kernel(fastmath={"contract", "nsz"})
+def tool_frame(table: Array, q: Array) -> Frame:
+    """Return the tool's frame at joint angles (n,)."""
+    return tool_six(table, q) if q.shape[0] == 6 else _tool_frame(table, q, q.shape[0])
+
+
 @kernel("const f8[::1], f8[::1], f8[:, ::1]", fastmath={"contract", "nsz"})
 def forward(table: Array, q: Array, T: Array) -> int:
-    """Write the tool's pose at joint angles (6,) into T_base_tool (4, 4); returns the validity of q."""
+    """Write the tool's pose at joint angles (n,) into T_base_tool (4, 4); returns the validity of q."""
     store(tool_frame(table, q), T)
     return validity(q)
 
 
 @kernel("const f8[::1], f8[::1], f8[:, :, ::1]", fastmath={"contract", "nsz"})
 def links(table: Array, q: Array, Ts: Array) -> int:
-    """Write frame 0, the frames of links 1 to 6 and the tool's into (8, 4, 4); returns the validity of q."""
-    modified = table[60] != 0.0
+    """Write frame 0, the frames of links 1 to n and the tool's into (n + 2, 4, 4); returns the validity of q."""
+    modified = table[MODIFIED] != 0.0
     F = first_frame(table)
     store(F, Ts[0])
-    for i in range(6):
+    for i in range(q.shape[0]):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         rotated = after_rotation(table, i, c, s, F)
         F = after_link(table, i, rotated)
         store(rotated if modified else F, Ts[i + 1])
-    store(after(table, TOOL, F), Ts[7])
+    store(after(table, TOOL, F), Ts[q.shape[0] + 1])
     return validity(q)
 
 
-@kernel(fastmath={"contract", "nsz"})
-def _axes(table: Array, q: Array, J: Array) -> Frame:
-    """Write the joints' axes into rows 3 to 5 of J and points on them into rows 0 to 2; return the tool's frame."""
+@kernel(fastmath={"contract", "nsz"}, forceinline=True)
+def _jacobian_base(table: Array, q: Array, J: Array, joints: int) -> Frame:
+    """Write the Jacobian (6, n) of so many joints in base axes; return the tool's frame."""
     F = first_frame(table)
-    for i in range(6):
+    for i in range(joints):
         way = table[6 * i + 5]
+        # A point on the joint's axis, and the axis itself.
         J[0, i], J[1, i], J[2, i] = F[9], F[10], F[11]
         J[3, i], J[4, i], J[5, i] = way * F[6], way * F[7], way * F[8]
         s, c = sincos(way * q[i] + table[6 * i + 4])
         F = after_link(table, i, after_rotation(table, i, c, s, F))
-    return after(table, TOOL, F)
-
-
-@kernel(fastmath={"contract", "nsz"})
-def jacobian_base(table: Array, q: Array, J: Array) -> Frame:
-    """Write the Jacobian (6, 6) in base axes; return the tool's frame."""
-    F = _axes(table, q, J)
-    for i in range(6):
+    F = after(table, TOOL, F)
+    for i in range(joints):
         rx, ry, rz = F[9] - J[0, i], F[10] - J[1, i], F[11] - J[2, i]
         zx, zy, zz = J[3, i], J[4, i], J[5, i]
         J[0, i], J[1, i], J[2, i] = zy * rz - zz * ry, zz * rx - zx * rz, zx * ry - zy * rx
@@ -271,9 +281,21 @@ def jacobian_base(table: Array, q: Array, J: Array) -> Frame:
 
 
 @kernel(fastmath={"contract", "nsz"})
+def jacobian_six(table: Array, q: Array, J: Array) -> Frame:
+    """Write the Jacobian (6, 6) in base axes; return the tool's frame."""
+    return _jacobian_base(table, q, J, 6)
+
+
+@kernel(fastmath={"contract", "nsz"})
+def jacobian_base(table: Array, q: Array, J: Array) -> Frame:
+    """Write the Jacobian (6, n) in base axes; return the tool's frame."""
+    return jacobian_six(table, q, J) if q.shape[0] == 6 else _jacobian_base(table, q, J, q.shape[0])
+
+
+@kernel(fastmath={"contract", "nsz"})
 def _into_tool_axes(F: Frame, J: Array) -> None:
     """Express the columns of J, given in base axes, in the axes of a frame."""
-    for i in range(6):
+    for i in range(J.shape[1]):
         for k in (0, 3):
             x, y, z = J[k, i], J[k + 1, i], J[k + 2, i]
             J[k, i] = F[0] * x + F[1] * y + F[2] * z
@@ -283,7 +305,7 @@ def _into_tool_axes(F: Frame, J: Array) -> None:
 
 @kernel("const f8[::1], f8[::1], b1, f8[:, ::1]", fastmath={"contract", "nsz"})
 def jacobian(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
-    """Write the Jacobian (6, 6) of the tool's point, [linear; angular] rows; returns the validity of q."""
+    """Write the Jacobian (6, n) of the tool's point, [linear; angular] rows; returns the validity of q."""
     F = jacobian_base(table, q, J)
     if in_tool_axes:
         _into_tool_axes(F, J)
@@ -292,24 +314,23 @@ def jacobian(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
 
 @kernel("const f8[::1], f8[:, ::1], b1, f8[:, :, ::1]", fastmath={"contract", "nsz"})
 def jacobian_batch(table: Array, q: Array, in_tool_axes: bool, J: Array) -> int:
-    """Write the Jacobians at joint angles (N, 6) into (N, 6, 6); returns the worst validity."""
+    """Write the Jacobians at joint angles (N, n) into (N, 6, n); returns the worst validity."""
     worst = GOOD
     for n in range(q.shape[0]):
         worst = max(worst, jacobian(table, q[n], in_tool_axes, J[n]))
     return worst
 
 
-@kernel("const f8[::1], f8[::1], f8[::1], b1, f8[:, ::1]", fastmath={"contract", "nsz"})
-def jacobian_rate(table: Array, q: Array, qd: Array, in_tool_axes: bool, J: Array) -> int:
-    """Write the time derivative of the Jacobian (6, 6); returns the validity of q."""
-    F = jacobian_base(table, q, J)
+@kernel(fastmath={"contract", "nsz"}, forceinline=True)
+def _jacobian_rate(F: Frame, qd: Array, in_tool_axes: bool, J: Array, joints: int) -> None:
+    """Write the time derivative of the Jacobian (6, n) of so many joints in place of the Jacobian in base axes."""
     vx = vy = vz = ox = oy = oz = 0.0  # the tool's whole velocity
-    for i in range(6):
+    for i in range(joints):
         vx, vy, vz = vx + J[0, i] * qd[i], vy + J[1, i] * qd[i], vz + J[2, i] * qd[i]
         ox, oy, oz = ox + J[3, i] * qd[i], oy + J[4, i] * qd[i], oz + J[5, i] * qd[i]
     # In tool axes the columns are seen from a frame that rotates with the tool, so its rotation is subtracted.
     wx, wy, wz = (-ox, -oy, -oz) if in_tool_axes else (0.0, 0.0, 0.0)
-    for i in range(6):
+    for i in range(joints):
         lx, ly, lz, zx, zy, zz = J[0, i], J[1, i], J[2, i], J[3, i], J[4, i], J[5, i]
         # w: what rotates the axis (joints up to i; axis i does not rotate itself); v: what moves the tool beyond joint i.
         vx, vy, vz = vx - lx * qd[i], vy - ly * qd[i], vz - lz * qd[i]
@@ -320,6 +341,16 @@ def jacobian_rate(table: Array, q: Array, qd: Array, in_tool_axes: bool, J: Arra
         J[2, i] = wx * ly - wy * lx + zx * vy - zy * vx
     if in_tool_axes:
         _into_tool_axes(F, J)
+
+
+@kernel("const f8[::1], f8[::1], f8[::1], b1, f8[:, ::1]", fastmath={"contract", "nsz"})
+def jacobian_rate(table: Array, q: Array, qd: Array, in_tool_axes: bool, J: Array) -> int:
+    """Write the time derivative of the Jacobian (6, n); returns the validity of q."""
+    F = jacobian_base(table, q, J)
+    if q.shape[0] == 6:
+        _jacobian_rate(F, qd, in_tool_axes, J, 6)
+    else:
+        _jacobian_rate(F, qd, in_tool_axes, J, q.shape[0])
     return validity(q)
 
 
@@ -330,9 +361,25 @@ def _joint(table: Array, i: int, sines: Array, cosines: Array, k: int, F: Frame)
 
 
 @kernel(fastmath={"contract", "nsz"})
+def _to_batch(F: Frame, out: Array, k: int) -> None:
+    """Write a frame as configuration k of a batch."""
+    out[k], out[8 + k], out[16 + k] = F[0], F[1], F[2]
+    out[24 + k], out[32 + k], out[40 + k] = F[3], F[4], F[5]
+    out[48 + k], out[56 + k], out[64 + k] = F[6], F[7], F[8]
+    out[72 + k], out[80 + k], out[88 + k] = F[9], F[10], F[11]
+
+
+@kernel(fastmath={"contract", "nsz"})
 def frames(table: Array, sines: Array, cosines: Array, out: Array, n: int) -> None:
-    """Write the tool's frames (96,) for sines and cosines (48,) of theta."""
+    """Write the tool's frames (96,) for sines and cosines (8 n,) of theta."""
     first = first_frame(table)
+    if table[JOINTS] != 6.0:
+        for k in range(n):
+            F = first
+            for i in range(int(table[JOINTS])):
+                F = _joint(table, i, sines, cosines, k, F)
+            _to_batch(after(table, TOOL, F), out, k)
+        return
     for k in range(n):
         F = _joint(table, 0, sines, cosines, k, first)
         F = _joint(table, 1, sines, cosines, k, F)
@@ -340,16 +387,12 @@ def frames(table: Array, sines: Array, cosines: Array, out: Array, n: int) -> No
         F = _joint(table, 3, sines, cosines, k, F)
         F = _joint(table, 4, sines, cosines, k, F)
         F = _joint(table, 5, sines, cosines, k, F)
-        F = after(table, TOOL, F)
-        out[k], out[8 + k], out[16 + k] = F[0], F[1], F[2]
-        out[24 + k], out[32 + k], out[40 + k] = F[3], F[4], F[5]
-        out[48 + k], out[56 + k], out[64 + k] = F[6], F[7], F[8]
-        out[72 + k], out[80 + k], out[88 + k] = F[9], F[10], F[11]
+        _to_batch(after(table, TOOL, F), out, k)
 
 
 @kernel(fastmath={"contract", "nsz"})
 def thetas(table: Array, q: Array, theta: Array, n: int) -> None:
-    """Write theta (48,) of joint angles (48,), rad."""
+    """Write theta (48,) of six joints' angles (48,), rad."""
     for i in range(6):
         way, offset = table[6 * i + 5], table[6 * i + 4]
         for k in range(n):
@@ -374,17 +417,20 @@ def errors(out: Array, G: Frame, position: Array, angle: Array, n: int) -> None:
 
 @kernel("const f8[::1], f8[:, ::1], f8[:, :, ::1], f8[::1], i8", fastmath={"contract", "nsz"})
 def forward_batch(table: Array, q: Array, Ts: Array, work: Array, n: int) -> int:
-    """Write the tool's poses at joint angles (N, 6) into (N, 4, 4); work is (240,), n is 8. Returns the worst validity."""
-    worst, count = 0, q.shape[0]
-    theta, sines, cosines, out = work[:48], work[48:96], work[96:144], work[144:240]
+    """Write the tool's poses at joint angles (N, n) into (N, 4, 4); returns the worst validity.
+
+    ``work`` is (BATCH_WORK,), ``n`` is 8.
+    """
+    worst, count, joints = 0, q.shape[0], q.shape[1]
+    theta, sines, cosines, out = work[:56], work[56:112], work[112:168], work[168:264]
     theta[:] = 0.0
     for start in range(0, count, n):
         used = min(n, count - start)
         for k in range(used):
             worst = max(worst, validity(q[start + k]))
-            for i in range(6):
+            for i in range(joints):
                 theta[8 * i + k] = table[6 * i + 5] * q[start + k, i] + table[6 * i + 4]
-        sincos_each(theta, sines, cosines, 6 * n)
+        sincos_each(theta, sines, cosines, joints * n)
         frames(table, sines, cosines, out, n)
         for k in range(used):
             T = Ts[start + k]

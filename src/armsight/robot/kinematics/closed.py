@@ -268,7 +268,7 @@ def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: A
     """Write the thetas of all solutions into a batch, one after the other.
 
     Args:
-        table: (96,) a packed table whose KIND is PARALLEL or SPHERICAL.
+        table: (102,) a packed table whose KIND is PARALLEL or SPHERICAL.
         M: the requested frame just after joint 6's rotation, in frame 0 of the table.
         near: (6,) joint angles, rad: what an undetermined joint is given.
         clamp: write the closest that a step can come where a pose is out of reach.

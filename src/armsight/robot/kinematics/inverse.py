@@ -1,6 +1,6 @@
-"""Inverse kinematics: from a requested pose to checked, polished and sorted joint angles, or to the nearest pose.
+"""Inverse kinematics of six joints: a requested pose to checked, polished and sorted joint angles, or the nearest pose.
 
-In: the packed table (96,), the table of its closed form, limits and T_base_tool. Out: rows of joint angles with what is
+In: the packed table (102,), the table of its closed form, limits and T_base_tool. Out: rows of joint angles with what is
 left of the error, their configuration and their state. In this order:
 
 1. The requested pose: whether it is a rigid motion; its rotation is made orthonormal to the last digit.
@@ -29,10 +29,10 @@ from armsight.robot.kinematics.chain import (
     before,
     errors,
     frames,
-    jacobian_base,
+    jacobian_six,
     sincos_each,
     thetas,
-    tool_frame,
+    tool_six,
 )
 from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
 from armsight.robot.kinematics.table import KIND, UNBASE, UNTOOL
@@ -162,7 +162,7 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
     """Move joint angles (6,) in-place towards a requested frame, within bounds.
 
     Args:
-        table: (96,) packed table.
+        table: (102,) packed table.
         G: the requested frame of the tool.
         q: (6,) where to start, within the bounds; where it ends.
         low: (6,) lower bounds, rad.
@@ -178,7 +178,7 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
     damping, better = 0.0, True
     for _ in range(most):
         if better:
-            cost = pose_error(jacobian_base(table, q, J), G, e)
+            cost = pose_error(jacobian_six(table, q, J), G, e)
             if cost < _NONE:
                 break
             damping = 0.1 * damping if damping > 0.0 else 1e-6 * min(1.0, cost)
@@ -190,7 +190,7 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
                 size = max(size, abs(step[i]))
             for i in range(6):
                 trial[i] = min(high[i], max(low[i], q[i] + step[i] / max(1.0, size)))
-            after = pose_error(tool_frame(table, trial), G, g)
+            after = pose_error(tool_six(table, trial), G, g)
         better = after < cost
         if better:
             q[:] = trial
@@ -299,7 +299,7 @@ def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool
     descend(table, F, q, work[17], work[18], steps, work)
     for i in range(6):
         row[i] = wrap(q[i])
-    pose_error(tool_frame(table, row), F, e)
+    pose_error(tool_six(table, row), F, e)
     row[POSITION] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     row[ANGLE] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
     return bool(max(row[POSITION], row[ANGLE]) < _WRONG)
@@ -410,8 +410,8 @@ def inverse(
     """Write all joint angles that bring the tool to a pose.
 
     Args:
-        table: (96,) packed table; its KIND is not 0 where ``closed`` is the same arm exactly.
-        closed: (96,) the table that the closed form works on, KIND 0 where there is none.
+        table: (102,) packed table; its KIND is not 0 where ``closed`` is the same arm exactly.
+        closed: (102,) the table that the closed form works on, KIND 0 where there is none.
         limits: (2, 6) lower and upper limits of the joints, rad.
         T: (4, 4) T_base_tool, m.
         near: (6,) joint angles, rad: what an undetermined joint is given, and which of several revolutions is taken.

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.geometry.pose import inverse
-from armsight.robot.kinematics.table import ACROSS, BASE, BEND, FOREARM, KIND, TOOL, UNTOOL, link
+from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND, TOOL, UNTOOL, link
 
 NEITHER, PARALLEL, SPHERICAL = 0, 1, 2
 
@@ -31,15 +31,15 @@ def recognised(table: Array) -> tuple[Array, bool]:
     """Find the structure of a table.
 
     Args:
-        table: (96,) packed table.
+        table: (102,) packed table.
 
     Returns:
-        (96,) the table that the closed-form inverse works on, its kind at KIND (NEITHER where there is none): the same arm
+        (102,) the table that the closed-form inverse works on, its kind at KIND (NEITHER where there is none): the same arm
         written with its parallel axes pointing one way, or the nearest that has a structure; and whether it is exact.
     """
     for near_rad, near_m, exact in ((1e-12, 1e-12, True), (_NEAR_RAD, _NEAR_M, False)):
         squared = _squared(table, near_rad)
-        rows = squared[:BASE].reshape(6, 6)
+        rows = squared[:36].reshape(6, 6)
         for kind in (SPHERICAL, PARALLEL):
             if _fits(rows, kind, near_m):
                 return _finished(squared, kind), exact
@@ -52,7 +52,7 @@ def _squared(table: Array, near_rad: float) -> Array:
     ``Rx(pi) Rz(theta) Tz(d) Tx(a) Rx(alpha) = Rz(-theta) Tz(-d) Tx(a) Rx(alpha + pi)`` carries it one link further.
     """
     out = table.copy()
-    rows = out[:BASE].reshape(6, 6)
+    rows = out[:36].reshape(6, 6)
     for row in rows:
         quarter = np.rint(np.arctan2(row[_SIN], row[_COS]) / (np.pi / 2))
         if abs(np.arctan2(row[_SIN], row[_COS]) - quarter * np.pi / 2) <= near_rad:
@@ -82,7 +82,7 @@ def _fits(rows: Array, kind: int, near_m: float) -> bool:
 def _finished(squared: Array, kind: int) -> Array:
     """Write what the closed form needs into a squared table whose small lengths vanish."""
     out = squared.copy()
-    rows = out[:BASE].reshape(6, 6)
+    rows = out[:36].reshape(6, 6)
     along, across = rows[2, _A], 0.0
     rows[4, _A] = 0.0
     shift = rows[1, _D] + rows[2, _D] + rows[3, _D]

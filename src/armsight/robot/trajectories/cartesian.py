@@ -48,14 +48,14 @@ class PathMotion:
         return self.law.duration_s
 
     def at(self, t_s: float | Array) -> Joints:
-        """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
+        """Return the joints, (n,) or (N, n), ``t_s`` seconds after the start."""
         times = clamped(t_s, self.duration_s)
         share, speed, acceleration = (part[:, :1] for part in self.law.at(times.ravel()))
         points = self.path.at(share[:, 0])
         q = refined(self.arm, points.T_base_tool, self.guide.near(share[:, 0]))
         q1, q2 = derivatives(self.arm, q, points)
         joints = (q, q1 * speed, q1 * acceleration + q2 * speed**2)
-        return Joints(*(part.reshape(*times.shape, 6) for part in joints))
+        return Joints(*(part.reshape(*times.shape, self.arm.joints) for part in joints))
 
 
 def follow(
@@ -73,9 +73,9 @@ def follow(
     Args:
         arm: the arm.
         path: the path; its start is where ``q_start`` puts the tool.
-        q_start: (6,) angles to start from, rad.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        q_start: (n,) angles to start from, rad.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
         cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
 

@@ -66,14 +66,14 @@ def circle(
 
     Args:
         arm: the arm.
-        q_start: (6,) angles to start from, rad; their configuration is kept.
+        q_start: (n,) angles to start from, rad; their configuration is kept.
         center_base: (3,) a point of the axis, m, base frame: the centre where it lies in the circle's plane.
         axis_base: (3,) direction of the axis, any length, base frame; the tool moves about it by the right hand.
         angle_rad: how far round, rad; a full circle by default, negative for the other way.
         rotation_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
             axis times ``angle_rad`` rotates the tool with the circle.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the circle. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the circle. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
@@ -107,11 +107,11 @@ def arc(
 
     Args:
         arm: the arm.
-        q_start: (6,) angles to start from, rad; their configuration is kept.
+        q_start: (n,) angles to start from, rad; their configuration is kept.
         via_base: (3,) a point on the arc between start and goal, m, base frame.
         T_base_goal: (4, 4) pose of the tool to end at.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the arc. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the arc. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:

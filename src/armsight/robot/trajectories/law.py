@@ -240,7 +240,7 @@ def bounds(arm: Arm, guide: Walk) -> Array:
 
 
 def along(guide: Walk, law: Law | Profile, t_s: Array) -> Joints:
-    """Return the joints (N, 6) at times (N,), between the points of the walk by interpolation; angles are left at 0."""
+    """Return the joints (N, n) at times (N,), between the points of the walk by interpolation; angles are left at 0."""
     share, speed, acceleration = (part[:, :1] for part in law.at(t_s))
     q1, q2 = (columns(share[:, 0], guide.share, part) for part in (guide.q1, guide.q2))
     return Joints(np.zeros_like(q1), q1 * speed, q1 * acceleration + q2 * speed**2)

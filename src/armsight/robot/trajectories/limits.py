@@ -41,11 +41,11 @@ def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | N
     Raises:
         InputError: wrong shapes, NaN, or outside the limits, or bound to leave them whatever is done.
     """
-    zero = np.zeros(6)
+    zero, shape = np.zeros(arm.joints), (arm.joints,)
     start = Joints(
         inside(arm, q, "q_start"),
-        zero if qd is None else checked(qd, (6,), "qd_start"),
-        zero if qdd is None else checked(qdd, (6,), "qdd_start"),
+        zero if qd is None else checked(qd, shape, "qd_start"),
+        zero if qdd is None else checked(qdd, shape, "qdd_start"),
     )
     # The speed still gains this while the acceleration is taken back at full jerk.
     gain = np.where(start.qdd == 0, 0.0, start.qdd * np.abs(start.qdd) / (2 * arm.qddd_max))
@@ -64,12 +64,12 @@ def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | N
 
 
 def inside(arm: Arm, q: ArrayLike, name: str) -> Array:
-    """Return joint angles (6,), rad, that have been found within the arm's limits.
+    """Return joint angles (n,), rad, that have been found within the arm's limits.
 
     Raises:
         InputError: wrong shape, NaN or outside.
     """
-    angles = checked(q, (6,), name)
+    angles = checked(q, (arm.joints,), name)
     arm.forward(angles)  # rejects degrees with a hint
     if (reason := outside(arm, angles)) is not None:
         raise InputError(f"{name}: {reason}")
@@ -77,7 +77,7 @@ def inside(arm: Arm, q: ArrayLike, name: str) -> Array:
 
 
 def outside(arm: Arm, q: Array) -> str | None:
-    """Return which joint (6,) is beyond its limits, in words; None where none is."""
+    """Return which joint (n,) is beyond its limits, in words; None where none is."""
     over = np.maximum(arm.q_min - q, q - arm.q_max)
     i = int(np.argmax(over))
     if over[i] <= ROUNDING:
@@ -87,7 +87,7 @@ def outside(arm: Arm, q: Array) -> str | None:
 
 
 def worst(arm: Arm, t_s: Array, joints: Joints) -> Worst:
-    """Return where samples (N, 6) at times (N,) come nearest to a limit of speed, acceleration or jerk."""
+    """Return where samples (N, n) at times (N,) come nearest to a limit of speed, acceleration or jerk."""
     found = []
     for order, (name, unit, ratios, limit) in enumerate(_ratios(arm, t_s, joints), start=1):
         row, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
@@ -104,7 +104,7 @@ def time_scales(arm: Arm, t_s: Array, joints: Joints) -> Array:
 
 
 def _ratios(arm: Arm, t_s: Array, joints: Joints) -> list[tuple[str, str, Array, Array]]:
-    """Return name, unit, ratio (N, 6) to the limit, and limit (6,), of speed, acceleration and jerk."""
+    """Return name, unit, ratio (N, n) to the limit, and limit (n,), of speed, acceleration and jerk."""
     steps = np.diff(t_s)
     full = steps > 0.5 * np.median(steps) if len(steps) else np.zeros(0, bool)  # the last one may be a sliver
     jerk = np.zeros_like(joints.qdd)

@@ -66,10 +66,10 @@ def line(
 
     Args:
         arm: the arm.
-        q_start: (6,) angles to start from, rad; their configuration is kept.
+        q_start: (n,) angles to start from, rad; their configuration is kept.
         T_base_goal: (4, 4) pose of the tool to end at.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the line. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the line. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -40,7 +41,7 @@ class Walk(NamedTuple):
 
     Attributes:
         share: (K,) shares of the way, rising from 0.
-        q: (K, 6) joint angles, rad.
+        q: (K, n) joint angles, rad.
         q1: (K, 6) their derivative by the share, and ``q2`` the second.
         q2: see ``q1``.
     """
@@ -51,8 +52,10 @@ class Walk(NamedTuple):
     q2: Array
 
     def near(self, share: Array) -> Array:
-        """Return joint angles (N, 6) near shares (N,), to choose the right solution by."""
-        return columns(share, self.share, self.q)
+        """Return joint angles (N, n) near shares (N,), to choose the right solution by."""
+        if self.q.shape[1] == 6 or len(self.share) < 2:
+            return columns(share, self.share, self.q)
+        return np.asarray(CubicHermiteSpline(self.share, self.q, self.q1)(share))
 
 
 class Obstacle(NamedTuple):
@@ -75,7 +78,7 @@ def columns(x: Array, at: Array, values: Array) -> Array:
 
 
 def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
-    """Return the joint angles (N, 6) of poses (N, 4, 4) from ones close by, by Newton's method.
+    """Return the joint angles (N, n) of poses (N, 4, 4) from ones close by, by Newton's method.
 
     Raises:
         InputError: they were not close, or the poses are singular.
@@ -83,7 +86,7 @@ def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
     q = q_near
     off = behind(T_base_tool, arm.forward(q))
     for _ in range(NEWTON):
-        step = np.linalg.solve(arm.jacobian(q), off[..., None])[..., 0]
+        step = _joints_by(arm.jacobian(q), off)
         if np.abs(step).max() > FAR_RAD:
             break
         q = q + step
@@ -105,18 +108,32 @@ def behind(T_goal: Array, T: Array) -> Array:
 
 
 def derivatives(arm: Arm, q: Array, points: PathPoints) -> tuple[Array, Array]:
-    """Return q', q'' (N, 6) by the share of the way at joint angles (N, 6)."""
+    """Return q', q'' (N, n) by the share of the way at joint angles (N, n)."""
     J = arm.jacobian(q)
-    q1 = np.asarray(np.linalg.solve(J, points.twist[..., None])[..., 0], np.float64)
-    rate = np.array([arm.jacobian_rate(a, b) @ b for a, b in zip(q, q1, strict=True)])
-    return q1, np.asarray(np.linalg.solve(J, (points.bend - rate)[..., None])[..., 0], np.float64)
+    q1 = _joints_by(J, points.twist)
+    rates = [arm.jacobian_rate(a, b) for a, b in zip(q, q1, strict=True)]
+    rate = np.array([Jd @ b for Jd, b in zip(rates, q1, strict=True)])
+    q2 = _joints_by(J, points.bend - rate)
+    if arm.joints > 6:
+        # The least speeds that follow the path change along the free motion, too: (I - J+ J) J'^T (J J^T)^-1 twist.
+        y = np.swapaxes(np.array(rates), 1, 2) @ np.linalg.solve(J @ np.swapaxes(J, 1, 2), points.twist[..., None])
+        q2 = q2 + (y - np.linalg.pinv(J) @ (J @ y))[..., 0]
+    return q1, q2
+
+
+def _joints_by(J: Array, V: Array) -> Array:
+    """Return the least joint motion (N, n) that moves the tool by V (N, n), for Jacobians (N, 6, n)."""
+    if J.shape[-1] == 6:
+        return np.asarray(np.linalg.solve(J, V[..., None])[..., 0], np.float64)
+    return np.asarray((np.linalg.pinv(J) @ V[..., None])[..., 0], np.float64)
 
 
 def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Return the smallest singular value (N,) and the sign of the determinant (N,) at joint angles (N, 6)."""
+    """Return the smallest singular value (N,) and the sign of the determinant (N,) at joint angles (N, n)."""
     # The linear rows are divided by the arm's size, m, so that they compare with the angular ones.
     J: Array = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1, 1, 1])[:, None]
-    return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), np.asarray(np.sign(np.linalg.det(J)))
+    smallest = np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1])
+    return smallest, np.asarray(np.sign(np.linalg.det(J))) if arm.joints == 6 else np.ones(len(q))
 
 
 def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obstacle | None]:
@@ -125,15 +142,20 @@ def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obst
     Args:
         arm: the arm.
         path: the path.
-        q_start: (6,) joint angles at its start, rad.
+        q_start: (n,) joint angles at its start, rad.
         bends: (C, 2) shares between which steps are to be smaller.
 
     Returns:
         The walk up to the first obstacle, and that; None where there is none.
     """
+    if arm.joints < 6:
+        raise InputError(
+            f"{arm.name} has {arm.joints} joints: it cannot move its tool along a path with its orientation held; use a "
+            "motion from joint angles to joint angles, or a tracked path"
+        )
     share = _steps(path, bends)
     points = path.at(share)
-    q, reason = _chain(arm, points, q_start)
+    q, reason = _chain(arm, points, q_start) if arm.joints == 6 else _redundant_chain(arm, path, share, q_start)
     smallest, sign = singular_values(arm, q)
     bad = (smallest < SINGULAR) | (sign != sign[0]) | np.array([outside(arm, row) is not None for row in q])
     bad[1:] |= (np.abs(np.diff(q, axis=0)) > FAR_RAD).any(axis=1)
@@ -169,7 +191,7 @@ def _steps(path: Path, bends: Array) -> Array:
 
 
 def _chain(arm: Arm, points: PathPoints, q_start: Array) -> tuple[Array, str | None]:
-    """Return joint angles (K, 6) from point to point, and why they end where the reach does; they end at a limit too."""
+    """Return joint angles (K, n) from point to point, and why they end where the reach does; they end at a limit too."""
     chain = [q_start]
     for T in points.T_base_tool[1:]:
         q = _solve(arm, T, chain[-1])
@@ -181,8 +203,27 @@ def _chain(arm: Arm, points: PathPoints, q_start: Array) -> tuple[Array, str | N
     return np.array(chain), None
 
 
+def _redundant_chain(arm: Arm, path: Path, share: Array, q_start: Array) -> tuple[Array, str | None]:
+    """Return joint angles (K, n) at shares (K,), by the least speeds that follow the path, as :func:`_chain` does.
+
+    The midpoint rule, and Newton's method for what it leaves.
+    """
+    chain, middles, ends = [q_start], path.at((share[1:] + share[:-1]) / 2), path.at(share)
+    for k, step in enumerate(np.diff(share)):
+        q = chain[-1]
+        half = q + step / 2 * _joints_by(arm.jacobian(q), ends.twist[k])
+        ahead = q + step * _joints_by(arm.jacobian(half), middles.twist[k])
+        try:
+            chain.append(refined(arm, ends.T_base_tool[k + 1 : k + 2], ahead[None])[0])
+        except InputError:
+            return np.array(chain), "the path leaves the reach of the arm, or comes too near to a singularity"
+        if outside(arm, chain[-1]) is not None:
+            break
+    return np.array(chain), None
+
+
 def _solve(arm: Arm, T_base_tool: Array, q_near: Array) -> Array | str:
-    """Return the joint angles (6,) of a pose nearest to others, inside the limits or not; or why there are none."""
+    """Return the joint angles (n,) of a pose nearest to others, inside the limits or not; or why there are none."""
     found = arm.inverse(T_base_tool, near=q_near)
     if not len(found):
         return f"the path leaves the reach of the arm ({found.reason})"
@@ -192,7 +233,7 @@ def _solve(arm: Arm, T_base_tool: Array, q_near: Array) -> Array | str:
 
 
 def _problem(arm: Arm, q: Array, sign: float) -> str | None:
-    """Return what is wrong with joint angles (6,), in words; None where nothing is."""
+    """Return what is wrong with joint angles (n,), in words; None where nothing is."""
     if (reason := outside(arm, q)) is not None:
         return reason
     smallest, now = singular_values(arm, q[None])

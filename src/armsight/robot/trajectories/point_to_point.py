@@ -29,10 +29,10 @@ def point_to_point(
 
     Args:
         arm: the arm, for its limits.
-        q_start: (6,) angles to start from, rad.
-        q_goal: (6,) angles to end at, rad.
-        qd_start: (6,) speeds to start with, rad/s; None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2; None for none.
+        q_start: (n,) angles to start from, rad.
+        q_goal: (n,) angles to end at, rad.
+        qd_start: (n,) speeds to start with, rad/s; None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2; None for none.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:

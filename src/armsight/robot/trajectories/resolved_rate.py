@@ -71,7 +71,7 @@ class TrackedMotion:
     spline: CubicSpline
 
     def at(self, t_s: float | Array) -> Joints:
-        """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
+        """Return the joints, (n,) or (N, n), ``t_s`` seconds after the start."""
         times = clamped(t_s, self.duration_s)
         return Joints(*(np.asarray(self.spline(times, order)) for order in range(3)))
 
@@ -100,10 +100,10 @@ def resolved_rate(
 
     Args:
         arm: the arm.
-        q_start: (6,) angles to start from, rad; they put the tool at the path's start.
+        q_start: (n,) angles to start from, rad; they put the tool at the path's start.
         path: the path: a LinePath, an ArcPath, a BlendedPath, or anything with their ``at``.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long the reference is to take, s; None for about as short as the limits allow.
         tolerance_m: how far the tool may leave the path where damping sets in, m.
 
@@ -197,8 +197,8 @@ def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
 
 
 def _speeds(J: Array, V: Array, scale: Array) -> tuple[Array, float]:
-    """Return joint speeds (6,) for a tool velocity (6,), damped, and the smallest singular value."""
-    U, s, Vt = np.linalg.svd(J / scale[:, None])
+    """Return joint speeds (n,) for a tool velocity (6,), damped, and the smallest singular value."""
+    U, s, Vt = np.linalg.svd(J / scale[:, None], full_matrices=False)
     soft = max(0.0, 1 - (s[-1] / SOFT) ** 2)
     return (s / (s**2 + (DAMPING * soft) ** 2) * ((V / scale) @ U)) @ Vt, float(s[-1])
 
@@ -230,7 +230,7 @@ def _track(arm: Arm, q_start: Array, path: Path, law: Profile) -> _Run:
 
 
 def _step(arm: Arm, q: Array, points: PathPoints, V_ref: Array, row: int, scale: Array) -> tuple[Array, Array, float]:
-    """Return the joint speeds (6,) commanded now, how far the tool is behind (6,), and the smallest singular value."""
+    """Return the joint speeds (n,) commanded now, how far the tool is behind (6,), and the smallest singular value."""
     off = behind(points.T_base_tool[row], arm.forward(q))
     qd, least = _speeds(arm.jacobian(q), V_ref[row] + GAIN * off, scale)
     return qd, off, least
@@ -239,7 +239,7 @@ def _step(arm: Arm, q: Array, points: PathPoints, V_ref: Array, row: int, scale:
 def _motion(run: _Run, qd_start: Array) -> TrackedMotion:
     """Return a run as a trajectory."""
     row = int(np.argmin(run.least))
-    spline = CubicSpline(run.t_s, run.q, bc_type=((1, qd_start), (1, np.zeros(6))))
+    spline = CubicSpline(run.t_s, run.q, bc_type=((1, qd_start), (1, np.zeros_like(qd_start))))
     return TrackedMotion(
         float(run.t_s[-1]),
         float(run.off_m.max()),

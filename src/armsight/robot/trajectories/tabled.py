@@ -40,7 +40,7 @@ class Tabled:
         self._coefficients = np.stack(parts, axis=1)
 
     def at(self, t_s: float | Array) -> Joints:
-        """Return the joints, (6,) or (N, 6), ``t_s`` seconds after the start."""
+        """Return the joints, (n,) or (N, n), ``t_s`` seconds after the start."""
         times = clamped(t_s, self.duration_s)
         piece = np.clip(np.searchsorted(self._t_s, times, side="right") - 1, 0, len(self._coefficients) - 1)
         x = times - self._t_s[piece]

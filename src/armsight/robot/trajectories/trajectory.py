@@ -28,7 +28,7 @@ class Joints(NamedTuple):
     """The joints at an instant, or at N of them with a leading axis.
 
     Attributes:
-        q: (6,) or (N, 6) angles, rad.
+        q: (n,) or (N, n) angles, rad.
         qd: the same of the speeds, rad/s.
         qdd: the same of the accelerations, rad/s^2.
     """

@@ -88,12 +88,12 @@ def waypoints(
 
     Args:
         arm: the arm.
-        q_start: (6,) angles to start from, rad; their configuration is kept.
+        q_start: (n,) angles to start from, rad; their configuration is kept.
         Ts_base_way: (M, 4, 4) poses of the tool, M >= 2; all but the last are passed at a distance (see the module).
         blend_m: how far before a way-point its blend begins, m; shortened to half the lines beside it. On lines that
             mostly rotate, a radian counts as 0.25 m.
-        qd_start: (6,) speeds to start with, rad/s; they must carry the tool along the first line. None for rest.
-        qdd_start: (6,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the first line. None for rest.
+        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
         duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:

@@ -23,6 +23,7 @@ from armsight.geometry.pose import transform
 from armsight.kernels import kernel
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos, store
+from armsight.robot.kinematics.table import rows_of
 
 GRAVITY_M_S2 = 9.81
 #: Radii of the links, share of the arm's whole length; of a joint's housing, share of its link's; density, kg/m^3.
@@ -54,7 +55,7 @@ class Solids(Record):
 
 def solids(arm: Arm) -> Solids:
     """Return what an arm is made of: a capsule along each d and a, housings about its joints, last the load at its tool."""
-    rows = arm.table[:36].reshape(6, 6)
+    rows = rows_of(arm.table)
     whole = float(np.abs(rows[:, :2]).sum())
     radii = _RADII * whole
     parts: list[tuple[int, Array, Array, float, bool]] = [

@@ -30,7 +30,7 @@ from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.kernels import kernel
 from armsight.robot.arm import Arm
 from armsight.robot.boards.link import Sensed
-from armsight.robot.kinematics.table import BASE, TOOL, link
+from armsight.robot.kinematics.table import BASE, TOOL, link, rows_of
 from armsight.sim.workcell.arm import TrueArm, pot_travel
 from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, Motors, Solids, chosen, inertia, solids
 
@@ -90,7 +90,7 @@ def mjcf(arm: Arm, parts: Solids, motors: Motors, backlash_rad: Array, stiffness
 
 def _links(arm: Arm, parts: Solids, motors: Motors) -> str:
     """Write the links, one body in the other; body i is row frame i."""
-    rows = arm.table[:BASE].reshape(6, 6)
+    rows = rows_of(arm.table)
     T_6_tool = np.vstack([arm.table[TOOL : TOOL + 12].reshape(3, 4), [0, 0, 0, 1]])
     T, opened = np.vstack([arm.table[BASE : BASE + 12].reshape(3, 4), [0, 0, 0, 1]]), ""
     for i, (a, d, c, s, offset, way) in enumerate(rows):

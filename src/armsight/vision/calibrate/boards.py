@@ -413,6 +413,11 @@ def _enough(usable: int, given: int, rejected: list[RejectedPair]) -> None:
         f"{usable} of {given} pairs are usable, at least {LEAST_PAIRS} are needed, 15 or more are better"
         + (f": {why}{more}" if why else "")
         + ". Is --target the board in the images (inner corners, columns x rows)?"
+        + (
+            " Does a driver mirror the images of one camera?"
+            if any("gross errors" in r.reason for r in rejected)
+            else ""
+        )
     )
 
 

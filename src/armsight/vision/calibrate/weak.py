@@ -128,7 +128,8 @@ def _sides(calibration: Calibration) -> str | None:
     if x < 0 and abs(x) > abs(y):
         return (
             "the camera given as right stands to the left of the other: are left and right exchanged? (the result is "
-            "valid for the cameras as they were given)"
+            "valid for the cameras as they were given) Or are all images upside down, or mirrored by the driver? Mirrored "
+            "images give a mirrored world: switch it off"
         )
     return None
 

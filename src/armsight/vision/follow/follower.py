@@ -9,7 +9,7 @@ errors of the last predictions, and everything from pixels to covariance is one 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeGuard
 
 import numpy as np
@@ -48,6 +48,7 @@ from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from armsight.vision.posefit import moved
 from armsight.vision.rig import StereoRig
+from armsight.vision.shutter import LOOSE_PX
 
 #: A prediction expires after so many shots, or so many times the time between the last two poses; poses less than so
 #: many seconds apart give no velocity.
@@ -93,6 +94,10 @@ Way = Literal["followed", "searched", "lost"]
 #: How far discs may be from where they are predicted, px: after a search, when nothing is known of the velocity; at the
 #: least and at the most; and in sizes of the last errors of prediction.
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
+#: Exposures so far apart, s, move a body by more than a gate allows: a search then lets larger gaps pass.
+_APART_S = 5e-4
+#: A pose from another source is taken back by so much, s, to be predicted from there.
+_BEFORE_S = 1e-3
 #: While it is searched where it is expected, the whole image is searched once in so many shots.
 _SEARCH_EVERY = 8
 #: A pose found by searching that differs from the prediction by more than this is reported as a jump: rad; image px.
@@ -117,12 +122,14 @@ class Follower:
     way: Way
     jump: str | None
 
-    def __init__(self, rig: StereoRig, target: Target) -> None:
+    def __init__(self, rig: StereoRig, target: Target, apart_s: float = 0.0) -> None:
         """Prepare to follow.
 
         Args:
             rig: the calibrated pair.
             target: a body whose markers are discs and nothing else, with the normals of all known.
+            apart_s: standard deviation of the time between the two exposures of a shot, s: by as much as a moving body
+                moves in it, its images may contradict each other.
         """
         self.way, self.jump = "lost", None
         self._track: BodyTrack | None = None
@@ -151,19 +158,27 @@ class Follower:
             np.isfinite(discs.normals[:, 0]),
             np.array(discs.radii_m),
             np.where(discs.bright, 1, -1),
+            0.0,
         )
+        self.expose_apart(apart_s)
         self._found = _buffers(len(discs.radii_m), rig.parameter_count)
         self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
         self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
         self._work, self._outline = workspace(), search.workspace()
 
-    def measure(self, shot: Shot, expected: Array | None = None) -> PoseEstimate | Missed:
+    def expose_apart(self, apart_s: float) -> None:
+        """Replace the standard deviation of the time between the two exposures of a shot, s."""
+        self._scene = self._scene._replace(apart_s=apart_s)
+        self._loose = replace(self.rig, sigma_px=max(self.rig.sigma_px, LOOSE_PX)) if apart_s > _APART_S else self.rig
+
+    def measure(self, shot: Shot, expected: Array | None = None, twist: Array | None = None) -> PoseEstimate | Missed:
         """Measure one shot; shots must come in the order of their time.
 
         Args:
             shot: the pair of images.
             expected: T_left_body (4, 4) from another source, such as an arm's joints, used while the body is lost: it
                 is searched there, and in the whole image only once in several shots, for that takes long.
+            twist: (6,) velocity of the body there, m/s and rad/s, in its own axes; at rest by default.
         """
         self._count += 1
         t_s = float(self._count) if shot.t_s is None else shot.t_s
@@ -175,7 +190,7 @@ class Follower:
             result = self._followed(shot, track, t_s)
         lost = self.way == "lost"
         if usable and result is None and lost and expected is not None:
-            result = self._expected(shot, expected, t_s)
+            result = self._expected(shot, expected, np.zeros(6) if twist is None else twist, t_s)
         if isinstance(result, PoseEstimate):
             self.way, self._vain = "followed", 0
             return result
@@ -184,7 +199,7 @@ class Follower:
                 "not where it was lost, nor where it is expected; the whole image was searched shortly before"
             )
         else:
-            result, self._vain = measure(self.rig, self.target, shot), 0
+            result, self._vain = measure(self._loose, self.target, shot), 0
         if isinstance(result, Missed):
             self.way = "lost"
             self._vain += 1
@@ -226,16 +241,18 @@ class Follower:
             velocity(track.T_left_body, result.T_left_body, step_s, twist)
         self._track = BodyTrack(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, step_s, False)
 
-    def _expected(self, shot: Shot, T_left_body: Array, t_s: float) -> PoseEstimate | None:
+    def _expected(self, shot: Shot, T_left_body: Array, twist: Array, t_s: float) -> PoseEstimate | None:
         """Measure around a pose from another source; None where that gives no plausible pose."""
         assert shot.left is not None
         self._noise = search.noise_of(grey(shot.left))
         self._found.contrast[:] = 0.0
+        before = np.empty((4, 4))
+        moved(T_left_body, -_BEFORE_S * twist, before)
         result = self._followed(
-            shot, BodyTrack(T_left_body, np.zeros(6), t_s - 1.0, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
+            shot, BodyTrack(before, twist, t_s - _BEFORE_S, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
         )
-        if result is not None:  # that pose gives no velocity
-            self._track = BodyTrack(result.T_left_body, np.zeros(6), t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
+        if result is not None:  # one pose gives no velocity
+            self._track = BodyTrack(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
         return result
 
     def _followed(self, shot: Shot, track: BodyTrack, t_s: float) -> PoseEstimate | None:

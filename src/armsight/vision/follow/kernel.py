@@ -42,7 +42,7 @@ _OFF_SIGMAS = 6.0
 
 @kernel_types(
     "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1], "
-    "b1[::1], f8[::1], i8[::1]"
+    "b1[::1], f8[::1], i8[::1], f8"
 )
 class DiscScene(NamedTuple):
     """The quantities that are constant from pair to pair.
@@ -61,6 +61,7 @@ class DiscScene(NamedTuple):
         faces: (M,) whether the normal's side is known.
         radii: (M,) m.
         signs: (M,) 1 bright, -1 dark.
+        apart_s: standard deviation of the time between the two exposures, s.
     """
 
     fisheye: NDArray[np.bool_]
@@ -76,6 +77,7 @@ class DiscScene(NamedTuple):
     faces: NDArray[np.bool_]
     radii: Array
     signs: NDArray[np.int64]
+    apart_s: float
 
 
 @kernel_types(
@@ -352,15 +354,15 @@ def sum_squares(scene: DiscScene, found: DiscMeasurement) -> None:
 
 
 @kernel
-def plausible(scene: DiscScene, found: DiscMeasurement) -> bool:
-    """Return whether every residual is plausible: not larger than noise and calibration together allow."""
+def plausible(scene: DiscScene, found: DiscMeasurement, twist: Array) -> bool:
+    """Return whether every residual is plausible: not larger than noise, calibration and exposures that differ allow."""
     C, J_rig = scene.cov_rig, found.J_rig
     for row in range(len(found.whitened)):
         r = found.whitened[row] * found.whitened[row]
-        if r > _OFF_SIGMAS * _OFF_SIGMAS and r > _OFF_SIGMAS * _OFF_SIGMAS * (
-            1.0 + dot(J_rig[row], applied(C, J_rig[row]))
-        ):
-            return False
+        if r > _OFF_SIGMAS * _OFF_SIGMAS:
+            apart = scene.apart_s * dot(found.J[row], twist)
+            if r > _OFF_SIGMAS * _OFF_SIGMAS * (1.0 + apart * apart + dot(J_rig[row], applied(C, J_rig[row]))):
+                return False
     return True
 
 
@@ -522,7 +524,7 @@ def follow_pair(
     if both < 3:
         return 0, np.inf, wrong
     cost = settle(scene, found)
-    if not np.isfinite(cost) or not plausible(scene, found):
+    if not np.isfinite(cost) or not plausible(scene, found, twist):
         return 0, np.inf, wrong
     chi_square = uncertainty(scene, found, cov_noise, cost, limits[seen])
     triangulated(scene, found)

@@ -47,9 +47,22 @@ MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidista
 def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read the left and the right camera_info file, in this order."""
     count_paths(paths, (2,), FILES)
+    return rig_of([load_yaml(path) for path in paths], paths, options)
+
+
+def rig_of(documents: Sequence[Mapping[str, Foreign]], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Return the rig of a left and a right camera_info.
+
+    Args:
+        documents: both, with the keys of the files.
+        paths: where they come from, for messages.
+        options: what the user added.
+
+    Raises:
+        InputError: one is damaged, or they are no stereo pair.
+    """
     cameras, Ts, notes = [], [], []
-    for path in paths:
-        document = load_yaml(path)
+    for path, document in zip(paths, documents, strict=True):
         with naming(path):
             camera, T_rect_camera, said = _read_one(document, options)
         cameras.append(camera)

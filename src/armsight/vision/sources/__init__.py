@@ -2,7 +2,8 @@
 
 The contract is in ``source.py``; :func:`open_source` opens a spec.
 
-- Recordings: ``folder.py``, ``pairs.py`` (two globs of images), ``video.py``.
+- Recordings: ``folder.py``, ``pairs.py`` (two globs of images), ``video.py``, ``bag/`` (of ROS and Foxglove),
+  ``lerobot.py``.
 - Live cameras: ``usb.py``, ``url.py``, with ``timing.py`` (pairing by time stamp) and ``capture.py`` (OpenCV's
   capture).
 - ``v4l2.py``: the attached cameras and their formats, for ``armsight cameras``.
@@ -14,14 +15,16 @@ import os
 from collections.abc import Callable
 
 from armsight.errors import InputError
+from armsight.vision.sources.bag import open_bag_source
 from armsight.vision.sources.folder import FolderSource
+from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
 from armsight.vision.sources.source import Source
 from armsight.vision.sources.url import open_url
 from armsight.vision.sources.usb import open_usb
 from armsight.vision.sources.video import open_video
 
-__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "open_source"]
+__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "notes_of", "open_source"]
 
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
@@ -29,6 +32,8 @@ SOURCES: dict[str, Callable[[str], Source]] = {
     "video": open_video,
     "url": open_url,
     "usb": open_usb,
+    "bag": open_bag_source,
+    "lerobot": open_lerobot,
 }
 
 
@@ -36,7 +41,7 @@ def open_source(spec: str) -> Source:
     """Open a source.
 
     Args:
-        spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``,
+        spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``, ``bag:FILE``,
             ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``; docs/howto/sources.md.
 
     Raises:
@@ -50,3 +55,8 @@ def open_source(spec: str) -> Source:
         return FolderSource.open(spec)
     known = ", ".join(f"{name}:..." for name in SOURCES)
     raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")
+
+
+def notes_of(source: Source) -> tuple[str, ...]:
+    """Return what a source left out or found odd when it was opened, a line each."""
+    return tuple(getattr(source, "notes", ()))

@@ -237,7 +237,8 @@ class UrlSource:
         for reader, image in zip(self._readers, images, strict=True):
             if image is None:
                 return Shot(name, None, None, t_s, f"{reader.stream.url}: the frame cannot be decoded")
-        return Shot(name, images[0], images[1], t_s)
+        encoded = (left, right) if isinstance(left, bytes) and isinstance(right, bytes) else None
+        return Shot(name, images[0], images[1], t_s, None, encoded)
 
     def close(self) -> None:
         """Stop both threads."""

@@ -1,0 +1,112 @@
+"""What a user waits for: help, the first measurement, calibration with its report, identification, the demo.
+
+    python benchmarks/speed.py            all but the demo
+    python benchmarks/speed.py --demo     and the demo: --quick, then whole
+
+Times of discs: ``markers.py 2``; from image to command: ``experiment.py``; of identification: ``identify.py --speed``.
+Every command runs in a process of its own, as a user types it; the median of several. ``import cv2`` runs beside it: what a
+program that uses OpenCV needs at least. Cold is the first run after the pages of the environment were given back to the
+system (``posix_fadvise``), warm the median of those that follow. Real recordings are looked for at ARMSIGHT_DATA.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from armsight.app.main import COMMANDS
+
+DATA = Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
+ARMSIGHT = str(Path(sys.executable).with_name("armsight"))
+REPEATS = 5
+
+
+def forget_pages() -> None:
+    """Give the environment's files in the page cache back to the system, as after a start of the computer."""
+    os.sync()
+    for root in {sysconfig.get_path("purelib"), str(Path(__file__).resolve().parent.parent / "src")}:
+        for path in Path(root).rglob("*"):
+            if path.is_file() and (path.suffix in (".py", ".pyc", ".so") or ".so." in path.name):
+                handle = os.open(path, os.O_RDONLY)
+                os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+                os.close(handle)
+
+
+def seconds(*command: str) -> float:
+    """Run a command and return how long it took, s."""
+    began = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    return time.perf_counter() - began
+
+
+def report(name: str, value: float, most: float | None, unit: str = "s") -> None:
+    """Print a figure beside what is required."""
+    asked = "" if most is None else f"  at most {most:g}: {'met' if value <= most else 'MISSED'}"
+    print(f"{name:58s} {value:8.2f} {unit}{asked}", flush=True)
+
+
+def helps() -> None:
+    """Time the help of every command."""
+    times = {name: float(np.median([seconds(ARMSIGHT, name, "-h") for _ in range(REPEATS)])) for name in COMMANDS}
+    slowest = max(times, key=lambda name: times[name])
+    report(f"-h of {len(times)} commands, the slowest ({slowest})", times[slowest], 0.15)
+
+
+def first_measurement(folder: Path) -> None:
+    """Time one pair of a board, cold and warm, beside importing OpenCV."""
+    pairs = DATA / "stereo" / "opencv-480p"
+    rig, target = str(folder / "rig.json"), ("--target", "chessboard:9x6:25mm")
+    many = ("--left", str(pairs / "left*.jpg"), "--right", str(pairs / "right*.jpg"))
+    one = ("--left", str(pairs / "left01.jpg"), "--right", str(pairs / "right01.jpg"))
+    seconds(ARMSIGHT, "calibrate", *many, *target, "-o", rig)
+    measure = (ARMSIGHT, "measure", rig, *target, *one)
+    opencv = (sys.executable, "-c", "import cv2")
+    for name, prepare, repeats in (("cold", forget_pages, 1), ("warm", lambda: None, REPEATS)):
+        times = []
+        for command in (opencv, measure):
+            prepare()
+            times.append(float(np.median([seconds(*command) for _ in range(repeats)])))
+        report(f"import cv2, {name}", times[0], None)
+        report(f"measure one pair, beyond import cv2, {name}", times[1] - times[0], 2.0)
+
+
+def calibration(folder: Path) -> None:
+    """Time a calibration of 29 pairs of 640x360 with its report."""
+    pairs = DATA / "stereo" / "webcams-360p"
+    images = ("--left", str(pairs / "left*.jpg"), "--right", str(pairs / "right*.jpg"))
+    outputs = ("-o", str(folder / "webcams.json"), "--report", str(folder / "report"))
+    took_s = seconds(ARMSIGHT, "calibrate", *images, "--target", "chessboard:9x6:24.23mm", *outputs)
+    report("calibrate, 29 pairs of 640x360, with report", took_s, 15.0)
+
+
+def demo(folder: Path) -> None:
+    """Time the demo, and its memory."""
+    for name, options, most in (("demo --quick", ("--quick",), 30.0), ("demo", (), 120.0)):
+        report(name, seconds(ARMSIGHT, "demo", *options, "-o", str(folder / name.replace(" ", ""))), most)
+    report("memory of the demo", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6, 1.2, "GB")
+
+
+def main() -> None:
+    """Run and print."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        helps()
+        if DATA.is_dir():
+            first_measurement(folder)
+            calibration(folder)
+        else:
+            print(f"no real recordings at {DATA}: set ARMSIGHT_DATA to their folder")
+        if "--demo" in sys.argv:
+            demo(folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""``armsight batch``: measure, replay, identify or check many recordings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+OPERATIONS = ("measure", "replay", "identify", "check")
+
+
+@click.command("batch")
+@click.argument("operation", type=click.Choice(OPERATIONS))
+@click.argument("recordings", metavar="'GLOB'...", nargs=-1, required=True)
+@click.option(
+    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder of the results."
+)
+@click.option("--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info, or instead of it.")
+@click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
+@click.option("--arm", metavar="ARM", help="The arm model.")
+@click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
+@click.option("--workers", type=click.IntRange(min=1), help="Processes; by default as many as this machine has cores.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="A Dask cluster that exists, instead.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+def command(
+    operation: str,
+    recordings: tuple[str, ...],
+    output: Path,
+    rig: str | None,
+    target: str | None,
+    arm: str | None,
+    estimator: str,
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+) -> None:
+    """Measure many recordings, on all cores or on a cluster; started again it goes on where it was.
+
+    Quote the GLOB: 'archive/**/*.mcap', 's3://bucket/**/*.bag'. A recording that fails is a row with its reason. identify
+    takes tables of poses (armsight identify -h), check folders of runs (armsight check -h), measure and replay recordings
+    (armsight replay -h).
+    """
+    from armsight.app.batch.run import Batch, run_batch
+    from armsight.app.batch.work import Options
+    from armsight.errors import InputError
+
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers and --scheduler: a cluster has its own workers; give one of the two")
+    options = Options(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
+    batch = Batch(recordings, output.expanduser(), options, workers, scheduler)
+    done = run_batch(batch, lambda line: click.echo(line, err=True))
+    if as_json:
+        click.echo(json.dumps(done.to_json()))
+        return
+    click.echo(
+        f"{done.recordings} recordings: {done.ok} done, {done.failed} failed (their rows have the reasons), {done.before} "
+        f"of them before; {done.shots} shots; written to {output}"
+    )
+
+
+def _absolute(name: str | None) -> str | None:
+    """Return the absolute path of a file, by which other processes find it; names of other things stay."""
+    return str(Path(name).resolve()) if name is not None and Path(name).is_file() else name

@@ -1,0 +1,239 @@
+"""Hand the recordings out to Dask's workers, and collect what comes back.
+
+A few recordings a worker are handed out at a time, the next when one is done: so the scheduler holds the same however many
+there are. Each result is stored in ``parts`` as it comes; a batch that is started again skips those whose recording
+and options are the same. A worker that dies loses the recordings it had in hand: Dask hands them to another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from armsight import __version__
+from armsight.app.batch.work import Done, Options, work
+from armsight.app.progress import bar
+from armsight.errors import InputError
+from armsight.files import check_folder, replacing, write_text
+
+#: Files of a batch.
+SHOTS, RECORDINGS, ABOUT, PARTS = "shots.parquet", "recordings.parquet", "batch.json", "parts"
+#: Recordings in hand a worker: one that it works on, and the next.
+_IN_HAND = 2
+_Client: TypeAlias = Any
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What is to be done.
+
+    Attributes:
+        recordings: paths with wildcards.
+        output: folder of the results.
+        options: what is done with each.
+        workers: processes; None is one a core.
+        scheduler: address of a cluster; None is this machine.
+    """
+
+    recordings: Sequence[str]
+    output: Path
+    options: Options
+    workers: int | None = None
+    scheduler: str | None = None
+
+
+@dataclass(frozen=True)
+class BatchDone:
+    """What came out.
+
+    Attributes:
+        recordings: how many there are.
+        ok: how many were done.
+        failed: how many failed.
+        before: how many were done before the batch was started again.
+        shots: how many shots they have.
+    """
+
+    recordings: int
+    ok: int
+    failed: int
+    before: int
+    shots: int
+
+    def to_json(self) -> dict[str, int]:
+        """Return it as JSON."""
+        return asdict(self)
+
+
+def require_dask() -> None:
+    """Raise an InputError with what to install unless Dask, fsspec and pyarrow can be imported."""
+    try:
+        import distributed
+        import fsspec
+        import pyarrow  # noqa: F401 - only whether they are there
+    except ImportError as error:
+        raise InputError(f'batch needs {error.name}, which is not installed: pip install "armsight[batch]"') from None
+    del distributed, fsspec
+
+
+def found_recordings(patterns: Sequence[str]) -> list[str]:
+    """Return the recordings that patterns match, sorted; local ones as absolute paths.
+
+    Raises:
+        InputError: a pattern matches nothing, or its store cannot be read.
+    """
+    import fsspec
+
+    found: set[str] = set()
+    for pattern in patterns:
+        try:
+            fs, path = fsspec.core.url_to_fs(os.path.expanduser(pattern))
+            names = fs.glob(path)
+        except (OSError, ValueError, ImportError) as error:
+            raise InputError(f"{pattern}: cannot be searched: {error}") from None
+        if not names:
+            raise InputError(f"{pattern}: no such recording; quote the pattern to keep the shell off it")
+        found.update(names if "://" not in pattern else (fs.unstrip_protocol(name) for name in names))
+    return sorted(found)
+
+
+def _key(path: str, options: Options) -> str:
+    """Return a name that changes with a recording's path, size and time, the options and the version."""
+    try:
+        import fsspec
+
+        fs, name = fsspec.core.url_to_fs(path)
+        about = fs.info(name)
+        state = [about.get("size"), str(about.get("mtime", about.get("LastModified", about.get("ETag"))))]
+    except OSError:
+        state = []
+    text = json.dumps([path, state, options.to_json(), __version__])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
+    """Run a batch.
+
+    Args:
+        batch: what is to be done.
+        say: is given the address of the dashboard, and notes.
+
+    Raises:
+        InputError: no recordings, a package is missing, or the folder cannot be written to.
+    """
+    require_dask()
+    paths = found_recordings(batch.recordings)
+    check_folder(batch.output, problem="no batch can be written here")
+    parts = batch.output / PARTS
+    try:
+        parts.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{parts}: cannot be written: {error.strerror}") from None
+    keys = {path: _key(path, batch.options) for path in paths}
+    left = [path for path in paths if not (parts / keys[path]).is_file()]
+    about = {"version": __version__, "options": batch.options.to_json(), "recordings": list(batch.recordings)}
+    write_text(batch.output / ABOUT, json.dumps(about, indent=1) + "\n")
+    if left:
+        with _client(batch, len(left), say) as (client, workers), bar("recordings", len(left)) as advance:
+            for path, done in _results(client, left, batch.options, _IN_HAND * workers):
+                _store(parts / keys[path], done)
+                advance()
+    recordings, shots = _write(batch.output, [parts / keys[path] for path in paths])
+    ok = sum(row["status"] == "ok" for row in recordings)
+    return BatchDone(len(paths), ok, len(paths) - ok, len(paths) - len(left), shots)
+
+
+@contextlib.contextmanager
+def _client(batch: Batch, count: int, say: Callable[[str], None]) -> Iterator[tuple[_Client, int]]:
+    """Give the block a client and the number of workers."""
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    with contextlib.ExitStack() as stack:
+        if batch.scheduler is not None:
+            try:
+                client = stack.enter_context(Client(batch.scheduler, timeout=10))
+            except (OSError, ValueError, TimeoutError) as error:
+                raise InputError(f"--scheduler {batch.scheduler}: no cluster answers there: {error}") from None
+        else:
+            workers = min(batch.workers or len(os.sched_getaffinity(0)), count)
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+            )
+            client = stack.enter_context(Client(stack.enter_context(cluster)))
+        say(f"dashboard: {client.dashboard_link}")
+        yield client, max(1, len(client.scheduler_info()["workers"]))
+
+
+def _results(client: _Client, paths: list[str], options: Options, in_hand: int) -> Iterator[tuple[str, Done]]:
+    """Yield what comes back, in any order."""
+    from distributed import as_completed
+
+    waiting = iter(paths)
+
+    def submitted(path: str) -> Any:  # noqa: ANN401 - a future of the library
+        future = client.submit(work, path, options, pure=False, retries=1)
+        names[future.key] = path
+        return future
+
+    names: dict[str, str] = {}
+    first = [path for _, path in zip(range(in_hand), waiting, strict=False)]
+    completed = as_completed([submitted(path) for path in first])
+    for future in completed:
+        path = names.pop(future.key)
+        try:
+            done = future.result()
+        except Exception as error:  # noqa: BLE001 - workers that die again and again at one recording
+            done = Done({"recording": path, "status": "failed", "reason": f"{type(error).__name__}: {error}"}, [])
+        future.release()
+        yield path, done
+        following = next(waiting, None)
+        if following is not None:
+            completed.add(submitted(following))
+
+
+def _store(path: Path, done: Done) -> None:
+    with replacing(path, "wb") as file:
+        pickle.dump((done.recording, done.shots), file)
+
+
+def _write(folder: Path, parts: list[Path]) -> tuple[list[dict[str, Any]], int]:
+    """Write both tables from the parts, in the order of the recordings; return the recordings' rows, and the shots."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    rows: list[dict[str, Any]] = []
+    columns: dict[str, None] = {}
+    for part in parts:  # first the columns: recordings may differ in them
+        recording, shots = _load(part)
+        rows.append(recording)
+        columns |= dict.fromkeys(shots[0] if shots else ())
+    names = list({name: None for row in rows for name in row})
+    with replacing(folder / RECORDINGS, "wb") as file:
+        parquet.write_table(pa.table({name: [row.get(name) for row in rows] for name in names}), file)
+    count = 0
+    kinds = [
+        (name, pa.string() if name in ("recording", "shot", "status", "reason") else pa.float64()) for name in columns
+    ]
+    with replacing(folder / SHOTS, "wb") as file, parquet.ParquetWriter(file, pa.schema(kinds)) as writer:
+        for part in parts:
+            _, shots = _load(part)
+            count += len(shots)
+            if shots:
+                data = {name: [shot.get(name) for shot in shots] for name, _ in kinds}
+                writer.write_table(pa.table(data, schema=pa.schema(kinds)))
+    return rows, count
+
+
+def _load(part: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    with part.open("rb") as file:
+        recording, shots = pickle.load(file)
+    return recording, shots

@@ -1,0 +1,53 @@
+"""``armsight export``: the tables of a run in another form."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+FORMS = ("csv", "parquet", "mcap", "tum", "ros2")
+
+
+@click.command("export")
+@click.argument("run", metavar="RUN")
+@click.option("--to", "form", required=True, type=click.Choice(FORMS), help="The form.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="OUT",
+    type=click.Path(path_type=Path),
+    help="New or empty folder; with --to mcap a file.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the written files as one JSON object.")
+def command(run: str, form: str, output: Path, as_json: bool) -> None:
+    """Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.
+
+    RUN is the folder of armsight run, demo or record, or its run.mcap. csv and parquet: poses, the live track, joints. tum:
+    one file a track, for evo. mcap: the same file, compressed with zstd. ros2: a bag (MCAP) with images, camera_info,
+    odometry, joint states and tf.
+    """
+    from armsight.app.export.bags import write_mcap, write_ros2
+    from armsight.app.export.tables import write_csv, write_parquet, write_tum
+    from armsight.app.replay.recorded import read_run, run_file
+    from armsight.errors import InputError
+
+    file = run_file(run)
+    if file is None:
+        raise InputError(f"{run}: no run.mcap there; give the folder of a run, or a file .mcap")
+    output = output.expanduser()
+    if output.exists() and (output.is_file() or any(output.iterdir())):
+        raise InputError(f"{output}: is there already; give a new name")
+    if form in ("mcap", "ros2"):
+        files = {"mcap": write_mcap, "ros2": write_ros2}[form](file, output)
+    else:
+        recorded = read_run(file)
+        if recorded is None:
+            raise InputError(f"{file}: not written by armsight; its poses come from armsight replay")
+        for note in recorded.notes:
+            click.echo(f"note: {note}", err=True)
+        files = {"csv": write_csv, "parquet": write_parquet, "tum": write_tum}[form](recorded, output)
+    answer = {"run": run, "to": form, "files": [str(path) for path in files]}
+    click.echo(json.dumps(answer) if as_json else "\n".join(map(str, files)))

@@ -1,0 +1,144 @@
+"""A run as tables: CSV, Parquet, and TUM's text (time, position, quaternion x y z w), which evo reads."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+from armsight.app.replay.recorded import JointsDatum, RecordedRun, ShotDatum
+from armsight.app.run.record import require_pyarrow
+from armsight.errors import InputError
+from armsight.files import replacing, write_text
+
+#: A column of a datum -> its key, and the names of its parts; a key without parts is one column.
+_SHOT: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("shot", ()),
+    ("status", ()),
+    ("reason", ()),
+    ("t_s", ()),
+    ("sigma_t_s", ()),
+    ("arrival_s", ()),
+    ("age_s", ()),
+    ("position_m", ("x_m", "y_m", "z_m")),
+    ("quaternion_wxyz", ("qw", "qx", "qy", "qz")),
+    ("points", ()),
+    ("misfit", ()),
+    ("reprojection_rms_px", ()),
+    ("residual_rms_m", ()),
+    ("outcome", ()),
+)
+_MATRICES = (
+    ("covariance", "cov"),
+    ("covariance_precision", "cov_precision"),
+    ("covariance_calibration", "cov_calibration"),
+)
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+_LIVE = ("t_s", "status", "vision_age_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+Cell = str | float | int | None
+Table = tuple[list[str], list[list[Cell]]]
+
+
+def tables_of(run: RecordedRun) -> dict[str, Table]:
+    """Return the tables of a run by name: poses, live, joints; those without rows are left out."""
+    found: dict[str, Table] = {"poses": _poses(run), "live": _live(run), "joints": _joints(run)}
+    return {name: table for name, table in found.items() if table[1]}
+
+
+def _poses(run: RecordedRun) -> Table:
+    header = [part for key, parts in _SHOT for part in (parts or (key,))]
+    header += [f"{short}_{i}{j}" for _, short in _MATRICES for i, j in _UPPER]
+    rows: list[list[Cell]] = []
+    for each in run.of(ShotDatum):
+        row: list[Cell] = []
+        for key, parts in _SHOT:
+            value = each.content.get(key)
+            row += [value] if not parts else ([None] * len(parts) if value is None else value)
+        for key, _ in _MATRICES:
+            matrix = each.content.get(key)
+            row += [None if matrix is None else matrix[i][j] for i, j in _UPPER]
+        rows.append(row)
+    return header, rows
+
+
+def _live(run: RecordedRun) -> Table:
+    header = [*_LIVE, *(f"cov_{i}{j}" for i, j in _UPPER)]
+    rows: list[list[Cell]] = []
+    for each in run.of(JointsDatum):
+        content = each.content
+        if "tool_position_m" not in content:
+            continue
+        cov = content["tool_covariance"]
+        row: list[Cell] = [content["t_s"][-1], content["status"], content["vision_age_s"]]
+        row += [*content["tool_position_m"], *content["tool_quaternion_wxyz"], *(cov[i][j] for i, j in _UPPER)]
+        rows.append(row)
+    return header, rows
+
+
+def _joints(run: RecordedRun) -> Table:
+    rows: list[list[Cell]] = [
+        [t_s, *q]
+        for each in run.of(JointsDatum)
+        for t_s, q in zip(each.content["t_s"], each.content["q_rad"], strict=True)
+    ]
+    return ["t_s", *(f"q{k}_rad" for k in range(1, 7))], rows
+
+
+def write_csv(run: RecordedRun, folder: Path) -> list[Path]:
+    """Write a CSV a table; return the files."""
+    files = []
+    for name, (header, rows) in _some(run, tables_of(run)).items():
+        output = io.StringIO()
+        writer = csv.writer(output, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([["" if cell is None else cell for cell in row] for row in rows])
+        files.append(_file(folder, f"{name}.csv"))
+        write_text(files[-1], output.getvalue())
+    return files
+
+
+def write_parquet(run: RecordedRun, folder: Path) -> list[Path]:
+    """Write a Parquet file a table; return the files."""
+    require_pyarrow()
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    files = []
+    for name, (header, rows) in _some(run, tables_of(run)).items():
+        columns = list(zip(*rows, strict=True))
+        table = pa.table({key: pa.array(column) for key, column in zip(header, columns, strict=True)})
+        files.append(_file(folder, f"{name}.parquet"))
+        with replacing(files[-1], "wb") as file:
+            parquet.write_table(table, file)
+    return files
+
+
+def write_tum(run: RecordedRun, folder: Path) -> list[Path]:
+    """Write body.tum, the body in the left camera's frame, and tool.tum, the tool in the base; return the files."""
+    tables = {name: table for name, table in tables_of(run).items() if name in ("poses", "live")}
+    files = []
+    for name, (header, rows) in _some(run, tables).items():
+        at = [header.index(key) for key in ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+        lines = [" ".join(repr(row[k]) for k in at) for row in rows if all(row[k] is not None for k in at)]
+        if lines:
+            files.append(_file(folder, {"poses": "body.tum", "live": "tool.tum"}[name]))
+            write_text(files[-1], "\n".join(lines) + "\n")
+    if not files:
+        raise InputError(f"{run.path}: holds no pose with a time")
+    return files
+
+
+def _some(run: RecordedRun, tables: dict[str, Table]) -> dict[str, Table]:
+    """Return tables, of which there must be one."""
+    if not tables:
+        raise InputError(f"{run.path}: holds no shot and no joint reading")
+    return tables
+
+
+def _file(folder: Path, name: str) -> Path:
+    """Return a file in a folder, which is made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    return folder / name

@@ -1,0 +1,220 @@
+"""``armsight handeye``: hand-eye calibration of anyone's data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from armsight.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from armsight.app.handeye.images import Seen
+    from armsight.app.handeye.read import PoseTable
+    from armsight.app.handeye.result import HandEyeRun
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says; the names are its options'."""
+
+    robot: Path
+    eye: str
+    model: str | None
+    rotation: str | None
+    units: str | None
+    columns: str | None
+    seen: Path | None
+    seen_rotation: str | None
+    seen_units: str | None
+    images: str | None
+    camera: str | None
+    rig: Path | None
+    left: str | None
+    right: str | None
+    target: str | None
+    streams: bool
+    scale: bool
+    detect_units: bool
+    plan: int
+    output: Path | None
+    as_json: bool
+
+
+@click.command("handeye")
+@click.option("--robot", required=True, metavar="POSES.csv", type=click.Path(path_type=Path), help="Poses or joints.")
+@click.option(
+    "--eye",
+    required=True,
+    type=click.Choice(["in-hand", "to-hand"]),
+    help="Does the arm carry the camera, or the target?",
+)
+@click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
+@click.option(
+    "--rotation",
+    metavar="CONVENTION",
+    help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ...",
+)
+@click.option("--units", type=click.Choice(["m", "mm"]), help="Of lengths whose columns do not name a unit.")
+@click.option("--columns", metavar="NAME=COLUMN,...", help="Names of columns in your table, such as x_mm=X,rx_deg=A.")
+@click.option(
+    "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
+)
+@click.option("--seen-rotation", metavar="CONVENTION", help="The same for the target's table.")
+@click.option("--seen-units", type=click.Choice(["m", "mm"]), help="The same for the target's table.")
+@click.option("--images", metavar="GLOB", help="Images of one camera; quote the glob.")
+@click.option("--camera", metavar="CAMERA|fit", help="Its calibration, .json or .yaml; fit: from these images.")
+@click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="A calibrated pair of cameras.")
+@click.option("--left", metavar="GLOB", help="Left images of the rig; quote the glob.")
+@click.option("--right", metavar="GLOB", help="Right images.")
+@click.option("--target", metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file.")
+@click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
+@click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
+@click.option("--detect-units", is_flag=True, help="Take lengths that cannot be metres for millimetres, and say so.")
+@click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+def command(**given: object) -> None:
+    """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
+
+    Prints both transforms with sigma, the error on poses left out, how much of it is the arm and how much the camera, which
+    poses are blunders, and which direction the motion leaves open. Forms of tables, and examples: docs/howto/handeye.md.
+    """
+    options = Options(**given)  # type: ignore[arg-type]
+    _require_one_way(options)
+
+    from armsight.app.handeye.report import write_handeye_report
+    from armsight.app.handeye.result import as_json, plan_csv, text
+    from armsight.app.progress import steps
+    from armsight.app.report.page import put_files, writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+
+    folder = None
+    if options.output is not None:
+        require_matplotlib()
+        folder = writable_folder(options.output, "no report")
+    with steps() as progress:
+        run = calibrate(options, progress)
+        if folder is not None:
+            progress("writing")
+            write_handeye_report(run, folder)
+            files = {"handeye.json": json.dumps(as_json(run), indent=1).encode() + b"\n"}
+            if run.plan is not None:
+                files["plan.csv"] = plan_csv(run.plan).encode()
+            put_files(folder, files)
+    for note in run.recording.notes:
+        click.echo(f"note: {note}", err=True)
+    if options.as_json:
+        click.echo(json.dumps(as_json(run)))
+        return
+    click.echo(text(run))
+    if folder is not None:
+        click.echo(f"\nwritten: {folder}/report.html, handeye.json" + (", plan.csv" if run.plan is not None else ""))
+
+
+def _require_one_way(options: Options) -> None:
+    """Refuse options that do not go together."""
+    ways = {
+        "--seen": options.seen is not None,
+        "--images with --camera": options.images is not None or options.camera is not None,
+        "--rig with --left and --right": options.rig is not None
+        or options.left is not None
+        or options.right is not None,
+    }
+    if sum(ways.values()) != 1:
+        raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
+    if (options.images is None) != (options.camera is None):
+        raise InputError("--images and --camera belong together: --camera CAMERA.json, or --camera fit")
+    if ways["--rig with --left and --right"] and None in (options.rig, options.left, options.right):
+        raise InputError("--rig, --left and --right belong together")
+    if options.seen is None and options.target is None:
+        raise InputError("images need --target, such as chessboard:9x6:25mm (inner corners, side of a square)")
+    if options.streams and options.seen is None:
+        raise InputError("--streams needs --seen, a table of the target's poses with t_s; images have no times here")
+
+
+def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
+    """Read both sides, look at whether they fit, calibrate.
+
+    Raises:
+        ArmsightError: the input is wrong, or the motions leave a direction open.
+    """
+    from armsight.app.handeye.plan import plan_poses
+    from armsight.app.handeye.read import read_pose_table
+    from armsight.app.handeye.recording import links_of, paired
+    from armsight.app.handeye.result import HandEyeRun
+    from armsight.app.handeye.suspect import require_plausible
+    from armsight.loop.handeye.structured import calibrate_structured
+    from armsight.robot.arm_file import open_arm
+
+    progress("reading")
+    arm = None if options.model is None else open_arm(options.model)
+    robot = read_pose_table(
+        options.robot,
+        rotation=options.rotation,
+        unit=options.units,
+        detect_units=options.detect_units,
+        columns=options.columns,
+        arm=arm,
+    )
+    seen = _seen(options, progress)
+    if options.streams:
+        return _streams(options, robot, seen, progress)
+    recording = paired(robot, seen, options.eye == "in-hand", arm)
+    progress("looking at whether both sides fit")
+    recording = require_plausible(recording, arm, detect_units=options.detect_units)
+    links = None if arm is None else links_of(recording, arm)
+    found = calibrate_structured(
+        recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress
+    )
+    progress("choosing poses")
+    plan = plan_poses(found, recording.poses, options.plan) if options.plan else None
+    return HandEyeRun(recording, found, None, 0.0, plan)
+
+
+def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
+    """Read or measure the poses of the target."""
+    from armsight.app.handeye.images import see_with_camera, see_with_rig
+    from armsight.app.handeye.read import read_pose_table
+    from armsight.app.handeye.recording import seen_in_table
+
+    if options.seen is not None:
+        table = read_pose_table(
+            options.seen, rotation=options.seen_rotation, unit=options.seen_units, detect_units=options.detect_units
+        )
+        return seen_in_table(table)
+    target = str(options.target)
+    if options.images is not None:
+        return see_with_camera(options.images, str(options.camera), target, progress)
+    assert options.rig is not None
+    return see_with_rig(options.rig, str(options.left), str(options.right), target, progress)
+
+
+def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[[str], None]) -> HandEyeRun:
+    """Calibrate two streams with an unknown clock offset."""
+    from armsight.app.handeye.plan import plan_poses
+    from armsight.app.handeye.recording import of_streams
+    from armsight.app.handeye.result import HandEyeRun
+    from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
+
+    for path, t_s in ((options.robot, robot.t_s), (options.seen, seen.t_s)):
+        if t_s is None:
+            raise InputError(f"{path}: line 1: --streams needs a column t_s, seconds")
+    assert robot.t_s is not None
+    assert seen.t_s is not None
+    hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
+    eye_stream = PoseStream.of(seen.t_s, seen.Ts, str(options.seen))
+    eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
+    found = calibrate_structured_streams(
+        hand, eye_stream, eye=eye, centre=seen.centre, scale=options.scale, progress=progress
+    )
+    recording = of_streams(robot, seen, found)
+    plan = plan_poses(found.handeye, recording.poses, options.plan) if options.plan else None
+    return HandEyeRun(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)

@@ -1,0 +1,338 @@
+"""Tables of poses as robots, cameras and people write them.
+
+In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
+
+- no first line of names: 16 (or 12) numbers a row, a matrix row by row; 7: x, y, z and a quaternion; 6: x, y, z and three
+  numbers of a rotation; the option ``rotation`` names its convention.
+- Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line.
+- named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
+  ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model. ``t_s`` is a time, ``image`` the
+  image that belongs to a row, ``name`` a name that both tables share.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import read_columns, read_table, read_text
+from armsight.geometry.rotation import nearest_rotation
+from armsight.loop.identify import ROTATIONS
+from armsight.robot.arm import Arm
+
+#: What three or four numbers of a rotation may mean: quaternions in both orders, and the conventions of three angles.
+CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)
+#: Names that ``--columns`` may give the file's own for.
+COLUMNS = (
+    *(f"{axis}{unit}" for axis in "xyz" for unit in ("", "_m", "_mm")),
+    *("qw", "qx", "qy", "qz"),
+    *(f"r{axis}{unit}" for axis in "xyz" for unit in ("", "_deg", "_rad")),
+    *(f"r{i}{j}" for i in "123" for j in "123"),
+    *(f"q{i}_{unit}" for i in range(1, 8) for unit in ("rad", "deg")),
+    *("t_s", "image", "name"),
+)
+#: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
+FAR_M, NEAR_M = 20.0, 0.02
+#: How far a matrix may be from a rotation: what six digits leave.
+LOOSE = 2e-3
+_UR = re.compile(r"p\[([^\]]*)\]")
+_JOINT = re.compile(r"q(\d+)_(rad|deg)")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable(Record):
+    """The poses of a file.
+
+    Attributes:
+        path: the file.
+        lines: (N,) the line of each row.
+        Ts: (N, 4, 4) the poses, m.
+        numbers: (N, K) the numbers of the rotations as in the file; (N, 0) for matrices and joints.
+        convention: what they were taken for, one of CONVENTIONS; "" for matrices and joints.
+        q: (N, J) joint angles, rad; None where there are none.
+        t_s: (N,) times, s; None where there are none.
+        names: of the rows, or of their images; None where there are none.
+        unit_m: the unit that lengths were read in, m.
+        notes: what was found out while reading.
+    """
+
+    path: Path
+    lines: NDArray[np.int64]
+    Ts: Array
+    numbers: Array
+    convention: str
+    q: Array | None
+    t_s: Array | None
+    names: tuple[str, ...] | None
+    unit_m: float
+    notes: tuple[str, ...]
+
+
+def read_pose_table(
+    path: Path,
+    *,
+    rotation: str | None = None,
+    unit: str | None = None,
+    detect_units: bool = False,
+    columns: str | None = None,
+    arm: Arm | None = None,
+) -> PoseTable:
+    """Read a table of poses.
+
+    Args:
+        path: the file.
+        rotation: one of CONVENTIONS; None: what the columns' names say.
+        unit: "m" or "mm" for lengths whose columns do not name one; None: m.
+        detect_units: whether lengths that cannot be metres are taken for millimetres, with a note.
+        columns: NAME=THEIRS,... with names of COLUMNS.
+        arm: the model whose joints the table has.
+
+    Raises:
+        InputError: the file, the line and what was expected.
+    """
+    if rotation is not None and rotation not in CONVENTIONS:
+        raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
+    head, rows = _cells(path, columns)
+    table = _Columns(path, head, rows)
+    lines = np.array([line for line, _ in rows])
+    unit_m, q = 1.0, None
+    notes: tuple[str, ...] = ()
+    numbers, convention = np.zeros((len(rows), 0)), ""
+    joints = sorted((int(found[1]), name) for name in head if (found := _JOINT.fullmatch(name)))
+    if joints:
+        q = table.joints([name for _, name in joints], arm)
+    if q is not None and arm is not None and not table.has_position():
+        Ts = np.asarray(arm.forward(q))
+    elif q is not None and not table.has_position():
+        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
+    else:
+        p, unit_m, notes = _positions(table, unit, detect_units)
+        R, numbers, convention = table.rotations(rotation)
+        Ts = stacked(R, p)
+    return PoseTable(path, lines, Ts, numbers, convention, q, table.times(), table.names(), unit_m, notes)
+
+
+def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of the columns, made up where there are none, and the rows with their lines."""
+    text = read_text(path).removeprefix("\ufeff")
+    if "p[" in text:
+        rows = []
+        for line, row in enumerate(text.splitlines(), 1):
+            found = _UR.search(row)
+            if found is None and row.strip():
+                raise InputError(f"{path}: line {line}: expected p[x, y, z, rx, ry, rz], found {row.strip()[:40]!r}")
+            if found is not None:
+                rows.append((line, [cell.strip() for cell in found[1].split(",")]))
+        return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, rows, 6)
+    first = text.partition("\n")[0]
+    if any(mark in first for mark in ",;\t"):
+        cells = read_table(path, read_columns(columns, COLUMNS))
+    else:
+        cells = [line.split() for line in text.splitlines()]
+    rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
+    rows = [(line, row[:-1] if row and row[-1] == "" else row) for line, row in rows if any(row)]
+    rows = [(line, row) for line, row in rows if not row[0].startswith("#")]
+    if not rows:
+        raise InputError(f"{path}: no rows; one line a pose is needed")
+    head = rows[0][1]
+    if not _is_number(head[0]) or any(re.fullmatch(r"[A-Za-z_]\w*", cell) and not _is_number(cell) for cell in head):
+        if len(set(head)) != len(head):
+            raise InputError(f"{path}: line {rows[0][0]} names a column twice")
+        return head, _even(path, rows[1:], len(head))
+    matrix = [f"{letter}" for i in "123" for letter in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
+    forms = {
+        16: [*matrix, "_0", "_1", "_2", "_3"],
+        12: matrix,
+        7: ["x", "y", "z", "n1", "n2", "n3", "n4"],
+        6: ["x", "y", "z", "n1", "n2", "n3"],
+        8: ["t_s", "x", "y", "z", "n1", "n2", "n3", "n4"],
+    }
+    if len(head) not in forms:
+        raise InputError(
+            f"{path}: line {rows[0][0]}: {len(head)} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
+            "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
+        )
+    return forms[len(head)], _even(path, rows, len(head))
+
+
+def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tuple[int, list[str]]]:
+    """Return the rows if all have as many fields as there are columns."""
+    for line, row in rows:
+        if len(row) != count:
+            raise InputError(
+                f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line"
+            )
+    if not rows:
+        raise InputError(f"{path}: no rows; one line a pose is needed")
+    return rows
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+class _Columns:
+    """Columns of a table by their names."""
+
+    def __init__(self, path: Path, head: list[str], rows: list[tuple[int, list[str]]]) -> None:
+        self.path, self.at, self.rows = path, {name: k for k, name in enumerate(head)}, rows
+
+    def has_position(self) -> bool:
+        """Return whether there are positions."""
+        return any(name in self.at for name in ("x", "x_m", "x_mm"))
+
+    def numbers(self, names: list[str]) -> Array:
+        """Return columns (N, K)."""
+        for name in names:
+            if name not in self.at:
+                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {', '.join(self.at)}")
+        out = np.empty((len(self.rows), len(names)))
+        for i, (line, row) in enumerate(self.rows):
+            for k, name in enumerate(names):
+                cell = row[self.at[name]]
+                if not _is_number(cell) or not np.isfinite(float(cell)):
+                    raise InputError(
+                        f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; correct or remove the line"
+                    )
+                out[i, k] = float(cell)
+        return out
+
+    def joints(self, names: list[str], arm: Arm | None) -> Array:
+        """Return joint angles (N, J), rad."""
+        if arm is not None and len(names) != len(arm.joint_names):
+            raise InputError(
+                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has {len(arm.joint_names)}"
+            )
+        q = self.numbers(names)
+        return np.radians(q) if names[0].endswith("_deg") else q
+
+    def times(self) -> Array | None:
+        """Return the times (N,), s."""
+        return self.numbers(["t_s"])[:, 0] if "t_s" in self.at else None
+
+    def names(self) -> tuple[str, ...] | None:
+        """Return the names of the rows, or of their images."""
+        key = next((key for key in ("image", "name") if key in self.at), None)
+        if key is None:
+            return None
+        found = tuple(row[self.at[key]] for _, row in self.rows)
+        twice = next((name for name in found if found.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"{self.path}: {key} {twice!r} names two rows; a row belongs to one image")
+        return found
+
+    def rotations(self, rotation: str | None) -> tuple[Array, Array, str]:
+        """Return the rotations (N, 3, 3), the numbers they come from, and their convention."""
+        if "r11" in self.at:
+            R = self.numbers([f"r{i}{j}" for i in "123" for j in "123"]).reshape(-1, 3, 3)
+            return self._checked(R), np.zeros((len(R), 0)), ""
+        if "qw" in self.at:
+            found, convention = self.numbers(["qw", "qx", "qy", "qz"]), "wxyz"
+        elif "n4" in self.at:
+            if rotation not in ("wxyz", "xyzw"):
+                raise InputError(
+                    f"{self.path}: which of the four numbers of a quaternion is w? give --rotation wxyz or --rotation xyzw"
+                )
+            found, convention = self.numbers(["n1", "n2", "n3", "n4"]), rotation
+        else:
+            found, convention = self._angles(rotation)
+        return self._checked(rotations_by(found, convention, self.path)), found, convention
+
+    def _angles(self, rotation: str | None) -> tuple[Array, str]:
+        """Return three numbers of a rotation (N, 3), degrees, and their convention."""
+        unit = next((u for u in ("_rad", "_deg", "") if f"rx{u}" in self.at), None)
+        names = ["n1", "n2", "n3"] if "n1" in self.at else [f"r{axis}{unit}" for axis in "xyz"]
+        if unit is None and "n1" not in self.at:
+            raise InputError(
+                f"{self.path}: line 1: no rotation: qw qx qy qz, rx_deg ry_deg rz_deg, or r11 .. r33 are needed; there are "
+                f"{', '.join(list(self.at)[:10])}"
+            )
+        found = self.numbers(names)
+        convention = rotation or ("rotvec" if unit == "_rad" else None)
+        if convention is None or convention in ("wxyz", "xyzw"):
+            raise InputError(
+                f"{self.path}: what do the three numbers of a rotation mean? give --rotation rotvec, or the order of the "
+                "angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
+            )
+        radians = unit == "_rad" or (unit != "_deg" and bool((np.abs(found) <= 2 * np.pi + 1e-3).all()))
+        return (np.degrees(found) if radians else found), convention
+
+    def _checked(self, R: Array) -> Array:
+        """Return rotations, cleaned of rounding."""
+        for (line, _), one in zip(self.rows, R, strict=True):
+            off, turn = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
+            if off < LOOSE and turn < 0:
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
+                    "and camera poses are right-handed: exchange no axes without a sign"
+                )
+            if off >= LOOSE:
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})"
+                )
+        return np.asarray([nearest_rotation(one) for one in R])
+
+
+def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
+    """Return rotations (N, 3, 3) of quaternions (N, 4), or of angles (N, 3) in degrees, in a convention.
+
+    Raises:
+        InputError: a quaternion whose length is not 1.
+    """
+    if convention in ("wxyz", "xyzw"):
+        lengths = np.linalg.norm(numbers, axis=1)
+        if (np.abs(lengths - 1) > 1e-2).any():
+            raise InputError(f"{path}: a quaternion has length {lengths[np.argmax(np.abs(lengths - 1))]:.4g}, not 1")
+        return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "wxyz" else numbers).as_matrix())
+    if convention == "rotvec":
+        return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())
+    order = ["xyz".index(axis) for axis in convention.lower()]
+    return np.asarray(Rotation.from_euler(convention, np.radians(numbers[:, order])).as_matrix())
+
+
+def stacked(R: Array, p: Array) -> Array:
+    """Return poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    Ts = np.tile(np.eye(4), (len(R), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = R, p
+    return Ts
+
+
+def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, float, tuple[str, ...]]:
+    """Return positions (N, 3), m, the unit they were read in, and notes."""
+    suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
+    if suffix is None:
+        raise InputError(f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed")
+    p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
+    given = suffix[1:] or unit
+    unit_m = 1e-3 if given == "mm" else 1.0
+    far = float(np.abs(p).max()) * unit_m
+    if unit_m == 1.0 and far > FAR_M:
+        if not detect:
+            raise InputError(
+                f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
+                "give --units mm, or --detect-units"
+            )
+        return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
+    if unit_m == 1e-3 and far < NEAR_M:
+        if not detect:
+            raise InputError(
+                f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
+                "give --units m, or --detect-units"
+            )
+        return (
+            p,
+            1.0,
+            (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
+        )
+    return unit_m * p, unit_m, ()

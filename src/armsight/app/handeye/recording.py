@@ -1,0 +1,155 @@
+"""Both sides of a hand-eye calibration brought together: row by row, or as two streams.
+
+In: a table of robot poses, and what was seen. Out: :class:`Recording`, rows that belong together, with their names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.app.handeye.images import Seen, upright
+from armsight.app.handeye.read import PoseTable
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, log_se3, mean_pose
+from armsight.loop.handeye.handeye import MIN_POSES, Poses
+from armsight.loop.handeye.streams import StructuredStreams
+from armsight.robot.arm import Arm
+
+#: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
+TCP_M, TCP_RAD = 5e-3, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Recording(Record):
+    """Rows of both sides.
+
+    Attributes:
+        poses: the rows that have both sides.
+        rows: (N,) the row of the robot's table that each is from.
+        names: what each is called in messages.
+        t_s: (N,) times, s, on one clock; None where there are none.
+        robot: the robot's table.
+        seen: what was seen.
+        matched: (N,) the row of ``seen`` that each is from.
+        notes: what was found out.
+    """
+
+    poses: Poses
+    rows: NDArray[np.int64]
+    names: tuple[str, ...]
+    t_s: Array | None
+    robot: PoseTable
+    seen: Seen
+    matched: NDArray[np.int64]
+    notes: tuple[str, ...]
+
+
+def seen_in_table(table: PoseTable) -> Seen:
+    """Return the target's poses of a table as what was seen."""
+    n = len(table.Ts)
+    names = table.names or tuple(f"line {line}" for line in table.lines)
+    return Seen(table.Ts, np.zeros((n, 6, 6)), names, ("",) * n, table.t_s, np.zeros(3))
+
+
+def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Recording:
+    """Bring the rows together: by name where the robot's table has names that were seen, else by order.
+
+    Raises:
+        InputError: rows and images do not pair up, or hardly one shows the target.
+    """
+    notes = [*robot.notes, *seen.notes]
+    rows, matched = _matched(robot, seen)
+    shown = np.array([not seen.missed[k] for k in matched])
+    lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
+    if lost:
+        more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+        notes.append(f"no target in {', '.join(lost[:3])}{more}")
+    rows, matched = rows[shown], matched[shown]
+    if len(rows) < MIN_POSES:
+        raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
+    A, B = robot.Ts[rows], seen.Ts[matched]
+    if seen.symmetries:
+        B, turned = upright(A, B, seen.symmetries, in_hand)
+        if (turned >= 0).any():
+            notes.append(
+                f"the board looks the same turned: {int((turned >= 0).sum())} of {len(B)} were turned to agree"
+            )
+    both_clocks = robot.t_s is not None and seen.t_s is not None
+    t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
+    names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
+    notes += _tcp(robot, arm)
+    poses = Poses(A, B, seen.covs[matched], in_hand, seen.centre)
+    return Recording(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
+
+
+def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of both sides that belong together."""
+    if robot.names is not None:
+        there = {name: k for k, name in enumerate(seen.names)} | {
+            Path(name).stem: k for k, name in enumerate(seen.names)
+        }
+        keys = [
+            next((key for key in (name, Path(name).name, Path(name).stem) if key in there), None)
+            for name in robot.names
+        ]
+        found = [(r, there[key]) for r, key in enumerate(keys) if key is not None]
+        if not found:
+            raise InputError(
+                f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen.names[0]}, ...)"
+            )
+        rows, matched = (np.array(part) for part in zip(*found, strict=True))
+        return rows, matched
+    if len(robot.Ts) != len(seen.Ts):
+        raise InputError(
+            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give it a column "
+            "image (or name), or t_s on both sides and --streams, so that they can be told apart"
+        )
+    return np.arange(len(robot.Ts)), np.arange(len(seen.Ts))
+
+
+def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
+    """Return a note where the poses are those of a TCP, not of the model's flange."""
+    if arm is None or robot.q is None or robot.numbers.shape[1] == 0:
+        return []
+    offset = inverse(np.asarray(arm.forward(robot.q))) @ robot.Ts
+    mean = mean_pose(offset)
+    left = log_se3(inverse(mean) @ offset)
+    if (
+        np.median(np.linalg.norm(left[:, :3], axis=1)) > TCP_M
+        or np.median(np.linalg.norm(left[:, 3:], axis=1)) > TCP_RAD
+    ):
+        return [
+            f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"
+        ]
+    p = 1e3 * mean[:3, 3]
+    turn = float(np.degrees(np.linalg.norm(log_se3(mean)[3:])))
+    if np.linalg.norm(p) < 1.0 and turn < 0.5:
+        return []
+    return [
+        f"{robot.path}: its poses are of a TCP at [{p[0]:.1f} {p[1]:.1f} {p[2]:.1f}] mm, {turn:.1f} deg from the flange "
+        f"of {arm.name}: the transform found is from this TCP, not from the flange"
+    ]
+
+
+def links_of(recording: Recording, arm: Arm) -> Array | None:
+    """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
+    if recording.robot.q is None:
+        return None
+    frames = np.array([arm.links(q) for q in recording.robot.q[recording.rows]])
+    return np.asarray(inverse(frames) @ frames[:, -1:])
+
+
+def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> Recording:
+    """Return the rows of two streams that were calibrated; the flange's poses are interpolated."""
+    assert robot.t_s is not None
+    assert seen.t_s is not None
+    rows = np.clip(np.searchsorted(robot.t_s, found.t_s + found.offset_s), 0, len(robot.t_s) - 1)
+    matched = np.searchsorted(seen.t_s, found.t_s)
+    poses = Poses(found.A, found.B, np.zeros((len(found.A), 6, 6)), found.handeye.eye == "in_hand", seen.centre)
+    names = tuple(f"t {t:.3f} s" for t in found.t_s)
+    return Recording(poses, rows, names, found.t_s, robot, seen, matched, (*robot.notes, *seen.notes))

@@ -1,0 +1,218 @@
+"""What a hand-eye calibration says: the text, the JSON, and the table of the next poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armsight.app.handeye.plan import PosePlan, worst_sigmas
+from armsight.app.handeye.recording import Recording
+from armsight.app.report.table import TextTable, plain_text
+from armsight.data import Array, Record
+from armsight.geometry.pose import log_se3, mean_pose
+from armsight.loop.handeye.noise import OF_THE_ARM
+from armsight.loop.handeye.structured import StructuredHandEye
+
+#: A structure whose mean log density is within this of the best is not told from it.
+TOLD = 0.2
+#: A scale that differs from 1 by this many sigmas is said.
+SCALE_SIGMAS = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeRun(Record):
+    """A calibration with what it was made from.
+
+    Attributes:
+        recording: both sides.
+        found: the calibration.
+        offset_s: to be added to the eye's times; None where there are no streams; sigma_offset_s its sigma.
+        plan: the poses to take next; None where not asked for.
+    """
+
+    recording: Recording
+    found: StructuredHandEye
+    offset_s: float | None
+    sigma_offset_s: float
+    plan: PosePlan | None
+
+
+def names(run: HandEyeRun) -> tuple[str, str]:
+    """Return what the flange carries and what stands still: names of the transforms."""
+    if run.found.eye == "in_hand":
+        return "T_flange_rig", "T_base_body"
+    return "T_flange_body", "T_base_rig"
+
+
+def blunders(run: HandEyeRun) -> list[str]:
+    """Return the rows taken for blunders, by name, the worst first."""
+    out = np.flatnonzero(~run.found.used)
+    worst = out[np.argsort(-run.found.distance[out])]
+    return [f"{run.recording.names[k]}: {np.sqrt(run.found.distance[k]):.0f} sigma from the others" for k in worst]
+
+
+def whose(run: HandEyeRun) -> str:
+    """Return how much of the error is the arm's and how much the camera's, as a sentence."""
+    found = run.found
+    best = found.likelihoods[found.structure]
+    near = [name for name, value in found.likelihoods.items() if name != found.structure and best - value < TOLD]
+    arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
+    if arm == 0:
+        said = f"the camera's error, {camera:.2f} mm RMS at the target, explains the residuals best"
+    elif camera == 0:
+        said = f"the arm's error, {arm:.2f} mm RMS at the target, explains the residuals best"
+    else:
+        said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
+    if {"robot", "camera", "camera, depth apart"} & set(near) and not (arm and camera):
+        said += "; these poses hardly tell arm from camera"
+    return f"{said} (structure of the noise: {found.structure})"
+
+
+def headline(run: HandEyeRun) -> str:
+    """Return the result in one line."""
+    position, angle = run.found.held_out.rms()
+    return (
+        f"poses left out: {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS; {int(run.found.used.sum())} of "
+        f"{len(run.found.used)} poses used"
+    )
+
+
+def open_direction(run: HandEyeRun) -> str:
+    """Return in which direction the mounting is known worst."""
+    found = run.found
+    values, vectors = np.linalg.eigh(found.cov[6:9, 6:9])
+    axis = found.T_flange_held[:3, :3] @ vectors[:, -1]
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    named = " ".join(f"{value:.2f}" for value in axis)
+    ratio = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
+    turned = log_se3(np.linalg.inv(mean_pose(run.recording.poses.A)) @ run.recording.poses.A)[:, 3:]
+    spread, axes = np.linalg.eigh(turned.T @ turned / len(turned))
+    least = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+    about = " ".join(f"{value:.2f}" for value in least)
+    return (
+        f"worst known along [{named}] of the flange: sigma {1e3 * np.sqrt(values[-1]):.2f} mm, {ratio:.1f} times the best; "
+        f"the poses rotate least about [{about}] ({np.degrees(np.sqrt(max(spread[0], 0.0))):.1f} deg RMS)"
+    )
+
+
+def text(run: HandEyeRun) -> str:
+    """Return what people read."""
+    found = run.found
+    sigma = np.sqrt(np.diag(found.cov))
+    rows = []
+    for name, T, s in zip(names(run), (found.T_flange_held, found.T_base_still), (sigma[6:], sigma[:6]), strict=True):
+        along = _along(T, s)
+        angles = Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
+        cells = [f"{1e3 * v:.2f} ± {1e3 * e:.2f}" for v, e in zip(T[:3, 3], along, strict=True)]
+        cells += [f"{v:.3f} ± {np.degrees(e):.3f}" for v, e in zip(angles, s[3:], strict=True)]
+        rows.append((name, *cells))
+    head = ("", "x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
+    lines = [headline(run), "", plain_text(TextTable("angles: xyz about fixed axes; ± sigma", head, tuple(rows))), ""]
+    lines += [whose(run), open_direction(run)]
+    if run.offset_s is not None:
+        lines.append(
+            f"clock offset {1e3 * run.offset_s:.2f} ± {1e3 * run.sigma_offset_s:.2f} ms, to be added to the camera's times"
+        )
+    if found.sigma_scale:
+        lines.append(
+            f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
+        )
+    out = blunders(run)
+    lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
+    if run.plan is not None:
+        lines += ["", plan_text(run.plan)]
+    return "\n".join(lines)
+
+
+def _along(T: Array, sigma: Array) -> Array:
+    """Return sigmas along the parent's axes of a translation whose sigmas are along its own."""
+    return np.asarray(np.sqrt(np.square(T[:3, :3]) @ np.square(sigma[:3])))
+
+
+def plan_text(plan: PosePlan) -> str:
+    """Return the next poses as a table."""
+    rows = []
+    for k, (T, m, rad) in enumerate(zip(plan.Ts_base_flange, plan.sigma_m, plan.sigma_rad, strict=True), 1):
+        p, angles = 1e3 * T[:3, 3], Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
+        values = [*(f"{v:.1f}" for v in p), *(f"{v:.1f}" for v in angles), f"{1e3 * m:.2f}", f"{np.degrees(rad):.3f}"]
+        rows.append((str(k), *values))
+    head = ("next", "x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg", "sigma, mm", "deg")
+    title = (
+        f"poses of the flange to take next (sigma along the worst axis now {1e3 * plan.before[0]:.2f} mm, "
+        f"{np.degrees(plan.before[1]):.3f} deg); check that your arm reaches them freely"
+    )
+    return plain_text(TextTable(title, head, tuple(rows)))
+
+
+def plan_csv(plan: PosePlan) -> str:
+    """Return the next poses as a table that the command reads."""
+    lines = ["x_m,y_m,z_m,qw,qx,qy,qz"]
+    for T in plan.Ts_base_flange:
+        x, y, z, w = Rotation.from_matrix(np.array(T[:3, :3])).as_quat()
+        lines.append(",".join(f"{v:.9g}" for v in (*T[:3, 3], w, x, y, z)))
+    return "\n".join(lines) + "\n"
+
+
+def as_json(run: HandEyeRun) -> dict[str, Any]:
+    """Return what programs read; m and rad."""
+    found = run.found
+    held, still = names(run)
+    position, angle = found.held_out.rms()
+    worst_m, worst_rad = worst_sigmas(found.cov)
+    document: dict[str, Any] = {
+        "eye": found.eye,
+        held: found.T_flange_held.tolist(),
+        still: found.T_base_still.tolist(),
+        "cov_m_rad": found.cov.tolist(),
+        "cov_order": [f"{still}: right tangent, translation then rotation", f"{held}: the same"],
+        "held_out_rms_m": position,
+        "held_out_rms_rad": angle,
+        "held_out_mean_m": found.held_out.mean()[0],
+        "arm_rms_m": found.arm_m,
+        "camera_rms_m": found.camera_m,
+        "noise": {
+            "structure": found.structure,
+            "sigmas": found.sigmas,
+            "of_the_arm": [name for name in found.sigmas if name in OF_THE_ARM],
+            "log_likelihood_left_out": found.likelihoods,
+        },
+        "worst_sigma_m": worst_m,
+        "worst_sigma_rad": worst_rad,
+        "open_direction": open_direction(run),
+        "poses": [
+            {
+                "name": name,
+                "line": int(run.recording.robot.lines[row]),
+                "used": bool(used),
+                "sigmas_from_the_others": float(np.sqrt(distance)),
+                "held_out_m": None if np.isnan(m) else float(m),
+                "held_out_rad": None if np.isnan(rad) else float(rad),
+            }
+            for name, row, used, distance, m, rad in zip(
+                run.recording.names,
+                run.recording.rows,
+                found.used,
+                found.distance,
+                found.held_out.position_m,
+                found.held_out.angle_rad,
+                strict=True,
+            )
+        ],
+        "notes": list(run.recording.notes),
+    }
+    if found.sigma_scale:
+        document |= {"target_scale": found.scale, "target_scale_sigma": found.sigma_scale}
+    if run.offset_s is not None:
+        document |= {"clock_offset_s": run.offset_s, "clock_offset_sigma_s": run.sigma_offset_s}
+    if run.recording.seen.scatter_px:
+        document["reprojection_rms_px"] = run.recording.seen.scatter_px
+    if run.plan is not None:
+        document["plan"] = {
+            "T_base_flange": run.plan.Ts_base_flange.tolist(),
+            "sigma_m": run.plan.sigma_m.tolist(),
+            "sigma_rad": run.plan.sigma_rad.tolist(),
+        }
+    return document

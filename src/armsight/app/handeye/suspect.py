@@ -1,0 +1,186 @@
+"""What is wrong with hand-eye data that do not fit: other readings of the same numbers are tried.
+
+In: a recording. Out: nothing where it fits as given; an InputError in one line where another reading fits far better: rows
+shifted against the images, the other mounting or inverse transforms, another unit, another order of angles, quaternions or
+joints.
+
+How well a reading fits is the median residual of the closed forms
+(:func:`~armsight.loop.handeye.handeye.starts`): of a position, m, or of a rotation as it moves a point at 0.3 m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations, permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.app.handeye.read import CONVENTIONS, rotations_by, stacked
+from armsight.app.handeye.recording import Recording
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
+from armsight.loop.handeye.structured import scale_between
+from armsight.robot.arm import Arm
+
+#: Data whose median residual is below this, m, are taken as they are.
+FITS_M = 2e-3
+#: Another reading must fit better by this factor, and its median residual be below this, m.
+BETTER, PLAUSIBLE_M = 4.0, 0.02
+#: Poses that a reading is judged by at most, and the rows by which poses are looked for against the images.
+JUDGED, SHIFTS = 60, (1, -1, 2, -2)
+#: Scales that mistaken units make: mm for m, cm, inches.
+UNITS = {
+    1000.0: "millimetres taken for metres",
+    100.0: "centimetres taken for metres",
+    39.37: "inches taken for metres",
+}
+
+
+def misfit(poses: Poses) -> float:
+    """Return the median residual, m, of the best closed form."""
+    rows = np.linspace(0, len(poses.A) - 1, min(JUDGED, len(poses.A))).round().astype(np.int64)
+    part = poses.rows(rows)
+    found = starts(part.A, part.right_side)
+    if not found:
+        return float("inf")
+    X, Z = found[0]
+    e, _, _ = residuals(part, Z, X)
+    return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
+
+
+def _angles(Ts: Array) -> Array:
+    """Return the angles between neighbouring poses, rad."""
+    return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
+
+
+def require_plausible(recording: Recording, arm: Arm | None, *, detect_units: bool = False) -> Recording:
+    """Refuse data that fit far better read in another way.
+
+    Args:
+        recording: the rows.
+        arm: the model, where the robot's poses come from joints.
+        detect_units: whether lengths in another unit are converted, with a note, in place of an error.
+
+    Returns:
+        The recording, its lengths converted where that was asked for and needed.
+
+    Raises:
+        InputError: what is likely wrong, and what to do.
+    """
+    p = recording.poses
+    as_given = misfit(p)
+    if as_given < FITS_M:
+        return recording
+    best, advice, converted = as_given, "", None
+    units = {said for _, said in _scaled(p)}
+    for poses, said in _readings(recording, arm):
+        try:
+            other = misfit(poses)
+        except np.linalg.LinAlgError:
+            continue
+        if other < best:
+            best, advice = other, said
+            converted = poses if said in units else None
+    if best < as_given / BETTER and best < PLAUSIBLE_M:
+        if detect_units and converted is not None:
+            note = f"{advice.partition(':')[0]}; converted"
+            return replace(recording, poses=converted, notes=(*recording.notes, note))
+        raise InputError(
+            f"{recording.robot.path}: {advice} (median residual {1e3 * best:.1f} mm; as given {1e3 * as_given:.1f})"
+        )
+    return recording
+
+
+def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, str]]:
+    """Yield other readings of the same data, with what it would mean."""
+    p = recording.poses
+    n = len(p.A)
+    for shift in SHIFTS:
+        if n - abs(shift) >= 6:
+            first, second = (
+                (slice(shift, None), slice(None, -shift)) if shift > 0 else (slice(None, shift), slice(-shift, None))
+            )
+            rows = np.arange(n)
+            yield (
+                replace(p.rows(rows[second]), A=p.A[first]),
+                f"the rows are shifted by {abs(shift)} against the images: row {1 + max(shift, 0)} of the robot belongs to "
+                f"image {1 + max(-shift, 0)}; remove what is too much at either end, or add a column image",
+            )
+    mountings = ("in_hand", "to_hand")
+    given, other = mountings if p.in_hand else mountings[::-1]
+    yield (
+        replace(p, in_hand=not p.in_hand),
+        f"these poses fit --eye {other.replace('_', '-')}, not {given.replace('_', '-')}: either the mounting is the other "
+        "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
+    )
+    yield from _scaled(p)
+    scale = scale_between(p)
+    B = p.B.copy()
+    B[:, :3, 3] *= scale
+    yield (
+        replace(p, B=B),
+        f"the target seems to be {scale:.3g} times as large as given: is the size of --target right? --scale fits it",
+    )
+    table = recording.robot
+    if table.convention:
+        position = p.A[:, :3, 3]
+        for convention in CONVENTIONS:
+            width = 4 if convention in ("wxyz", "xyzw") else 3
+            if convention == table.convention or width != table.numbers.shape[1]:
+                continue
+            R = rotations_by(table.numbers[recording.rows], convention, table.path)
+            yield (
+                replace(p, A=stacked(R, position)),
+                f"the rotations are {convention}, not {table.convention}: --rotation {convention}",
+            )
+        if table.numbers.shape[1] == 3:
+            R = rotations_by(np.degrees(table.numbers[recording.rows]), table.convention, table.path)
+            yield (
+                replace(p, A=stacked(R, position)),
+                "the rotations are in radians, not degrees: name the columns rx_rad ry_rad rz_rad",
+            )
+    if arm is not None and table.q is not None and table.numbers.shape[1] == 0:
+        yield from _joints(p, arm, table.q[recording.rows])
+
+
+def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
+    """Yield readings of the target's lengths in other units."""
+    for factor, said in UNITS.items():
+        for scale, whose in (
+            (factor, f"the robot's lengths are {said}"),
+            (1 / factor, f"the target's lengths are {said}"),
+        ):
+            B = p.B.copy()
+            B[:, :3, 3] *= scale
+            A = p.A.copy()
+            if scale > 1:
+                A[:, :3, 3] /= scale
+                B = p.B
+            yield replace(p, A=A, B=B), f"{whose}: give --units or --seen-units, or --detect-units"
+
+
+def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
+    """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
+    n = q.shape[1]
+    rows = np.linspace(0, len(q) - 1, min(JUDGED, len(q))).round().astype(np.int64)
+    seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
+    orders: list[tuple[int, ...]] = [
+        tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
+    ]
+    orders.append(tuple(range(n))[::-1])
+    if n <= 6:
+        orders = [order for order in permutations(range(n)) if order != tuple(range(n))]
+    scored: list[tuple[float, NDArray[np.int64]]] = []
+    for order in orders:
+        turned = _angles(np.asarray(arm.forward(q[rows][:, order])))
+        scored.append((float(np.median(np.abs(turned - seen))), np.array(order)))
+    for _, at in sorted(scored, key=lambda one: one[0])[:3]:
+        named = ", ".join(f"q{k + 1}" for k in at)
+        yield (
+            replace(p, A=np.asarray(arm.forward(q[:, at]))),
+            f"the joints are in another order: {arm.name}'s are {named} here",
+        )

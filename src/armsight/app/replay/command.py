@@ -1,0 +1,84 @@
+"""``armsight replay``: measuring and the estimators again, on a recording."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+
+import click
+
+
+@click.command("replay")
+@click.argument("recording", metavar="RUN|BAG")
+@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write the tables to this folder.")
+@click.option("--rig", metavar="RIG.json", help="Another rig: needs images or tags in the recording.")
+@click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
+@click.option("--arm", metavar="ARM", help="Another arm model.")
+@click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
+@click.option(
+    "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
+)
+@click.option("--stream", multiple=True, metavar="STREAM", help="Publish meanwhile: see armsight measure -h.")
+@click.option(
+    "--compare",
+    "other",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Show what differs from the tables in this folder.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+def command(
+    recording: str,
+    output: Path | None,
+    rig: str | None,
+    target: str | None,
+    arm: str | None,
+    estimator: str,
+    rate: float,
+    stream: tuple[str, ...],
+    other: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure and estimate again what was recorded, also with another rig, body, arm or estimator.
+
+    RUN is the folder of armsight run, demo or record, or its run.mcap. BAG is a recording of ROS or Foxglove,
+    FILE[,left=TOPIC,right=TOPIC], with images or tags of two cameras; its camera_info is the rig where they are of a stereo
+    pair. Without changes the answers of a run's estimators are the same to the last digit, and the command says so.
+    """
+    from armsight.app.replay.compare import compare
+    from armsight.app.replay.open import Request, replay
+    from armsight.app.replay.tables import LIVE, POSES, write_tables
+    from armsight.files import check_folder
+
+    if output is not None:
+        check_folder(output, holding=(POSES, LIVE), apart_from=(other and other / POSES, other and other / LIVE))
+    request = Request(recording, rig, target, arm, estimator, rate, stream)
+    replayed = replay(request, lambda line: click.echo(line, err=True))
+    measured = sum(pose.ok for pose in replayed.poses)
+    answer: dict[str, object] = {
+        "recording": recording,
+        "shots": len(replayed.poses),
+        "measured": measured,
+        "estimates": len(replayed.live),
+        "differences": replayed.differences,
+        "same": None if replayed.differences is None else not any(replayed.differences.values()),
+    }
+    lines = [f"{measured} of {len(replayed.poses)} shots measured, {len(replayed.live)} estimates"]
+    if replayed.differences is not None:
+        lines.append(
+            "the estimates are those of the run, to the last digit"
+            if answer["same"]
+            else "the estimates differ from those of the run by at most "
+            + ", ".join(f"{name} {value:.3g}" for name, value in replayed.differences.items())
+        )
+    if output is not None:
+        write_tables(output.expanduser(), replayed)
+        lines.append(f"written to {output}")
+    if other is not None:
+        with tempfile.TemporaryDirectory() as temporary:
+            write_tables(Path(temporary), replayed)
+            found = compare(other, Path(temporary))
+        answer["compared"] = [each.to_json() for each in found]
+        lines += [line for each in found for line in each.lines()]
+    click.echo(json.dumps(answer) if as_json else "\n".join(lines))

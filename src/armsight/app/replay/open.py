@@ -1,0 +1,157 @@
+"""Open what is to be replayed, and replay it: the request of the command line in, a :class:`~.run.Replayed` out."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from armsight.app.replay.recorded import RecordedRun, read_run, run_file
+from armsight.app.replay.run import Pace, Replayed, replay_run, replay_source, replay_tags
+from armsight.app.stream.datum import Published
+from armsight.app.stream.mcap_file import ARM, BODY, arm_of
+from armsight.app.stream.streams import open_streams
+from armsight.data import Body
+from armsight.errors import InputError
+from armsight.robot.arm_file import open_arm
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import Source, notes_of, open_source
+from armsight.vision.sources.bag import Bag
+from armsight.vision.sources.bag.camera_info import bag_rig
+from armsight.vision.sources.bag.images import IMAGES, image_topics, parsed, source_of
+from armsight.vision.sources.bag.states import read_joints
+from armsight.vision.sources.bag.tags import TAGS, read_tags
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be replayed, as the command line names it; None is what was recorded.
+
+    Attributes:
+        recording: RUN or BAG.
+        rig: rig file.
+        target: spec of a board, or body file.
+        arm: arm model.
+        estimator: a name of ESTIMATORS.
+        rate: seconds of the recording a second; 0 as fast as possible.
+        streams: what to publish to.
+    """
+
+    recording: str
+    rig: str | None = None
+    target: str | None = None
+    arm: str | None = None
+    estimator: str = "kalman"
+    rate: float = 0.0
+    streams: tuple[str, ...] = ()
+
+
+def replay(request: Request, say: Callable[[str], None]) -> Replayed:
+    """Replay a recording.
+
+    Args:
+        request: what is to be replayed.
+        say: is given notes, a line each.
+
+    Raises:
+        InputError: not a recording, or it does not hold what the request needs.
+    """
+    file = run_file(request.recording)
+    recorded = None if file is None else read_run(file)
+    if recorded is not None and recorded.has_estimator:
+        return _of_run(request, recorded, say)
+    return _of_source(request, recorded, say)
+
+
+def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None]) -> Replayed:
+    """Run the estimators of a run again."""
+    for note in recorded.notes:
+        say(f"note: {note}")
+    if request.rig is not None or request.target is not None:
+        raise InputError(
+            f"{request.recording}: another --rig or --target needs the images of every shot, which a run does not keep; "
+            "its estimators can be replayed, with another --arm or --estimator"
+        )
+    if ARM not in recorded.properties or BODY not in recorded.properties:
+        raise InputError(f"{recorded.path}: its metadata name no arm or no body: it was written by another version")
+    arm = arm_of(recorded.properties[ARM]) if request.arm is None else open_arm(request.arm)
+    body = _body_of(recorded)
+    rig = StereoRig.from_text(recorded.properties["rig.json"], f"{recorded.path}: rig.json")
+    changed = request.arm is not None or request.estimator != "kalman"
+    with contextlib.closing(open_streams(request.streams, Published(rig, body, arm), say)) as publisher:
+        return replay_run(
+            recorded,
+            arm,
+            body,
+            estimator=request.estimator,
+            pace=Pace(request.rate),
+            publisher=publisher,
+            changed=changed,
+        )
+
+
+def _body_of(recorded: RecordedRun) -> Body:
+    """Return the body of a run, from the text in its metadata."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / BODY
+        path.write_text(recorded.properties[BODY], encoding="utf-8")
+        return open_target(str(path)).body
+
+
+def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[str], None]) -> Replayed:
+    """Measure the images or the tags of a recording again."""
+    if request.target is None:
+        raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
+    path, named = parsed(request.recording.removeprefix("bag:"))
+    if Path(path).expanduser().is_dir() and (Path(path).expanduser() / "shots.csv").is_file():
+        return _of_images(request, open_source(path), None, say)
+    bag = Bag(path if recorded is None else recorded.path)
+    if bag.of_kind(*IMAGES):
+        return _of_images(request, source_of(bag, image_topics(bag, named)), bag, say)
+    if not bag.of_kind(*TAGS):
+        raise InputError(f"{request.recording}: holds neither images nor tags of two cameras; it holds {bag.holds()}")
+    rig = _rig(request, bag, named)
+    csv = request.target.lower().endswith(".csv")
+    target: Target | Body = open_body(request.target) if csv else open_target(request.target)
+    body = target if isinstance(target, Body) else target.body
+    spec = request.recording if request.recording.startswith("bag:") else f"bag:{request.recording}"
+    shots, notes = read_tags(spec, target)
+    for note in notes:
+        say(f"note: {note}")
+    with contextlib.closing(open_streams(request.streams, Published(rig, body), say)) as publisher:
+        replayed = replay_tags(rig, body, shots, pace=Pace(request.rate), publisher=publisher)
+    return _with_joints(replayed, bag, say)
+
+
+def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[[str], None]) -> Replayed:
+    """Measure the images of a recording again."""
+    assert request.target is not None
+    for note in notes_of(source):
+        say(f"note: {note}")
+    target, rig = open_target(request.target), _rig(request, bag, {})
+    with contextlib.closing(open_streams(request.streams, Published(rig, target.body), say)) as publisher:
+        replayed = replay_source(rig, target, source, pace=Pace(request.rate), publisher=publisher)
+    return replayed if bag is None else _with_joints(replayed, bag, say)
+
+
+def _rig(request: Request, bag: Bag | None, named: dict[str, str]) -> StereoRig:
+    """Return the rig that was given, or that of the recording."""
+    if request.rig is not None:
+        return StereoRig.load(request.rig)
+    if bag is None:
+        raise InputError(f"{request.recording}: holds no rig: give --rig")
+    return bag_rig(bag, named)
+
+
+def _with_joints(replayed: Replayed, bag: Bag, say: Callable[[str], None]) -> Replayed:
+    """Add the joint readings of a recording, where it has some."""
+    joints = read_joints(bag)
+    if joints is None:
+        return replayed
+    for note in joints.notes:
+        say(f"note: {note}")
+    return Replayed(replayed.poses, replayed.live, joints, replayed.differences)

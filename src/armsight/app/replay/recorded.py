@@ -1,0 +1,109 @@
+"""What run.mcap holds of a run: its metadata, and every datum in the order it was published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum
+from armsight.app.stream.mcap_file import RUN_MCAP, TOPICS
+from armsight.data import Correspondences, JointStates, Missed, Points, PoseEstimate
+from armsight.errors import InputError
+from armsight.vision.sources.bag import Bag
+from armsight.vision.sources.bag.camera_info import METADATA
+
+_KINDS = {topic: kind for kind, topic in TOPICS.items()}
+_NOTHING = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
+
+
+@dataclass(frozen=True)
+class RecordedDatum:
+    """A datum as it stands in the file.
+
+    Attributes:
+        kind: ShotDatum, JointsDatum or EventDatum: what was published.
+        content: its JSON; docs/reference/data.md describes the keys.
+    """
+
+    kind: type
+    content: dict[str, Any]
+
+    @property
+    def result(self) -> PoseEstimate | Missed:
+        """What was measured in a shot, with all digits; the points are not recorded."""
+        if self.content["status"] != "ok":
+            return Missed(str(self.content["reason"]))
+        points = Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 0)), _NOTHING)
+        return PoseEstimate(
+            np.array(self.content["T_left_body"]),
+            np.array(self.content["covariance_body"]),
+            np.array(self.content["covariance_precision_body"]),
+            float("nan" if self.content["residual_rms_m"] is None else self.content["residual_rms_m"]),
+            float(self.content["reprojection_rms_px"]),
+            float(self.content["misfit"]),
+            points,
+        )
+
+    @property
+    def states(self) -> JointStates:
+        """The readings of a batch."""
+        return JointStates(np.array(self.content["t_s"], float), np.array(self.content["q_rad"], float).reshape(-1, 6))
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A run.mcap.
+
+    Attributes:
+        path: of the file.
+        properties: its metadata: versions, rig file, body file, arm.
+        data: in the order they were published.
+        notes: what could not be read.
+    """
+
+    path: Path
+    properties: dict[str, str]
+    data: tuple[RecordedDatum, ...]
+    notes: tuple[str, ...] = field(default=())
+
+    def of(self, kind: type) -> Iterator[RecordedDatum]:
+        """Yield the data of one kind."""
+        return (each for each in self.data if each.kind is kind)
+
+    @property
+    def has_estimator(self) -> bool:
+        """Whether an estimator ran: there are joints and the event that it began."""
+        return any(True for _ in self.of(JointsDatum)) and any(True for _ in self.of(EventDatum))
+
+
+def run_file(path: str | Path) -> Path | None:
+    """Return the run.mcap that a path names, the file itself or the one in a folder; None where it is no run."""
+    given = Path(path).expanduser()
+    if given.is_dir():
+        given = given / RUN_MCAP
+    return given if given.name.endswith(".mcap") and given.is_file() else None
+
+
+def read_run(path: Path) -> RecordedRun | None:
+    """Read a run.mcap; None where an MCAP file was not written by armsight.
+
+    Raises:
+        InputError: it cannot be read, or a package is missing.
+    """
+    bag = Bag(path)
+    if METADATA not in bag.metadata:
+        return None
+    data = []
+    for message in bag.messages([topic for topic in _KINDS if topic in bag.topics]):
+        content = message.decode()
+        if not isinstance(content, dict):
+            raise InputError(f"{path}: a datum on {message.topic} is no JSON object")
+        data.append(RecordedDatum(_KINDS[message.topic], content))
+    return RecordedRun(path, bag.metadata[METADATA], tuple(data), tuple(bag.notes))
+
+
+__all__ = ["EventDatum", "JointsDatum", "RecordedDatum", "RecordedRun", "ShotDatum", "read_run", "run_file"]

@@ -1,0 +1,241 @@
+"""Run again what was recorded: the estimators of a run, or the measurement of a recording's images or tags.
+
+In: a :class:`~.recorded.RecordedRun`, or a rig, a target and a source. Out: :class:`Replayed`. The estimator is given what
+it was given when the run was recorded, in the same order: where nothing was changed its answers are the same to the last
+digit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from armsight.app.measure.poses import ShotPose, left_axes, shot_pose
+from armsight.app.replay.recorded import EventDatum, JointsDatum, RecordedDatum, RecordedRun, ShotDatum
+from armsight.app.stream.sink import Publisher
+from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.errors import InputError
+from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Estimator, Mounting, Prior
+from armsight.robot.arm import Arm
+from armsight.vision.detections import SeenShot
+from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.markers.marker import Target
+from armsight.vision.measure import measure, measure_seen
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import Source
+from armsight.vision.sources.bag.states import JointStream
+
+
+@dataclass(frozen=True)
+class LiveRow:
+    """The estimate after one batch of readings.
+
+    Attributes:
+        t_s: time of the newest reading, s.
+        position_m: (3,) of the tool in the base.
+        quaternion_wxyz: (4,) of the tool.
+        cov: (6, 6) along the axes of the base.
+        vision_age_s: time since the newest measurement used, s; infinite before the first.
+    """
+
+    t_s: float
+    position_m: Array
+    quaternion_wxyz: Array
+    cov: Array
+    vision_age_s: float
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What came out.
+
+    Attributes:
+        poses: one a shot.
+        live: one a batch of readings; none without an estimator.
+        joints: the joint readings that a bag holds; None without.
+        differences: largest absolute difference of the estimates to those recorded, by name; none where not comparable.
+    """
+
+    poses: tuple[ShotPose, ...]
+    live: tuple[LiveRow, ...] = ()
+    joints: JointStream | None = None
+    differences: dict[str, float] | None = None
+
+
+def live_row(estimate: ArmEstimate) -> LiveRow:
+    """Return an estimate as a row."""
+    T = estimate.T_base_tool
+    return LiveRow(
+        estimate.t_s,
+        T[:3, 3],
+        quaternion_wxyz(T[:3, :3]),
+        left_axes(T, estimate.cov),
+        estimate.vision_age_s,
+    )
+
+
+class Pace:
+    """Waits so that recorded times pass at a rate.
+
+    Args:
+        rate: seconds of the recording a second; 0 does not wait.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._began: tuple[float, float] | None = None
+
+    def wait(self, t_s: float | None) -> None:
+        """Wait until a time of the recording is due, s."""
+        if self._rate <= 0.0 or t_s is None:
+            return
+        now = time.monotonic()
+        if self._began is None or t_s < self._began[1]:
+            self._began = (now, t_s)
+        time.sleep(max(0.0, self._began[0] + (t_s - self._began[1]) / self._rate - now))
+
+
+def replay_run(
+    recorded: RecordedRun, arm: Arm, body: Body, *, estimator: str, pace: Pace, publisher: Publisher, changed: bool
+) -> Replayed:
+    """Run the estimators of a run again.
+
+    Args:
+        recorded: the run.
+        arm: the nominal arm.
+        body: what was measured.
+        estimator: a name of ESTIMATORS.
+        pace: of the replay.
+        publisher: is given what comes out.
+        changed: whether arm or estimator are others: the estimates are then not compared with the recorded ones.
+    """
+    state = _RunAgain(arm, estimator)
+    poses: list[ShotPose] = []
+    rows: list[LiveRow] = []
+    before: list[RecordedDatum] = []
+    for each in recorded.data:
+        if each.kind is EventDatum:
+            state.event(each.content)
+        elif each.kind is JointsDatum:
+            states = each.states
+            pace.wait(float(states.t_s[-1]))
+            estimate = state.joints(states)
+            if estimate is not None:
+                rows.append(live_row(estimate))
+                before.append(each)
+                publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
+        else:
+            result, t_s = each.result, each.content["t_s"]
+            outcome = state.vision(result, t_s, each.content)
+            poses.append(shot_pose(str(each.content["shot"]), t_s, body, result))
+            shot = Shot(str(each.content["shot"]), None, None, t_s)
+            publisher.put(ShotDatum(shot, result, each.content["arrival_s"], each.content["sigma_t_s"], outcome))
+    differences = None if changed else _differences(before, rows)
+    return Replayed(tuple(poses), tuple(rows), None, differences)
+
+
+class _RunAgain:
+    """The estimator of a run, and what was given to it."""
+
+    def __init__(self, arm: Arm, name: str) -> None:
+        self._arm, self._name = arm, name
+        self._estimator: Estimator | None = None
+        self._mounting: Mounting | None = None
+        self._batches: list[JointStates] = []
+        self._seen: list[tuple[float, PoseEstimate]] = []
+
+    def event(self, content: dict[str, Any]) -> None:
+        if content["event"] == "mounting":
+            self._mounting = Mounting(
+                *(np.array(content[key], float) for key in ("T_base_rig", "T_tool_body", "covariance"))
+            )
+            return
+        options: dict[str, Any] = {"prior": Prior(**content["prior"]), "delay": Delay(**content["delay"])}
+        if self._name == "kalman":
+            options["learns_delay"] = bool(content["learns_delay"])
+        self._estimator = ESTIMATORS[self._name](self._arm, **options)
+        if content["anew"] and self._mounting is not None:
+            # As the loop does when it replaces its estimator: all that was measured before, in order of time.
+            seen = list(self._seen)
+            for states in self._batches:
+                self._estimator.joints(states)
+                while seen and seen[0][0] <= states.t_s[-1]:
+                    t_s, pose = seen.pop(0)
+                    self._estimator.vision(self._mounting.pose_measurement(pose, t_s))
+
+    def joints(self, states: JointStates) -> ArmEstimate | None:
+        self._batches.append(states)
+        if self._estimator is None:
+            return None
+        self._estimator.joints(states)
+        return self._estimator.estimate()
+
+    def vision(self, result: PoseEstimate | Missed, t_s: float | None, content: dict[str, Any]) -> str | None:
+        if not isinstance(result, PoseEstimate) or t_s is None:
+            return None
+        self._seen.append((t_s, result))
+        if self._mounting is None or self._estimator is None or "outcome" not in content:
+            return None
+        measurement = self._mounting.pose_measurement(result, t_s)
+        if "covariance_suspected" in content:
+            suspected = np.array(content["covariance_suspected"], float)
+            measurement = replace(measurement, cov_common=measurement.cov_common + suspected)
+        return self._estimator.vision(measurement).value
+
+
+def _differences(before: list[RecordedDatum], rows: list[LiveRow]) -> dict[str, float]:
+    """Return the largest absolute differences of estimates to the recorded ones, by name with unit."""
+    found = {"position_m": 0.0, "quaternion": 0.0, "covariance": 0.0}
+    for was, row in zip(before, rows, strict=True):
+        content = was.content
+        for name, key, value in (
+            ("position_m", "tool_position_m", row.position_m),
+            ("quaternion", "tool_quaternion_wxyz", row.quaternion_wxyz),
+            ("covariance", "tool_covariance", row.cov),
+        ):
+            found[name] = max(found[name], float(np.abs(np.array(content[key]) - value).max()))
+    return found
+
+
+def replay_source(rig: StereoRig, target: Target, source: Source, *, pace: Pace, publisher: Publisher) -> Replayed:
+    """Measure the images of a recording again."""
+    measured = Follower(rig, target).measure if follows(target) else lambda shot: measure(rig, target, shot)
+
+    def results() -> Iterator[tuple[Shot, PoseEstimate | Missed]]:
+        with contextlib.closing(source):
+            while (shot := source.read()) is not None:
+                pace.wait(shot.t_s)
+                yield shot, measured(shot)
+
+    return _shots(results(), target.body, publisher)
+
+
+def replay_tags(rig: StereoRig, body: Body, shots: Iterable[SeenShot], *, pace: Pace, publisher: Publisher) -> Replayed:
+    """Measure the recorded tags again."""
+
+    def results() -> Iterator[tuple[Shot, PoseEstimate | Missed]]:
+        for shot in shots:
+            pace.wait(shot.t_s)
+            yield Shot(shot.name, None, None, shot.t_s), measure_seen(rig, body, shot)
+
+    return _shots(results(), body, publisher)
+
+
+def _shots(results: Iterable[tuple[Shot, PoseEstimate | Missed]], body: Body, publisher: Publisher) -> Replayed:
+    poses = []
+    for shot, result in results:
+        poses.append(shot_pose(shot.name, shot.t_s, body, result))
+        publisher.put(ShotDatum(shot, result))
+    if not poses:
+        raise InputError("the recording ended without a single shot")
+    return Replayed(tuple(poses))
+
+
+#: Called with a line about what is done.
+Say = Callable[[str], None]

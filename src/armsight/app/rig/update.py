@@ -1,0 +1,152 @@
+"""``armsight rig update``: the relative pose of the cameras estimated again from what a run saw, and its page.
+
+In: a run's folder, with its rig, its body and its detections. Out: a new rig file, lines for people or JSON, and a page
+with the old rig beside the new one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.report.page import PAGE, html_page, put_files, table, text, writable_folder
+from armsight.data import Missed
+from armsight.errors import InputError
+from armsight.loop.health.update import DEPTHS_M, RigUpdate, updated_rig
+from armsight.vision.detections import SeenShot, detection_times, read_detections
+from armsight.vision.markers.targets import open_body
+from armsight.vision.rig import StereoRig
+
+_FILES = {"rig": "rig.json", "body": "body.toml", "detections": "detections.csv"}
+
+
+def update(run: Path, output: Path, since_s: float | None, report: Path | None) -> dict[str, Any]:
+    """Estimate the relative pose of a run's cameras again; write the rig, and a page where one is asked for.
+
+    Args:
+        run: the run's folder.
+        output: the rig file to write.
+        since_s: only shots from this time on are used, board's clock, s; None: from when the run itself found that the
+            cameras had moved, or all.
+        report: folder of the page.
+
+    Returns:
+        What was found, as JSON has it.
+
+    Raises:
+        InputError: a file of the run is missing or wrong, or its shots do not determine the pose.
+    """
+    files = {name: run / file for name, file in _FILES.items()}
+    for file in files.values():
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; RUN is the folder of `armsight run` or `armsight demo`")
+    rig, body = StereoRig.load(files["rig"]), open_body(str(files["body"]))
+    folder = None if report is None else writable_folder(report, "no page")
+    shots = read_detections(files["detections"], body)
+    since_s = _found_since(run) if since_s is None else since_s
+    used = shots if since_s is None else _from(shots, detection_times(files["detections"]), since_s)
+    if not used:
+        raise InputError(f"{files['detections']}: no shot from {since_s:g} s on; it has {len(shots)} shots")
+    found = updated_rig(rig, body, used)
+    if isinstance(found, Missed):
+        raise InputError(f"{run}: the rig is not updated: {found.reason}")
+    made = {"command": "rig update", "run": str(run), "since_s": since_s, "shots": found.shots}
+    new = replace(found.rig, provenance=made | {"before": dict(rig.provenance)})
+    new.save(output)
+    answer = {"rig": str(output), "run": str(run), "since_s": since_s, **figures(found)}
+    if folder is not None:
+        put_files(folder, {PAGE: page(rig, new, found, run, since_s).encode()})
+        answer["report"] = str(folder / PAGE)
+    return answer
+
+
+def _from(shots: list[SeenShot], times: Mapping[str, float], since_s: float) -> list[SeenShot]:
+    """Return the shots from a time on."""
+    return [shot for shot in shots if times.get(shot.name, -math.inf) >= since_s]
+
+
+def _found_since(run: Path) -> float | None:
+    """Return since when a run found that its cameras had moved against each other, s; None where it did not."""
+    file = run / "summary.json"
+    try:
+        health = json.loads(file.read_text(encoding="utf-8")).get("health", [])
+        since = [each["since_s"] for each in health if each["cause"] == "rig"]
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+        return None
+    return float(since[0]) if since and isinstance(since[0], int | float) else None
+
+
+def figures(found: RigUpdate) -> dict[str, Any]:
+    """Return the figures of an update, as JSON has them."""
+    return {
+        "rotation_changed_deg": float(np.degrees(found.rotation_rad)),
+        "rotation_sigma_deg": float(np.degrees(found.sigma_rad)),
+        "shift_across_baseline_m": found.shift_m,
+        "depth_error_of_old_rig_m": {
+            f"{depth:g}": value if math.isfinite(value) else None
+            for depth, value in zip(DEPTHS_M, found.depth_errors_m, strict=True)
+        },
+        "epipolar_rms_before_px": found.epipolar_px[0],
+        "epipolar_rms_after_px": found.epipolar_px[1],
+        "shots": found.shots,
+        "differing_shots": found.stays,
+    }
+
+
+def lines(answer: Mapping[str, Any]) -> list[str]:
+    """Return what was found as lines for people."""
+    depths = ", ".join(
+        f"{'unknown' if value is None else f'{1e3 * value:+.2f} mm'} at {depth} m"
+        for depth, value in answer["depth_error_of_old_rig_m"].items()
+    )
+    return [
+        f"right camera: rotated by {answer['rotation_changed_deg']:.3f} +- {answer['rotation_sigma_deg']:.3f} deg, shifted "
+        f"across the baseline by {1e3 * answer['shift_across_baseline_m']:.3f} mm",
+        f"depth error of the old rig: {depths}",
+        f"epipolar distance, RMS: {answer['epipolar_rms_before_px']:.3f} px before, "
+        f"{answer['epipolar_rms_after_px']:.3f} px after",
+        f"{answer['shots']} shots used, {answer['differing_shots']} differ from one another; written to {answer['rig']}",
+    ]
+
+
+def page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: float | None) -> str:
+    """Return the page of an update: its figures, and the old rig beside the new one."""
+    head = (
+        (
+            "right camera rotated by",
+            f"{np.degrees(found.rotation_rad):.3f} &plusmn; {np.degrees(found.sigma_rad):.3f} deg",
+        ),
+        ("shifted across the baseline by", f"{1e3 * found.shift_m:.3f} mm"),
+        *(
+            (
+                f"depth error of the old rig at {depth:g} m",
+                f"{1e3 * value:+.2f} mm" if math.isfinite(value) else "unknown",
+            )
+            for depth, value in zip(DEPTHS_M, found.depth_errors_m, strict=True)
+        ),
+        (
+            "epipolar distance (Sampson), RMS",
+            f"{found.epipolar_px[0]:.3f} px before, {found.epipolar_px[1]:.3f} px after",
+        ),
+        ("shots used; of these differing", f"{found.shots}; {found.stays}"),
+        ("from", "all shots" if since_s is None else f"{since_s:.1f} s on"),
+    )
+    sigmas = (np.sqrt(np.maximum(np.diag(rig.cov), 0.0)) for rig in (old, new))
+    values = (np.concatenate([*(c.parameters for c in rig.cameras), rig.T_left_right[:3, 3]]) for rig in (old, new))
+    rows = [
+        (text(name), f"{a:.6g}", f"{sa:.2g}", f"{b:.6g}", f"{sb:.2g}")
+        for name, a, sa, b, sb in zip(
+            new.parameter_names, *(column for pair in zip(values, sigmas, strict=True) for column in pair), strict=False
+        )
+    ]
+    sections = {
+        "figures": ("What changed", table(("", ""), head, "numbers")),
+        "rigs": ("Old and new rig", table(("", "old", "sigma", "new", "sigma"), rows, "numbers")),
+    }
+    return html_page("armsight rig update", "Rig updated", text(run), sections)

@@ -1,0 +1,233 @@
+"""A run without motion: shots of an arm that another program moved, and the joint angles that it logged.
+
+In: a source of shots, a rig, a body and :class:`~armsight.app.run.angles.LoggedAngles`. Out: a folder with the hand-eye
+calibration, the poses it was made from (as ``armsight identify`` reads them), the error of every pose when it is left out,
+a summary and a page.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.report.page import PAGE, bullets, html_page, picture, table, text
+from armsight.app.report.plotting import drawing, new_figure, png
+from armsight.app.run.angles import LoggedAngles
+from armsight.app.run.calibrate import HandEyeRun
+from armsight.app.run.folder import write_handeye
+from armsight.data import Array, Missed, PoseEstimate, Record
+from armsight.errors import CalibrationError
+from armsight.files import write_text
+from armsight.geometry.pose import inverse
+from armsight.loop.estimators import Mounting
+from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
+from armsight.robot.arm import Arm
+from armsight.vision.markers.marker import Target
+from armsight.vision.measure import measure
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import Source
+
+MIN_POSES = 12
+#: Rows that belong to the neighbouring shots fit so many times better: then they are shifted.
+_SHIFTED, _STEP_SHARE = 3.0, 0.2
+_MOVED_RAD = float(np.radians(0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedRun(Record):
+    """The result.
+
+    Attributes:
+        run: the hand-eye calibration and its poses.
+        names: (N,) shots of its poses.
+        shots: how many shots there were.
+        unpaired: shots that no row of angles belongs to.
+        shift: 1 where the angles of the row before fit the shots better than their own, -1 those of the row behind, else 0.
+    """
+
+    run: HandEyeRun
+    names: tuple[str, ...]
+    shots: int
+    unpaired: tuple[str, ...]
+    shift: int
+
+    @property
+    def error_mm(self) -> Array:
+        """(N,) distance of the body from where the others' fit has it, mm; NaN of an outlier."""
+        return 1e3 * self.run.found.held_out.position_m
+
+    @property
+    def error_deg(self) -> Array:
+        """(N,) angle of the body to where the others' fit has it, degrees; NaN of an outlier."""
+        return np.degrees(self.run.found.held_out.angle_rad)
+
+    @property
+    def weak(self) -> tuple[str, ...]:
+        """Why the result must not be trusted; empty where nothing says so."""
+        if not self.shift:
+            return ()
+        side = "before" if self.shift > 0 else "behind"
+        return (
+            f"the angles of the row {side} fit every shot far better than its own: are rows and images shifted by one?",
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what summary.json has."""
+        found, (position, angle) = self.run.found, self.run.found.held_out.rms()
+        return {
+            "shots": self.shots,
+            "poses": len(self.names),
+            "missed": list(self.run.missed),
+            "without_angles": list(self.unpaired),
+            "outliers": [name for name, used in zip(self.names, found.used, strict=True) if not used],
+            "held_out_position_rms_mm": round(1e3 * position, 4),
+            "held_out_angle_rms_deg": round(float(np.degrees(angle)), 5),
+            "held_out_position_max_mm": round(1e3 * found.held_out.most()[0], 4),
+            "sigma_flange_mm": round(1e3 * found.sigma_flange_m, 4),
+            "sigma_flange_deg": round(float(np.degrees(found.sigma_flange_rad)), 5),
+            "share": found.share,
+            "rows_shifted_by": self.shift,
+            "weak": list(self.weak),
+        }
+
+
+def run_logged(
+    source: Source, rig: StereoRig, target: Target, arm: Arm, angles: LoggedAngles, progress: Callable[[str], None]
+) -> LoggedRun:
+    """Measure every shot and calibrate hand and eye with the logged angles.
+
+    Raises:
+        InputError: rows and shots do not belong together.
+        CalibrationError: too few shots show the body, or the motions leave a direction open.
+    """
+    names: list[str] = []
+    times: list[float | None] = []
+    seen: list[PoseEstimate | Missed] = []
+    while (shot := source.read()) is not None:
+        progress(f"measuring shot {len(names) + 1}")
+        names.append(shot.name)
+        times.append(shot.t_s)
+        seen.append(measure(rig, target, shot))
+    if not names:
+        raise CalibrationError("the source has no shot")
+    q_all = angles.at(names, times)
+    unpaired = tuple(name for name, q in zip(names, q_all, strict=True) if q is None)
+    missed = tuple(f"{name}: {r.reason}" for name, r in zip(names, seen, strict=True) if isinstance(r, Missed))
+    good = [k for k, result in enumerate(seen) if isinstance(result, PoseEstimate) and q_all[k] is not None]
+    if len(good) < MIN_POSES:
+        first = f": {missed[0]}" if missed else ""
+        raise CalibrationError(
+            f"{len(good)} of {len(names)} shots show the body and have joint angles; {MIN_POSES} at least are needed{first}"
+        )
+    poses = [result for k in good if isinstance(result := seen[k], PoseEstimate)]
+    q = np.array([q_all[k] for k in good])
+    Ts, covs = np.array([each.T_left_body for each in poses]), np.array([each.cov for each in poses])
+    progress("hand-eye: calibrating")
+    centre = target.body.points.mean(axis=0)
+    found = _calibrated(arm, q, Ts, covs, centre)
+    if isinstance(found, CalibrationError):
+        raise found
+    steps = np.diff(q, axis=0, prepend=q[:1])
+    approach = np.sign(np.where(np.abs(steps) > _MOVED_RAD, steps, 0.0))
+    mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
+    run = HandEyeRun(mounting, found, q, Ts, covs, approach, missed)
+    progress("hand-eye: are rows and shots shifted?")
+    return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, _shift(arm, run, centre))
+
+
+def _calibrated(
+    arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array, shares: tuple[Share, ...] = SHARES
+) -> HandEye | CalibrationError:
+    try:
+        return calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts, covs, centre=centre, shares=shares)
+    except CalibrationError as error:
+        return error
+
+
+def _shift(arm: Arm, run: HandEyeRun, centre: Array) -> int:
+    """Return by how many rows the angles seem to be late: 1, -1, or 0."""
+    own = run.found.held_out.rms()[0]
+    steps_m = np.linalg.norm(np.diff(run.Ts_left_body[:, :3, 3], axis=0), axis=1)
+    if own < _STEP_SHARE * np.median(steps_m):  # a shift makes errors as large as the steps from pose to pose
+        return 0
+    best, shift = own / _SHIFTED, 0
+    for late in (1, -1):
+        q, Ts, covs = (run.q[:-1], run.Ts_left_body[1:], run.covs[1:])
+        if late < 0:
+            q, Ts, covs = run.q[1:], run.Ts_left_body[:-1], run.covs[:-1]
+        other = _calibrated(arm, q, Ts, covs, centre, SHARES[:1])
+        if isinstance(other, HandEye) and other.used.mean() > 0.8 and other.held_out.rms()[0] < best:
+            best, shift = other.held_out.rms()[0], late
+    return shift
+
+
+def write_logged(folder: Path, result: LoggedRun, properties: dict[str, str]) -> dict[str, Any]:
+    """Write the files of a run without motion and return its summary."""
+    summary = {**properties, **result.to_json()}
+    write_handeye(folder, result.run)
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
+    writer.writerow(["shot", *(f"q{k + 1}_deg" for k in range(result.run.q.shape[1])), "error_mm", "error_deg", "used"])
+    rows = zip(
+        result.names, np.degrees(result.run.q), result.error_mm, result.error_deg, result.run.found.used, strict=True
+    )
+    for name, q, mm, deg, used in rows:
+        writer.writerow([name, *np.round(q, 4), _rounded(mm), _rounded(deg), int(used)])
+    write_text(folder / "errors.csv", output.getvalue())
+    write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    write_text(folder / PAGE, _page(result, summary))
+    return summary
+
+
+def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
+    """Return a summary for people: mm and degrees."""
+    lines = [
+        f"{summary['poses']} of {summary['shots']} shots measured with joint angles"
+        + (f", {len(summary['outliers'])} outliers" if summary["outliers"] else ""),
+        f"left out of the fit: {summary['held_out_position_rms_mm']:.3f} mm RMS"
+        f" ({summary['held_out_position_max_mm']:.3f} at most), {summary['held_out_angle_rms_deg']:.3f} deg RMS",
+        f"of it the arm by its joints: sigma {summary['sigma_flange_mm']:.3f} mm an axis",
+        f"{folder / PAGE}",
+        f"next, what explains it: armsight identify --arm {summary['arm']} --data {folder / 'handeye_poses.csv'} -o DIR",
+    ]
+    return lines
+
+
+def _rounded(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.4f}"
+
+
+def _page(result: LoggedRun, summary: dict[str, Any]) -> str:
+    with drawing():
+        figure = new_figure(3.0)
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        at = np.arange(len(result.names))
+        top.bar(at, result.error_mm)
+        top.set_ylabel("mm")
+        bottom.bar(at, result.error_deg)
+        bottom.set_ylabel("deg")
+        bottom.set_xlabel("pose")
+        data = png(figure)
+    rows = [[text(key), text(value)] for key, value in summary.items() if not isinstance(value, list)]
+    weak = bullets(result.weak) if result.weak else ""
+    missed = bullets([*result.run.missed, *(f"{name}: no joint angles" for name in result.unpaired)])
+    return html_page(
+        "armsight run",
+        f"{summary['arm']}: logged poses",
+        "The arm was moved by another program; each pose is predicted by a fit to the others.",
+        {
+            "errors": (
+                "Error of each pose left out of the fit",
+                weak + picture(data, "error of each pose, mm and degrees"),
+            ),
+            "summary": ("Summary", table(["", "value"], rows)),
+            "missed": ("Shots that were not used", missed),
+        },
+    )

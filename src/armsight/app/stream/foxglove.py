@@ -1,0 +1,273 @@
+"""The messages of Foxglove's protobuf schemas for what a run publishes.
+
+In: a datum. Out: (topic, message) pairs for run.mcap, and for a WebSocket. Frames: base, rig, left, right, body, tool; the
+left camera's frame is the rig's. Covariances are along the axes of the frame that the pose is in, translation first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+
+from armsight.app.measure.poses import left_axes
+from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
+from armsight.errors import InputError
+from armsight.geometry.rotation import quaternion_wxyz
+from armsight.vision.rigfiles.rigfile import rectification
+
+#: A protobuf message.
+Message: TypeAlias = Any
+#: Images that cameras deliver as pixels are compressed here, at most one pair in this time, s: it takes long.
+_COMPRESS_EVERY_S, _QUALITY = 1.0, 85
+#: Joints and the tool are shown at most once in this time, s; as JSON all are published.
+_JOINTS_EVERY_S = 0.02
+#: The ellipsoid has this many sigmas, and at least this radius, m, to be seen.
+_SIGMAS, _LEAST_M = 3.0, 2e-4
+_NS = 1_000_000_000
+_GREEN, _RED, _YELLOW = (0.1, 0.8, 0.2, 1.0), (0.9, 0.2, 0.1, 1.0), (1.0, 0.8, 0.1, 0.4)
+_LEVELS = {"info": 2, "warning": 3, "error": 4}
+_MODELS = {"fisheye": "equidistant", "brown8": "rational_polynomial"}
+
+
+def require_foxglove(what: str, extra: str) -> None:
+    """Raise an InputError with what to install unless the schemas and mcap can be imported."""
+    try:
+        import foxglove_schemas_protobuf.Log_pb2  # noqa: F401 - only whether it is there
+        import mcap_protobuf.schema  # noqa: F401 - as above
+    except ImportError:
+        raise InputError(
+            f'{what} needs mcap-protobuf-support and foxglove-schemas-protobuf: pip install "armsight[{extra}]"'
+        ) from None
+
+
+class Messages:
+    """Makes messages; it remembers what is sent once.
+
+    Args:
+        published: rig, body and arm.
+    """
+
+    def __init__(self, published: Published) -> None:
+        from foxglove_schemas_protobuf import (
+            CameraCalibration_pb2,
+            CompressedImage_pb2,
+            FrameTransforms_pb2,
+            ImageAnnotations_pb2,
+            JointStates_pb2,
+            Log_pb2,
+            Odometry_pb2,
+            PoseInFrame_pb2,
+            SceneUpdate_pb2,
+        )
+        from google.protobuf.timestamp_pb2 import Timestamp
+
+        self._published = published
+        self._Calibration: Message = CameraCalibration_pb2.CameraCalibration
+        self._Compressed: Message = CompressedImage_pb2.CompressedImage
+        self._Transforms: Message = FrameTransforms_pb2.FrameTransforms
+        self._Annotations: Message = ImageAnnotations_pb2.ImageAnnotations
+        self._Joints: Message = JointStates_pb2.JointStates
+        self._Log: Message = Log_pb2.Log
+        self._Odometry: Message = Odometry_pb2.Odometry
+        self._Pose: Message = PoseInFrame_pb2.PoseInFrame
+        self._Scene: Message = SceneUpdate_pb2.SceneUpdate
+        self._Timestamp: Message = Timestamp
+        self._calibrated = False
+        self._compressed_s = -np.inf
+        self._joints_s = -np.inf
+        self._T_base_rig: Array | None = None
+
+    def of(self, datum: ShotDatum | JointsDatum | NoteDatum | EventDatum) -> Iterator[tuple[str, Message]]:
+        """Yield the topic and the message of all that a datum says."""
+        stamp = self._stamp(datum.time_s)
+        if isinstance(datum, ShotDatum):
+            yield from self._of_shot(datum, stamp)
+        elif isinstance(datum, JointsDatum):
+            yield from self._of_joints(datum, stamp)
+        elif isinstance(datum, NoteDatum):
+            yield "/log", self._log(stamp, datum.level, datum.text)
+
+    def _stamp(self, t_s: float) -> Message:
+        seconds, nanos = divmod(nanoseconds(t_s), _NS)
+        return self._Timestamp(seconds=seconds, nanos=nanos)
+
+    def _log(self, stamp: Message, level: str, text: str) -> Message:
+        return self._Log(timestamp=stamp, level=_LEVELS[level], message=text, name="armsight")
+
+    def _of_shot(self, datum: ShotDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
+        if not self._calibrated:
+            self._calibrated = True
+            yield from self._calibrations(stamp)
+        yield from self._images(datum.shot, stamp)
+        if datum.T_base_rig is not None:
+            self._T_base_rig = datum.T_base_rig
+        result = datum.result
+        yield "/tf", self._transforms(stamp, result)
+        if isinstance(result, PoseEstimate):
+            yield from self._of_pose(result, stamp)
+            for side, annotations in zip(SIDES, self._annotations(result, stamp), strict=True):
+                yield f"/{side}/annotations", annotations
+            if result.dropped:
+                said = "; ".join(f"{each.point}: {each.reason}" for each in result.dropped)
+                yield "/log", self._log(stamp, "info", f"{datum.shot.name}: left out {said}")
+        elif isinstance(result, Missed):
+            yield "/log", self._log(stamp, "warning", f"{datum.shot.name}: missed: {result.reason}")
+        if datum.outcome is not None and not datum.outcome.startswith("used"):
+            yield "/log", self._log(stamp, "warning", f"{datum.shot.name}: {datum.outcome}")
+
+    def _images(self, shot: Shot, stamp: Message) -> Iterator[tuple[str, Message]]:
+        """Yield both images as the cameras delivered them; of pixels one pair a second, to look at, as JPEG."""
+        encoded = shot.encoded
+        if encoded is None and shot.left is not None and shot.right is not None:
+            if shot.t_s is not None and 0.0 <= shot.t_s - self._compressed_s < _COMPRESS_EVERY_S:
+                return
+            self._compressed_s = -np.inf if shot.t_s is None else shot.t_s
+            encoded = (_jpeg(shot.left), _jpeg(shot.right))
+        if encoded is None:
+            return
+        for side, data in zip(SIDES, encoded, strict=True):
+            kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+            yield f"/{side}/image", self._Compressed(timestamp=stamp, frame_id=side, data=data, format=kind)
+
+    def _calibrations(self, stamp: Message) -> Iterator[tuple[str, Message]]:
+        rig = self._published.rig
+        if rig is None:
+            return
+        R1, R2, P1, P2, _ = rectification(rig)
+        for side, camera, R, P in zip(SIDES, rig.cameras, (R1, R2), (P1, P2), strict=True):
+            d = camera.distortion.tolist()
+            if camera.model in ("none", "brown4"):
+                d += [0.0] * (5 - len(d))
+            yield (
+                f"/{side}/calibration",
+                self._Calibration(
+                    timestamp=stamp,
+                    frame_id=side,
+                    width=camera.image_size_px[0],
+                    height=camera.image_size_px[1],
+                    distortion_model=_MODELS.get(camera.model, "plumb_bob"),
+                    D=d,
+                    K=camera.matrix.ravel().tolist(),
+                    R=R.ravel().tolist(),
+                    P=P.ravel().tolist(),
+                ),
+            )
+
+    def _transforms(self, stamp: Message, result: PoseEstimate | Missed | None) -> Message:
+        found = self._Transforms()
+        frames: list[tuple[str, str, Array]] = [("rig", "left", np.eye(4))]
+        if self._published.rig is not None:
+            frames.append(("rig", "right", self._published.rig.T_left_right))
+        if self._T_base_rig is not None:
+            frames.insert(0, ("base", "rig", self._T_base_rig))
+        if isinstance(result, PoseEstimate):
+            frames.append(("left", "body", result.T_left_body))
+        for parent, child, T in frames:
+            self._add_transform(found, stamp, parent, child, T)
+        return found
+
+    def _add_transform(self, found: Message, stamp: Message, parent: str, child: str, T: Array) -> None:
+        one = found.transforms.add(parent_frame_id=parent, child_frame_id=child, timestamp=stamp)
+        _set_pose(one.translation, one.rotation, T)
+
+    def _of_pose(self, result: PoseEstimate, stamp: Message) -> Iterator[tuple[str, Message]]:
+        T = result.T_left_body
+        cov = left_axes(T, result.cov)
+        yield "/pose", self._in_frame(stamp, "left", T)
+        yield "/odometry", self._odometry(stamp, "left", "body", T, cov)
+        scene = self._Scene()
+        entity = scene.entities.add(timestamp=stamp, frame_id="left", id="ellipsoid", frame_locked=True)
+        values, axes = np.linalg.eigh(cov[:3, :3])
+        axes = axes * np.sign(np.linalg.det(axes))
+        sphere = entity.spheres.add()
+        E = np.eye(4)
+        E[:3, :3], E[:3, 3] = axes, T[:3, 3]
+        _set_pose(sphere.pose.position, sphere.pose.orientation, E)
+        size = 2 * np.maximum(_SIGMAS * np.sqrt(np.maximum(values, 0.0)), _LEAST_M)
+        sphere.size.x, sphere.size.y, sphere.size.z = size.tolist()
+        _colour(sphere.color, _YELLOW)
+        yield "/scene", scene
+
+    def _in_frame(self, stamp: Message, frame: str, T: Array) -> Message:
+        found = self._Pose(timestamp=stamp, frame_id=frame)
+        _set_pose(found.pose.position, found.pose.orientation, T)
+        return found
+
+    def _odometry(self, stamp: Message, frame: str, body: str, T: Array, cov: Array) -> Message:
+        found = self._Odometry(timestamp=stamp, frame_id=frame, body_frame_id=body)
+        _set_pose(found.pose.position, found.pose.orientation, T)
+        found.pose_covariance.extend(cov.ravel().tolist())
+        return found
+
+    def _annotations(self, result: PoseEstimate, stamp: Message) -> Iterator[Message]:
+        """Yield what was detected in the left and in the right image: used points green, left out ones red by name."""
+        seen, names = result.points.seen, self._published.body.point_names
+        reasons = {each.point: each.reason for each in result.dropped}
+        for camera in range(2):
+            found = self._Annotations(timestamp=stamp)
+            used = found.points.add(timestamp=stamp, type=1, thickness=6.0)
+            _colour(used.outline_color, _GREEN)
+            for row, (u, v) in zip(seen.ids.tolist(), seen.uv[:, camera].tolist(), strict=True):
+                if u == u and names[row] not in reasons:  # a number: this camera saw the point
+                    used.points.add(x=u, y=v)
+            for line, (point, reason) in enumerate(reasons.items(), start=1):
+                text = found.texts.add(timestamp=stamp, text=f"{point}: {reason}", font_size=12.0)
+                text.position.x, text.position.y = 8.0, 16.0 * line
+                _colour(text.text_color, _RED)
+            yield found
+
+    def _of_joints(self, datum: JointsDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
+        if 0.0 <= datum.time_s - self._joints_s < _JOINTS_EVERY_S:
+            return
+        self._joints_s = datum.time_s
+        q = datum.states.q[-1]
+        joints = self._Joints(timestamp=stamp)
+        for k, angle in enumerate(q.tolist(), start=1):
+            joints.joints.add(name=f"joint{k}", position=angle)
+        yield "/joints", joints
+        if datum.T_base_tool is None or datum.cov is None:
+            return
+        T = datum.T_base_tool
+        yield "/tool/odometry", self._odometry(stamp, "base", "tool", T, left_axes(T, datum.cov))
+        found = self._Transforms()
+        self._add_transform(found, stamp, "base", "tool", T)
+        yield "/tf", found
+        if self._published.arm is not None:
+            yield "/arm", self._arm(stamp, q)
+
+    def _arm(self, stamp: Message, q: Array) -> Message:
+        """Return the arm as a line through the origins of its links."""
+        arm = self._published.arm
+        assert arm is not None
+        scene = self._Scene()
+        entity = scene.entities.add(timestamp=stamp, frame_id="base", id="arm", frame_locked=True)
+        line = entity.lines.add(type=0, thickness=0.01)
+        for p in arm.links(q)[:, :3, 3].tolist():
+            line.points.add(x=p[0], y=p[1], z=p[2])
+        line.pose.orientation.w = 1.0
+        _colour(line.color, (0.6, 0.6, 0.65, 1.0))
+        return scene
+
+
+def nanoseconds(t_s: float) -> int:
+    """Return a time in ns, at least 0, as every container needs it."""
+    return max(0, round(1e9 * t_s))
+
+
+def _jpeg(image: Image) -> bytes:
+    """Return an image to look at: 8 bits, JPEG."""
+    shown = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    return bytes(cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+
+
+def _set_pose(position: Message, orientation: Message, T: Array) -> None:
+    position.x, position.y, position.z = T[:3, 3].tolist()
+    orientation.w, orientation.x, orientation.y, orientation.z = quaternion_wxyz(T[:3, :3]).tolist()
+
+
+def _colour(field: Message, rgba: tuple[float, float, float, float]) -> None:
+    field.r, field.g, field.b, field.a = rgba

@@ -1,0 +1,204 @@
+"""run.mcap: everything a run publishes, in one file that Foxglove, Lichtblick and rerun open.
+
+Beside the messages of ``foxglove.py`` it holds every datum as JSON with all digits, on ``/armsight/shot``,
+``/armsight/joints`` and ``/armsight/event``, from which ``armsight replay`` reads; and, as metadata, the rig file and the
+versions. A chunk is written out at least every half a second: if the process is killed, no more than that is missing.
+
+foxglove-schemas-protobuf with mcap-protobuf-support is used, not foxglove-sdk: together 4 MB of Python against a binary of
+54 MB, for the same schemas.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from armsight import __version__
+from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.sink import Sink
+from armsight.data import Shot
+from armsight.errors import InputError
+from armsight.robot.arm import Arm
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources.bag.camera_info import METADATA, RIG
+
+#: Name of the file in the folder of a run.
+RUN_MCAP = "run.mcap"
+#: Keys of its metadata beside the rig file: the body file, and the nominal arm.
+BODY, ARM = "body.toml", "arm.json"
+#: Topics of the data as JSON, by kind.
+TOPICS: dict[type, str] = {
+    ShotDatum: "/armsight/shot",
+    JointsDatum: "/armsight/joints",
+    EventDatum: "/armsight/event",
+}
+_CHUNK = 1 << 20
+#: A shot that is younger by its own stamp was stamped by a live camera, s.
+_LIVE_S = 10.0
+_SCHEMA = json.dumps({"type": "object"}).encode()
+
+
+class McapSink(Sink):
+    """Writes run.mcap.
+
+    Args:
+        path: the file, which must not exist.
+        published: what all data have in common; its properties become metadata.
+
+    Raises:
+        InputError: the file cannot be made, or a package is missing.
+    """
+
+    def __init__(self, path: Path, published: Published) -> None:
+        require_foxglove("run.mcap", "record")
+        from mcap.writer import CompressionType, Writer
+
+        super().__init__()
+        self.path = path
+        self._published, self._messages = published, Messages(published)
+        try:
+            self._file: IO[bytes] = path.open("xb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        # Images are compressed already: LZ4 passes over them fastest.
+        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.LZ4)
+        self._writer.start(profile="", library="armsight")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._written = 0
+        self._writer.add_metadata(METADATA, dict(published.properties))
+        self._file.flush()
+
+    def write(self, datum: Datum) -> None:
+        """Write a datum: its Foxglove messages, and itself as JSON."""
+        log_ns = nanoseconds(datum.time_s)
+        if isinstance(datum, ShotDatum) and datum.arrival_s is not None:
+            log_ns = nanoseconds(datum.arrival_s)
+        stamp_ns = nanoseconds(datum.time_s)
+        for topic, message in self._messages.of(datum):
+            self._add(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
+        if not isinstance(datum, NoteDatum):
+            content: Mapping[str, Any] = (
+                datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
+            )
+            channel = self._json_channel(TOPICS[type(datum)])
+            self._add(channel, log_ns, stamp_ns, json.dumps(content, allow_nan=False).encode())
+
+    def _add(self, channel: int, log_ns: int, stamp_ns: int, data: bytes) -> None:
+        self._writer.add_message(channel, log_ns, data, stamp_ns)
+
+    def _channel(self, topic: str, message: Any) -> int:  # noqa: ANN401 - a protobuf message
+        if topic not in self._channels:
+            from mcap_protobuf.schema import register_schema
+
+            name = type(message).DESCRIPTOR.full_name
+            if name not in self._schemas:
+                self._schemas[name] = register_schema(self._writer, type(message))
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+        return self._channels[topic]
+
+    def _json_channel(self, topic: str) -> int:
+        if topic not in self._channels:
+            schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", _SCHEMA)
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+        return self._channels[topic]
+
+    def tick(self) -> None:
+        """Write the chunk out: what is in it survives the end of the process."""
+        # The library ends a chunk by its size alone, and has no public way to end one by time.
+        self._writer._Writer__finalize_chunk()
+        self._file.flush()
+
+    def finish(self) -> None:
+        """Write the index and close the file."""
+        try:
+            if self.problem is None:
+                if self.dropped:
+                    note = NoteDatum(
+                        0.0, f"{self.dropped} of {self.taken} data were dropped: the disk is too slow", "warning"
+                    )
+                    self.write(note)
+                self._writer.finish()
+        finally:
+            self._file.close()
+
+
+class LazyMcap:
+    """run.mcap in a folder, begun with the first datum; one of an earlier run is replaced.
+
+    Args:
+        folder: of the run.
+        published: what all data have in common.
+        say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
+    """
+
+    def __init__(self, folder: Path, published: Published, say: Callable[[str], None]) -> None:
+        self._path, self._published, self._say = folder / RUN_MCAP, published, say
+        self._began = False
+        self.sink: McapSink | None = None
+
+    def put(self, datum: Datum) -> None:
+        """Take a datum and return at once."""
+        if not self._began:
+            self._began = True
+            try:
+                require_foxglove("run.mcap", "record")
+            except InputError as error:
+                self._say(f"note: no run.mcap is written: {error}")
+                return
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._path.unlink(missing_ok=True)
+            except OSError as error:
+                raise InputError(f"{self._path}: cannot be written: {error.strerror}") from None
+            self.sink = McapSink(self._path, self._published)
+            self.sink.start()
+        if self.sink is not None:
+            self.sink.put(datum)
+
+    def put_shot(self, shot: Shot) -> None:
+        """Take a shot that was recorded and not measured."""
+        now = time.monotonic()  # the clock of live cameras' stamps
+        live = shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S
+        self.put(ShotDatum(shot, None, now if live or shot.t_s is None else None))
+
+    def close(self) -> None:
+        """Write what was taken, and end."""
+        sink, self.sink = self.sink, None
+        if sink is not None:
+            sink.close()
+            if sink.problem is not None:
+                self._say(f"note: {self._path}: not complete: {sink.problem}")
+            elif sink.dropped:
+                self._say(f"note: {self._path}: {sink.dropped} of {sink.taken} data were dropped: the disk is too slow")
+
+
+def properties(rig: StereoRig | None, body_text: str | None, arm: Arm | None = None, **more: str) -> dict[str, str]:
+    """Return the metadata of a run: versions, the rig file, the body file and the nominal arm, with all digits."""
+    found = {"version": __version__} | more
+    if rig is not None:
+        found[RIG] = rig.to_text()
+    if body_text is not None:
+        found[BODY] = body_text
+    if arm is not None:
+        values = {each.name: getattr(arm, each.name) for each in fields(arm) if each.init}
+        listed = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+        found[ARM] = json.dumps(listed)
+    return found
+
+
+def arm_of(text: str) -> Arm:
+    """Return the arm of a run's metadata."""
+    values: dict[str, Any] = json.loads(text)
+    names = tuple(values.pop("joint_names"))
+    arrays: dict[str, Any] = {
+        name: np.array(value, float) if isinstance(value, list) else value for name, value in values.items()
+    }
+    return Arm(joint_names=names, **arrays)

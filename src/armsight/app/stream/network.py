@@ -1,0 +1,183 @@
+"""JSON lines over the network: one object a line, ``kind`` says what it is of, the other keys are those of the datum.
+
+``json+tcp:PORT`` listens: every reader that connects is sent each datum from then on. ``json+udp:HOST:PORT`` sends one
+datagram a datum. A TCP reader that is too slow is not waited for: of what waits for it the oldest lines are dropped.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.sink import Sink
+from armsight.errors import InputError
+
+#: Lines that may wait for one reader.
+_WAITING = 256
+#: A datagram holds no more, bytes.
+_DATAGRAM = 60_000
+_KINDS = {ShotDatum: "shot", JointsDatum: "joints", EventDatum: "event", NoteDatum: "log"}
+
+
+def json_line(datum: Datum, published: Published) -> bytes:
+    """Return a datum as one line of JSON."""
+    if isinstance(datum, NoteDatum):
+        content: Mapping[str, Any] = {"t_s": datum.time_s, "level": datum.level, "text": datum.text}
+    elif isinstance(datum, EventDatum):
+        content = {"t_s": datum.time_s, **datum.content}
+    else:
+        content = datum.to_json(published.body)
+    return json.dumps({"kind": _KINDS[type(datum)], **content}, allow_nan=False).encode() + b"\n"
+
+
+def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:
+    """Read ``[HOST:]PORT``; port 0 is any that is free.
+
+    Raises:
+        InputError: not of that form.
+    """
+    match = re.fullmatch(r"(?:(.+):)?(\d{1,5})", spec)
+    if match is None or int(match[2]) > 65535:
+        raise InputError(f"--stream {what}:{spec}: expected {what}:[HOST:]PORT, such as {what}:8766")
+    return match[1] or host, int(match[2])
+
+
+def listening(host: str, port: int, what: str) -> socket.socket:
+    """Return a socket that listens.
+
+    Raises:
+        InputError: the port is in use, or not allowed.
+    """
+    try:
+        return socket.create_server((host, port))
+    except OSError as error:
+        raise InputError(f"--stream {what}:{port}: cannot listen there: {error.strerror}") from None
+
+
+class _Connected:
+    """One that has connected: its socket, and the bytes that wait for it."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        self.connection = connection
+        self.waiting: deque[bytes] = deque()
+        self.rest = b""  # of the line that is being sent: it must be completed
+
+    def send(self) -> bool:
+        """Send as much as the reader takes; return False once it is gone."""
+        try:
+            while self.rest or self.waiting:
+                self.rest = self.rest or self.waiting.popleft()
+                self.rest = self.rest[self.connection.send(self.rest) :]
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        return True
+
+
+class TcpSink(Sink):
+    """Sends bytes to every reader that has connected.
+
+    Args:
+        published: what all data have in common.
+        listener: listens; the sink closes it.
+    """
+
+    def __init__(self, published: Published, listener: socket.socket) -> None:
+        super().__init__()
+        self.published = published
+        self._listener = listener
+        self._listener.setblocking(False)
+        self._readers: list[_Connected] = []
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return int(self._listener.getsockname()[1])
+
+    def encoded(self, datum: Datum) -> list[bytes]:
+        """Return a datum as the messages that are sent, each whole or not at all."""
+        return [json_line(datum, self.published)]
+
+    def write(self, datum: Datum) -> None:
+        """Send a datum to every reader."""
+        self.tick()
+        if not self._readers:
+            return
+        for data in self.encoded(datum):
+            for reader in self._readers:
+                if len(reader.waiting) >= _WAITING:
+                    reader.waiting.popleft()
+                    self.dropped += 1
+                reader.waiting.append(data)
+        self._send()
+
+    def tick(self) -> None:
+        """Accept new readers, and send what waits."""
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except BlockingIOError:
+                break
+            self._readers.append(_Connected(connection))
+        self._send()
+
+    def _send(self) -> None:
+        for reader in list(self._readers):
+            if not reader.send():
+                reader.connection.close()
+                self._readers.remove(reader)
+
+    def finish(self) -> None:
+        """Close all connections."""
+        for reader in self._readers:
+            reader.connection.close()
+        self._listener.close()
+
+
+class UdpSink(Sink):
+    """Sends one datagram a datum; one that is too large goes without its points.
+
+    Args:
+        published: what all data have in common.
+        address: host and port to send to.
+    """
+
+    def __init__(self, published: Published, address: tuple[str, int]) -> None:
+        super().__init__()
+        self._published, self._address = published, address
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def write(self, datum: Datum) -> None:
+        """Send a datum."""
+        data = json_line(datum, self._published)
+        if len(data) > _DATAGRAM:
+            content = json.loads(data)
+            content.pop("points_m", None)
+            data = json.dumps(content).encode() + b"\n"
+        try:
+            self._socket.sendto(data, self._address)
+        except OSError:  # nobody listens, or the network is full
+            self.dropped += 1
+
+    def finish(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def open_json_tcp(rest: str, published: Published) -> TcpSink:
+    """Open ``[HOST:]PORT``."""
+    host, port = host_and_port(rest, "json+tcp", host="127.0.0.1")
+    return TcpSink(published, listening(host, port, "json+tcp"))
+
+
+def open_json_udp(rest: str, published: Published) -> UdpSink:
+    """Open ``[HOST:]PORT``."""
+    return UdpSink(published, host_and_port(rest, "json+udp", host="127.0.0.1"))

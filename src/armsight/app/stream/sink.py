@@ -1,0 +1,134 @@
+"""The contract of what data are published to: a queue and a thread, so that whoever publishes never waits.
+
+To write a new one: derive from :class:`Sink` and implement ``write``; ``tick`` and ``finish`` where they are needed. All
+three run in the sink's thread.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Protocol
+
+from armsight.app.stream.datum import Datum
+
+#: How often ``tick`` is called at least, s.
+TICK_S = 0.25
+#: How long :meth:`Sink.close` waits for the thread, s.
+_CLOSE_S = 10.0
+
+
+class Publisher(Protocol):
+    """Takes data and returns at once."""
+
+    def put(self, datum: Datum) -> None:
+        """Take a datum."""
+        ...
+
+    def close(self) -> None:
+        """Publish what was taken, and end."""
+        ...
+
+
+class Sink:
+    """A publisher with a thread. The oldest datum is dropped where more than ``limit`` wait: the latest win, counted.
+
+    Args:
+        limit: how many data may wait.
+
+    Attributes:
+        taken: how many data were taken.
+        dropped: how many of them were dropped.
+        cpu_s: computing time of the thread, s.
+        problem: what ended the publishing early; None where nothing did.
+    """
+
+    def __init__(self, limit: int = 512) -> None:
+        self.taken = self.dropped = 0
+        self.cpu_s = 0.0
+        self.problem: str | None = None
+        self._limit = limit
+        self._queue: deque[Datum] = deque()
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def put(self, datum: Datum) -> None:
+        """Take a datum and return at once."""
+        with self._changed:
+            if self._closing or self.problem is not None:
+                return
+            self.taken += 1
+            if len(self._queue) >= self._limit:
+                self._queue.popleft()
+                self.dropped += 1
+            self._queue.append(datum)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Publish what waits, and end the thread; a second call has no effect."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join(_CLOSE_S)
+
+    def _run(self) -> None:
+        ticked = time.monotonic()
+        try:
+            while True:
+                with self._changed:
+                    if not self._queue and not self._closing:
+                        self._changed.wait(TICK_S)
+                    waiting, self._queue = self._queue, deque()
+                    closing = self._closing
+                for datum in waiting:
+                    self.write(datum)
+                if time.monotonic() - ticked >= TICK_S:
+                    self.tick()
+                    ticked = time.monotonic()
+                if closing and not waiting:
+                    break
+        except OSError as error:
+            self.problem = error.strerror or str(error)
+        except Exception as error:  # noqa: BLE001 - nobody else watches this thread; the measurement goes on
+            self.problem = f"{type(error).__name__}: {error}"
+        finally:
+            try:
+                self.finish()
+            except OSError as error:
+                self.problem = self.problem or error.strerror or str(error)
+            self.cpu_s = time.thread_time()
+
+    def write(self, datum: Datum) -> None:
+        """Publish one datum."""
+        raise NotImplementedError
+
+    def tick(self) -> None:
+        """Do what is due now and then."""
+
+    def finish(self) -> None:
+        """Release what was opened."""
+
+
+class Fanout:
+    """Publishes to several sinks; with none it does nothing."""
+
+    def __init__(self, sinks: Iterable[Publisher] = ()) -> None:
+        self.sinks = tuple(sinks)
+
+    def put(self, datum: Datum) -> None:
+        """Hand a datum to every sink."""
+        for sink in self.sinks:
+            sink.put(datum)
+
+    def close(self) -> None:
+        """Close every sink."""
+        for sink in self.sinks:
+            sink.close()

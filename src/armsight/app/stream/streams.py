@@ -1,0 +1,68 @@
+"""The streams that a user names: ``--stream KIND:...`` in, a publisher out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from armsight.app.stream.datum import Datum, Published
+from armsight.app.stream.igtl import open_igtl
+from armsight.app.stream.network import open_json_tcp, open_json_udp
+from armsight.app.stream.sink import Sink
+from armsight.app.stream.websocket import open_foxglove
+from armsight.errors import InputError
+
+#: Kind -> what opens the rest of the text; another kind is one line here.
+STREAMS: dict[str, Callable[[str, Published], Sink]] = {
+    "foxglove": open_foxglove,
+    "json+tcp": open_json_tcp,
+    "json+udp": open_json_udp,
+    "igtl": open_igtl,
+}
+
+
+class Streams:
+    """Publishes to several streams; with none it does nothing.
+
+    Args:
+        sinks: the streams by the user's text.
+        say: is given a line at the end for what was dropped, and for what ended a stream early.
+    """
+
+    def __init__(self, sinks: dict[str, Sink], say: Callable[[str], None]) -> None:
+        self._sinks, self._say = sinks, say
+
+    def put(self, datum: Datum) -> None:
+        """Hand a datum to every stream."""
+        for sink in self._sinks.values():
+            sink.put(datum)
+
+    def close(self) -> None:
+        """Close every stream; a second call has no effect."""
+        sinks, self._sinks = self._sinks, {}
+        for name, sink in sinks.items():
+            sink.close()
+            if sink.problem is not None:
+                self._say(f"note: --stream {name} ended early: {sink.problem}")
+            if sink.dropped:
+                self._say(f"note: --stream {name}: {sink.dropped} data were dropped, a reader was too slow")
+
+
+def open_streams(specs: Sequence[str], published: Published, say: Callable[[str], None]) -> Streams:
+    """Open the streams that a user names, and start them.
+
+    Raises:
+        InputError: an unknown kind, a port that is no number or in use, or a package is missing.
+    """
+    sinks: dict[str, Sink] = {}
+    try:
+        for spec in specs:
+            kind, _, rest = spec.partition(":")
+            if kind not in STREAMS:
+                raise InputError(f"--stream {spec}: unknown kind {kind!r}; known are {', '.join(STREAMS)}")
+            sinks[spec] = STREAMS[kind](rest, published)
+            sinks[spec].start()
+    except InputError:
+        for sink in sinks.values():
+            sink.close()
+        raise
+    return Streams(sinks, say)

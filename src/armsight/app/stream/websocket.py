@@ -1,0 +1,87 @@
+"""A WebSocket that Foxglove connects to: the messages of run.mcap, live.
+
+``foxglove:PORT`` listens (8765 is the usual port); in Foxglove: Open connection, ws://HOST:PORT. The server is that of
+foxglove-sdk; it drops messages for a reader that is too slow.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from armsight.app.stream.datum import Datum, EventDatum, NoteDatum, Published
+from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.mcap_file import TOPICS
+from armsight.app.stream.network import host_and_port
+from armsight.app.stream.sink import Sink
+from armsight.errors import InputError
+
+
+class FoxgloveSink(Sink):
+    """Publishes to everybody who is connected.
+
+    Args:
+        published: what all data have in common.
+        host: name or address to listen at.
+        port: to listen at; 0 is any that is free.
+
+    Raises:
+        InputError: the port is in use, or a package is missing.
+    """
+
+    def __init__(self, published: Published, host: str, port: int) -> None:
+        try:
+            import foxglove
+        except ImportError:
+            raise InputError(
+                '--stream foxglove needs foxglove-sdk, which is not installed: pip install "armsight[stream]"'
+            ) from None
+        require_foxglove("--stream foxglove", "stream")
+        super().__init__()
+        self._published, self._messages = published, Messages(published)
+        self._context = foxglove.Context()
+        self._channels: dict[str, Any] = {}
+        self._foxglove = foxglove
+        try:
+            self._server = foxglove.start_server(name="armsight", host=host, port=port, context=self._context)
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"--stream foxglove:{port}: cannot listen there: {error}") from None
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return int(self._server.port)
+
+    def write(self, datum: Datum) -> None:
+        """Publish the messages of a datum, and the datum itself as JSON."""
+        log_ns = nanoseconds(datum.time_s)
+        for topic, message in self._messages.of(datum):
+            if topic not in self._channels:
+                from mcap_protobuf.schema import build_file_descriptor_set
+
+                schema = self._foxglove.Schema(
+                    name=type(message).DESCRIPTOR.full_name,
+                    encoding="protobuf",
+                    data=build_file_descriptor_set(type(message)).SerializeToString(),
+                )
+                self._channels[topic] = self._foxglove.Channel(
+                    topic, message_encoding="protobuf", schema=schema, context=self._context
+                )
+            self._channels[topic].log(message.SerializeToString(), log_time=log_ns)
+        if isinstance(datum, NoteDatum):
+            return
+        topic = TOPICS[type(datum)]
+        if topic not in self._channels:
+            self._channels[topic] = self._foxglove.Channel(topic, message_encoding="json", context=self._context)
+        content = datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
+        self._channels[topic].log(json.dumps(content).encode(), log_time=log_ns)
+
+    def finish(self) -> None:
+        """Stop the server."""
+        self._server.stop()
+
+
+def open_foxglove(rest: str, published: Published) -> FoxgloveSink:
+    """Open ``[HOST:]PORT``."""
+    host, port = host_and_port(rest, "foxglove", host="127.0.0.1")
+    return FoxgloveSink(published, host, port)

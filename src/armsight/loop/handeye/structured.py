@@ -1,0 +1,664 @@
+"""Hand-eye calibration whose noise has a structure: whose error it is, and whether neighbouring poses share it.
+
+In: :class:`~armsight.loop.handeye.handeye.Poses`, and where there are streams their times and speeds. Out:
+:class:`StructuredHandEye`: both transforms with a covariance that allows for the structure, the sources of the error, and
+the error of poses left out. In order:
+
+1. A robust start: closed forms from all poses and from small parts (:func:`~armsight.loop.handeye.handeye.starts`), then
+   least squares with the weights of Student's t; what is further than chance allows is left out as a blunder.
+2. Motions that leave a direction open are refused (:func:`require_rotations`, :func:`require_known`).
+3. For every structure of noise the variances of the greatest restricted likelihood; poses left out decide between the
+   structures (:mod:`armsight.loop.handeye.noise`).
+
+The rows are put into an order of their own first (by time, else by content), so that theirs changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+from scipy.stats import f as f_distribution
+
+from armsight.data import Array, Record
+from armsight.errors import CalibrationError, InputError
+from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose
+from armsight.geometry.rotation import skew
+from armsight.loop.handeye.handeye import (
+    CHANCE,
+    CLEARLY,
+    MIN_POSES,
+    PART,
+    PARTS,
+    Eye,
+    HeldOut,
+    Poses,
+    kronecker,
+    residuals,
+    starts,
+)
+from armsight.loop.handeye.noise import (
+    OF_THE_ARM,
+    SHARED,
+    STRUCTURES,
+    Linear,
+    blocks,
+    error_maps,
+    held_out,
+    left_out_squares,
+    pose_kernel,
+    reml,
+    solve,
+    time_kernel,
+    walk_gathered,
+)
+
+#: Poses that variances and held-out likelihoods come from at most, evenly spread, and those of a shared error.
+MAX_VARIANCE, MAX_SHARED = 150, 40
+#: Poses that the transforms come from at most, and those with a shared error.
+MAX_FIT, MAX_SHARED_FIT = 1000, 120
+#: Fewest poses for a structure with shared errors.
+MIN_SHARED = 12
+#: Numbers left of the residuals for each variance at least: fewer do not determine it.
+PER_VARIANCE = 8
+#: Parts that are left out, one after the other; of so few poses each one by itself.
+FOLDS, FEW = 5, 24
+#: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
+CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
+#: A sigma of the mounting beyond this (m, rad) is no calibration.
+OPEN_M, OPEN_RAD = 0.1, 0.1
+#: Degrees of freedom of Student's t in the robust start.
+FREEDOM = 4.0
+#: A scale must be off by this many sigmas to be believed.
+SURELY = 5.0
+#: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
+HANGING = 1.0
+#: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
+POSITIONS, SURELY_LOWER = "positions alone", 3.0
+#: The structures that are tried only then.
+HANGS = tuple(name for name in SHARED if name != "robot's geometry off")
+#: Rounds of least squares and of leaving out.
+ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredHandEye(Record):
+    """A hand-eye calibration.
+
+    Attributes:
+        eye: "to_hand": the rig stands still and the flange carries the body; "in_hand": the other way round.
+        T_base_still: (4, 4) what stands still, in the base: the rig, or in_hand the body.
+        T_flange_held: (4, 4) what the flange carries: the body, or in_hand the rig.
+        cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, m and rad.
+        scale: true lengths over those of the measured body; 1 where it was taken as given.
+        sigma_scale: its sigma; zero where it was not fitted.
+        step_s: what is left of the time offset, s, to be added to the eye's times; sigma_step_s its sigma; zero without.
+        structure: of the noise, one of ``STRUCTURES``.
+        sigmas: source -> sigma of one axis, m, rad, s, or a factor.
+        likelihoods: structure -> mean logarithm of the probability density of a pose left out.
+        arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
+        camera_m: what vision's error does, m.
+        held_out: the error on poses left out of the fit.
+        used: (N,) whether a pose was used, and not taken for a blunder.
+        distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
+    """
+
+    eye: Eye
+    T_base_still: Array
+    T_flange_held: Array
+    cov: Array
+    scale: float
+    sigma_scale: float
+    step_s: float
+    sigma_step_s: float
+    structure: str
+    sigmas: dict[str, float]
+    likelihoods: dict[str, float]
+    arm_m: float
+    camera_m: float
+    held_out: HeldOut
+    used: NDArray[np.bool_]
+    distance: Array
+
+    def predict(self, Ts_base_flange: Array) -> Array:
+        """Return T_rig_body (..., 4, 4) at poses of the flange (..., 4, 4)."""
+        if self.eye == "in_hand":
+            return np.asarray(inverse(Ts_base_flange @ self.T_flange_held) @ self.T_base_still)
+        return np.asarray(inverse(self.T_base_still) @ Ts_base_flange @ self.T_flange_held)
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess(Record):
+    """Transforms, scale and what is left of the time offset.
+
+    Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
+    body's noise: ``per_m`` of them make one metre.
+    """
+
+    Z: Array
+    X: Array
+    per_m: float = 1.0
+    step_s: float = 0.0
+
+    def moved(self, x: Array, free: tuple[bool, bool]) -> _Guess:
+        """Return the guess after a step (P,) of Z, X and what is free of scale and time."""
+        rest = list(x[12:])
+        per_m = self.per_m * float(np.exp(np.clip(rest.pop(0), -1, 1))) if free[0] else self.per_m
+        step_s = self.step_s + float(np.clip(rest.pop(0), -0.05, 0.05)) if free[1] else self.step_s
+        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), per_m, step_s)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem(Record):
+    """What is fitted: the poses in their own order, and what their streams say."""
+
+    poses: Poses
+    t_s: Array | None
+    speed: Array | None
+    free: tuple[bool, bool]
+    links: Array | None = None
+
+    def rows(self, rows: NDArray[np.int64]) -> _Problem:
+        """Return a part of the rows."""
+        t_s, speed, links = (None if a is None else a[rows] for a in (self.t_s, self.speed, self.links))
+        return _Problem(self.poses.rows(rows), t_s, speed, self.free, links)
+
+    def scaled(self, guess: _Guess) -> Poses:
+        """Return the poses with the guess's time, the flange's lengths in the body's unit."""
+        p = self.poses
+        A = p.A.copy() if self.speed is None or guess.step_s == 0 else p.A @ exp_se3(guess.step_s * self.speed)
+        A[:, :3, 3] *= guess.per_m
+        return Poses(A, p.B, p.cov, p.in_hand, p.centre)
+
+    def linear(self, guess: _Guess) -> Linear:
+        """Return the residuals at a guess, with what noise does to them; no shared sources."""
+        poses = self.scaled(guess)
+        e, J, carry = residuals(poses, guess.Z, guess.X)
+        unit = np.repeat([guess.per_m, 1.0], 3)  # an error of the flange of 1 m, and of 1 rad
+        if self.free[0]:
+            way = np.zeros((len(e), 6, 1))
+            way[:, :3] = np.swapaxes(poses.A[:, :3, :3], 1, 2) @ poses.A[:, :3, 3:]
+            J = np.concatenate([J, carry @ way], axis=2)
+        carry = carry * unit
+        if self.free[1] and self.speed is not None:
+            J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
+        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {})
+
+    def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
+        """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
+        change = np.eye(len(cov))
+        change[:3, :3] = change[6:9, 6:9] = np.eye(3) / guess.per_m
+        Z, X = guess.Z.copy(), guess.X.copy()
+        Z[:3, 3] /= guess.per_m
+        X[:3, 3] /= guess.per_m
+        if self.free[0]:
+            change[:3, 12] = -Z[:3, :3].T @ Z[:3, 3]
+            change[6:9, 12] = -X[:3, :3].T @ X[:3, 3]
+        return replace(guess, Z=Z, X=X), change @ cov @ change.T
+
+    def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
+        """Add the correlations of shared sources to residuals of the same rows."""
+        kernel = {"robot drifting over its poses": pose_kernel(self.poses.A)}
+        if self.t_s is not None:
+            kernel["robot drifting over time"] = time_kernel(self.t_s)
+        return replace(linear, kernel=kernel, walk=gathered)
+
+
+def calibrate_structured(
+    poses: Poses,
+    *,
+    t_s: Array | None = None,
+    speed: Array | None = None,
+    links: Array | None = None,
+    scale: bool = False,
+    structures: Sequence[str] = tuple(STRUCTURES),
+    progress: Callable[[str], None] = lambda line: None,
+) -> StructuredHandEye:
+    """Calibrate hand and eye, with the structure of the noise that poses left out support best.
+
+    Args:
+        poses: four or more.
+        t_s: (N,) times of the poses, s, where they are known: what drifts over time, or walks, needs them.
+        speed: (N, 6) twist of the flange, right tangent, m/s and rad/s, of streams: the rest of the time offset is fitted.
+        links: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
+        scale: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it is
+            surely not 1.
+        structures: names to choose from.
+        progress: called with the name of each step as it begins.
+
+    Raises:
+        InputError: fewer than four poses.
+        CalibrationError: the motions leave a direction open.
+    """
+    n = len(poses.A)
+    if n < MIN_POSES:
+        raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
+    order = _own_order(poses, t_s)
+    whole = _Problem(poses, t_s, speed, (False, speed is not None), links).rows(order)
+    progress("hand-eye: start")
+    if scale:
+        whole, guess, used = _with_scale(whole)
+    else:
+        guess, used = _robust(whole, _first(whole))
+    require_rotations(whole.poses.rows(used), whole.linear(guess).e[used])
+    found, used = _chosen(whole, guess, used, structures, progress)
+    used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
+    used_rows[order], distance[order] = used, found.distance
+    position, angle = np.full(n, np.nan), np.full(n, np.nan)
+    position[order], angle[order] = found.held_out.position_m, found.held_out.angle_rad
+    return replace(found, used=used_rows, distance=distance, held_out=HeldOut(position, angle))
+
+
+def _own_order(poses: Poses, t_s: Array | None) -> NDArray[np.int64]:
+    """Return an order of the rows that does not depend on theirs: by time, else by what they hold."""
+    keys = np.concatenate([poses.B[:, :3].reshape(len(poses.B), -1), poses.A[:, :3].reshape(len(poses.A), -1)], axis=1)
+    if t_s is not None:
+        keys = np.concatenate([keys, t_s[:, None]], axis=1)
+    return np.asarray(np.lexsort(keys.T))
+
+
+def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return at most this many of the rows, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
+
+
+def _first(problem: _Problem) -> list[_Guess]:
+    """Return closed-form starts, most plausible first."""
+    part = problem.rows(_spread(np.arange(len(problem.poses.A)), 300)).poses
+    return [_Guess(Z, X) for X, Z in starts(part.A, part.right_side)[:3]]
+
+
+def _middle_sigmas(e: Array) -> tuple[float, float]:
+    """Return sigmas along one axis of position and rotation, from the median."""
+    middle = np.sqrt(chdtri(3, 0.5))
+    position, rotation = (max(float(np.median(np.linalg.norm(p, axis=1))) / middle, 1e-9) for p in (e[:, :3], e[:, 3:]))
+    return position, rotation
+
+
+def _robust(problem: _Problem, guesses: list[_Guess]) -> tuple[_Guess, NDArray[np.bool_]]:
+    """Refine starts with the weights of Student's t; return the best, and which rows are no blunders."""
+    best: tuple[float, _Guess] | None = None
+    rows = _spread(np.arange(len(problem.poses.A)), MAX_FIT)
+    part = problem.rows(rows)
+    for start in guesses:
+        guess = start
+        for _ in range(25):
+            linear = part.linear(guess)
+            position, rotation = _middle_sigmas(linear.e)
+            white = np.repeat([1 / position, 1 / rotation], 3)
+            e, J = linear.e * white, linear.J * white[:, None]
+            weight = (FREEDOM + 6) / (FREEDOM + np.sum(e**2, axis=1))
+            H = np.einsum("n,nki,nkj->ij", weight, J, J)
+            x = -np.linalg.lstsq(H, np.einsum("n,nki,nk->i", weight, J, e), rcond=1e-14)[0]
+            guess = guess.moved(x, problem.free)
+            if np.abs(x).max() < 1e-7:
+                break
+        cost = float(np.sum(np.log(_middle_sigmas(part.linear(guess).e))))
+        if best is None or cost < best[0] - 1e-6:
+            best = (cost, guess)
+    assert best is not None
+    e = problem.linear(best[1]).e
+    position, rotation = _middle_sigmas(e)
+    far = np.sum((e / np.repeat([position, rotation], 3)) ** 2, axis=1)
+    used = far < 3 * chdtri(6, CHANCE)  # generous: axes differ; the structure's own covariance judges later
+    return best[1], used
+
+
+def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]:
+    """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
+    known, used_known = _robust(problem, _first(problem))
+    free = replace(problem, free=(True, problem.free[1]))
+    per_m = 1 / scale_between(problem.poses)
+    scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
+    guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
+    found, used = _robust(free, guesses)
+    rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
+    linear = free.rows(rows).linear(found)
+    b = blocks(linear, "robot and camera")
+    solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
+    sure = abs(np.log(found.per_m) + solved.x[12]) > SURELY * np.sqrt(solved.cov[12, 12])
+    (before_m, before_rad), (after_m, after_rad) = (
+        _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
+    )
+    gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
+    if (sure or gained > 1) and 1e-4 < found.per_m < 1e4:
+        return free, found, used
+    return problem, known, used_known
+
+
+def scale_between(poses: Poses) -> float:
+    """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
+
+    Of the parts' answers it is that of the smallest median residual.
+    """
+    p = poses.rows(_spread(np.arange(len(poses.A)), 300))
+    A, B = p.A, p.right_side
+    rng = np.random.default_rng(0)
+    best = (np.inf, 1.0)
+    for k in range(PARTS + 1):
+        part = np.arange(len(A)) if k == 0 or len(A) <= PART else rng.choice(len(A), PART, replace=False)
+        _, Z = kronecker(A[part], B[part])
+        M = np.concatenate(
+            [A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3)), -(B[:, :3, 3] @ Z[:3, :3].T)[..., None]], axis=2
+        )
+        found = np.linalg.lstsq(M[part].reshape(-1, 7), -A[part, :3, 3].ravel(), rcond=None)[0]
+        left = float(np.median(np.linalg.norm(M @ found + A[:, :3, 3], axis=1)))
+        if found[6] > 0 and left < best[0]:
+            best = (left, float(found[6]))
+    return best[1]
+
+
+def require_rotations(poses: Poses, e: Array) -> None:
+    """Refuse motions whose rotations are about one axis only, as far as the noise allows to tell.
+
+    Args:
+        poses: the poses used.
+        e: (N, 6) their residuals, which say how large the noise of rotations is.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
+    mean = mean_pose(poses.A)
+    turned = log_se3(inverse(mean) @ poses.A)[:, 3:]
+    values, axes = np.linalg.eigh(turned.T @ turned / len(turned))
+    noise = _middle_sigmas(e)[1]
+    least = max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
+    spread = np.sqrt(np.maximum(values[::-1], 0.0))
+    held = _held(poses)
+    if spread[0] < least:
+        raise CalibrationError(
+            f"the flange hardly rotates (RMS {np.degrees(spread[0]):.2f} deg, noise {np.degrees(noise):.2f} deg): the "
+            f"translation of {held} stays open in every direction; rotate the wrist about two axes, by 20 degrees and more"
+        )
+    if spread[1] < least:
+        axis = axes[:, 2] * np.sign(axes[np.argmax(np.abs(axes[:, 2])), 2])
+        named = " ".join(f"{value:.2f}" for value in axis)
+        raise CalibrationError(
+            f"the flange rotates about one axis only, [{named}] in the flange ({np.degrees(spread[0]):.1f} deg RMS; across "
+            f"it {np.degrees(spread[1]):.2f} deg, the noise {np.degrees(noise):.2f} deg): the translation of {held} "
+            "along this axis stays open; rotate about a second axis, by 20 degrees and more"
+        )
+
+
+def require_known(poses: Poses, Z: Array, X: Array, cov: Array) -> None:
+    """Refuse a result one of whose directions is known so badly that it is no calibration.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
+    for name, R, block in ((_held(poses), X[:3, :3], cov[6:12, 6:12]), (_still(poses), Z[:3, :3], cov[:6, :6])):
+        for kind, part, most, unit, times in (
+            ("translation", block[:3, :3], OPEN_M, "mm", 1e3),
+            ("rotation", block[3:, 3:], OPEN_RAD, "deg", np.degrees(1.0)),
+        ):
+            values, vectors = np.linalg.eigh(part)
+            sigma = float(np.sqrt(max(values[-1], 0.0)))
+            if sigma < most:
+                continue
+            axis = R @ vectors[:, -1]
+            named = " ".join(f"{value:.2f}" for value in axis * np.sign(axis[np.argmax(np.abs(axis))]))
+            first = name.split("-")[0]
+            raise CalibrationError(
+                f"the motions leave the {kind} of {name} open: along or about [{named}] in the {first} its sigma is "
+                f"{times * sigma:.0f} {unit}; rotate the flange about two axes that are not parallel, by 20 degrees and "
+                "more, and take more poses"
+            )
+
+
+def _held(poses: Poses) -> str:
+    return "flange-rig" if poses.in_hand else "flange-body"
+
+
+def _still(poses: Poses) -> str:
+    return "base-body" if poses.in_hand else "base-rig"
+
+
+def _start_variances(linear: Linear, structure: str) -> Array:
+    """Return variances to begin at: what the residuals are, shared evenly between the sources."""
+    position, rotation = _middle_sigmas(linear.e)
+    sources = STRUCTURES[structure]
+    small = {"time_s": 1e-6, "image": 1.0, "walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
+    even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
+    return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
+
+
+def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
+    """Return whether a structure can be told from these poses."""
+    sources = STRUCTURES[structure]
+    if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
+        return False
+    if "image" in sources:
+        return covered
+    if "link_m" in sources:
+        return problem.links is not None and count >= MIN_SHARED
+    if "time_s" in sources:
+        return problem.speed is not None
+    if structure == "robot drifting over time" or "walk_m" in sources:
+        walks = "walk_m" not in sources or problem.poses.in_hand
+        return problem.t_s is not None and count >= MIN_SHARED and walks
+    return structure not in SHARED or count >= MIN_SHARED
+
+
+def _chosen(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structures: Sequence[str],
+    progress: Callable[[str], None],
+) -> tuple[StructuredHandEye, NDArray[np.bool_]]:
+    """Try the structures, leave out blunders by the covariance of the best, and fit with it."""
+    covered = bool((np.abs(whole.poses.cov).reshape(len(used), -1).max(axis=1) > 0).all())
+    names = [name for name in structures if _allowed(name, whole, int(used.sum()), covered)]
+    if not names:
+        raise InputError(f"none of the structures {', '.join(structures)} can be told from these poses")
+    gathered = walk_gathered(whole.scaled(guess)) if whole.t_s is not None and whole.poses.in_hand else {}
+    simple = "robot and camera" if "robot and camera" in names else names[0]
+    guess, used, variances = _settled(whole, guess, used, simple, gathered)
+    hanging = _hanging(whole, guess, used, simple, variances, gathered)
+    trials = {}
+    for name in names:
+        if name in HANGS and name not in hanging:
+            continue
+        progress(f"hand-eye: poses left out ({name})")
+        trials[name] = _trial(whole, guess, used, name, gathered)
+    best = _best(whole, trials)
+    progress(f"hand-eye: fitting ({best})")
+    guess, used, variances = _settled(whole, guess, used, best, gathered)
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, best, gathered)
+    solved = solve(blocks(linear, best), variances)
+    x, cov = solved.x, solved.cov
+    guess = guess.moved(x, whole.free)
+    freedom = max(linear.e.size // 2 - 6, 3)  # of positions, and of rotations
+    # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
+    cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
+    metric, cov = whole.metric(guess, cov)
+    require_known(whole.poses, metric.Z, metric.X, cov)
+    sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
+    arm, camera = _displacements(whole, linear, best, variances, guess)
+    rest = np.sqrt(np.diag(cov)[12:]).tolist()
+    sigma_scale = rest.pop(0) if whole.free[0] else 0.0
+    distance = _distances(whole, guess, best, variances, gathered)
+    found = StructuredHandEye(
+        eye="in_hand" if whole.poses.in_hand else "to_hand",
+        T_base_still=metric.Z,
+        T_flange_held=metric.X,
+        cov=cov[:12, :12],
+        scale=1 / guess.per_m,
+        sigma_scale=sigma_scale / guess.per_m,
+        step_s=guess.step_s,
+        sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
+        structure=best,
+        sigmas=sigmas,
+        likelihoods={name: trial[0] for name, trial in trials.items()},
+        arm_m=arm,
+        camera_m=camera,
+        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][2]),
+        used=used,
+        distance=distance,
+    )
+    return found, used
+
+
+#: Mean log density of poses left out, their residuals, and their rows.
+_Trial = tuple[float, Array, NDArray[np.int64]]
+
+
+def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
+    """Return the structure that poses left out are most probable under.
+
+    Positions alone never win so: they do where they predict positions left out better, clearly and surely.
+    """
+    others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
+    best = max(others, key=lambda name: others[name][0])
+    if POSITIONS not in trials or best in SHARED or best == POSITIONS:
+        return best
+    of, alone = (
+        np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
+        for e in (trials[best][1], trials[POSITIONS][1])
+    )
+    lower = of - alone
+    sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
+    return POSITIONS if sure and of.mean() > CLEARLY**2 * alone.mean() else best
+
+
+def _hanging(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
+) -> set[str]:
+    """Return the structures with shared errors that the residuals of neighbours speak for (Moran's test)."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT)
+    if structure in SHARED or len(rows) < MIN_SHARED:
+        return set(SHARED)
+    part = whole.rows(rows)
+    linear = part.shared(part.linear(guess), guess, {})
+    C = blocks(linear, structure).covariance(variances)
+    white = np.linalg.solve(np.linalg.cholesky(C), linear.e[..., None])[..., 0]
+    kernels = dict(linear.kernel)
+    if gathered:
+        n = len(rows)
+        kernels["camera walking"] = np.asarray(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) == 1, dtype=float)
+    found = set()
+    for name, K in kernels.items():
+        others = K - np.diag(np.diag(K))
+        moran = float(np.einsum("ik,ij,jk->", white, others, white)) / np.sqrt(2 * 6 * float((others**2).sum()))
+        if moran > HANGING:
+            found.add(name)
+    return found
+
+
+def _linear(
+    whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]
+) -> Linear:
+    """Return the residuals of rows, with what the structure needs."""
+    part = whole.rows(rows)
+    linear = part.linear(guess)
+    if structure not in SHARED:
+        return linear
+    return part.shared(linear, guess, {name: W[rows] for name, W in gathered.items()})
+
+
+def _settled(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
+) -> tuple[_Guess, NDArray[np.bool_], Array]:
+    """Alternate variances, transforms and blunders until they stay."""
+    variances: Array | None = None
+    for _ in range(ROUNDS):
+        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+        linear = _linear(whole, guess, few, structure, gathered)
+        if variances is None:
+            variances = reml(blocks(linear, structure), _start_variances(linear, structure))
+        else:
+            variances = reml(blocks(linear, structure), variances, 10)
+        rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
+        linear = _linear(whole, guess, rows, structure, gathered)
+        b = blocks(linear, structure)
+        solved = solve(b, variances)
+        x = solved.x
+        guess = guess.moved(x, whole.free)
+        if structure in SHARED:
+            far = left_out_squares(b, solved)
+            keep = used.copy()
+            keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
+        else:
+            keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
+        if keep.sum() < max(MIN_POSES, len(keep) // 3):
+            keep = used
+        settled = bool((keep == used).all()) and float(np.abs(x).max()) < 1e-5
+        used = keep
+        if settled:
+            break
+    assert variances is not None
+    return guess, used, variances
+
+
+def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array, gathered: dict[str, Array]) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's own residual, over 6."""
+    linear = whole.linear(guess)
+    C = np.array(linear.given) * (0.0 if "image" in STRUCTURES[structure] else 1.0)
+    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
+        if name == "image":
+            C += variance * linear.given
+        elif name in gathered:
+            C += variance * gathered[name]
+        else:
+            M = linear.maps[name.replace("drift", "flange")]
+            C += variance * M @ np.swapaxes(M, 1, 2)
+    C += 1e-16 * np.eye(6)
+    return np.asarray(np.einsum("ni,ni->n", linear.e, np.linalg.solve(C, linear.e[..., None])[..., 0]) / 6)
+
+
+def _trial(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
+) -> _Trial:
+    """Return the mean log density of poses left out under a structure, their residuals, and their rows."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+    linear = _linear(whole, guess, rows, structure, gathered)
+    b = blocks(linear, structure)
+    variances = reml(b, _start_variances(linear, structure))
+    n = len(rows)
+    order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
+    density, residual = held_out(linear, structure, variances, parts)
+    return float(density.mean()), residual, rows
+
+
+def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
+    """Return the distances of the body's middle and the angles, of the rows that were left out in turn."""
+    n = len(whole.poses.A)
+    position, angle = np.full(n, np.nan), np.full(n, np.nan)
+    moved = (residual[:, :3] - np.cross(whole.poses.centre, residual[:, 3:])) / guess.per_m
+    position[rows], angle[rows] = np.linalg.norm(moved, axis=1), np.linalg.norm(residual[:, 3:], axis=1)
+    return HeldOut(position, angle)
+
+
+def _displacements(
+    whole: _Problem, linear: Linear, structure: str, variances: Array, guess: _Guess
+) -> tuple[float, float]:
+    """Return the RMS distances by which the arm's and vision's errors move the body's middle, m."""
+    middle = np.concatenate([np.eye(3), -skew(whole.poses.centre)], axis=1) / guess.per_m
+    arm = camera = 0.0
+    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
+        if name == "image":
+            size = float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+        elif name in linear.walk:
+            size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
+        else:
+            M = middle @ linear.maps[name.replace("drift", "flange")]
+            size = float(np.einsum("nij,nij->n", M, M).mean())
+        if name in OF_THE_ARM:
+            arm += variance * size
+        else:
+            camera += variance * size
+    if "image" not in STRUCTURES[structure]:
+        camera += float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+    return float(np.sqrt(arm)), float(np.sqrt(camera))

@@ -1,0 +1,154 @@
+"""The relative pose of the cameras estimated again from a body in view, where the cameras moved after their calibration.
+
+In: a calibrated rig, a body, and detections of it. Out: the rig with what these say of it, with its covariance; or why
+they say too little. Model and sums are those of :mod:`armsight.loop.health.rig`. All parameters of the rig are estimated,
+with the calibration as their prior; the prior of the right camera's pose is dropped, except for the length of the
+baseline: the shots cannot distinguish it from the size of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.health.rig import RigWatch, free_directions
+from armsight.vision.detections import SeenShot
+from armsight.vision.match import epipolar_distances
+from armsight.vision.measure import measure_seen
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+
+#: Depths at which the effect is given, m.
+DEPTHS_M = (0.5, 1.0, 2.0)
+#: Fewer shots that differ than this are rejected, and a rotation of the right camera less well known than this, rad.
+LEAST_STAYS, MOST_SIGMA_RAD = 8, float(np.radians(0.02))
+#: The cameras may have moved so far (m, rad): the prior of their pose.
+_MOVED = np.repeat([0.01, np.radians(2.0)], 3)
+#: Standard deviations of a detection by which detections are gated, step by step of the fit, px: loosely while the rig is
+#: wrong, at the end by that of the rig (0). And the one that the fit starts with, before the residuals give it.
+_GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class RigUpdate(Record):
+    """A rig whose relative pose was estimated again.
+
+    Attributes:
+        rig: the new rig.
+        rotation_rad: rotation of the right camera against the old rig.
+        sigma_rad: standard deviation of the rotation about its worst axis.
+        shift_m: distance of the right camera from where the old rig has it, across the baseline.
+        depth_errors_m: error of the depth that the old rig measures on the left camera's axis at DEPTHS_M.
+        epipolar_px: RMS distance of the detections from their epipolar lines (Sampson), before and after.
+        shots: number of shots that were used.
+        stays: how many of them differ from one another.
+    """
+
+    rig: StereoRig
+    rotation_rad: float
+    sigma_rad: float
+    shift_m: float
+    depth_errors_m: tuple[float, ...]
+    epipolar_px: tuple[float, float]
+    shots: int
+    stays: int
+
+
+def updated_rig(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> RigUpdate | Missed:
+    """Estimate the relative pose of a rig's cameras again.
+
+    Args:
+        rig: as it was calibrated, with its covariance.
+        body: what is in view; its size gives the scale.
+        shots: detections of it, anywhere in view.
+
+    Returns:
+        The new rig, or why the shots do not determine it.
+    """
+    if not rig.cov.any():
+        return Missed("the rig has no covariance: what is known of the cameras themselves must stand in its file")
+    prior, count = _prior(rig), rig.parameter_count
+    new, stays, found, noise_px, cov = rig, 0, list[PoseEstimate](), _NOISE_PX, prior
+    for gate_px in _GATES_PX:
+        gate = replace(new, cov=prior, sigma_px=gate_px or rig.sigma_px)
+        measured = [measure_seen(gate, body, shot) for shot in shots]
+        found = [each for each in measured if isinstance(each, PoseEstimate)]
+        if not found:
+            reason = next((each.reason for each in measured if isinstance(each, Missed)), "no shot")
+            return Missed(f"the body is measured in no shot: {reason}")
+        watch = RigWatch(replace(new, cov=prior, sigma_px=noise_px), body, 0.0)
+        sums, stays = watch.information(found)
+        if stays < LEAST_STAYS:
+            return Missed(
+                f"{stays} of {len(found)} shots differ from one another, {LEAST_STAYS} are needed: move the body through "
+                "the view"
+            )
+        L, so_far = watch.prior, np.zeros(len(sums.b))
+        so_far[:count] = _difference(rig, new)
+        whole = L @ np.linalg.solve(L.T @ sums.H @ L + np.eye(len(L)), L.T)
+        step = whole @ (sums.b + sums.H @ so_far)
+        left = sums.square - 2.0 * float((step - so_far) @ sums.b) + float((step - so_far) @ sums.H @ (step - so_far))
+        noise_px *= float(np.sqrt(max(left, 0.0) / max(sums.freedom, 1.0)))
+        new, cov = rig.perturbed(step[:count]), whole[:count, :count]
+    return _checked(rig, replace(new, cov=(cov + cov.T) / 2), body, found, stays)
+
+
+def _checked(
+    old: StereoRig, new: StereoRig, body: Body, found: Sequence[PoseEstimate], stays: int
+) -> RigUpdate | Missed:
+    """Return the update with its figures, or why it is rejected."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(new.cov[-3:, -3:])[-1]))
+    if sigma > MOST_SIGMA_RAD:
+        return Missed(
+            f"the shots leave the rotation of the right camera uncertain by {np.degrees(sigma):.3f} deg, at most "
+            f"{np.degrees(MOST_SIGMA_RAD):.3f} is accepted: move the body through the whole view, and nearer"
+        )
+    uv = np.concatenate([each.points.seen.uv[each.points.seen.paired] for each in found])
+    before, after = (
+        float(np.sqrt(np.mean(np.square(epipolar_distances(each, uv[:, 0], uv[:, 1]))))) for each in (old, new)
+    )
+    if after > before:
+        return Missed(
+            f"the new pose explains the shots worse than the old one: epipolar distance {after:.3f} px, {before:.3f} "
+            "before; was the body moving, or are cameras or body others than the files say?"
+        )
+    moved = _difference(old, new)[-6:]
+    along = old.T_left_right[:3, :3].T @ old.T_left_right[:3, 3] / old.baseline_m
+    across = moved[:3] - along * float(along @ moved[:3])
+    return RigUpdate(
+        new,
+        float(np.linalg.norm(moved[3:])),
+        sigma,
+        float(np.linalg.norm(across)),
+        tuple(_depth_error(old, new, depth) for depth in DEPTHS_M),
+        (before, after),
+        len(found),
+        stays,
+    )
+
+
+def _prior(rig: StereoRig) -> Array:
+    """Return the covariance (P, P) of the parameters once the cameras may have moved."""
+    free = free_directions(rig)
+    moved = np.array([_MOVED[0], _MOVED[0], *_MOVED[3:]])
+    return np.asarray(rig.cov + (free * moved**2) @ free.T)
+
+
+def _difference(old: StereoRig, new: StereoRig) -> Array:
+    """Return the step (P,) with ``old.perturbed(step)`` the other rig."""
+    cameras = [b.parameters - a.parameters for a, b in zip(old.cameras, new.cameras, strict=True)]
+    return np.concatenate([*cameras, log_se3(inverse(old.T_left_right) @ new.T_left_right)])
+
+
+def _depth_error(old: StereoRig, new: StereoRig, depth_m: float) -> float:
+    """Return the error of the depth, m, that the old rig measures of a point on the left axis at a depth, m; or NaN."""
+    point = np.array([[0.0, 0.0, depth_m]])
+    there = inverse(new.T_left_right)
+    uv = [new.left.project(point), new.right.project(point @ there[:3, :3].T + there[:3, 3])]
+    seen = Correspondences(np.zeros(1, np.int64), np.stack(uv, axis=1), np.tile(1e-4 * np.eye(2), (1, 2, 1, 1)))
+    points = triangulate(old, Body("axis", ("point",), point), seen)
+    return float(points.p_left[0, 2] - depth_m) if len(points.ids) else float("nan")

@@ -1,0 +1,382 @@
+"""An AR4 as a board: goals go out, the motors' encoders come back.
+
+In: :class:`~armsight.data.JointCommand`. Out: :class:`~armsight.data.JointStates`, on the host's clock: the Teensy sends
+none. It keeps its own controller (steppers with ramps), takes no duty, and holds the arm as long as it has power; there is
+no watchdog. Its encoders sit on the motors: what belts and gears lose is not in the readings.
+
+The lines have no checksum. A disturbed reading is found by its limits and by how fast a joint can move; a disturbed
+command is not found.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NoReturn, Self
+
+import numpy as np
+
+from armsight.data import Array, JointCommand, JointStates
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.ar4 import lines
+from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
+from armsight.robot.boards.ar4.models import HOMING_GROUPS, MODELS, MOST_SPEED_DEG_S, SENSE, Ar4Model
+from armsight.robot.boards.codes import Alarm, BoardState, Command, Limited
+from armsight.robot.boards.contract import Abilities, checked_goals
+from armsight.robot.boards.link import Link
+from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome, plain_status
+
+BAUD = 115200
+#: The firmware's version that this codec was written for; others of the same first number are spoken to as well.
+VERSION = "2.1.0"
+#: Readings a second: a position line takes 7 ms at 115200 baud.
+RATE_HZ = 50.0
+LATENCY_S = 0.05
+#: A goal further from the present position than this is a mistake, not a step of a motion.
+MOST_STEP_RAD = float(np.radians(20.0))
+_ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
+_POLL_S, _DRAIN_S = 0.001, 0.05
+#: Homing of a group of joints: to the switches, away from them, to the rest position.
+_HOMING_S = 60.0
+_STOPS = 3
+#: What an encoder may show beyond the limits and beyond the fastest motion, degrees.
+_MARGIN_DEG = 5.0
+
+
+class Ar4Board:
+    """The joints of an AR4; :meth:`connect` makes one.
+
+    Args:
+        link: the wire.
+        name: what errors call it, such as its port.
+        model: which AR4.
+        now: the clock that passes while the link is read, s.
+    """
+
+    def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
+        self.name, self.model = name, model
+        self.abilities = Abilities(JOINTS, RATE_HZ, LATENCY_S, takes_duty=False, own_controller=True, releases=False)
+        self.welcome = Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None)
+        self._link, self._now = link, now
+        self._reader = LineReader()
+        self._begin_s = now()
+        self._sent = self._broken = 0
+        self._enabled = self._stopped = False
+        self._t_s = 0.0
+        self._reported: Array = np.zeros(JOINTS)  # degrees of the encoders
+        self._speed_rad_s: Array = np.zeros(JOINTS)
+        self._goal: Array = np.zeros(JOINTS)
+        self._goal_speed: Array = np.zeros(JOINTS)
+        self._written_s = -np.inf
+
+    @classmethod
+    def connect(
+        cls, link: Link, *, name: str = "the AR4", model: str = "mk3", now: Callable[[], float] = time.monotonic
+    ) -> Self:
+        """Start the conversation and read the joints; nothing moves.
+
+        Args:
+            link: the wire to the Teensy; closed where this raises.
+            name: what errors call it, such as its port.
+            model: mk1, mk2 or mk3.
+            now: the clock that passes while the link is read, s.
+
+        Raises:
+            InputError: there is no such model.
+            DeviceError: nothing answers, or a firmware of another kind.
+        """
+        try:
+            if model not in MODELS:
+                raise InputError(f"no AR4 {model!r}; there are {', '.join(MODELS)}")
+            board = cls(link, name, MODELS[model], now)
+            board._start(VERSION)
+            board._read()
+            board._goal = board._q()
+            return board
+        except BaseException:
+            link.close()
+            raise
+
+    @property
+    def homed(self) -> bool:
+        """Whether the encoders were set since power-on: they begin at 0, which no homed arm shows in all joints."""
+        return bool(np.any(self._reported != 0.0))
+
+    @property
+    def status(self) -> BoardStatus:
+        """The newest status; nobody measures the supply."""
+        faults = (JointFault(Alarm.EMERGENCY_STOP),) if self._stopped else ()
+        state = BoardState.ENABLED if self._enabled else BoardState.DISABLED
+        return plain_status(self._t_s, BoardState.STOPPED if self._stopped else state, faults, float("nan"), self._sent)
+
+    @property
+    def joints(self) -> JointReport:
+        """The newest report; duties are not known and 0."""
+        none = (Limited(0),) * JOINTS
+        return JointReport(self._t_s, self._speed_rad_s, self._goal, self._goal_speed, np.zeros(JOINTS), none)
+
+    @property
+    def broken_messages(self) -> int:
+        """Number of answers that were disturbed or did not come."""
+        return self._broken + self._reader.broken
+
+    def soft_limits(self) -> tuple[Array, Array]:
+        """Return the joints' limits (6,), rad."""
+        return np.radians(self.model.low_deg), np.radians(self.model.high_deg)
+
+    def send(self, command: JointCommand) -> int:
+        """Send goals, at most ``RATE_HZ`` times a second: the newest counts; duration and duty are not used.
+
+        Raises:
+            InputError: the arm is not homed, a goal is outside the limits, or more than 20 degrees away.
+            DeviceError: the port is gone.
+        """
+        q_ref = checked_goals(command, JOINTS)
+        self._require_homed()
+        goal = np.degrees(q_ref)
+        beyond = (goal < self.model.low_deg - 1e-6) | (goal > self.model.high_deg + 1e-6)
+        far = np.abs(q_ref - self._q()) > MOST_STEP_RAD
+        if beyond.any():
+            k = int(np.argmax(beyond))
+            raise InputError(
+                f"joint {k + 1} is to go to {goal[k]:.1f} deg; the AR4 {self.model.name} is allowed"
+                f" {self.model.low_deg[k]:.1f} to {self.model.high_deg[k]:.1f}"
+            )
+        if far.any():
+            k = int(np.argmax(far))
+            raise InputError(
+                f"joint {k + 1} is at {np.degrees(self._q()[k]):.1f} deg and is to go to {goal[k]:.1f} at once;"
+                f" {np.degrees(MOST_STEP_RAD):.0f} at most: send goals step by step"
+            )
+        self._goal, self._goal_speed = q_ref, np.asarray(command.qd_ref, float)
+        if self._now() - self._written_s >= 1 / RATE_HZ:
+            self._write_goal()
+        self._sent += 1
+        return self._sent
+
+    def command(self, command: Command) -> int:
+        """Take the arm over, or reset the emergency stop.
+
+        Raises:
+            InputError: the AR4 has no such command.
+            DeviceError: the emergency stop is pressed.
+        """
+        if command in (Command.ENABLE, Command.ENABLE_INWARD):
+            self._take_over()
+        elif command is Command.CLEAR_STOP:
+            self._enabled = False
+            self._listen(_DRAIN_S)  # answers to goals say what was before
+            self._ask(lines.reset_stop(), Ar4Stopped)
+            if self._stopped:
+                raise DeviceError(f"{self.name}: the emergency stop is still pressed")
+        elif command is Command.CLEAR_FAULTS:
+            self._read()
+        else:
+            raise InputError(f"{self.name}: an AR4's drives stay on; switch its supply off")
+        self._sent += 1
+        return self._sent
+
+    def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
+        """Do nothing: the Teensy answers as it is asked, or :meth:`command` raises."""
+
+    def enable(self, *, inward: bool = False) -> None:
+        """Take the arm over where it is.
+
+        Raises:
+            InputError: it is not homed.
+            DeviceError: the emergency stop was pressed.
+        """
+        self.command(Command.ENABLE)
+
+    def stop(self) -> None:
+        """Slow all joints down to rest, where the drives hold them; they cannot be switched off by the host."""
+        for _ in range(_STOPS):
+            self._link.write(lines.move_with([0.0] * JOINTS))
+        self._enabled = False
+
+    def home(self, *, at_once: int = JOINTS) -> None:
+        """Drive the joints to their limit switches, set the encoders there, and go to the rest position.
+
+        Args:
+            at_once: how many joints at a time: 1, 2, 3 or 6.
+
+        Raises:
+            InputError: another number.
+            DeviceError: a switch was not reached; the Teensy's words.
+        """
+        if at_once not in HOMING_GROUPS:
+            raise InputError(f"{at_once} joints at once are not possible; 1, 2, 3 or 6 are")
+        question = lines.home(HOMING_GROUPS[at_once] + "012345")
+        self._ask(question, Ar4Values, wait_s=_HOMING_S * JOINTS / at_once, tries=1, heading=Heading.HOMED)
+        self._t_s = -np.inf  # the encoders were set anew: a jump
+        self._read()
+        self._require_homed()
+        self._goal = self._q()
+
+    def receive(self, wait_s: float = 0.0) -> JointStates:
+        """Read the joints, as often as ``RATE_HZ`` allows and once at least, and let the rest of ``wait_s`` pass.
+
+        Raises:
+            DeviceError: the Teensy does not answer any more, has restarted, or reports an error.
+        """
+        begin = self._now()
+        times, read = [], []
+        for k in range(1 + int(wait_s * RATE_HZ)):
+            if k:
+                self._listen(max(0.0, begin + k / RATE_HZ - self._now()))
+                if self._now() - begin >= wait_s:
+                    break
+            homed = self.homed
+            self._read()
+            if homed and not self.homed:
+                raise DeviceError(f"{self.name}: all encoders read 0: the Teensy has restarted; home the arm again")
+            times.append(self._t_s)
+            read.append(self._q())
+        self._listen(max(0.0, begin + wait_s - self._now()))
+        return JointStates(np.array(times), np.array(read))
+
+    def close(self) -> None:
+        """Close the port; the arm goes to its last goal and is held there."""
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _q(self) -> Array:
+        """Return the newest joint angles (6,), rad."""
+        return np.radians(self.model.angles_deg(self._reported))
+
+    def _start(self, version: str) -> None:
+        """Name version and model; a firmware of another version of the same kind is asked again in its own."""
+        answer = self._ask(lines.start(version, self.model.name), Ar4Start, wait_s=_START_S)
+        assert isinstance(answer, Ar4Start)
+        self.welcome = Welcome(f"ar4 {self.model.name}", answer.version, 0, BAUD, None)
+        if not answer.version_matches:
+            if answer.version.partition(".")[0] != VERSION.partition(".")[0] or answer.version == version:
+                raise DeviceError(
+                    f"{self.name}: the Teensy's firmware is version {answer.version}; this armsight knows {VERSION}:"
+                    " put the firmware of ar4_ros_driver on it"
+                )
+            self._start(answer.version)
+        elif not answer.model_matches:
+            raise DeviceError(f"{self.name}: the Teensy's firmware {answer.version} knows no {self.model.name}")
+
+    def _require_homed(self) -> None:
+        if not self.homed:
+            raise InputError(
+                f"{self.name}: all encoders read 0: the arm was not homed since it was switched on; `armsight board home`"
+            )
+
+    def _take_over(self) -> None:
+        """Make the present position the goal; the answer says whether the emergency stop was pressed."""
+        self._read()
+        self._require_homed()
+        self._goal = self._q()
+        self._ask(lines.move_to(self._reported.tolist()), Ar4Stopped)
+        if self._stopped:
+            raise DeviceError(f"{self.name}: the emergency stop was pressed: release it, then `armsight board clear`")
+        self._enabled = True
+
+    def _write_goal(self) -> None:
+        self._link.write(lines.move_to(self.model.reported_deg(np.degrees(self._goal)).tolist()))
+        self._written_s = self._now()
+
+    def _read(self) -> None:
+        """Read the positions; a reading that no joint can have is a disturbed one."""
+        for _ in range(_TRIES):
+            asked = self._now()
+            answer = self._ask(lines.positions(), Ar4Values, heading=Heading.POSITIONS)
+            assert isinstance(answer, Ar4Values)
+            t_s, reported = (asked + self._now()) / 2 - self._begin_s, np.array(answer.values)
+            if self._possible(reported, t_s):
+                passed = t_s - self._t_s
+                if 0 < passed < 1.0:
+                    self._speed_rad_s = np.radians(SENSE * (reported - self._reported) / passed)
+                self._t_s, self._reported = t_s, reported
+                return
+            self._broken += 1
+        joint = int(np.argmax(np.abs(reported - self._reported)))
+        raise DeviceError(
+            f"{self.name}: joint {joint + 1} jumped from {self._reported[joint]:.1f} to {reported[joint]:.1f} deg of its"
+            " encoder: is the line disturbed, or was the arm homed by another program? Connect again"
+        )
+
+    def _possible(self, reported: Array, t_s: float) -> bool:
+        """Return whether the encoders may read so, degrees, after what they read before."""
+        if not np.any(reported):
+            return True  # a Teensy that has restarted
+        width = self.model.high_deg - self.model.low_deg
+        if np.any(np.abs(reported) > width + 2 * _MARGIN_DEG):
+            return False
+        if not self._t_s > 0.0:  # the first reading, or the first after homing
+            return True
+        passed = t_s - self._t_s
+        return bool(np.all(np.abs(reported - self._reported) <= 2 * MOST_SPEED_DEG_S * passed + _MARGIN_DEG))
+
+    def _ask(
+        self,
+        question: bytes,
+        kind: type[Ar4Start] | type[Ar4Values] | type[Ar4Stopped],
+        *,
+        wait_s: float = _ANSWER_S,
+        tries: int = _TRIES,
+        heading: Heading | None = None,
+    ) -> Ar4Start | Ar4Values | Ar4Stopped:
+        """Ask and return the answer of this kind; what else comes meanwhile is taken.
+
+        Raises:
+            DeviceError: none comes, or an error.
+        """
+        heard = 0
+        for _ in range(tries):
+            self._link.write(question)
+            until = self._now() + wait_s
+            while self._now() < until:
+                data = self._link.read(_POLL_S)
+                heard += len(data)
+                for answer in self._taken(data):
+                    if isinstance(answer, kind) and heading in (None, getattr(answer, "heading", None)):
+                        return answer
+            self._broken += 1
+        self._silent(question, heard)
+
+    def _listen(self, wait_s: float) -> None:
+        """Let time pass and take what comes; a goal that had to wait is written when its time has come."""
+        until = self._now() + wait_s
+        while True:
+            self._taken(self._link.read(min(_POLL_S, max(0.0, until - self._now()))))
+            if self._enabled and self._now() - self._written_s >= 1 / RATE_HZ:
+                self._write_goal()
+            if self._now() >= until - 1e-9:
+                return
+
+    def _taken(self, data: bytes) -> list[Ar4Start | Ar4Values | Ar4Stopped]:
+        """Return the answers in these bytes; errors raise, the state of the emergency stop is kept."""
+        found: list[Ar4Start | Ar4Values | Ar4Stopped] = []
+        for line in self._reader.take(data):
+            answer = lines.read_line(line)
+            if answer is None:
+                self._broken += 1
+            elif not isinstance(answer, Ar4Text):
+                if isinstance(answer, Ar4Stopped):
+                    self._stopped = answer.pressed
+                    self._enabled = self._enabled and not answer.pressed
+                found.append(answer)
+            elif answer.heading is Heading.ERROR:
+                raise DeviceError(f"{self.name}: the Teensy reports: {answer.text}")
+        return found
+
+    def _silent(self, question: bytes, heard: int) -> NoReturn:
+        asked = question[:2].decode()
+        if heard:
+            raise DeviceError(
+                f"{self.name}: bytes come, but no answer to {asked}: is it the right port and {BAUD} baud, and does the"
+                " Teensy have the firmware of ar4_ros_driver?"
+            )
+        raise DeviceError(
+            f"{self.name}: nothing answers {asked}: is the Teensy switched on, is it the right port, and does it have the"
+            " firmware of ar4_ros_driver?"
+        )

@@ -1,0 +1,144 @@
+"""The contract of what a run can drive: our own :class:`~armsight.robot.boards.board.Board`, and other controllers.
+
+To add one: a folder beside ``feetech/`` and ``ar4/`` with a codec and a class that fulfils :class:`MotionBoard`, and a line
+in ``opening``. A board says in its :class:`Abilities` what it cannot do, so that a caller rejects a request with one line
+instead of sending what nobody acts on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+
+from armsight.data import Array, JointCommand, JointStates
+from armsight.errors import InputError
+from armsight.robot.boards.codes import Command
+from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """What a board can do, and what it cannot.
+
+    Attributes:
+        joints: how many joints it drives.
+        rate_hz: readings a second, at most.
+        latency_s: time from a command to the state that shows it, s; 0 where it is the tick's.
+        takes_duty: whether ``gravity_duty`` of a command reaches the motors.
+        own_controller: whether the joints are controlled by a controller that armsight cannot tune, configure or test.
+        releases: whether the drives can be switched off.
+    """
+
+    joints: int
+    rate_hz: float
+    latency_s: float = 0.0
+    takes_duty: bool = True
+    own_controller: bool = False
+    releases: bool = True
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What it cannot do, as texts."""
+        texts = []
+        if not self.takes_duty:
+            texts.append("takes no duty: gravity is not compensated")
+        if self.own_controller:
+            texts.append("keeps its own controller: no gains, no configuration, no self-test")
+        if not self.releases:
+            texts.append("cannot switch its drives off")
+        return tuple(texts)
+
+
+class MotionBoard(Protocol):
+    """What drives the joints of an arm and reads them; time passes in :meth:`receive` and in what waits."""
+
+    @property
+    def abilities(self) -> Abilities:
+        """What it can do."""
+        ...
+
+    @property
+    def welcome(self) -> Welcome:
+        """Who it is."""
+        ...
+
+    @property
+    def status(self) -> BoardStatus:
+        """Its newest status; counts that it does not keep are 0."""
+        ...
+
+    @property
+    def joints(self) -> JointReport:
+        """Its newest report of how the joints are driven."""
+        ...
+
+    @property
+    def broken_messages(self) -> int:
+        """Number of broken or missing messages from it."""
+        ...
+
+    def soft_limits(self) -> tuple[Array, Array]:
+        """Return the lower and the upper limits (n,) that it keeps the joints within, rad."""
+        ...
+
+    def send(self, command: JointCommand) -> int:
+        """Send a motion command and return its number.
+
+        Raises:
+            InputError: a shape, a number that is not finite, or what the board rejects at once.
+            DeviceError: the board is gone.
+        """
+        ...
+
+    def command(self, command: Command) -> int:
+        """Send a command other than motion and return its number."""
+        ...
+
+    def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
+        """Wait until the board acknowledged the command of this number.
+
+        Raises:
+            DeviceError: it was rejected, or nothing was heard of it.
+        """
+        ...
+
+    def enable(self, *, inward: bool = False) -> None:
+        """Switch the drives on, at the present position, and wait until they are."""
+        ...
+
+    def stop(self) -> None:
+        """Stop in an emergency."""
+        ...
+
+    def receive(self, wait_s: float = 0.0) -> JointStates:
+        """Let ``wait_s`` pass and return all readings since the last call.
+
+        Raises:
+            DeviceError: the board is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the link; a driven arm then does what its board does without commands."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def checked_goals(command: JointCommand, count: int) -> Array:
+    """Return the joint angles (count,) of a command to a board without duty, rad.
+
+    Raises:
+        InputError: another number of joints, or an angle that is not finite.
+    """
+    q_ref = np.asarray(command.q_ref, dtype=float)
+    if q_ref.shape != (count,):
+        raise InputError(f"q_ref is of shape {q_ref.shape}; this board has {count} joints: is it the right arm?")
+    if not np.isfinite(q_ref).all():
+        joint = int(np.argmin(np.isfinite(q_ref)))
+        raise InputError(f"q_ref of joint {joint + 1} is {q_ref[joint]}; it must be finite")
+    return q_ref

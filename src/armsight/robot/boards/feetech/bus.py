@@ -1,0 +1,231 @@
+"""Questions to the servos of a bus and their answers; and what is wrong with a bus whose answers do not come.
+
+In: a :class:`~armsight.robot.boards.link.Link` and registers. Out: numbers, or one :class:`~armsight.errors.DeviceError`
+that says which id does not answer. Nothing waits longer than its time limit: an answer comes within milliseconds or not at
+all, and a question is asked ``TRIES`` times, because one disturbed byte spoils it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.feetech.packets import (
+    Instruction,
+    PacketReader,
+    StatusPacket,
+    packet,
+    sync_read,
+    sync_write,
+)
+from armsight.robot.boards.feetech.registers import (
+    LOCK,
+    MODEL,
+    POSITION,
+    STATE_BYTES,
+    STS3215,
+    TORQUE,
+    Register,
+    ServoStates,
+    states_of,
+)
+from armsight.robot.boards.link import Link
+
+BAUD = 1_000_000
+#: How long answers may take: USB adapters hold bytes back for up to 16 ms.
+ANSWER_S = 0.03
+_POLL_S = 0.0005
+TRIES = 4
+#: Ids that are looked for where an expected one does not answer.
+LOOKED_FOR = range(1, 13)
+
+
+class ServoBus:
+    """The servos on a wire.
+
+    Args:
+        link: the wire; :meth:`close` closes it.
+        name: what errors call it, such as its port.
+        baud: bits a second on it, for errors.
+        now: the clock that passes while the link is read, s.
+
+    Attributes:
+        lost: answers that did not come whole.
+    """
+
+    def __init__(self, link: Link, name: str, baud: int = BAUD, now: Callable[[], float] = time.monotonic) -> None:
+        self.name, self.baud, self.now = name, baud, now
+        self._link = link
+        self._reader = PacketReader()
+        self.lost = self._bytes = 0
+
+    @property
+    def broken(self) -> int:
+        """Answers that were broken or did not come."""
+        return self._reader.broken + self.lost
+
+    def close(self) -> None:
+        """Close the wire."""
+        self._link.close()
+
+    def wait(self, wait_s: float) -> None:
+        """Let time pass; what comes meanwhile answers nothing."""
+        self._link.read(wait_s)
+
+    def ping(self, id: int) -> bool:
+        """Return whether a servo answers to an id, broken or not."""
+        return any(self._heard(packet(id, Instruction.PING)) for _ in range(2))
+
+    def read(self, id: int, register: Register) -> int:
+        """Return what a register of a servo holds.
+
+        Raises:
+            DeviceError: it does not answer.
+        """
+        question = packet(id, Instruction.READ, bytes((register.address, register.width)))
+        for _ in range(TRIES):
+            answers = self._ask(question, [id], register.width)
+            if id in answers:
+                return register.decode(answers[id].parameters)
+        self._explain([id])
+
+    def write(self, id: int, register: Register, value: int) -> None:
+        """Write a register of a servo, which acknowledges it.
+
+        Raises:
+            DeviceError: it does not.
+        """
+        data = bytes((register.address,)) + register.encode(value)
+        for _ in range(TRIES):
+            if id in self._ask(packet(id, Instruction.WRITE, data), [id], 0):
+                return
+        self._explain([id])
+
+    def states(self, ids: Sequence[int]) -> ServoStates:
+        """Return the states of servos, all read with one question.
+
+        Raises:
+            DeviceError: one does not answer.
+        """
+        question = sync_read(POSITION.address, STATE_BYTES, ids)
+        for _ in range(TRIES):
+            answers = self._ask(question, ids, STATE_BYTES)
+            if len(answers) == len(ids):
+                return states_of([answers[id].parameters for id in ids], tuple(answers[id].error for id in ids))
+        self._explain([id for id in ids if id not in answers])
+
+    def write_all(self, register: Register, values: dict[int, bytes]) -> None:
+        """Write bytes from a register on to each servo; nobody acknowledges."""
+        self._link.write(sync_write(register.address, values))
+
+    def meet(self, ids: Sequence[int]) -> None:
+        """Check that each id answers, alone and as an STS3215.
+
+        Raises:
+            DeviceError: one does not, or two servos share an id, or nothing answers at all.
+        """
+        silent = [id for id in ids if not self.ping(id)]
+        if silent:
+            self._explain(silent)
+        self.states(ids)
+        for id in ids:
+            if (model := self.read(id, MODEL)) != STS3215:
+                raise DeviceError(f"{self.name}: id {id} is of model {model}; an STS3215 is {STS3215}")
+
+    def unlocked_write(self, id: int, register: Register, value: int) -> None:
+        """Write a stored register of a servo whose torque is off, and read it back.
+
+        Raises:
+            InputError: the torque is on.
+            DeviceError: it does not answer, or does not keep the value.
+        """
+        if self.read(id, TORQUE):
+            raise InputError(f"{self.name}: the torque of id {id} is on; switch it off first, the arm will sink")
+        self.write(id, LOCK, 0)
+        try:
+            self.write(id, register, value)
+            kept = self.read(id, register)
+        finally:
+            self.write(id, LOCK, 1)
+        if kept != value:
+            raise DeviceError(f"{self.name}: id {id} keeps {kept} in register {register.address} instead of {value}")
+
+    def _ask(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
+        """Ask once and return the whole answers of these ids with ``count`` bytes; without those that came twice."""
+        self._link.read(0.0)  # what came late answers nothing
+        self._reader.clear()
+        self._link.write(question)
+        answers: dict[int, StatusPacket] = {}
+        until = self.now() + ANSWER_S
+        while len(answers) < len(ids) and self.now() < until:
+            data = self._link.read(_POLL_S)
+            self._bytes += len(data)
+            for answer in self._reader.take(data):
+                if answer.id in ids and len(answer.parameters) == count:
+                    answers[answer.id] = answer
+        self.lost += len(ids) - len(answers)
+        return answers
+
+    def _heard(self, question: bytes) -> bytes:
+        """Return all bytes that a question is answered with."""
+        self._link.read(0.0)
+        self._link.write(question)
+        data, until = b"", self.now() + ANSWER_S
+        while not data and self.now() < until:
+            data = self._link.read(_POLL_S)
+        self._bytes += len(data)
+        return data + self._link.read(2 * _POLL_S) if data else data
+
+    def _explain(self, silent: Sequence[int]) -> NoReturn:
+        """Raise what is wrong where these ids did not answer whole."""
+        found = {id: self._quality(id) for id in LOOKED_FOR}
+        answering = [id for id, whole in found.items() if whole]
+        broken = [id for id, whole in found.items() if whole is False]
+        if not answering and self._bytes:
+            raise DeviceError(
+                f"{self.name}: bytes come, but no whole answer: is {self.baud} the servos' baud rate, is the wire sound,"
+                " and is this a bus of STS3215 servos?"
+            )
+        if not answering:
+            raise DeviceError(
+                f"{self.name}: no servo answers: is their own power supply on, is it the right port, and are they set to"
+                f" {self.baud} baud?"
+            )
+        there = f"found {_listed(answering)}"
+        if broken:
+            lacking = (
+                f" and none answers as {_listed(gone)}" if (gone := [s for s in silent if s not in broken]) else ""
+            )
+            raise DeviceError(
+                f"{self.name}: answers of id {_listed(broken)} collide{lacking}: two servos share an id; connect one"
+                f" servo at a time and give each its own ({there})"
+            )
+        if lost := [id for id in silent if id not in answering]:
+            raise DeviceError(
+                f"{self.name}: no servo answers as id {_listed(lost)} ({there}): is its cable plugged in, and its id set?"
+            )
+        raise DeviceError(
+            f"{self.name}: id {_listed(silent)} answers now and then only: is a plug loose, or the wire disturbed?"
+        )
+
+    def _quality(self, id: int) -> bool | None:
+        """Return True where an id gives a whole answer, False where only broken ones, None where none."""
+        question = packet(id, Instruction.READ, bytes((POSITION.address, STATE_BYTES)))
+        heard = False
+        for _ in range(TRIES):
+            data = self._heard(question)
+            if not data:
+                if not heard:
+                    return None
+                continue
+            heard = True
+            answers = [each for each in PacketReader().take(data) if each.id == id]
+            if len(answers) == 1 and len(answers[0].parameters) == STATE_BYTES:
+                return True
+        return False
+
+
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids))

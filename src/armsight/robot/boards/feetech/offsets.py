@@ -1,0 +1,93 @@
+"""The homing offsets on the servos (register 31): what is there, what a correction makes of it, and writing it.
+
+A servo reports ``actual - offset``. A joint that really is further by an angle than it reports needs an offset that is
+smaller by as many counts. The register holds -2047 to 2047. The torque must be off: an offset that changes under torque
+moves the joint.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.robot.boards.feetech.bus import ServoBus
+from armsight.robot.boards.feetech.calibration import ServoCalibration
+from armsight.robot.boards.feetech.registers import HOMING_OFFSET, MOST_OFFSET, RAD_PER_COUNT, TORQUE
+
+
+class OffsetChange(NamedTuple):
+    """The homing offset of a joint.
+
+    Attributes:
+        name: of the joint.
+        id: of its servo.
+        old: what its register holds, counts.
+        new: what it is to hold.
+    """
+
+    name: str
+    id: int
+    old: int
+    new: int
+
+
+def corrected_offsets(bus: ServoBus, calibration: ServoCalibration, further_rad: Array) -> list[OffsetChange]:
+    """Return the offsets that make joints report what they really are at; nothing is written.
+
+    Args:
+        bus: the servos.
+        calibration: which servo drives which joint.
+        further_rad: (n,) true angle less reported one of each joint, rad.
+
+    Raises:
+        InputError: a correction that is no number, or one that the register does not hold.
+        DeviceError: a servo does not answer.
+    """
+    further = np.asarray(further_rad, float)
+    count = len(calibration.ids)
+    if further.shape != (count,) or not np.isfinite(further).all():
+        raise InputError(f"{count} corrections are needed, one a joint ({', '.join(calibration.names)})")
+    changes = []
+    for name, id, angle in zip(calibration.names, calibration.ids, further.tolist(), strict=True):
+        old = bus.read(id, HOMING_OFFSET)
+        new = old - round(angle / RAD_PER_COUNT)
+        if abs(new) > MOST_OFFSET:
+            raise InputError(
+                f"{name} (id {id}): its offset would be {new}; the register holds -{MOST_OFFSET} to {MOST_OFFSET}: mount"
+                " the horn by some teeth further round, and calibrate anew"
+            )
+        changes.append(OffsetChange(name, id, old, new))
+    return changes
+
+
+def require_released(bus: ServoBus, changes: list[OffsetChange]) -> None:
+    """Raise an InputError if the torque of a servo whose offset changes is on."""
+    for change in changes:
+        if change.new != change.old and bus.read(change.id, TORQUE):
+            raise InputError(
+                f"{bus.name}: the torque of {change.name} (id {change.id}) is on; support the arm, then"
+                " `armsight board release`"
+            )
+
+
+def write_changes(bus: ServoBus, changes: list[OffsetChange]) -> None:
+    """Write the offsets that change, and read each back; where one fails, those before it get their old values again.
+
+    Raises:
+        InputError: a torque is on; nothing was written.
+        DeviceError: a servo does not answer, or does not keep the value.
+    """
+    require_released(bus, changes)
+    written: list[OffsetChange] = []
+    try:
+        for change in changes:
+            if change.new != change.old:
+                written.append(change)
+                bus.unlocked_write(change.id, HOMING_OFFSET, change.new)
+    except BaseException:
+        for change in reversed(written):
+            bus.unlocked_write(change.id, HOMING_OFFSET, change.old)
+        raise

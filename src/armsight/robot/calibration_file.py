@@ -1,0 +1,237 @@
+"""Calibrated tables of single arms, as their makers' ROS drivers keep them: Universal Robots' and UFACTORY's YAML.
+
+Both are one form: ``kinematics:`` with x, y, z, m, and roll, pitch, yaw, rad, for every joint: where its frame stands in
+the frame of the joint before; it turns about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1 to
+wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
+
+In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a
+little
+off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to those of
+the nominal table as its axes allow; and how far the two arms put their tools apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_text, write_text
+from armsight.geometry.pose import inverse, pose
+from armsight.geometry.rotation import log_so3
+from armsight.robot.arm import Arm
+from armsight.robot.urdf import ChainLink, arm_rows, check_same, rotation_of
+from armsight.robot.urdf_write import roll_pitch_yaw
+
+#: What Universal Robots call their joints here.
+UR_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+#: Seeded poses within the limits over which two arms are compared, and a tool further off than this is not of this arm, m.
+_POSES, _FAR_M = 1000, 0.1
+#: What a file cannot hold of a flange is said from here on, m and rad.
+_HELD = 1e-9
+
+
+class Difference(NamedTuple):
+    """How far apart two arms put their tools at the same joint angles, over poses within the limits.
+
+    Attributes:
+        mean_m: mean distance, m.
+        most_m: greatest, m.
+        mean_rad: mean angle between the tools, rad.
+        most_rad: greatest, rad.
+        a_m: (n,) what the second arm's link lengths are more, m; NaN where a row's axes are no longer parallel or have
+        become
+            so, and lengths cannot be compared.
+        d_m: (n,) link offsets likewise, m.
+        alpha_rad: (n,) twists, rad.
+        offset_rad: (n,) zeros, rad.
+    """
+
+    mean_m: float
+    most_m: float
+    mean_rad: float
+    most_rad: float
+    a_m: Array
+    d_m: Array
+    alpha_rad: Array
+    offset_rad: Array
+
+
+def read_calibration(path: str | Path, nominal: Arm) -> Arm:
+    """Return a single arm as a calibration file has it.
+
+    Args:
+        path: the YAML file.
+        nominal: the maker's table of this kind of arm.
+
+    Raises:
+        InputError: unreadable, not of this form or not of this arm; the message names the joint.
+    """
+    origins = _origins(path, nominal)
+    links = [ChainLink(T, np.array([0.0, 0.0, 1.0])) for T in origins]
+    links.append(ChainLink(nominal.T_flange_tool, np.zeros(3)))
+    rows = arm_rows(f"{path}", list(nominal.joint_names), links, np.eye(4))
+    arm = replace(
+        nominal,
+        name=f"{nominal.name}_calibrated",
+        a=rows.a,
+        d=rows.d,
+        alpha=rows.alpha,
+        offset=rows.offset,
+        direction=rows.direction,
+        convention="standard",
+        T_base_0=rows.T_base_0,
+        T_flange_tool=rows.T_flange_tool,
+        source=f"calibration {Path(path).name}; nominal: {nominal.source}",
+    )
+    check_same(f"{path}", arm, links)
+    if (far := difference(nominal, arm).mean_m) > _FAR_M:
+        raise InputError(
+            f"{path}: its tool is {1e3 * far:.0f} mm from that of {nominal.name} on the mean: is it the calibration of "
+            "another kind of arm, or in mm?"
+        )
+    return arm
+
+
+def _origins(path: str | Path, nominal: Arm) -> list[Array]:
+    """Return where each joint's frame stands in that of the joint before (4, 4)."""
+    document = _yaml(path)
+    kinematics = document.get("kinematics")
+    if not isinstance(kinematics, Mapping):
+        raise InputError(f"{path}: no kinematics; a calibration of ur_calibration or of xarm_ros has them")
+    names = _names(nominal)
+    missing = [name for name in names if not isinstance(kinematics.get(name), Mapping)]
+    if missing:
+        there = ", ".join(str(name) for name in kinematics)
+        raise InputError(
+            f"{path}: kinematics: {missing[0]} is missing; {nominal.name} has {', '.join(names)}, there are {there}"
+        )
+    if f"joint{len(names) + 1}" in kinematics:
+        raise InputError(f"{path}: kinematics: has joint{len(names) + 1}; {nominal.name} has {len(names)} joints")
+    out = []
+    for name in names:
+        values = [kinematics[name].get(key) for key in _KEYS]
+        for key, value in zip(_KEYS, values, strict=True):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise InputError(f"{path}: kinematics: {name}: {key} is {value!r}, must be a number")
+        x, y, z, *angles = values
+        out.append(pose(rotation_of(np.array(angles)), np.array([x, y, z])))
+    return out
+
+
+def _names(arm: Arm) -> tuple[str, ...]:
+    """Return what a file calls an arm's joints."""
+    return (
+        UR_NAMES
+        if arm.joint_names[0] == "shoulder_pan" and arm.joints == 6
+        else tuple(f"joint{i + 1}" for i in range(arm.joints))
+    )
+
+
+def _yaml(path: str | Path) -> Mapping[str, object]:
+    try:
+        import yaml
+    except ImportError:
+        raise InputError(f"{path}: YAML files need PyYAML: pip install 'armsight[formats]'") from None
+    try:
+        document = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(document, Mapping):
+        raise InputError(f"{path}: not a calibration: a mapping with kinematics is needed")
+    return document
+
+
+def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:
+    """Return an arm as a calibration file of its maker's, and what of its flange that cannot hold.
+
+    Args:
+        arm: the arm, such as an identified one.
+        nominal: the maker's table of this kind of arm, whose frames the file follows.
+
+    Returns:
+        The YAML text, and how far the file's flange is off the arm's, m and rad: zero where axis n goes through the origin
+        of the flange along its z, as in the makers' tables.
+
+    Raises:
+        InputError: another number of joints, a joint that turns the other way, or coupled motors.
+    """
+    if arm.joints != nominal.joints:
+        raise InputError(f"{arm.name} has {arm.joints} joints, {nominal.name} {nominal.joints}")
+    if ((arm.direction < 0).any() and (nominal.direction > 0).all()) or (arm.coupling != np.eye(arm.joints)).any():
+        raise InputError(
+            f"{arm.name}: joints that turn the other way, and coupled motors, have no place in such a file"
+        )
+    frames, before = _frames(arm, nominal), np.eye(4)
+    lines = ["kinematics:"]
+    for name, F in zip(_names(nominal), frames, strict=True):
+        T = inverse(before) @ F
+        lines.append(f"  {name}:")
+        for key, value in zip(_KEYS, (*T[:3, 3], *roll_pitch_yaw(T[:3, :3])), strict=True):
+            lines.append(f"    {key}: {float(value)!r}")
+        before = F
+    if _names(nominal) == UR_NAMES:
+        lines.append("  hash: armsight")
+    left = inverse(frames[-1]) @ arm.links(np.zeros(arm.joints))[-2]
+    return "\n".join(lines) + "\n", float(np.linalg.norm(left[:3, 3])), float(np.linalg.norm(log_so3(left[:3, :3])))
+
+
+def write_calibration(arm: Arm, nominal: Arm, path: str | Path) -> tuple[float, float]:
+    """Write an arm as a calibration file; arguments and what is returned as of :func:`calibration_text`."""
+    text, off_m, off_rad = calibration_text(arm, nominal)
+    write_text(path, text)
+    return off_m, off_rad
+
+
+def _axes(arm: Arm) -> tuple[Array, Array]:
+    """Return points on the joints' axes and their directions (n, 3), base, with all joints at zero."""
+    T, modified = arm.links(np.zeros(arm.joints)), arm.convention == "modified"
+    frames = T[1:-1] if modified else T[:-2]
+    return frames[:, :3, 3], frames[:, :3, 2] * arm.direction[:, None]
+
+
+def _frames(arm: Arm, nominal: Arm) -> list[Array]:
+    """Return the joints' frames (4, 4) at zero, on the axes of an arm, else as near as can be to the nominal ones."""
+    T, zero = nominal.links(np.zeros(nominal.joints)), np.zeros(3)
+    out = []
+    for i, (point, z) in enumerate(zip(*_axes(arm), strict=True)):
+        if nominal.convention == "modified":
+            c, s = np.cos(nominal.offset[i]), np.sin(nominal.offset[i])
+            F = T[i + 1] @ pose(np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]), zero)
+        else:
+            F = T[i] @ pose(np.eye(3), np.array([0.0, 0.0, nominal.d[i]]))
+        if i == arm.joints - 1:
+            F = arm.links(np.zeros(arm.joints))[-2]  # the last frame is the flange
+        origin = point + z * (z @ (F[:3, 3] - point))
+        x = F[:3, 0] - z * (z @ F[:3, 0])
+        x /= np.linalg.norm(x)
+        out.append(pose(np.stack([x, np.cross(z, x), z], axis=1), origin))
+    return out
+
+
+def difference(first: Arm, second: Arm) -> Difference:
+    """Return how far apart two arms of the same joints put their tools.
+
+    Raises:
+        InputError: they have not the same number of joints.
+    """
+    if first.joints != second.joints:
+        raise InputError(f"{first.name} has {first.joints} joints, {second.name} {second.joints}")
+    q = np.random.default_rng(0).uniform(first.q_min, first.q_max, (_POSES, first.joints))
+    A, B = first.forward(q), second.forward(q)
+    far = np.linalg.norm(A[:, :3, 3] - B[:, :3, 3], axis=1)
+    turned = np.linalg.norm(log_so3(np.swapaxes(A[:, :3, :3], 1, 2) @ B[:, :3, :3]), axis=1)
+    changes = {name: getattr(second, name) - getattr(first, name) for name in ("a", "d", "alpha", "offset")}
+    for name in ("alpha", "offset"):
+        changes[name] = np.remainder(changes[name] + np.pi, 2 * np.pi) - np.pi
+    parallel = [np.abs(np.sin(arm.alpha)) < 1e-12 for arm in (first, second)]
+    unlike = (parallel[0] != parallel[1]) | (first.convention != second.convention)
+    unlike = unlike | np.append(False, unlike[:-1])  # the next row takes back what a far normal put into this one
+    rows = [np.where(unlike, np.nan, changes[name]) for name in ("a", "d", "alpha", "offset")]
+    return Difference(float(far.mean()), float(far.max()), float(turned.mean()), float(turned.max()), *rows)

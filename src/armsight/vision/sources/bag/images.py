@@ -1,0 +1,282 @@
+"""Shots from the image topics of a recording.
+
+In: a :class:`~.reader.Bag`. Out: :class:`BagSource`. The topics are found by type; where there are more than two, their
+names say which are left and right, or the user does: ``bag:FILE,left=/a/image_raw,right=/b/image_raw``.
+
+Images of sensor_msgs/Image are taken as they are (8 or 16 bits, grey, BGR, RGB with or without alpha, Bayer), compressed
+ones are decoded by OpenCV.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from armsight.data import SIDES, Image, Shot
+from armsight.errors import InputError
+from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
+from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
+
+#: Types of messages that hold one image.
+IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
+#: Encoding -> type, channels, and OpenCV's conversion to grey or BGR.
+_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "16UC1": ("u2", 1, None),
+    "bgr8": ("u1", 3, None),
+    "8UC3": ("u1", 3, None),
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2BGR),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2BGR),
+    "bgr16": ("u2", 3, None),
+    "rgb16": ("u2", 3, cv2.COLOR_RGB2BGR),
+    # OpenCV names a Bayer pattern by its second row and column: ROS's RGGB is its BG.
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+}
+_COMPRESSED = re.compile(r"/(compressed|image_compressed)$")
+#: Words of a topic's name that say which camera it is of, left ones first.
+_NAMED = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
+#: Of several topics of one camera the first of these is taken: raw before rectified or processed images.
+_PREFERRED = ("image_raw", "image", "image_mono", "image_color")
+_S_NS = 1e9
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A shot to be: the message numbers of its two images, None where one has no partner."""
+
+    left: int | None
+    right: int | None
+    t_s: float
+    problem: str | None
+
+
+class BagSource:
+    """The stereo images of a recording; two messages that belong together are a shot.
+
+    An image without a partner is a shot with a problem, which says so.
+
+    Attributes:
+        notes: what was left out, or is odd, a line each.
+        topics: of the left and of the right images.
+    """
+
+    def __init__(self, bag: Bag, topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> None:
+        self.topics, self.notes = topics, (*bag.notes, *pairing.notes)
+        self._bag = bag
+        self._planned = _plan(topics, pairing, stamps)
+        self._shots = self._read()
+
+    @property
+    def count(self) -> int | None:
+        """How many shots there are, those without a partner included."""
+        return len(self._planned)
+
+    def read(self) -> Shot | None:
+        """Return the next shot, or None at the end."""
+        return next(self._shots, None)
+
+    def close(self) -> None:
+        """Hand out no more shots."""
+        self._shots = iter(())
+
+    def _read(self) -> Iterator[Shot]:
+        waiting: tuple[dict[int, BagMessage], dict[int, BagMessage]] = ({}, {})
+        messages = self._bag.messages(self.topics)
+        for number, planned in enumerate(self._planned):
+            name = f"{number:06d}"
+            if planned.problem is not None:
+                yield Shot(name, None, None, planned.t_s, planned.problem)
+                continue
+            needed = (planned.left, planned.right)
+            while any(n not in held for n, held in zip(needed, waiting, strict=True)):
+                message = next(messages, None)
+                if message is None:
+                    yield Shot(name, None, None, planned.t_s, "the recording ends before both images")
+                    return
+                waiting[self.topics.index(message.topic)][message.index] = message
+            pair_ = [held.pop(n) for n, held in zip(needed, waiting, strict=True) if n is not None]
+            for n, held in zip(needed, waiting, strict=True):  # those without a partner are not waited for
+                for old in [k for k in held if n is not None and k < n]:
+                    del held[old]
+            yield _shot(name, planned.t_s, pair_)
+
+
+def _plan(topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:
+    """Return the shots in the order of the left messages; those without a partner follow the one before."""
+    left, _ = stamps
+    rows: list[tuple[float, _Planned]] = []
+    for k, n in pairing.pairs:
+        rows.append((k, _Planned(k, n, left.t_ns[k] / _S_NS, None)))
+    of_right = {n: k for k, n in pairing.pairs}
+    for side, n in pairing.alone:
+        t_s = stamps[side].t_ns[n] / _S_NS
+        other = topics[1 - side]
+        problem = f"{topics[side]} has an image at {t_s:.3f} s, {other} none within {1e3 * pairing.allowed_s:.1f} ms"
+        at = float(n) if side == 0 else max((k for m, k in of_right.items() if m < n), default=-1) + 0.5
+        rows.append((at, _Planned(None, None, t_s, problem)))
+    return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
+
+
+def _shot(name: str, t_s: float, pair_: Sequence[BagMessage]) -> Shot:
+    """Decode two messages; one that cannot be decoded makes a shot with a problem."""
+    images: list[Image] = []
+    encoded: list[bytes] = []
+    for side, message in zip(SIDES, pair_, strict=True):
+        try:
+            image, data = decoded_image(message.kind, message.decode())
+        except InputError as error:
+            return Shot(name, None, None, t_s, f"{side} image: {error}")
+        images.append(image)
+        if data is not None:
+            encoded.append(data)
+    return Shot(name, images[0], images[1], t_s, None, (encoded[0], encoded[1]) if len(encoded) == 2 else None)
+
+
+def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
+    """Return the image of a message, (H, W) or (H, W, 3) BGR, and the file it was, where it was one.
+
+    Raises:
+        InputError: an unknown encoding, or data that do not fit its size.
+    """
+    if "Compressed" in kind:
+        data = bytes(message.data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        if image is None:
+            raise InputError(f"its {message.format or 'compressed'} data cannot be decoded")
+        return image, data
+    if message.encoding not in _ENCODINGS:
+        raise InputError(f"encoding {message.encoding!r} is not read; known are {', '.join(_ENCODINGS)}")
+    kind_, channels, convert = _ENCODINGS[message.encoding]
+    bigendian = bool(getattr(message, "is_bigendian", False))
+    dtype = np.dtype(f"{'>' if bigendian else '<'}{kind_}")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    raw = np.frombuffer(bytes(message.data), np.uint8)
+    row = width * channels * dtype.itemsize
+    if height < 1 or width < 1 or step < row or raw.size < step * (height - 1) + row:
+        raise InputError(
+            f"{width}x{height} {message.encoding} with rows of {step} bytes needs {step * height} bytes, it has {raw.size}"
+        )
+    padded = np.zeros(step * height, np.uint8)
+    padded[: min(raw.size, padded.size)] = raw[: padded.size]
+    pixels = padded.reshape(height, step)[:, :row].copy().view(dtype).astype(dtype.newbyteorder("="))
+    image = pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
+    return (image if convert is None else cv2.cvtColor(image, convert)), None
+
+
+def open_bag_source(rest: str) -> BagSource:
+    """Open ``FILE[,left=TOPIC][,right=TOPIC]``.
+
+    Raises:
+        InputError: not a recording, no images, one camera only, or topics that are ambiguous.
+    """
+    path, named = parsed(rest)
+    bag = Bag(path)
+    topics = image_topics(bag, named)
+    return source_of(bag, topics)
+
+
+def source_of(bag: Bag, topics: tuple[str, str]) -> BagSource:
+    """Return the shots of two image topics."""
+    stamps = stamps_of_topics(bag, topics)
+    return BagSource(bag, topics, pair(*stamps), stamps)
+
+
+def stamps_of_topics(bag: Bag, topics: tuple[str, str]) -> tuple[Stamps, Stamps]:
+    """Read the stamps of two topics."""
+    found: dict[str, tuple[list[int], list[int]]] = {topic: ([], []) for topic in topics}
+    for message in bag.messages(topics):
+        header, arrival = found[message.topic]
+        header.append(message.stamp_ns())
+        arrival.append(message.arrival_ns)
+    left, right = (stamps_of(topic, *found[topic]) for topic in topics)
+    for each in (left, right):
+        if not each.t_ns:
+            raise InputError(f"{bag.path}: {each.topic} holds no message that can be read")
+    return left, right
+
+
+def parsed(rest: str) -> tuple[str, dict[str, str]]:
+    """Read the text after ``bag:``: the path, and the topics by side."""
+    if Path(rest).expanduser().exists():
+        return rest, {}
+    path, *options = rest.split(",")
+    named: dict[str, str] = {}
+    for option in options:
+        key, equals, topic = option.partition("=")
+        if key not in SIDES or not equals or not topic:
+            raise InputError(f"bag:{rest}: expected bag:FILE[,left=TOPIC,right=TOPIC]; got {option!r}")
+        named[key] = topic
+    if len(named) == 1:
+        raise InputError(f"bag:{rest}: name both topics, left=TOPIC,right=TOPIC, or none")
+    return path, named
+
+
+def image_topics(bag: Bag, named: dict[str, str]) -> tuple[str, str]:
+    """Return the topics of the left and of the right images."""
+    return two_topics(bag, named, bag_topics=[t.name for t in bag.of_kind(*IMAGES)], what="images")
+
+
+def two_topics(bag: Bag, named: dict[str, str], bag_topics: list[str], what: str) -> tuple[str, str]:
+    """Return the left and the right one of a recording's topics of one sort.
+
+    Raises:
+        InputError: none, only one, or it is not clear which they are.
+    """
+    if named:
+        for topic in named.values():
+            if topic not in bag_topics:
+                raise InputError(
+                    f"{bag.path}: {topic} is no topic of {what}; there are {', '.join(bag_topics) or 'none'}"
+                )
+        if named["left"] == named["right"]:
+            raise InputError(f"{bag.path}: {named['left']} is given as both left and right")
+        return named["left"], named["right"]
+    if not bag_topics:
+        raise InputError(f"{bag.path}: holds no {what}; it holds {bag.holds()}")
+    chosen = _one_each(bag_topics)
+    for left_word, right_word in _NAMED:
+        pairs = [(t, p) for t in chosen if (p := _renamed(t, left_word, right_word)) in chosen and p != t]
+        if len(pairs) == 1:
+            return pairs[0]
+    if len(chosen) == 2:
+        return chosen[0], chosen[1]
+    if len(chosen) == 1:
+        raise InputError(f"{bag.path}: {what} of one camera only, {chosen[0]}; two are needed")
+    raise InputError(
+        f"{bag.path}: which {what} are left and right? name them, bag:{bag.path},left=TOPIC,right=TOPIC; there are "
+        f"{', '.join(chosen)}"
+    )
+
+
+def _renamed(topic: str, left: str, right: str) -> str:
+    return re.sub(rf"(?<![a-zA-Z]){left}(?![a-zA-Z0-9])", right, topic)
+
+
+def _one_each(topics: list[str]) -> list[str]:
+    """Return one topic a camera: not both the raw and the compressed, or rectified, images of one."""
+    cameras: dict[str, list[str]] = {}
+    for topic in topics:
+        camera, _, last = _COMPRESSED.sub("", topic).rpartition("/")
+        known = last in _PREFERRED or last.startswith("image_rect")
+        cameras.setdefault(camera if known else f"{camera}/{last}", []).append(topic)
+
+    def rank(topic: str) -> tuple[int, bool]:
+        last = _COMPRESSED.sub("", topic).rpartition("/")[2]
+        return (_PREFERRED.index(last) if last in _PREFERRED else len(_PREFERRED), bool(_COMPRESSED.search(topic)))
+
+    return sorted(min(group, key=rank) for group in cameras.values())

@@ -1,0 +1,342 @@
+"""Messages of a recording, whatever its container: ROS 1 bag, ROS 2 bag of sqlite3 or MCAP, Foxglove's MCAP.
+
+In: a path. Out: :class:`Topic` and, message by message, :class:`BagMessage`. ROS 1 and sqlite3 are read by ``rosbags``.
+MCAP is read by ``mcap`` record by record, from the front: so a file whose writer was killed, which has no index, is read
+as far as it goes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import struct
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from armsight.errors import InputError
+
+#: A message as its library decodes it; what it holds is checked where it is used.
+Decoded: TypeAlias = Any
+#: A record of the library mcap.
+_McapRecord: TypeAlias = Any
+#: A reader of the library rosbags.
+_RosReader: TypeAlias = Any
+#: Topic of a message, time of its arrival, ns, encoding, bytes, and what decodes them.
+_Raw: TypeAlias = tuple[str, int, str, bytes, Callable[[], Decoded]]
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_COMPRESSIONS = ("", "lz4", "zstd")
+#: Bytes before the stamp of a message that begins with a header: ROS 1 has a sequence number, CDR says its byte order.
+_BEFORE_STAMP = 4
+_SECOND_NS = 1_000_000_000
+_INSTALL = 'pip install "armsight[ros]"'
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a recording.
+
+    Attributes:
+        name: such as /stereo/left/image_raw.
+        kind: type of its messages without ROS 2's ``/msg/``: sensor_msgs/Image, foxglove.CompressedImage.
+        count: how many messages there are.
+    """
+
+    name: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One message.
+
+    Attributes:
+        topic: name of its topic.
+        kind: its type, as in :class:`Topic`.
+        index: its number on its topic, from 0.
+        arrival_ns: when it was recorded, ns, clock of the recorder.
+        encoding: of its bytes: ros1, cdr, protobuf or json.
+        data: its bytes.
+        decode: returns it decoded; raises InputError where it cannot be.
+    """
+
+    topic: str
+    kind: str
+    index: int
+    arrival_ns: int
+    encoding: str
+    data: bytes
+    decode: Callable[[], Decoded]
+
+    def stamp_ns(self) -> int:
+        """Return the time stamp of its header, ns; 0 where the sender set none."""
+        if self.encoding == "protobuf":
+            stamp = self.decode().timestamp
+            return int(stamp.seconds) * _SECOND_NS + int(stamp.nanos)
+        if self.encoding not in ("ros1", "cdr") or len(self.data) < _BEFORE_STAMP + 8:
+            return 0
+        big = self.encoding == "cdr" and not self.data[1] & 1  # second byte of CDR: its byte order
+        seconds, nanoseconds = struct.unpack_from(">iI" if big else "<iI", self.data, _BEFORE_STAMP)
+        return int(seconds) * _SECOND_NS + int(nanoseconds)
+
+
+class Bag:
+    """A recording that is read from its beginning as often as one likes.
+
+    Attributes:
+        path: as the user gave it.
+        notes: what could not be read, a line each; more may come while messages are read.
+        topics: its topics by name.
+        metadata: texts that its writer stored beside the messages, by name; MCAP alone has them.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._files = _files(path)
+        read = _McapFiles(path, self._files, self.notes, self.metadata) if _is_mcap(self._files[0]) else None
+        self._container: _McapFiles | _RosFile = read or _RosFile(path)
+        self.topics = {topic.name: topic for topic in self._container.topics()}
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order they were recorded.
+
+        Raises:
+            InputError: the file is damaged where nothing more can be read.
+        """
+        counts = dict.fromkeys(topics, 0)
+        for topic, arrival_ns, encoding, data, decode in self._container.messages(set(topics)):
+            yield BagMessage(topic, self.topics[topic].kind, counts[topic], arrival_ns, encoding, data, decode)
+            counts[topic] += 1
+
+    def of_kind(self, *kinds: str) -> list[Topic]:
+        """Return the topics of some types that hold messages, by name."""
+        return sorted((t for t in self.topics.values() if t.kind in kinds and t.count), key=lambda t: t.name)
+
+    def holds(self) -> str:
+        """Return what a recording holds, for messages."""
+        listed = [f"{t.name} ({t.kind}, {t.count})" for t in sorted(self.topics.values(), key=lambda t: t.name)]
+        text = ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "") or "nothing"
+        return "; ".join([text, *self.notes])
+
+
+def _files(path: str | Path) -> list[Path]:
+    """Return the files of a recording.
+
+    Raises:
+        InputError: nothing is there, or a folder holds no bag.
+    """
+    given = Path(path).expanduser()
+    if given.is_file():
+        return [given]
+    if not given.is_dir():
+        raise InputError(
+            f"{path}: no such recording; expected a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag"
+        )
+    for suffix in (".mcap", ".db3"):
+        if found := sorted(given.glob(f"*{suffix}")):
+            return found
+    raise InputError(f"{path}: this folder holds no recording: expected .mcap or .db3 files and metadata.yaml")
+
+
+def _is_mcap(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _plain(kind: str) -> str:
+    """Return the name of a type without ROS 2's middle part."""
+    return kind.replace("/msg/", "/")
+
+
+class _RosFile:
+    """A ROS 1 bag or a ROS 2 bag of sqlite3; it is open only while it is read."""
+
+    def __init__(self, path: str | Path) -> None:
+        try:
+            import rosbags.highlevel  # noqa: F401 - only whether it is there
+        except ImportError:
+            raise InputError(f"{path}: a ROS bag is read with rosbags, which is not installed: {_INSTALL}") from None
+        self._path = path
+        counts: dict[tuple[str, str], int] = {}
+        with self._opened() as reader:
+            self._store, self._is_cdr = reader.typestore, bool(reader.is2)
+            for each in reader.connections:
+                key = (each.topic, _plain(each.msgtype))
+                counts[key] = counts.get(key, 0) + each.msgcount
+        self._topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[_RosReader]:
+        """Open the file for a block; whatever the library finds wrong with it becomes one line."""
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        try:
+            path = Path(self._path).expanduser()
+            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+                yield reader
+        except (InputError, GeneratorExit):
+            raise
+        except Exception as error:  # noqa: BLE001 - a damaged file fails in many ways
+            raise InputError(f"{self._path}: {_ros_problem(self._path, error)}") from None
+
+    def topics(self) -> list[Topic]:
+        return self._topics
+
+    def messages(self, topics: Collection[str]) -> Iterator[_Raw]:
+        encoding = "cdr" if self._is_cdr else "ros1"
+        with self._opened() as reader:
+            connections = [each for each in reader.connections if each.topic in topics]
+            for connection, arrival_ns, data in reader.messages(connections) if connections else ():
+                decode = self._decoder(bytes(data), connection.msgtype)
+                yield connection.topic, arrival_ns, encoding, bytes(data), decode
+
+    def _decoder(self, data: bytes, kind: str) -> Callable[[], Decoded]:
+        def decode() -> Decoded:
+            try:
+                return (self._store.deserialize_cdr if self._is_cdr else self._store.deserialize_ros1)(data, kind)
+            except Exception as error:  # noqa: BLE001 - as above
+                raise InputError(f"{self._path}: a message of type {_plain(kind)} cannot be decoded: {error}") from None
+
+        return decode
+
+
+def _ros_problem(path: str | Path, error: Exception) -> str:
+    """Return what is wrong with a ROS bag, and what to do."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if "index" in text.lower():
+        return f"has no index ({text}): it was not closed; rebuild it: rosbag reindex {path}"
+    if isinstance(error, sqlite3.Error) or "metadata" in text.lower() or os.path.isdir(Path(path).expanduser()):
+        return f"damaged, or not a ROS bag ({text}); a ROS 2 bag that was not closed: ros2 bag reindex {path}"
+    return f"damaged, cut short, or not a ROS bag ({text})"
+
+
+class _McapFiles:
+    """MCAP files of one recording, read one after the other, each from its front."""
+
+    def __init__(
+        self, path: str | Path, files: list[Path], notes: list[str], metadata: dict[str, dict[str, str]]
+    ) -> None:
+        try:
+            import mcap.stream_reader  # noqa: F401 - only whether it is there
+        except ImportError:
+            raise InputError(f"{path}: MCAP is read with mcap, which is not installed: {_INSTALL}") from None
+        self._path, self._files, self._notes, self._metadata = path, files, notes, metadata
+
+    def topics(self) -> list[Topic]:
+        counts: dict[tuple[str, str], int] = {}
+        for file in self._files:
+            for schema, channel, _, _ in self._records(file, set(), note=True):
+                key = (channel.topic, _plain(schema.name if schema else channel.message_encoding))
+                counts[key] = counts.get(key, 0) + 1
+        return [Topic(name, kind, count) for (name, kind), count in counts.items()]
+
+    def messages(self, topics: Collection[str]) -> Iterator[_Raw]:
+        for file in self._files:
+            for schema, channel, message, decoders in self._records(file, topics):
+                decode = self._decoder(schema, channel, message, decoders)
+                yield channel.topic, message.log_time, channel.message_encoding, message.data, decode
+
+    def _records(
+        self, file: Path, topics: Collection[str], *, note: bool = False
+    ) -> Iterator[tuple[_McapRecord, _McapRecord, _McapRecord, dict[int, Callable[[bytes], Decoded]]]]:
+        """Yield schema, channel and message of a file's messages, all where no topics are named."""
+        from mcap import records
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+        schemas: dict[int, _McapRecord] = {0: None}
+        channels: dict[int, _McapRecord] = {}
+        decoders: dict[int, Callable[[bytes], Decoded]] = {}
+
+        def found(record: _McapRecord) -> _McapRecord:
+            if isinstance(record, records.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, records.Channel):
+                channels[record.id] = record
+            elif isinstance(record, records.Metadata) and note:
+                self._metadata[record.name] = dict(record.metadata)
+            elif isinstance(record, records.Message):
+                channel = channels[record.channel_id]
+                if not topics or channel.topic in topics:
+                    return schemas[channel.schema_id], channel, record, decoders
+            return None
+
+        try:
+            with file.open("rb") as stream:
+                for record in StreamReader(stream, emit_chunks=True).records:
+                    if not isinstance(record, records.Chunk):
+                        if (one := found(record)) is not None:
+                            yield one
+                        continue
+                    if record.compression not in _COMPRESSIONS:
+                        raise InputError(
+                            f"{self._path}: its chunks are compressed with {record.compression!r}; lz4 and zstd are read: "
+                            f"mcap compress --compression zstd {file} -o OUT.mcap"
+                        )
+                    for inner in breakup_chunk(record, validate_crc=True):
+                        if (one := found(inner)) is not None:
+                            yield one
+        except InputError:
+            raise
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot be read: {error.strerror or error}") from None
+        except Exception as error:  # noqa: BLE001 - a file that was cut anywhere fails in many ways; what was read stands
+            if note:
+                text = " ".join(str(error).split()) or type(error).__name__
+                self._notes.append(f"{file}: cut short or damaged ({text}): what was before is read")
+
+    def _decoder(
+        self,
+        schema: _McapRecord,
+        channel: _McapRecord,
+        message: _McapRecord,
+        decoders: dict[int, Callable[[bytes], Decoded]],
+    ) -> Callable[[], Decoded]:
+        def decode() -> Decoded:
+            try:
+                if channel.id not in decoders:
+                    decoders[channel.id] = _mcap_decoder(schema, channel)
+                return decoders[channel.id](message.data)
+            except InputError:
+                raise
+            except Exception as error:  # noqa: BLE001 - whatever a library finds wrong with one message
+                name = schema.name if schema else channel.message_encoding
+                raise InputError(f"{self._path}: a message of type {name} cannot be decoded: {error}") from None
+
+        return decode
+
+
+def _mcap_decoder(schema: _McapRecord, channel: _McapRecord) -> Callable[[bytes], Decoded]:
+    """Return what decodes the messages of a channel."""
+    if channel.message_encoding == "protobuf":
+        from mcap_protobuf.decoder import DecoderFactory
+
+        decode: Callable[[bytes], Decoded] | None = DecoderFactory().decoder_for("protobuf", schema)
+        assert decode is not None
+        return decode
+    if channel.message_encoding == "json":
+        import json
+
+        return json.loads
+    if channel.message_encoding in ("cdr", "ros1"):
+        try:
+            from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+        except ImportError:
+            raise InputError(f"ROS messages are decoded with rosbags, which is not installed: {_INSTALL}") from None
+        store = get_typestore(Stores.EMPTY)
+        text, kind = schema.data.decode(), schema.name
+        if "/msg/" not in kind:
+            kind = "/msg/".join(kind.split("/"))
+        store.register(get_types_from_idl(text) if schema.encoding == "ros2idl" else get_types_from_msg(text, kind))
+        ros1 = channel.message_encoding == "ros1"
+        return lambda data: (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(data, kind)
+    raise InputError(f"messages encoded as {channel.message_encoding!r} are not read; protobuf, json, cdr and ros1 are")

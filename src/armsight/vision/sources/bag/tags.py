@@ -1,0 +1,143 @@
+"""Tag corners that a recording holds instead of images.
+
+In: a recording with two topics of AprilTag detections, one a camera, and the body that carries the tags. Out: one
+:class:`~armsight.vision.detections.SeenShot` a pair of messages. Read are types that hold corners: apriltag_msgs'
+ApriltagArrayStamped and AprilTagDetectionArray, and isaac_ros's. apriltag_ros of ROS 1 publishes poses alone.
+
+Order of the corners: counter-clockwise in the image is the AprilTag library's, from the lower left; clockwise is OpenCV's,
+from the upper left. A body's points are called as :mod:`~armsight.vision.markers.tag` calls them, NAME.0 to NAME.3 from the
+upper left; a body of points (CSV) calls a tag by its number: 12.0 to 12.3.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array, Body, Ids
+from armsight.errors import InputError
+from armsight.vision.detections import SeenShot
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.tag import TagTarget
+from armsight.vision.markers.targets import Composite
+from armsight.vision.sources.bag.images import parsed, stamps_of_topics, two_topics
+from armsight.vision.sources.bag.pairing import pair
+from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
+
+#: Types of messages that hold a camera's detected tags, with corners.
+TAGS = (
+    "apriltag_msgs/ApriltagArrayStamped",
+    "apriltag_msgs/AprilTagDetectionArray",
+    "isaac_ros_apriltag_interfaces/AprilTagDetectionArray",
+)
+#: Types that hold their poses alone.
+_WITHOUT_CORNERS = ("apriltag_ros/AprilTagDetectionArray", "apriltag_ros_msgs/AprilTagDetectionArray")
+_S_NS = 1e9
+
+
+def holds_tags(spec: str) -> bool:
+    """Return whether ``bag:FILE`` names a recording of tags without images."""
+    return bool(Bag(parsed(spec.removeprefix("bag:"))[0]).of_kind(*TAGS))
+
+
+def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[str, ...]]:
+    """Read the detected tags of a recording.
+
+    Args:
+        spec: ``bag:FILE[,left=TOPIC,right=TOPIC]``.
+        target: the body that carries the tags.
+
+    Returns:
+        One record a pair of messages, and one with a problem a message without a partner; and what was left out.
+
+    Raises:
+        InputError: not a recording, no tags in it, of one camera only, or none of the body's.
+    """
+    path, named = parsed(spec.removeprefix("bag:"))
+    bag = Bag(path)
+    if not bag.of_kind(*TAGS) and (poses := bag.of_kind(*_WITHOUT_CORNERS)):
+        raise InputError(
+            f"{path}: {poses[0].name} holds poses of tags and no corners, which one camera measured: record the images, or "
+            "apriltag_msgs"
+        )
+    topics = two_topics(bag, named, [topic.name for topic in bag.of_kind(*TAGS)], "detected tags")
+    stamps = stamps_of_topics(bag, topics)
+    pairing = pair(*stamps)
+    points = _points(target)
+    unknown: dict[str, int] = {}
+    found: tuple[list[tuple[Ids, Array]], list[tuple[Ids, Array]]] = ([], [])
+    for message in bag.messages(topics):
+        found[topics.index(message.topic)].append(_corners(message, points, unknown))
+    nothing = (np.zeros(0, np.int64), np.zeros((0, 2)))
+    rows: list[tuple[int, tuple[int | None, int | None], str | None]] = []
+    rows += [(stamps[0].t_ns[k], (k, n), None) for k, n in pairing.pairs]
+    for side, n in pairing.alone:
+        alone = f"{topics[1 - side]} has no message within {1e3 * pairing.allowed_s:.1f} ms of {topics[side]}'s"
+        rows.append((stamps[side].t_ns[n], (n, None) if side == 0 else (None, n), alone))
+    rows.sort(key=lambda row: row[0])
+    shots = []
+    for number, (t_ns, numbers, problem) in enumerate(rows):
+        seen = [nothing if n is None else of[n] for n, of in zip(numbers, found, strict=True)]
+        (left, uv_left), (right, uv_right) = seen
+        if problem is None and not len(left) and not len(right):
+            problem = "no tag of the body was detected"
+        shots.append(SeenShot(f"{number:06d}", (left, right), (uv_left, uv_right), t_ns / _S_NS, problem))
+    if not any(len(ids) for shot in shots for ids in shot.ids):
+        raise InputError(f"{path}: no tag of body {_name(target)} is in it; it has {_listed(unknown) or 'none'}")
+    notes = [*bag.notes, *pairing.notes]
+    if unknown:
+        notes.append(f"tags that are not on the body were left out: {_listed(unknown)}")
+    return shots, tuple(notes)
+
+
+def _name(target: Target | Body) -> str:
+    return target.name if isinstance(target, Body) else target.body.name
+
+
+def _listed(unknown: dict[str, int]) -> str:
+    most = sorted(unknown.items(), key=lambda item: -item[1])
+    return ", ".join(f"{name} ({count} times)" for name, count in most[:8]) + (" ..." if len(most) > 8 else "")
+
+
+def _points(target: Target | Body) -> dict[int, int]:
+    """Return number of a tag -> row of its first corner in the body's points."""
+    body = target if isinstance(target, Body) else target.body
+    parts = target.parts if isinstance(target, Composite) else (target,)
+    tags = [tag for part in parts if isinstance(part, TagTarget) for tag in part.tags]
+    if tags:
+        return {tag.identity: body.point_names.index(f"{tag.name}.0") for tag in tags}
+    rows = {name: row for row, name in enumerate(body.point_names)}
+    numbers = sorted({int(name.partition(".")[0]) for name in rows if name.partition(".")[0].isdecimal()})
+    whole = [n for n in numbers if all(f"{n}.{k}" in rows and rows[f"{n}.{k}"] == rows[f"{n}.0"] + k for k in range(4))]
+    if not whole:
+        raise InputError(
+            f"body {body.name} carries no tags: expected a body file with tags, or a CSV whose points are called "
+            "NUMBER.0 to NUMBER.3, a tag's corners from the upper left, clockwise"
+        )
+    return {n: rows[f"{n}.0"] for n in whole}
+
+
+def _corners(message: BagMessage, points: dict[int, int], unknown: dict[str, int]) -> tuple[Ids, Array]:
+    """Return rows of the body's points and their pixels (N, 2); tags that are not on it are counted."""
+    decoded = message.decode()
+    ids, uv = [], []
+    for tag in getattr(decoded, "apriltags", None) or getattr(decoded, "detections", None) or ():
+        number = int(tag.id)
+        if number not in points:
+            name = f"{tag.family} {number}".strip()
+            unknown[name] = unknown.get(name, 0) + 1
+            continue
+        corners = _ordered(tag)
+        if np.isfinite(corners).all():
+            ids.append(points[number] + np.arange(4))
+            uv.append(corners)
+    if not ids:
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+    return np.concatenate(ids), np.concatenate(uv)
+
+
+def _ordered(tag: Decoded) -> Array:
+    """Return corners (4, 2) from the upper left, clockwise as one looks at the upright tag."""
+    corners = np.array([[float(point.x), float(point.y)] for point in tag.corners])
+    ahead = np.roll(corners, -1, axis=0)
+    clockwise = float(np.sum(corners[:, 0] * ahead[:, 1] - corners[:, 1] * ahead[:, 0])) > 0.0  # rows count downwards
+    return corners if clockwise else corners[::-1]

@@ -1,0 +1,43 @@
+"""``armsight arm calibrated``: a single arm's table beside that of its kind."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from armsight.robot.calibration_file import calibration_text, read_calibration
+from armsight.robot.models import MODELS
+from armsight.robot.urdf import read_urdf
+
+pytest.importorskip("yaml")
+UR5E = MODELS["ur5e"]
+#: One whose forearm is 0.4 mm longer.
+LONGER = dataclasses.replace(UR5E, a=UR5E.a - 4e-4 * np.eye(6)[2])
+
+
+def test_the_difference_is_said_and_the_arm_converted(armsight, tmp_path):
+    path, out, back = tmp_path / "calibration.yaml", tmp_path / "arm.urdf", tmp_path / "back.yaml"
+    path.write_text(calibration_text(LONGER, UR5E)[0])
+    said = armsight("arm", "calibrated", "ur5e", path, "-o", out)
+    assert said.code == 0
+    assert "ur5e_calibrated puts its tool 0.400 mm from ur5e on the mean" in said.out
+    q = np.array([0.1, -1.0, 0.9, 0.3, -0.4, 0.2])
+    np.testing.assert_allclose(read_urdf(out).forward(q), LONGER.forward(q), atol=1e-9)
+    said = armsight("arm", "calibrated", "ur5e", out, "-o", back, "--json")
+    found = json.loads(said.out)
+    assert found["tool_apart_mean_m"] == pytest.approx(4e-4, abs=1e-9)
+    assert found["changes"]["a_m"][2] == pytest.approx(-4e-4, abs=1e-9)
+    np.testing.assert_allclose(read_calibration(back, UR5E).forward(q), LONGER.forward(q), atol=1e-9)
+
+
+def test_mistakes_are_one_line_and_nothing_is_written(armsight, tmp_path):
+    path, out = tmp_path / "calibration.yaml", tmp_path / "arm.obj"
+    path.write_text(calibration_text(UR5E, UR5E)[0])
+    said = armsight("arm", "calibrated", "ur5e", path, "-o", out)
+    assert said.code == 2
+    assert "an arm is written as .urdf or .yaml" in said.err
+    said = armsight("arm", "calibrated", "xarm7", path)
+    assert said.code == 2
+    assert "joint1 is missing; xarm7 has joint1" in said.err
+    assert not out.exists()

@@ -1,0 +1,138 @@
+"""armsight batch: one row a shot and one a recording, the same by one and by two workers, and on again where it was."""
+
+import json
+
+import pytest
+
+pytest.importorskip("distributed")
+pytest.importorskip("mcap")
+
+from armsight.app.batch.run import Batch, found_recordings, run_batch
+from armsight.app.batch.work import Done, Options, work
+from armsight.errors import InputError
+from cli_runs import assert_rejected
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture
+def archive(tmp_path, rendered):
+    """Three short recordings, and a file that is none."""
+    import shutil
+
+    source = rendered.folder / "arm"
+    lines = (source / "shots.csv").read_text().splitlines()
+    for k in range(3):
+        folder = tmp_path / "archive" / f"take{k}"
+        folder.mkdir(parents=True)
+        chosen = lines[1 + k : 3 + k]
+        (folder / "shots.csv").write_text("\n".join([lines[0], *chosen]) + "\n")
+        for line in chosen:
+            for name in line.split(",")[2:4]:
+                shutil.copy(source / name, folder / name)
+    broken = tmp_path / "archive" / "take3"
+    broken.mkdir()
+    (broken / "shots.csv").write_text("shot,t_s\n")
+    return tmp_path / "archive"
+
+
+def tables(folder):
+    from pyarrow import parquet
+
+    return [parquet.read_table(folder / name).to_pylist() for name in ("recordings.parquet", "shots.parquet")]
+
+
+@pytest.fixture(scope="module")
+def clusters():
+    """The addresses of clusters of one and of two workers, in this process; benchmarks/record.py has processes."""
+    from distributed import LocalCluster
+
+    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    with LocalCluster(n_workers=1, **options) as one, LocalCluster(n_workers=2, **options) as two:
+        yield one.scheduler_address, two.scheduler_address
+
+
+def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, rendered, tmp_path, clusters):
+    options = Options("measure", str(rendered.rig), str(rendered.plate))
+    one, two = clusters
+    said = []
+    done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, scheduler=one), said.append)
+    assert (done.recordings, done.ok, done.failed, done.before, done.shots) == (4, 3, 1, 0, 6)
+    recordings, shots = tables(tmp_path / "one")
+    assert [row["status"] for row in recordings] == ["ok", "ok", "ok", "failed"]
+    assert "take3/shots.csv: line 1: expected the columns" in recordings[3]["reason"]
+    assert [row["recording"] for row in recordings] == [str(archive / f"take{k}") for k in range(4)]
+    assert all(row["status"] == "ok" and row["x_m"] is not None for row in shots)
+    assert json.loads((tmp_path / "one" / "batch.json").read_text())["options"]["operation"] == "measure"
+    again = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=two), said.append)
+    assert again.before == 0
+    assert tables(tmp_path / "two") == [recordings, shots]
+    # started again, after one part was lost
+    next((tmp_path / "two" / "parts").iterdir()).unlink()
+    parts = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "two" / "parts").iterdir()}
+    last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=one), said.append)
+    assert last.before == 3
+    assert tables(tmp_path / "two") == [recordings, shots]
+    assert all((tmp_path / "two" / "parts" / name).stat().st_mtime_ns == time for name, time in parts.items())
+
+
+def test_only_a_few_recordings_are_handed_out_at_a_time(monkeypatch):
+    """So the scheduler holds the same however many there are."""
+    import armsight.app.batch.run as module
+
+    class Future:
+        def __init__(self, key, path):
+            self.key, self.path = key, path
+
+        def result(self):
+            return Done({"recording": self.path, "status": "ok", "reason": None}, [])
+
+        def release(self):
+            held.discard(self.key)
+
+    class Client:
+        def submit(self, work, path, options, **how):
+            held.add(path)
+            most.append(len(held))
+            return Future(path, path)
+
+    class Completed(list):
+        add = list.append
+
+    held, most = set(), []
+    monkeypatch.setattr("distributed.as_completed", Completed)
+    paths = [f"{k:05d}" for k in range(10_000)]
+    found = [path for path, _ in module._results(Client(), paths, Options("measure"), 8)]
+    assert found == paths
+    assert max(most) <= 8
+
+
+def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
+    done = work(str(tmp_path / "none.bag"), Options("measure", target="chessboard:9x6:25mm"))
+    assert done.recording["status"] == "failed"
+    assert "no such recording" in done.recording["reason"]
+    assert done.shots == []
+
+
+def test_recordings_are_found_in_any_store(tmp_path):
+    import fsspec
+
+    memory = fsspec.filesystem("memory")
+    memory.pipe("/a/x.bag", b"1")
+    memory.pipe("/a/b/y.bag", b"2")
+    assert found_recordings(["memory://a/**/*.bag"]) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
+    assert "damaged" in work("memory:///a/x.bag", Options("measure", target="chessboard:9x6:25mm")).recording["reason"]
+    memory.rm("/a", recursive=True)
+    with pytest.raises(InputError, match="no such recording; quote the pattern"):
+        found_recordings([str(tmp_path / "*.bag")])
+
+
+def test_mistakes_are_one_line(armsight, tmp_path):
+    bad = ("batch", "measure", tmp_path / "*.bag", "-o", tmp_path / "out", "--target", "chessboard:9x6:25mm")
+    assert_rejected(armsight(*bad), "no such recording")
+    assert_rejected(armsight(*bad, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), "give one of the two")
+    assert list(tmp_path.iterdir()) == []

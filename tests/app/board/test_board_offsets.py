@@ -1,0 +1,148 @@
+"""``armsight board offsets``: asked first, old values kept, and a joint that then reports where it really is."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from armsight.app.board.offsets import further_of
+from armsight.errors import DeviceError, InputError
+from armsight.robot.arm_file import open_arm
+from armsight.robot.boards.feetech import bus as feetech
+from armsight.robot.boards.feetech.bus import ServoBus
+from armsight.robot.boards.feetech.calibration import NAMES, uncalibrated
+from armsight.robot.boards.feetech.offsets import corrected_offsets, write_changes
+from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
+from armsight.sim.boards.device import SteppedLink, serve
+from armsight.sim.boards.so101 import So101Bus, So101Mechanics
+from cli_runs import assert_rejected
+
+ZERO_DEG = (1.5, -0.8, 0.0, 2.2, -0.3, 0.0)
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+
+
+def made(**options):
+    mechanics = So101Mechanics(zero_rad=tuple(np.radians(ZERO_DEG)))
+    return So101Bus.made(mechanics, load=lambda q: np.zeros(6), **options)
+
+
+@pytest.fixture
+def arm():
+    """An SO-101 whose zeros are off, at a port, and the port's name as a board."""
+    device = made()
+    with serve(device, feetech.BAUD) as port:
+        yield device, f"feetech:{port.name}"
+
+
+def registers(device):
+    words = [int.from_bytes(table[31:33], "little") for table in device.tables]
+    return [-(word & 0x7FF) if word & 0x800 else word for word in words]
+
+
+def lerobot(path):
+    entries = {
+        name: {"id": k + 1, "drive_mode": 0, "homing_offset": 0, "range_min": 700, "range_max": 3396}
+        for k, name in enumerate((*NAMES, "gripper"))
+    }
+    path.write_text(json.dumps(entries))
+    return path
+
+
+FURTHER = ",".join(map(str, ZERO_DEG[:5]))
+
+
+def test_offsets_are_printed_and_nothing_is_written(armsight, arm, tmp_path):
+    device, name = arm
+    said = armsight("board", "offsets", "--board", name, "--json")
+    assert said.code == 0, said.err
+    (found,) = said.lines
+    assert not found["written"]
+    assert [each["id"] for each in found["joints"]] == [1, 2, 3, 4, 5]
+    assert registers(device) == [0] * 6
+
+
+def test_a_correction_makes_joints_report_where_they_are_and_is_taken_back(armsight, arm, tmp_path):
+    device, name = arm
+    file, keep = lerobot(tmp_path / "follower.json"), tmp_path / "old.json"
+    options = ("--board", name, "--calibration", file, "--yes", "--json")
+    said = armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep)
+    assert said.code == 0, said.err
+    assert "the old offsets are in" in said.err
+    counts = [-round(np.radians(each) / RAD_PER_COUNT) for each in ZERO_DEG]
+    assert registers(device) == counts
+    assert [each["homing_offset"] for each in json.loads(file.read_text()).values()] == [*counts[:5], 0]
+    assert json.loads(keep.read_text())["homing_offsets"] == {str(k): 0 for k in range(1, 6)}
+    assert all(table[55] == 1 for table in device.tables)  # locked again
+    said = armsight("board", "monitor", "--board", name, "--calibration", file, "--seconds", 0.05, "--json")
+    assert said.lines[-1]["q_rad"] == pytest.approx(device.servos.true_q[:5], abs=1.1 * RAD_PER_COUNT)
+    said = armsight("board", "offsets", *options, "--restore", keep, "--keep", tmp_path / "again.json")
+    assert said.code == 0, said.err
+    assert registers(device) == [0] * 6
+
+
+def test_it_asks_first(armsight, arm, tmp_path, monkeypatch):
+    device, name = arm
+    monkeypatch.setattr("click.confirm", lambda text, abort, err: (_ for _ in ()).throw(KeyboardInterrupt))
+    said = armsight("board", "offsets", "--board", name, "--further", FURTHER, "--keep", tmp_path / "old.json")
+    assert said.code == 130
+    assert "shoulder_pan" in said.err
+    assert registers(device) == [0] * 6
+    assert not (tmp_path / "old.json").exists()
+
+
+def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path):
+    device, name = arm
+    options, keep = ("--board", name, "--yes"), tmp_path / "old.json"
+    assert_rejected(armsight("board", "offsets", *options, "--further", "1,2"), "5 corrections are needed")
+    assert_rejected(armsight("board", "offsets", *options, "--further", "a"), "numbers of degrees")
+    assert_rejected(
+        armsight("board", "offsets", *options, "--further", "185,0,0,0,0", "--keep", keep),
+        "shoulder_pan (id 1): its offset would be -2105; the register holds -2047 to 2047",
+    )
+    assert_rejected(armsight("board", "offsets", *options, "--identified", "six_r"), "give one of --identified")
+    assert_rejected(armsight("board", "offsets", "--board", "emulated:host"), "has no homing offsets in its servos")
+    keep.write_text("{}")
+    assert_rejected(
+        armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep), "exists; old offsets are never"
+    )
+    assert_rejected(armsight("board", "offsets", *options, "--restore", keep), "not a file of old offsets")
+    device.servos.switch(1, True)
+    device.tables[1][40] = 1
+    assert_rejected(
+        armsight("board", "offsets", *options, "--further", FURTHER, "--keep", tmp_path / "new.json"),
+        "the torque of shoulder_lift (id 2) is on",
+    )
+    assert registers(device) == [0] * 6
+    said = armsight("board", "release", "--board", name)
+    assert said.out == "DISABLED\n", said.err
+    assert not device.servos.on.any()
+
+
+def test_where_one_servo_fails_the_others_get_their_old_offsets_back():
+    device = made()
+    link = SteppedLink(device)
+    bus = ServoBus(link, "bus", now=link.now)
+    calibration = uncalibrated(np.zeros(5), np.full(5, 4095.0))
+    changes = corrected_offsets(bus, calibration, np.radians(ZERO_DEG[:5]))
+    store = device._store
+
+    def broken(servo, address, data):
+        if not (servo == 3 and address == 31):
+            store(servo, address, data)
+
+    device._store = broken
+    with pytest.raises(DeviceError, match="id 4 keeps 0 in register 31 instead of -25"):
+        write_changes(bus, changes)
+    assert registers(device) == [0] * 6
+
+
+def test_an_identified_arm_gives_the_correction():
+    nominal, further = open_arm("six_r"), np.radians([0.5, -0.4, 0.0, 0.2, 0.1, -1.0])
+    from dataclasses import replace
+
+    # theta = direction q + offset: a joint that is further by e than it reports has direction e more in its offset.
+    identified = replace(nominal, offset=nominal.offset + nominal.direction * further)
+    assert further_of(identified, nominal) == pytest.approx(further)
+    with pytest.raises(InputError, match="are different arms"):
+        further_of(replace(nominal, direction=-nominal.direction), nominal)

@@ -1,0 +1,306 @@
+"""``armsight handeye``: forms of tables, what it says, and what it refuses."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from armsight.app.handeye.images import upright
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.robot.arm_file import open_arm
+from cli_runs import assert_rejected
+
+X = exp_se3(np.array([0.03, -0.02, 0.08, 0.2, -0.1, 1.2]))
+Z = exp_se3(np.array([0.5, 0.1, 0.4, 2.0, 0.3, -0.4]))
+
+
+def motion(n=14, seed=0, in_hand=True):
+    """Poses of a flange, and of the body as seen, both a little off; m."""
+    rng = np.random.default_rng(seed)
+    q = open_arm("six_r").home + rng.uniform(-0.6, 0.6, (n, 6))
+    A = open_arm("six_r").forward(q)
+    B = inverse(A @ X) @ Z if in_hand else inverse(Z) @ A @ X
+    return q, A, B @ exp_se3(rng.normal(0, [2e-4] * 3 + [5e-4] * 3, (n, 6)))
+
+
+def matrices(path, Ts):
+    """A table of 16 numbers a row."""
+    np.savetxt(path, Ts.reshape(-1, 16), fmt="%.9f")
+    return path
+
+
+def named(path, head, rows):
+    path.write_text("\n".join([head, *(",".join(str(cell) for cell in row) for row in rows)]) + "\n")
+    return path
+
+
+def quaternions(Ts):
+    x, y, z, w = Rotation.from_matrix(Ts[:, :3, :3]).as_quat().T
+    return np.stack([w, x, y, z], axis=1)
+
+
+@pytest.fixture
+def seen(tmp_path):
+    return matrices(tmp_path / "seen.txt", motion()[2])
+
+
+def found(armsight, robot, seen, *more, eye="in-hand"):
+    """The JSON of a run that must succeed."""
+    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", eye, "--json", *more)
+    assert said.code == 0, said.err
+    return said.lines[0], said.err
+
+
+def assert_right(document):
+    assert np.abs(log_se3(inverse(X) @ np.array(document["T_flange_rig"]))).max() < 2e-3
+
+
+def table(tmp_path, form, A, q):
+    """The robot's poses in one of the forms, and the options that go with it."""
+    p, angles = A[:, :3, 3], Rotation.from_matrix(A[:, :3, :3])
+    path = tmp_path / "robot.csv"
+    if form == "quaternion":
+        return named(path, "x_m,y_m,z_m,qw,qx,qy,qz", np.hstack([p, quaternions(A)])), ()
+    if form == "bare quaternion":
+        np.savetxt(path, np.hstack([p, quaternions(A)]), delimiter=",")
+        return path, ("--rotation", "wxyz")
+    if form == "ur":
+        vectors = np.hstack([p, angles.as_rotvec()])
+        path.write_text("".join("p[" + ", ".join(f"{v:.7f}" for v in row) + "]\n" for row in vectors))
+        return path, ()
+    if form == "euler, mm":
+        zyx = angles.as_euler("ZYX", degrees=True)[:, ::-1]
+        return named(path, "X,Y,Z,A,B,C", np.hstack([1e3 * p, zyx])), (
+            *("--rotation", "ZYX", "--units", "mm"),
+            *("--columns", "x=X,y=Y,z=Z,rx_deg=A,ry_deg=B,rz_deg=C"),
+        )
+    if form == "rotation vector, mm":
+        return named(path, "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad", np.hstack([1e3 * p, angles.as_rotvec()])), ()
+    if form == "joints":
+        head = ",".join(f"q{i}_deg" for i in range(1, 7))
+        return named(path, head, np.degrees(q)), ("--model", "six_r")
+    return matrices(path, A), ()
+
+
+@pytest.mark.parametrize(
+    "form", ["matrix", "quaternion", "bare quaternion", "ur", "euler, mm", "rotation vector, mm", "joints"]
+)
+def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
+    q, A, _ = motion()
+    robot, options = table(tmp_path, form, A, q)
+    document, _ = found(armsight, robot, seen, *options)
+    assert_right(document)
+    assert document["held_out_rms_m"] < 2e-3
+    assert all(pose["used"] for pose in document["poses"])
+
+
+def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsight, tmp_path):
+    _, A, B = motion(20)
+    B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))
+    robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
+    said = armsight(
+        "handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--plan", 2, "-o", tmp_path / "out"
+    )
+    assert said.code == 0, said.err
+    assert "T_flange_rig" in said.out
+    assert " ± " in said.out
+    assert "poses left out:" in said.out
+    assert "structure of the noise" in said.out
+    assert "worst known along" in said.out
+    assert "blunders, left out: 1" in said.out
+    assert "line 8" in said.out
+    assert "poses of the flange to take next" in said.out
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/png") == 4
+    assert len((tmp_path / "out" / "plan.csv").read_text().splitlines()) == 3
+    document = json.loads((tmp_path / "out" / "handeye.json").read_text())
+    assert document["plan"]["sigma_m"][1] < document["plan"]["sigma_m"][0] < document["worst_sigma_m"]
+
+
+def test_a_plan_keeps_its_promise(armsight, tmp_path):
+    """The poses planned, taken, give the sigma that was predicted."""
+    _, A, B = motion(10)
+    robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
+    first, _ = found(armsight, robot, seen, "--plan", 6)
+    more = np.array(first["plan"]["T_base_flange"])
+    taken = inverse(more @ X) @ Z @ exp_se3(np.random.default_rng(1).normal(0, [2e-4] * 3 + [5e-4] * 3, (6, 6)))
+    matrices(robot, np.concatenate([A, more]))
+    matrices(seen, np.concatenate([B, taken]))
+    after, _ = found(armsight, robot, seen)
+    assert after["worst_sigma_m"] < first["worst_sigma_m"]
+    assert after["worst_sigma_m"] == pytest.approx(first["plan"]["sigma_m"][-1], rel=0.6)
+
+
+def test_rows_shuffled_by_name_change_nothing(armsight, tmp_path):
+    _, A, B = motion()
+    names = [f"pose{k}" for k in range(14)]
+    order = np.random.default_rng(3).permutation(14)
+    head = "name,x_m,y_m,z_m,qw,qx,qy,qz"
+
+    def rows(Ts, order):
+        return [(names[k], *Ts[k, :3, 3], *quaternions(Ts[k : k + 1])[0]) for k in order]
+
+    seen = named(tmp_path / "seen.csv", head, rows(B, range(14)))
+    one, _ = found(armsight, named(tmp_path / "a.csv", head, rows(A, range(14))), seen)
+    other, _ = found(armsight, named(tmp_path / "b.csv", head, rows(A, order)), seen)
+    assert one["T_flange_rig"] == other["T_flange_rig"]
+    assert one["cov_m_rad"] == other["cov_m_rad"]
+
+
+def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
+    t_hand, t_eye = np.arange(0, 8, 0.02), np.arange(0.5, 7.5, 0.05)
+
+    def motion_at(t):
+        speeds = np.array([0.31, 0.47, 0.59, 0.71, 0.83, 1.03]) * 0.6 * np.pi
+        return exp_se3(np.array([0.2, 0.2, 0.15, 0.5, 0.4, 0.5]) * np.sin(speeds * t[:, None] + np.arange(6)))
+
+    B = (
+        inverse(motion_at(t_eye) @ X)
+        @ Z
+        @ exp_se3(np.random.default_rng(0).normal(0, [2e-4] * 3 + [5e-4] * 3, (140, 6)))
+    )
+    head = "t_s,x_m,y_m,z_m,qw,qx,qy,qz"
+    A = motion_at(t_hand)
+    robot = named(tmp_path / "a.csv", head, np.hstack([t_hand[:, None], A[:, :3, 3], quaternions(A)]))
+    seen = named(tmp_path / "b.csv", head, np.hstack([t_eye[:, None] - 0.123, B[:, :3, 3], quaternions(B)]))
+    document, _ = found(armsight, robot, seen, "--streams")
+    assert_right(document)
+    assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
+
+
+def test_millimetres_are_refused_or_detected(armsight, tmp_path, seen):
+    _, A, B = motion()
+    A = A.copy()
+    A[:, :3, 3] *= 1e3
+    robot = matrices(tmp_path / "robot.txt", A)
+    assert_rejected(
+        armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "--units mm"
+    )
+    document, notes = found(armsight, robot, seen, "--detect-units")
+    assert "read as millimetres" in notes
+    assert_right(document)
+    B = B.copy()
+    B[:, :3, 3] *= 0.5
+    half = matrices(tmp_path / "half.txt", B)
+    given = ("handeye", "--robot", matrices(robot, motion()[1]), "--seen", half, "--eye", "in-hand")
+    assert_rejected(armsight(*given), "2 times as large as given", "--scale")
+    document, _ = found(armsight, robot, half, "--scale")
+    assert document["target_scale"] == pytest.approx(2.0, rel=0.01)
+
+
+def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
+    q, A, _ = motion()
+
+    def rejected(robot, *words, more=(), eye="in-hand", by=seen):
+        assert_rejected(armsight("handeye", "--robot", robot, "--seen", by, "--eye", eye, *more), robot, *words)
+
+    path = tmp_path / "robot.txt"
+    rejected(matrices(path, np.roll(A, 1, axis=0)), "shifted by 1 against the images")
+    rejected(matrices(path, inverse(A)), "fit --eye to-hand", "inverse transforms")
+    rejected(matrices(path, A), "fit --eye in-hand", eye="to-hand")
+    mirrored = A.copy()
+    mirrored[3, :3, 0] *= -1
+    rejected(matrices(path, mirrored), "line 4", "left-handed")
+    angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("xyz", degrees=True)
+    euler = named(tmp_path / "e.csv", "x_m,y_m,z_m,rx_deg,ry_deg,rz_deg", np.hstack([A[:, :3, 3], angles]))
+    rejected(euler, "the rotations are xyz, not zyx", more=("--rotation", "zyx"))
+    rejected(euler, "give --rotation")
+    joints = named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q[:, [0, 2, 1, 3, 4, 5]])
+    rejected(joints, "the joints are in another order", "q1, q3, q2", more=("--model", "six_r"))
+    rejected(joints, "give --model")
+
+
+def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):
+    q, A, _ = motion()
+    tool = exp_se3(np.array([0.0, 0.0, 0.12, 0.0, 0.0, 0.3]))
+    head = ",".join([*(f"q{i}_rad" for i in range(1, 7)), "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"])
+    moved = A @ tool
+    robot = named(tmp_path / "r.csv", head, np.hstack([q, moved[:, :3, 3], quaternions(moved)]))
+    document, notes = found(armsight, robot, seen, "--model", "six_r")
+    assert "poses are of a TCP at [0.0 0.0 120.0] mm" in notes
+    assert np.abs(log_se3(inverse(inverse(tool) @ X) @ np.array(document["T_flange_rig"]))).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,0.1,1,0,oops,0\n", ["line 3", "qy is 'oops'", "not a number"]),
+        ("x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,1,0,0\n", ["line 2", "6 fields where 7"]),
+        ("x_m,y_m,z_m,qw,qx,qy\n0,0,0,1,0,0\n", ["line 1", "column qz is missing"]),
+        ("x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,2,0,0,0\n", ["quaternion has length 2"]),
+        ("1 2 3\n", ["line 1", "3 numbers without names"]),
+        ("p[0, 0, 0, 0, 0]\n", ["line 1", "5 fields where 6"]),
+        ("p[0, 0, 0, 0, 0, 0]\nhello\n", ["line 2", "expected p[x, y, z, rx, ry, rz]"]),
+        ("1 0 0 0 0 1 0 0 0 0 1.5 0\n", ["line 1", "no rotation"]),
+        ("0 0 0 1 0 0 0\n", ["--rotation wxyz or --rotation xyzw"]),
+        ("", ["no rows"]),
+    ],
+)
+def test_a_damaged_table_is_one_line(armsight, tmp_path, seen, text, words):
+    robot = tmp_path / "robot.csv"
+    robot.write_text(text)
+    assert_rejected(armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, *words)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ((), ["one way"]),
+        (("--images", "x*.png"), ["--images and --camera belong together"]),
+        (("--images", "x*.png", "--camera", "c.json"), ["--target"]),
+        (("--images", "x*.png", "--camera", "c.json", "--target", "chessboard:9x6:25mm"), ["no such images"]),
+        (("--rig", "r.json", "--target", "chessboard:9x6:25mm"), ["--rig, --left and --right"]),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(armsight, tmp_path, more, words):
+    robot = matrices(tmp_path / "robot.txt", motion()[1])
+    assert_rejected(armsight("handeye", "--robot", robot, "--eye", "in-hand", *more), *words)
+
+
+def test_images_of_one_camera(armsight, tmp_path):
+    """A chessboard drawn by a known camera, its calibration from a file and from the images."""
+    rng = np.random.default_rng(2)
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    squares = np.full((7 * 40 + 80, 9 * 40 + 80), 255, np.uint8)
+    for i in range(7):
+        for j in range(9):
+            if (i + j) % 2 == 0:
+                squares[40 + 40 * i : 80 + 40 * i, 40 + 40 * j : 80 + 40 * j] = 0
+    to_board = np.array(
+        [[0.025 / 40, 0, -0.05 + 0.5 * 0.025 / 40], [0, 0.025 / 40, -0.05 + 0.5 * 0.025 / 40], [0, 0, 1]]
+    )
+    A = []
+    for k in range(9):
+        xi = np.array(
+            [*rng.uniform(-0.03, 0.03, 2), rng.uniform(-0.05, 0.05), *rng.uniform(-0.4, 0.4, 2), rng.uniform(-1, 1)]
+        )
+        middle = np.array([0.0875, 0.0625, 0, 0, 0, 0])
+        T = exp_se3(np.array([0, 0, 0.45, 0, 0, 0])) @ exp_se3(xi) @ inverse(exp_se3(middle))
+        H = K @ T[:3, [0, 1, 3]] @ to_board
+        image = cv2.warpPerspective(squares, H, (640, 480), flags=cv2.INTER_AREA, borderValue=200)
+        cv2.imwrite(str(tmp_path / f"im{k}.png"), cv2.GaussianBlur(image, (3, 3), 0.6))
+        A.append(Z @ inverse(X @ T))
+    robot = matrices(tmp_path / "robot.txt", np.array(A))
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({"image_size_px": [640, 480], "K": K.tolist(), "distortion": []}))
+    given = ("handeye", "--robot", robot, "--eye", "in-hand", "--images", tmp_path / "im*.png", "--json")
+    said = armsight(*given, "--camera", camera, "--target", "chessboard:8x6:25mm")
+    assert said.code == 0, said.err
+    assert np.abs(log_se3(inverse(X) @ np.array(said.lines[0]["T_flange_rig"]))).max() < 3e-3
+    assert said.lines[0]["reprojection_rms_px"] < 0.2
+    camera.write_text(json.dumps({"image_size_px": [1280, 480], "K": K.tolist(), "distortion": []}))
+    assert_rejected(armsight(*given, "--camera", camera, "--target", "chessboard:8x6:25mm"), "640x480 px", "1280x480")
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+def test_a_board_that_looks_the_same_turned_is_turned_back(in_hand):
+    _, A, B = motion(12, in_hand=in_hand)
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    flip[:2, 3] = 0.2, 0.1
+    turned = B.copy()
+    turned[[2, 5, 6]] = turned[[2, 5, 6]] @ flip
+    back, which = upright(A, turned, (flip,), in_hand)
+    np.testing.assert_allclose(back, B, atol=1e-12)
+    assert list(np.flatnonzero(which >= 0)) == [2, 5, 6]

@@ -1,0 +1,196 @@
+"""armsight replay and export on a short recording; the estimators of a run are replayed to the last digit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap_protobuf")
+pytest.importorskip("foxglove_schemas_protobuf")
+pytest.importorskip("rosbags")
+
+from armsight.app.replay.compare import compare
+from armsight.app.stream.datum import EventDatum, JointsDatum, Published, ShotDatum, estimator_event, mounting_event
+from armsight.app.stream.mcap_file import McapSink, properties
+from armsight.data import Correspondences, JointStates, Missed, Points, PoseEstimate, Shot
+from armsight.geometry.pose import exp_se3, inverse, pose
+from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
+from armsight.robot.arm_file import open_arm
+from armsight.vision.markers.targets import open_target
+from armsight.vision.rig import StereoRig
+from armsight.vision.sources import open_source
+from bag_files import EPOCH_NS, Joints, Pixels, Sent, write_bag
+from cli_runs import assert_rejected
+
+BODY = """name = "plate"
+[[markers]]
+name = "a"
+position_mm = [0, 0, 0]
+normal = [0, 0, 1]
+x_axis = [1, 0, 0]
+tag = { family = "tag36h11", id = 1, size_mm = 40 }
+"""
+ARM = open_arm("six_r")
+MOUNTING = Mounting(
+    pose(np.eye(3), np.array([0.1, 0.2, 1.0])), pose(np.eye(3), np.array([0.0, 0.0, 0.05])), np.zeros((12, 12))
+)
+
+
+def estimate(T, cov):
+    nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
+    points = Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 0)), nothing)
+    return PoseEstimate(T, cov, 0.9 * cov, 1e-4, 0.1, 1.0, points)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a run whose estimator was given joints and poses, some of them missed, one of them far off."""
+    folder = tmp_path_factory.mktemp("run")
+    from strategies import ordinary_rig
+
+    rig = ordinary_rig("brown5")
+    rng = np.random.default_rng(7)
+    body_file = folder / "body.toml"
+    body_file.write_text(BODY)
+    published = Published(rig, open_target(str(body_file)).body, ARM, properties(rig, BODY, ARM))
+    sink = McapSink(folder / "run.mcap", published)
+    sink.start()
+    seen = []
+    estimator = KalmanEstimator(ARM, delay=Delay(0.02, 0.01))
+    sink.put(EventDatum(0.0, estimator_event(estimator, anew=False)))
+    batches = []
+    for k in range(120):
+        if k == 60:
+            estimator = KalmanEstimator(ARM, delay=Delay(0.018, 0.001), learns_delay=False)
+            sink.put(EventDatum(0.004 * k, estimator_event(estimator, anew=True)))
+            waiting = list(seen)
+            for states in batches:
+                estimator.joints(states)
+                while waiting and waiting[0][0] <= states.t_s[-1]:
+                    t_s, result = waiting.pop(0)
+                    estimator.vision(MOUNTING.pose_measurement(result, t_s))
+        t_s = 0.004 * k + 0.001 * np.arange(1, 5)
+        q = ARM.home + 0.3 * np.sin(t_s)[:, None] * np.linspace(0.5, 1, 6) + rng.normal(0, 1e-4, (4, 6))
+        states = JointStates(t_s, q)
+        batches.append(states)
+        estimator.joints(states)
+        now = estimator.estimate()
+        sink.put(JointsDatum(states, now.T_base_tool, now.cov, now.vision_age_s))
+        if k % 4 == 3:
+            shot = Shot(f"{k:06d}", None, None, float(t_s[0]))
+            if k % 12 == 11:
+                sink.put(ShotDatum(shot, Missed("hidden"), float(t_s[-1]), 1e-4))
+                continue
+            T = (
+                inverse(MOUNTING.T_base_rig)
+                @ ARM.forward(q[0])
+                @ MOUNTING.T_tool_body
+                @ exp_se3(rng.normal(0, 1e-4, 6))
+            )
+            result = estimate(T, np.diag([1e-8] * 3 + [1e-7] * 3))
+            seen.append((shot.t_s, result))
+            if k == 27:
+                sink.put(EventDatum(float(t_s[0]), mounting_event(MOUNTING)))
+            outcome, T_base_tool = None, None
+            if k >= 27:
+                measurement = MOUNTING.pose_measurement(result, shot.t_s)
+                outcome, T_base_tool = estimator.vision(measurement).value, measurement.T_base_tool
+            sink.put(ShotDatum(shot, result, float(t_s[-1]), 1e-4, outcome, MOUNTING.T_base_rig, T_base_tool))
+    sink.close()
+    assert sink.problem is None
+    return folder
+
+
+def test_the_estimators_of_a_run_are_the_same_to_the_last_digit(armsight, run, tmp_path):
+    said = armsight("replay", run, "-o", tmp_path / "again", "--json")
+    assert said.code == 0, said
+    (answer,) = said.lines
+    assert answer["estimates"] == 120
+    assert answer["measured"] == 20
+    assert answer["differences"] == {"position_m": 0.0, "quaternion": 0.0, "covariance": 0.0}
+    assert answer["same"] is True
+    said = armsight("replay", run / "run.mcap", "--compare", tmp_path / "again")
+    assert "the estimates are those of the run, to the last digit" in said.out
+    assert said.out.count("the same to the last digit") == 2
+
+
+def test_another_arm_or_estimator_changes_the_answers_and_compare_shows_it(armsight, run, tmp_path):
+    armsight("replay", run, "-o", tmp_path / "a")
+    said = armsight("replay", run, "--estimator", "latest", "--compare", tmp_path / "a", "--json")
+    (answer,) = said.lines
+    assert answer["same"] is None
+    poses, live = answer["compared"]
+    assert poses["same"]
+    assert not live["same"]
+    assert live["position_rms_m"] > 0
+    assert live["rows"] == 120
+    assert armsight("replay", run, "--arm", "ur5").code == 0
+
+
+def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):
+    assert_rejected(armsight("replay", run, "--rig", "r.json"), "needs the images of every shot")
+    assert_rejected(armsight("replay", tmp_path), "give --target")
+    assert_rejected(armsight("replay", tmp_path / "none.bag", "--target", "chessboard:9x6:25mm"), "no such recording")
+    assert_rejected(armsight("replay", run, "--compare", tmp_path), "no poses.csv or live.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "tum", "mcap", "ros2"])
+def test_a_run_is_exported(armsight, run, tmp_path, form):
+    out = tmp_path / ("out.mcap" if form == "mcap" else "out")
+    (answer,) = armsight("export", run, "--to", form, "-o", out, "--json").lines
+    files = [Path(name) for name in answer["files"]]
+    if form == "csv":
+        assert [file.name for file in files] == ["poses.csv", "live.csv", "joints.csv"]
+        header, *rows = files[0].read_text().splitlines()
+        assert header.startswith("shot,status,reason,t_s,sigma_t_s,arrival_s,age_s,x_m")
+        assert len(rows) == 30
+        assert len(files[2].read_text().splitlines()) == 481
+    if form == "parquet":
+        from pyarrow import parquet
+
+        assert parquet.read_table(files[0]).num_rows == 30
+    if form == "tum":
+        assert [len(file.read_text().splitlines()) for file in files] == [20, 120]
+        assert len(files[1].read_text().splitlines()[0].split()) == 8
+    if form == "mcap":
+        assert files[0].stat().st_size < (run / "run.mcap").stat().st_size
+        assert armsight("replay", out, "--json").lines[0]["same"] is True
+    if form == "ros2":
+        from rosbags.highlevel import AnyReader
+
+        with AnyReader(files) as reader:
+            kinds = {c.topic: c.msgtype for c in reader.connections}
+            assert kinds["/odometry"] == "nav_msgs/msg/Odometry"
+            assert kinds["/joint_states"] == "sensor_msgs/msg/JointState"
+            odometry = next(
+                reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/tool/odometry"
+            )
+            assert odometry.header.frame_id == "base"
+    assert_rejected(armsight("export", run, "--to", form, "-o", out), "is there already")
+
+
+def test_a_recording_of_images_is_measured_again_from_any_container(armsight, rendered, tmp_path):
+    """Shots as PNG, and as a bag of raw images with joints: the same poses, to the last digit."""
+    arguments = ["--target", rendered.plate, "--rig", rendered.rig]
+    source = open_source(str(rendered.folder / "arm"))
+    sent, q = [], np.linspace(0, 1, 6)
+    for k in range(4):
+        shot = source.read()
+        t = EPOCH_NS + 250_000_000 * k
+        sent += [Sent("/left/image_raw", t, Pixels(shot.left)), Sent("/right/image_raw", t, Pixels(shot.right))]
+        sent += [Sent("/joint_states", t - 1_000_000, Joints(list("abcdef"), q + k))]
+    sent.append(Sent("/joint_states", t + 1_000_000, Joints(list("abcdef"), q + 4)))
+    bag = write_bag(tmp_path / "a", "mcap", sent)
+    assert armsight("replay", bag, *arguments, "-o", tmp_path / "bag").code == 0
+    rows = (tmp_path / "bag" / "poses.csv").read_text().splitlines()
+    assert rows[0].endswith("q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad")
+    assert armsight("record", f"bag:{bag}", "-o", tmp_path / "png").code == 0
+    assert armsight("replay", tmp_path / "png", *arguments, "-o", tmp_path / "from_png").code == 0
+    (poses,) = compare(tmp_path / "bag", tmp_path / "from_png")
+    assert poses.rows == 4
+    # PNG's index rounds times to a microsecond; everything that was measured is the same.
+    assert {name for name, value in poses.largest.items() if value > 0 and name != "took_ms"} <= {"t_s"}
+    StereoRig.load(rendered.rig)
+    json.dumps(poses.to_json())

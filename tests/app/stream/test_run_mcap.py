@@ -1,0 +1,265 @@
+"""run.mcap: its messages are Foxglove's, another library reads them, and a killed process loses at most a second."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap_protobuf")
+pytest.importorskip("foxglove_schemas_protobuf")
+
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum
+from armsight.app.stream.mcap_file import LazyMcap, McapSink, arm_of, properties
+from armsight.data import Body, Dropped, JointStates, Missed, Shot
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+from armsight.robot.arm_file import open_arm
+from armsight.vision.detections import SeenShot
+from armsight.vision.measure import measure_seen
+from strategies import ordinary_rig
+
+RIG = ordinary_rig("brown5")
+BODY = Body("plate", tuple(f"P{k}" for k in range(6)), np.random.default_rng(3).uniform(-0.1, 0.1, (6, 3)))
+
+
+def measured():
+    """A pose estimate of the body half a metre ahead."""
+    T = pose(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.05, 0.0, 0.6]))
+    p_left = BODY.points @ T[:3, :3].T + T[:3, 3]
+    T_rl = np.linalg.inv(RIG.T_left_right)
+    uv = [RIG.left.project(p_left), RIG.right.project(p_left @ T_rl[:3, :3].T + T_rl[:3, 3])]
+    ids = np.arange(6)
+    result = measure_seen(RIG, BODY, SeenShot("a", (ids, ids), (np.asarray(uv[0]), np.asarray(uv[1]))))
+    assert not isinstance(result, Missed)
+    return result
+
+
+def published():
+    arm = open_arm("six_r")
+    return Published(RIG, BODY, arm, properties(RIG, "name = 'plate'", arm, command="test"))
+
+
+def read(path):
+    """Read an MCAP with the library: topic -> (schema, message) in order, and the metadata."""
+    found = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        metadata = {each.name: each.metadata for each in reader.iter_metadata()}
+        for schema, channel, message in reader.iter_messages():
+            decoded = json.loads(message.data) if channel.message_encoding == "json" else None
+            found.setdefault(channel.topic, []).append((schema, message, decoded))
+    return found, metadata
+
+
+def protobuf(path, topic):
+    """The decoded messages of a topic."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [each.decoded_message for each in reader.iter_decoded_messages(topics=[topic])]
+
+
+def write(path, data):
+    sink = McapSink(path, published())
+    sink.start()
+    for datum in data:
+        sink.put(datum)
+    sink.close()
+    assert sink.problem is None
+    assert sink.dropped == 0
+    return sink
+
+
+def test_every_datum_is_in_the_file_with_the_names_of_the_page(tmp_path):
+    result, image = measured(), np.zeros((4, 6), np.uint8)
+    T_base_rig = pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    states = JointStates(np.array([1.0, 1.001]), np.arange(12.0).reshape(2, 6) * 0.01)
+    jpeg = (b"\xff\xd8left\xff\xd9", b"\xff\xd8right\xff\xd9")
+    write(
+        tmp_path / "a.mcap",
+        [
+            EventDatum(0.5, {"event": "estimator"}),
+            JointsDatum(states, T_base_rig, np.eye(6) * 1e-6, 0.02),
+            ShotDatum(Shot("s0", image, image, 1.0, None, jpeg), result, 1.02, 1e-4, "used", T_base_rig, T_base_rig),
+            ShotDatum(Shot("s1", image, image, 1.1), Missed("too dark"), 1.12),
+            NoteDatum(1.2, "the rig has moved", "warning"),
+        ],
+    )
+    path = tmp_path / "a.mcap"
+    found, metadata = read(path)
+    kinds = {topic: rows[0][0].name for topic, rows in found.items()}
+    assert kinds == {
+        "/armsight/event": "armsight.event",
+        "/armsight/joints": "armsight.joints",
+        "/armsight/shot": "armsight.shot",
+        "/arm": "foxglove.SceneUpdate",
+        "/joints": "foxglove.JointStates",
+        "/left/annotations": "foxglove.ImageAnnotations",
+        "/left/calibration": "foxglove.CameraCalibration",
+        "/left/image": "foxglove.CompressedImage",
+        "/log": "foxglove.Log",
+        "/odometry": "foxglove.Odometry",
+        "/pose": "foxglove.PoseInFrame",
+        "/right/annotations": "foxglove.ImageAnnotations",
+        "/right/calibration": "foxglove.CameraCalibration",
+        "/right/image": "foxglove.CompressedImage",
+        "/scene": "foxglove.SceneUpdate",
+        "/tf": "foxglove.FrameTransforms",
+        "/tool/odometry": "foxglove.Odometry",
+    }
+    assert metadata["armsight"]["rig.json"] == RIG.to_text()
+    first, second = (decoded for _, _, decoded in found["/armsight/shot"])
+    assert (first["status"], first["points"], first["t_s"], first["outcome"]) == ("ok", 6, 1.0, "used")
+    assert first["age_s"] == pytest.approx(0.02)
+    assert first["T_left_body"] == result.T_left_body.tolist()
+    assert first["covariance_body"] == result.cov.tolist()
+    total = np.array(first["covariance_precision"]) + np.array(first["covariance_calibration"])
+    np.testing.assert_allclose(total, first["covariance"], atol=1e-20)
+    assert (second["status"], second["reason"]) == ("missed", "too dark")
+    assert found["/armsight/joints"][0][2]["q_rad"] == states.q.tolist()
+    # what the libraries decode
+    odometry = protobuf(path, "/odometry")[0]
+    assert (odometry.frame_id, odometry.body_frame_id) == ("left", "body")
+    assert odometry.pose.position.x == result.T_left_body[0, 3]
+    np.testing.assert_array_equal(np.reshape(odometry.pose_covariance, (6, 6)), first["covariance"])
+    frames = {(t.parent_frame_id, t.child_frame_id) for m in protobuf(path, "/tf") for t in m.transforms}
+    assert frames == {("base", "rig"), ("rig", "left"), ("rig", "right"), ("left", "body"), ("base", "tool")}
+    assert protobuf(path, "/right/image")[0].data == jpeg[1]
+    assert len(protobuf(path, "/left/annotations")[0].points[0].points) == 6
+    assert [m.message for m in protobuf(path, "/log")] == ["s1: missed: too dark", "the rig has moved"]
+    calibration = protobuf(path, "/right/calibration")[0]
+    assert calibration.P[3] / calibration.P[0] == pytest.approx(-RIG.baseline_m, rel=1e-6)
+    stamps = [(m.log_time, m.publish_time) for _, m, _ in found["/armsight/shot"]]
+    assert stamps == [(1_020_000_000, 1_000_000_000), (1_120_000_000, 1_100_000_000)]
+
+
+def test_the_ellipsoid_and_the_dropped_points_are_shown(tmp_path):
+    from dataclasses import replace
+
+    cov = np.diag([4e-6, 1e-6, 9e-6, 1e-8, 1e-8, 1e-8])
+    result = replace(measured(), T_left_body=np.eye(4), cov=cov, dropped=(Dropped("P2", "too far from the body"),))
+    write(tmp_path / "a.mcap", [ShotDatum(Shot("s0", None, None, 1.0), result)])
+    (scene,) = protobuf(tmp_path / "a.mcap", "/scene")
+    size = scene.entities[0].spheres[0].size
+    np.testing.assert_allclose(sorted((size.x, size.y, size.z)), [6e-3, 12e-3, 18e-3], rtol=1e-9)
+    (shown,) = protobuf(tmp_path / "a.mcap", "/left/annotations")
+    assert [text.text for text in shown.texts] == ["P2: too far from the body"]
+    assert len(shown.points[0].points) == 5
+    assert "P2: too far" in protobuf(tmp_path / "a.mcap", "/log")[0].message
+
+
+def test_the_file_is_hardly_larger_than_its_images(tmp_path):
+    jpeg = b"\xff\xd8" + np.random.default_rng(0).bytes(150_000) + b"\xff\xd9"
+    result = measured()
+    write(
+        tmp_path / "a.mcap",
+        [ShotDatum(Shot(f"{k}", None, None, 0.1 * k, None, (jpeg, jpeg)), result) for k in range(20)],
+    )
+    assert (tmp_path / "a.mcap").stat().st_size < 1.05 * 40 * len(jpeg)
+
+
+def test_the_arm_comes_back_with_all_digits():
+    arm = open_arm("ur5")
+    again = arm_of(properties(None, None, arm)["arm.json"])
+    q = np.linspace(-1, 1, 6)
+    np.testing.assert_array_equal(again.forward(q), arm.forward(q))
+    assert again.joint_names == arm.joint_names
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from test_run_mcap import published
+from armsight.app.stream.datum import NoteDatum
+from armsight.app.stream.mcap_file import McapSink
+sink = McapSink(Path(sys.argv[1]), published())
+sink.start()
+for k in range(10_000):
+    sink.put(NoteDatum(time.time(), str(k)))
+    print(time.time(), flush=True)
+    time.sleep(0.01)
+"""
+
+
+def test_a_killed_process_leaves_all_but_the_last_second(tmp_path):
+    path = tmp_path / "run.mcap"
+    here = Path(__file__).parent
+    paths = os.pathsep.join(map(str, [here, here.parents[1], here.parents[1] / "vision", *sys.path]))
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": paths},
+    )
+    last = 0.0
+    began = None
+    for line in process.stdout:
+        last = float(line)
+        began = began or last
+        if last - began > 2.0:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    from armsight.vision.sources.bag import Bag
+
+    bag = Bag(path)
+    logged = [message.decode().timestamp for message in bag.messages(["/log"])]
+    newest = logged[-1].seconds + 1e-9 * logged[-1].nanos
+    assert last - newest < 1.0
+    assert len(logged) > 10
+
+
+def test_a_reader_that_is_slow_loses_the_oldest_and_it_is_counted():
+    from armsight.app.stream.sink import Sink
+
+    class Slow(Sink):
+        def __init__(self):
+            super().__init__(limit=5)
+            self.got = []
+
+        def write(self, datum):
+            time.sleep(0.001)
+            self.got.append(datum.text)
+
+    sink = Slow()
+    for k in range(12):  # before it starts nothing is taken away
+        sink.put(NoteDatum(0.0, str(k)))
+    assert sink.dropped == 7
+    sink.start()
+    sink.close()
+    assert sink.got == ["7", "8", "9", "10", "11"]
+
+
+def test_a_full_disk_ends_the_file_and_not_the_run(small_disk):
+    said = []
+    file = LazyMcap(small_disk("64k"), published(), said.append)
+    data = np.random.default_rng(0).bytes(100_000)
+    for k in range(10):
+        file.put(ShotDatum(Shot(str(k), None, None, 0.1 * k, None, (data, data)), Missed("")))
+    file.close()
+    assert len(said) == 1
+    assert "run.mcap: not complete: No space left" in said[0]
+
+
+def test_without_the_package_nothing_is_written_and_it_is_said(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mcap_protobuf.schema", None)
+    said = []
+    file = LazyMcap(tmp_path, published(), said.append)
+    file.put(NoteDatum(0.0, "a"))
+    file.put(NoteDatum(0.0, "b"))
+    file.close()
+    assert list(tmp_path.iterdir()) == []
+    (line,) = said
+    assert 'pip install "armsight[record]"' in line
+    with pytest.raises(InputError, match="armsight\\[record\\]"):
+        McapSink(tmp_path / "a.mcap", published())

@@ -1,0 +1,197 @@
+"""Streams: JSON lines over TCP and UDP, OpenIGTLink read by pyigtl, Foxglove's WebSocket."""
+
+import json
+import socket
+import struct
+import sys
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from armsight.app.stream.datum import NoteDatum, Published, ShotDatum
+from armsight.app.stream.igtl import crc64, message, position_body, status_body, transform_body
+from armsight.app.stream.network import open_json_tcp
+from armsight.app.stream.streams import open_streams
+from armsight.data import Missed, Shot
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+
+SHOT = ShotDatum(Shot("s0", None, None, 2.5), Missed("too dark"), 2.52)
+
+
+def publish_until(sink, condition, datum=SHOT):
+    """Publish again and again until something has arrived."""
+    for _ in range(400):
+        sink.put(datum)
+        if condition():
+            return
+        time.sleep(0.01)
+    pytest.fail("nothing arrived")
+
+
+def test_json_over_tcp_is_one_object_a_line():
+    sink = open_json_tcp("0", Published())
+    sink.start()
+    with socket.create_connection(("127.0.0.1", sink.port)) as connection:
+        connection.settimeout(0.01)
+        got = b""
+
+        def arrived():
+            nonlocal got
+            try:
+                got += connection.recv(65536)
+            except TimeoutError:
+                return False
+            return got.count(b"\n") >= 2
+
+        publish_until(sink, arrived)
+    sink.close()
+    first = json.loads(got.split(b"\n")[0])
+    assert first == {
+        "kind": "shot",
+        "shot": "s0",
+        "t_s": 2.5,
+        "status": "missed",
+        "reason": "too dark",
+        "sigma_t_s": None,
+        "arrival_s": 2.52,
+        "age_s": pytest.approx(0.02),
+    }
+
+
+def test_a_tcp_reader_that_does_not_read_is_not_waited_for():
+    sink = open_json_tcp("0", Published())
+    sink.start()
+    with socket.create_connection(("127.0.0.1", sink.port)):
+        big = NoteDatum(0.0, "x" * 200_000)
+        publish_until(sink, lambda: sink.dropped > 0, big)
+    sink.close()
+    assert sink.problem is None
+
+
+def test_json_over_udp_is_one_datagram_a_datum():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5.0)
+        streams = open_streams([f"json+udp:127.0.0.1:{receiver.getsockname()[1]}"], Published(), pytest.fail)
+        streams.put(NoteDatum(1.0, "hello"))
+        assert json.loads(receiver.recv(65536)) == {"kind": "log", "t_s": 1.0, "level": "info", "text": "hello"}
+        streams.close()
+
+
+T = pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([0.1, -0.02, 0.85]))
+
+
+def test_openigtlink_is_what_pyigtl_reads():
+    pyigtl = pytest.importorskip("pyigtl")
+    from pyigtl.messages import MessageBase
+
+    def parsed(data):
+        header = MessageBase.parse_header(data[: MessageBase.IGTL_HEADER_SIZE])
+        found = MessageBase.create_message(header["message_type"])
+        body = data[MessageBase.IGTL_HEADER_SIZE :]
+        assert len(body) == header["body_size"]
+        found.unpack(header, body)
+        return found
+
+    transform = parsed(message("TRANSFORM", "armsight_body", 1.5, transform_body(T)))
+    assert isinstance(transform, pyigtl.TransformMessage)
+    assert transform.device_name == "armsight_body"
+    np.testing.assert_allclose(transform.matrix[:3, :3], T[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(transform.matrix[:3, 3], 1e3 * T[:3, 3], atol=1e-3)
+    assert transform.timestamp == pytest.approx(1.5)
+
+
+def test_a_position_is_that_of_the_specification():
+    """Three float32 of position, mm, four of the quaternion x y z w; pyigtl reads its own form of POINT under this name."""
+    x, y, z, *q = struct.unpack(">7f", position_body(T))
+    np.testing.assert_allclose([x, y, z], 1e3 * T[:3, 3], rtol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-6)
+
+
+def test_the_checksum_is_that_of_ecma_182():
+    assert crc64(b"123456789") == 0x6C40DF5F0B497347  # the check value of the catalogue of CRC algorithms
+    body = status_body(7, "missed", "too dark")
+    assert struct.unpack(">H", body[:2]) == (7,)
+    assert body.endswith(b"too dark\0")
+
+
+def test_a_client_of_openigtlink_receives_the_pose():
+    pyigtl = pytest.importorskip("pyigtl")
+    from test_run_mcap import BODY, RIG, measured
+
+    from armsight.app.stream.igtl import open_igtl
+
+    result = measured()
+    sink = open_igtl("0", Published(RIG, BODY))
+    sink.start()
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", sink.port)
+    got = []
+
+    def arrived():
+        got.extend(m for m in client.get_latest_messages() if isinstance(m, pyigtl.TransformMessage))
+        return bool(got)
+
+    try:
+        publish_until(sink, arrived, ShotDatum(Shot("s", None, None, 1.0), result))
+    finally:
+        client.stop()
+        sink.close()
+    np.testing.assert_allclose(got[0].matrix[:3, 3], 1e3 * result.T_left_body[:3, 3], atol=1e-3)
+
+
+def test_foxglove_s_server_listens_and_takes_everything():
+    pytest.importorskip("foxglove")
+    pytest.importorskip("mcap_protobuf")
+    from test_run_mcap import BODY, RIG, measured
+
+    from armsight.app.stream.websocket import open_foxglove
+
+    sink = open_foxglove("0", Published(RIG, BODY))
+    sink.start()
+    with socket.create_connection(("127.0.0.1", sink.port)) as connection:
+        connection.settimeout(5.0)
+        connection.sendall(
+            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+        )
+        answer = connection.recv(4096)
+        assert answer.startswith(b"HTTP/1.1 101")
+        for _ in range(3):
+            sink.put(ShotDatum(Shot("s", None, None, 1.0), measured()))
+        got = answer
+        while b"/armsight/shot" not in got:
+            got += connection.recv(65536)
+        assert b"foxglove.Odometry" in got
+    sink.close()
+    assert sink.problem is None
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("ros:1", "unknown kind 'ros'; known are foxglove, json\\+tcp, json\\+udp, igtl"),
+        ("json+tcp:abc", "expected json\\+tcp:\\[HOST:\\]PORT"),
+        ("igtl:99999", "expected igtl"),
+    ],
+)
+def test_a_stream_that_is_none_is_one_line(spec, words):
+    with pytest.raises(InputError, match=words):
+        open_streams([spec], Published(), pytest.fail)
+
+
+def test_a_port_in_use_is_named_and_nothing_stays_open():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"json\\+tcp:{port}: cannot listen there"):
+            open_streams(["json+udp:5", f"json+tcp:{port}"], Published(), pytest.fail)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(InputError, match="armsight\\[stream\\]"):
+        open_streams(["foxglove:0"], Published(), pytest.fail)

@@ -1,0 +1,211 @@
+"""The structure of the noise, its covariance by Monte Carlo, and what the motion leaves open."""
+
+import numpy as np
+import pytest
+from handeye_motions import error
+from scipy.stats import chi2
+
+from armsight.errors import CalibrationError, InputError
+from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop.handeye.handeye import Poses
+from armsight.loop.handeye.noise import Linear, _value_and_gradient, blocks, pose_kernel, walk_gathered
+from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
+from armsight.loop.handeye.structured import calibrate_structured
+from armsight.robot.arm_file import open_arm
+from asserts import numeric_jacobian
+
+CENTRE = np.array([0.05, 0.03, 0.0])
+
+
+def made(seed, *, n=25, in_hand=False, flange=(0.0, 0.0), camera=(0.0, 0.0, 0.0), links=(0.0, 0.0), walk=(0.0, 0.0)):
+    """Poses whose noise is known, the true Z and X, and T_link_flange; sigmas in m and rad."""
+    rng = np.random.default_rng(seed)
+    arm = open_arm("six_r")
+    q = arm.home + rng.uniform(-0.6, 0.6, (n, 6))
+    frames = np.array([arm.links(one) for one in q])
+    to_flange = inverse(frames) @ frames[:, -1:]
+    X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
+    A = frames[:, -1]
+    wrong = rng.normal(0, [links[0]] * 3 + [links[1]] * 3, (8, 6))  # one constant error a link
+    true = A.copy()
+    for k in range(8):
+        true = true @ inverse(to_flange[:, k]) @ exp_se3(wrong[k]) @ to_flange[:, k]
+    true = true @ exp_se3(rng.normal(0, [flange[0]] * 3 + [flange[1]] * 3, (n, 6)))
+    B = inverse(true @ X) @ Z if in_hand else inverse(Z) @ true @ X
+    about = exp_se3(np.concatenate([CENTRE, np.zeros(3)]))
+    B = (
+        B
+        @ about
+        @ exp_se3(np.concatenate([np.zeros((n, 3)), rng.normal(0, camera[2], (n, 3))], axis=1))
+        @ inverse(about)
+    )
+    B[:, :3, 3] += rng.normal(0, [camera[0], camera[0], camera[1]], (n, 3))
+    if any(walk):
+        eye, steps = inverse(B), exp_se3(rng.normal(0, [walk[0]] * 3 + [walk[1]] * 3, (n, 6)))
+        walked = [eye[0]]
+        for k in range(1, n):
+            walked.append(walked[-1] @ inverse(eye[k - 1]) @ eye[k] @ steps[k])
+        B = inverse(np.array(walked))
+    return Poses(A, B, np.zeros((n, 6, 6)), in_hand, CENTRE), Z, X, to_flange
+
+
+def nees(found, Z, X):
+    e = error(found, Z, X)
+    return float(e @ np.linalg.solve(found.cov, e))
+
+
+@pytest.mark.parametrize("in_hand", [False, True])
+def test_the_covariance_holds_the_error_of_arm_and_camera(in_hand):
+    squares = []
+    for seed in range(8):
+        poses, Z, X, _ = made(seed, in_hand=in_hand, flange=(3e-4, 5e-4), camera=(5e-4, 2e-3, 1e-3))
+        found = calibrate_structured(poses, structures=("robot and camera",))
+        squares.append(nees(found, Z, X))
+    # Chance 1e-3 at either end; the variances come from 138 numbers each, the covariance is widened for that.
+    assert chi2.ppf(1e-3, 96) / 1.2 < sum(squares) < 1.2 * chi2.isf(1e-3, 96)
+
+
+def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_for_it():
+    of_links, white = [], []
+    for seed in range(4):
+        poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), links=(3e-4, 1e-3))
+        found = calibrate_structured(poses, links=links, structures=("robot and camera", "robot's geometry off"))
+        assert found.structure == "robot's geometry off"
+        of_links.append(nees(found, Z, X))
+        white.append(nees(calibrate_structured(poses, structures=("robot and camera",)), Z, X))
+    # Eight links say little about their variances: the median, of which a draw of three sigmas takes nothing.
+    assert chi2.ppf(0.05, 12) < np.median(of_links) < chi2.isf(0.05, 12)
+    assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
+
+
+def test_poses_left_out_tell_the_arms_error_from_the_cameras():
+    both = ("robot", "camera, depth apart")
+    arm = calibrate_structured(made(1, n=60, flange=(1e-4, 5e-3))[0], structures=both)
+    camera = calibrate_structured(made(1, n=60, camera=(2e-4, 2e-3, 1e-3))[0], structures=both)
+    assert (arm.structure, camera.structure) == both
+    assert arm.camera_m == 0
+    assert arm.sigmas["flange_rad"] == pytest.approx(5e-3, rel=0.2)
+    assert camera.arm_m == 0
+    assert camera.sigmas["depth_m"] == pytest.approx(2e-3, rel=0.3)
+    assert camera.sigmas["lateral_m"] == pytest.approx(2e-4, rel=0.3)
+
+
+def test_a_walk_of_the_eye_is_recognised():
+    poses, Z, X, _ = made(3, n=60, in_hand=True, flange=(1e-5, 1e-5), walk=(1e-3, 1e-3))
+    found = calibrate_structured(poses, t_s=np.arange(60.0), structures=("robot and camera", "camera walking"))
+    assert found.structure == "camera walking"
+    assert found.sigmas["walk_m"] == pytest.approx(1e-3, rel=0.4)
+    assert nees(found, Z, X) < chi2.isf(1e-4, 12)
+
+
+def test_the_order_of_the_rows_changes_nothing():
+    poses, _, _, _ = made(5, flange=(1e-3, 1e-3), camera=(1e-3, 1e-3, 1e-3))
+    B = poses.B.copy()
+    B[4] = B[4] @ exp_se3(np.array([0.05, 0, 0, 0.2, 0, 0]))
+    poses = Poses(poses.A, B, poses.cov, poses.in_hand, poses.centre)
+    shuffled = np.random.default_rng(0).permutation(25)
+    one, other = calibrate_structured(poses), calibrate_structured(poses.rows(shuffled))
+    np.testing.assert_array_equal(one.T_flange_held, other.T_flange_held)
+    np.testing.assert_array_equal(one.cov, other.cov)
+    np.testing.assert_array_equal(one.used[shuffled], other.used)
+    np.testing.assert_array_equal(one.held_out.position_m[shuffled], other.held_out.position_m)
+    assert list(np.flatnonzero(~one.used)) == [4]
+
+
+def test_a_target_of_another_size_is_found():
+    poses, Z, X, _ = made(6, n=40, camera=(3e-4, 3e-4, 5e-4))
+    B = poses.B.copy()
+    B[:, :3, 3] *= 0.9
+    wrong = Poses(poses.A, B, poses.cov, poses.in_hand, poses.centre)
+    found = calibrate_structured(wrong, scale=True)
+    assert abs(found.scale - 1 / 0.9) < 4 * found.sigma_scale
+    assert found.sigma_scale < 2e-3
+    assert nees(found, Z, X) < chi2.isf(1e-4, 12)
+    assert calibrate_structured(poses, scale=True).sigma_scale == 0.0  # 1 is kept where nothing speaks against it
+
+
+def turned(xi, n=20, seed=0, noise=0.0):
+    """Poses of a flange that moves along tangents, seen exactly but for the rotation's noise, rad."""
+    rng = np.random.default_rng(seed)
+    A = exp_se3(xi)
+    B = A @ exp_se3(np.array([0.02, 0.05, 0.1, 0.3, -0.2, 0.4]))
+    B = B @ exp_se3(rng.normal(0, [noise] * 6, (n, 6)))
+    return Poses(A, B, np.zeros((n, 6, 6)), False, np.zeros(3))
+
+
+def test_rotation_about_one_axis_is_refused_and_the_axis_named_also_under_noise():
+    xi = np.zeros((20, 6))
+    xi[:, 0], xi[:, 4] = np.linspace(0, 0.3, 20), np.linspace(-0.6, 0.6, 20)
+    for noise in (0.0, 2e-3):
+        with pytest.raises(
+            CalibrationError, match=r"one axis only, \[-?0\.00 1\.00 -?0\.00\].*flange-body along this axis"
+        ):
+            calibrate_structured(turned(xi, noise=noise))
+
+
+def test_translations_alone_are_refused():
+    xi = np.concatenate([np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3)), np.zeros((20, 3))], axis=1)
+    with pytest.raises(CalibrationError, match=r"hardly rotates .* open in every direction"):
+        calibrate_structured(turned(xi, noise=1e-3))
+
+
+def test_too_few_poses_and_unknown_needs_are_refused():
+    poses, _, _, links = made(0)
+    with pytest.raises(InputError, match="4 or more poses, got 3"):
+        calibrate_structured(poses.rows(np.arange(3)))
+    with pytest.raises(InputError, match="robot's geometry off can be told"):
+        calibrate_structured(poses, structures=("robot's geometry off",))
+    assert calibrate_structured(poses, links=links, structures=("robot's geometry off",)).used.any()
+
+
+@pytest.mark.parametrize("structure", ["robot", "robot and camera", "robot drifting over its poses", "camera walking"])
+def test_the_gradient_of_the_restricted_likelihood(structure):
+    rng = np.random.default_rng(2)
+    poses, _, _, _ = made(2, n=6, in_hand=True)
+    maps = {
+        name: rng.normal(size=(6, 6, k))
+        for name, k in (
+            ("flange_m", 3),
+            ("flange_rad", 3),
+            ("lateral_m", 2),
+            ("depth_m", 1),
+            ("seen_rad", 3),
+            ("seen_m", 3),
+        )
+    }
+    linear = Linear(
+        rng.normal(size=(6, 6)),
+        rng.normal(size=(6, 6, 4)),
+        np.zeros((6, 6, 6)),
+        maps,
+        {"robot drifting over its poses": pose_kernel(poses.A)},
+        walk_gathered(poses),
+    )
+    b = blocks(linear, structure)
+    logs = rng.normal(size=len(b.sources))
+    numeric = numeric_jacobian(lambda x: np.array([_value_and_gradient(x, b)[0]]), logs, 1e-3)[0]
+    np.testing.assert_allclose(_value_and_gradient(logs, b)[1], numeric, rtol=1e-5, atol=1e-7)
+
+
+def test_a_pose_kernel_is_a_covariance():
+    A = exp_se3(np.random.default_rng(0).normal(0, [0.3] * 3 + [2.0] * 3, (60, 6)))
+    assert np.linalg.eigvalsh(pose_kernel(A)).min() > -1e-12
+
+
+def test_streams_give_the_offset_within_its_sigma():
+    speeds = np.array([0.31, 0.47, 0.59, 0.71, 0.83, 1.03]) * 0.6 * np.pi
+    size = np.array([0.2, 0.2, 0.15, 0.5, 0.4, 0.5])
+
+    def motion(t):
+        return exp_se3(size * np.sin(speeds * t[:, None] + np.arange(6)))
+
+    rng = np.random.default_rng(4)
+    X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
+    t_hand, t_eye = np.arange(0, 8, 0.01), np.arange(0.5, 7.5, 1 / 15)
+    B = inverse(Z) @ motion(t_eye) @ X @ exp_se3(rng.normal(0, [3e-4] * 3 + [1e-3] * 3, (len(t_eye), 6)))
+    found = calibrate_structured_streams(
+        PoseStream.of(t_hand, motion(t_hand), "hand"), PoseStream.of(t_eye - 0.3217, B, "eye")
+    )
+    assert found.sigma_offset_s < 1e-3
+    assert abs(found.offset_s - 0.3217) < 4 * found.sigma_offset_s
+    assert nees(found.handeye, Z, X) < chi2.isf(1e-4, 12)

@@ -1,0 +1,112 @@
+"""Changes of rig, body and joints that a filter would follow: found by closure, named, sized; none where none is."""
+
+import faults
+import numpy as np
+import pytest
+from arm_rig import ARM
+
+from armsight.loop.estimators import Innovation, Outcome, Prior
+from armsight.loop.estimators.armerror import layout
+from armsight.loop.estimators.errormodel import ErrorModel
+from armsight.loop.health.closure import ClosureWatch
+from armsight.loop.servo import Mode
+
+SHOT_S, AT_S, PRIOR = 0.1, 18.0, Prior()
+SHOT = np.repeat([1.5e-4, np.radians(0.02)], 3)
+PARTS = layout(6)
+COLUMNS = {"rig": slice(0, 6), "drift": slice(0, 6), "body": slice(36, 42)}
+
+
+def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, gain=0.0):
+    """A watch of a moving arm in the filter's own model; a change begins at AT_S; gain: of a filter that follows."""
+    rng = np.random.default_rng(seed)
+    watch = ClosureWatch(PRIOR.sigmas(0.0), ARM.joint_names)
+    model = ErrorModel(ARM, PRIOR, 0.0)
+    x, delta = PRIOR.sigmas(0.0) * rng.normal(size=PARTS.size), np.zeros(PARTS.size)
+    x[102:] = 0.0
+    rates, phases = rng.uniform(0.1, 0.3, 6), rng.uniform(0.0, 2 * np.pi, 6)
+    kept = np.ones(PARTS.size)
+    kept[PARTS.pose :] = np.exp(-0.05)
+    for k in range(round(seconds / SHOT_S)):
+        t_s = k * SHOT_S
+        angle = 2 * np.pi * rates * t_s + phases
+        q = ARM.home + 0.5 * np.sin(angle)
+        unseen = np.zeros((1, 3, 6))
+        unseen[0, 0] = unseen[0, 1] = np.sign(np.cos(angle))
+        (T,), (H,) = model.poses(np.zeros((1, PARTS.size)), q[None], unseen)
+        e = H @ x + SHOT * rng.normal(size=6)
+        if kind is not None and t_s >= AT_S:
+            if kind == "backlash":
+                column = 0.5 * (H[:, [PARTS.backlash + joint]] + H[:, [PARTS.floats + joint]])
+            else:
+                column = H[:, COLUMNS.get(kind, [PARTS.zeros[joint]])]
+            e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
+        delta *= kept
+        z = e - H @ delta
+        K = gain * np.linalg.pinv(H)
+        watch.take(Innovation(t_s, T, z, np.diag(SHOT**2), H, kept, K, Outcome.USED))
+        delta += K @ z
+    return watch
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_is_found_where_nothing_changes(seed):
+    watch = watched(seed, seconds=60.0)
+    assert watch.findings() == ()
+    assert watch.strongest < 1.0
+
+
+SHIFT = np.array([6e-4, 0.0, 3e-4, 0.0, np.radians(0.03), 0.0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "joint", "cause"),
+    [
+        ("rig", SHIFT, 0, "fixed"),
+        ("drift", SHIFT / 20.0, 0, "fixed"),
+        ("body", 2.0 * SHIFT, 0, "body"),
+        ("joint", np.radians(0.5), 2, "joint"),
+        ("joint", np.radians(-0.5), 1, "joint"),
+        ("backlash", np.radians(0.5), 1, "joint"),
+    ],
+)
+@pytest.mark.parametrize("gain", [0.0, 0.1])
+def test_a_change_is_named_sized_and_dated_though_a_filter_follows_it(kind, size, joint, cause, gain):
+    watch = watched(11, kind, size, joint, gain=gain)
+    (found,) = watch.findings()
+    change = watch.change
+    assert (found.cause, change.suspect.kind) == (cause, kind)
+    if cause == "joint":
+        assert change.suspect.joint == joint
+        assert ARM.joint_names[joint] in found.what
+    assert found.since_s == pytest.approx(AT_S, abs=4.0)
+    factor = (45.0 - AT_S) if kind == "drift" else 1.0
+    off = change.size - factor * np.atleast_1d(size)
+    if abs(found.since_s - AT_S) < 0.8 or kind != "drift":
+        assert off @ np.linalg.solve(change.cov, off) < 25.0
+
+
+def test_the_first_joint_looks_like_a_rotation_of_the_rig_about_its_axis():
+    (found,) = watched(12, "joint", np.radians(0.5), 0).findings()
+    assert "or the rig rotated about the axis of this joint" in found.what
+
+
+def test_sizes_scatter_as_their_covariance_says():
+    """Mean of the normalised error squared, of 6 freedoms; the beginnings that are tried are coarse."""
+    squares = []
+    for seed in range(20, 26):
+        change = watched(seed, "rig", SHIFT, seconds=40.0).change
+        assert change.suspect.kind == "rig"
+        off = change.size - SHIFT
+        squares.append(off @ np.linalg.solve(change.cov, off))
+    assert np.mean(squares) < 12.0
+
+
+def test_a_loop_on_a_rig_that_moved_is_no_worse_than_the_potentiometers(monkeypatch):
+    monkeypatch.setattr(faults, "LEARNED_S", 3.0)
+    monkeypatch.setattr(faults, "AT_S", 4.0)
+    alone = max(row[1] for row in faults.closed_loop(40, closes=False, seconds=9.0))
+    rows = faults.closed_loop(40, lambda t_s: np.array([0.01, 0.0, 0.0, 0.0, np.radians(0.8), 0.0]), seconds=9.0)
+    assert max(distance for t_s, distance, *_ in rows if t_s > 4.0) < 1.2 * alone
+    assert rows[-1][3] is Mode.DISTRUSTED
+    assert any(mode is Mode.VISION for *_, mode in rows)

@@ -1,0 +1,352 @@
+"""Recordings of ROS and Foxglove, written by rosbags and mcap, read back as shots, rig, tags, joints and poses."""
+
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+pytest.importorskip("mcap_protobuf")
+pytest.importorskip("foxglove_schemas_protobuf")
+
+from armsight.data import Body
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+from armsight.vision.rigfiles.rigfile import rectification
+from armsight.vision.sources import notes_of, open_source
+from armsight.vision.sources.bag import Bag
+from armsight.vision.sources.bag.camera_info import bag_rig, open_rig
+from armsight.vision.sources.bag.pairing import pair, stamps_of
+from armsight.vision.sources.bag.states import read_joints, read_track
+from armsight.vision.sources.bag.tags import read_tags
+from bag_files import CONTAINERS, EPOCH_NS, Info, Joints, Pixels, Sent, Tags, Transforms, write_bag
+from strategies import ordinary_rig
+
+LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
+STEP_NS = 33_000_000
+
+
+def images(count=4, late_ns=1_000_000, shape=(12, 16)):
+    """Two topics of random images, the right ones a little later."""
+    rng = np.random.default_rng(5)
+    return [
+        Sent(topic, EPOCH_NS + k * STEP_NS + dt, Pixels(rng.integers(0, 255, shape, np.uint8)))
+        for k in range(count)
+        for topic, dt in ((LEFT, 0), (RIGHT, late_ns))
+    ]
+
+
+def shots(spec):
+    source, found = open_source(spec), []
+    while (shot := source.read()) is not None:
+        found.append(shot)
+    assert len(found) == source.count
+    source.close()
+    assert source.read() is None
+    return found, notes_of(source)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("shape", [(12, 16), (12, 16, 3)])
+def test_pixels_and_times_are_the_same_through_every_container(tmp_path, container, shape):
+    sent = images(shape=shape)
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'a', container, sent)}")
+    assert notes == ()
+    assert [shot.t_s for shot in found] == [each.stamp_ns / 1e9 for each in sent[::2]]
+    for shot, left, right in zip(found, sent[::2], sent[1::2], strict=True):
+        assert shot.problem is None
+        np.testing.assert_array_equal(shot.left, left.content.image)
+        np.testing.assert_array_equal(shot.right, right.content.image)
+
+
+@pytest.mark.parametrize(
+    ("container", "compression"),
+    [("ros1", "lz4"), ("ros1", "bz2"), ("mcap", "zstd"), ("sqlite3", None), ("foxglove", None)],
+)
+def test_compressed_images_come_with_the_bytes_of_the_camera(tmp_path, container, compression):
+    sent = images()
+    for each in sent:
+        each.topic += "/compressed"
+        each.content.format = "png"
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', container, sent, compression)}")
+    assert found[2].encoded == (sent[4].content.encoded(), sent[5].content.encoded())
+    np.testing.assert_array_equal(found[2].right, sent[5].content.image)
+
+
+def test_ros_encodings_become_grey_or_bgr(tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8)
+    deep = np.arange(24, dtype=np.uint16).reshape(4, 6) * 900
+    sent = [Sent(t, EPOCH_NS, Pixels(rgb), options={"encoding": "rgb8"}) for t in (LEFT, RIGHT)]
+    sent += [Sent(t, EPOCH_NS + STEP_NS, Pixels(rgb), options={"encoding": "rgb8"}) for t in (LEFT, RIGHT)]
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'ros1', sent)}")
+    np.testing.assert_array_equal(found[0].left, rgb[..., ::-1])
+    sent = [Sent(t, EPOCH_NS + k * STEP_NS, Pixels(deep)) for k in range(2) for t in (LEFT, RIGHT)]
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'b', 'mcap', sent)}")
+    np.testing.assert_array_equal(found[1].right, deep)
+    sent = [
+        Sent(t, EPOCH_NS + k, Pixels(rgb), options={"encoding": "nv24"}) for k in (0, STEP_NS) for t in (LEFT, RIGHT)
+    ]
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'c', 'mcap', sent)}")
+    assert "encoding 'nv24' is not read" in found[0].problem
+
+
+def test_an_image_without_a_partner_is_a_shot_that_says_so(tmp_path):
+    sent = images(6)
+    del sent[5]  # the right image of the third shot
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'a', 'mcap', sent)}")
+    assert [shot.problem is None for shot in found] == [True, True, False, True, True, True]
+    assert f"{LEFT} has an image at" in found[2].problem
+    assert f"{RIGHT} none within" in found[2].problem
+    (note,) = notes
+    assert note.startswith(f"1 of 6 messages of {LEFT} and 0 of 5 of {RIGHT} have no partner")
+
+
+def test_stamps_of_zero_give_the_time_of_arrival_and_a_note(tmp_path):
+    sent = images()
+    for k, each in enumerate(sent):
+        each.arrival_ns, each.stamp_ns = each.stamp_ns, 0 if k else each.stamp_ns
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'a', 'ros1', sent)}")
+    assert [shot.t_s for shot in found] == [each.arrival_ns / 1e9 for each in sent[::2]]
+    assert sum("zero or negative" in note for note in notes) == 2
+
+
+def test_a_clock_that_jumps_is_said_and_the_shots_stay_paired():
+    header = [10**9 * k for k in (100, 101, 102, 50, 51, 52)]
+    arrival = [10**9 * k for k in (100, 101, 102, 103, 104, 105)]
+    left = stamps_of("/l", header, arrival)
+    right = stamps_of("/r", [t + 1000 for t in header], arrival)
+    assert "jumps 1 time, first by -52.000 s after message 2" in left.notes[0]
+    found = pair(left, right)
+    assert found.pairs == tuple((k, k) for k in range(6))
+    assert any("jumps" in note for note in found.notes)
+
+
+def test_pairing_is_that_of_an_exhaustive_search():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        left = np.sort(rng.choice(10_000, 30, replace=False)) * 10**6
+        right = np.sort(rng.choice(10_000, 25, replace=False)) * 10**6
+        found = pair(
+            stamps_of("/l", left.tolist(), left.tolist()), stamps_of("/r", right.tolist(), right.tolist()), 0.1
+        )
+        apart = np.abs(left[:, None] - right[None, :])
+        mutual = [
+            (i, int(apart[i].argmin()))
+            for i in range(30)
+            if apart[:, apart[i].argmin()].argmin() == i and apart[i].min() <= 10**8
+        ]
+        assert found.pairs == tuple(mutual)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda sent: [s for s in sent if s.topic == LEFT], ["images of one camera only", LEFT]),
+        (lambda sent: [Sent("/joint_states", EPOCH_NS, Joints(["a"], [0.0]))], ["holds no images", "/joint_states"]),
+        (
+            lambda sent: (
+                sent
+                + [Sent("/third/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))] * 2
+                + [Sent("/fourth/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))]
+            ),
+            None,
+        ),
+        (
+            lambda sent: (
+                [Sent(s.topic.replace("left", "x").replace("right", "y"), s.stamp_ns, s.content) for s in sent]
+                + [Sent("/z/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))]
+            ),
+            ["which images are left and right"],
+        ),
+    ],
+)
+def test_topics_that_are_no_stereo_pair_are_named(tmp_path, change, words):
+    path = write_bag(tmp_path / "a", "mcap", change(images()))
+    if words is None:  # the pair is known by its names
+        assert open_source(f"bag:{path}").topics == (LEFT, RIGHT)
+        return
+    with pytest.raises(InputError) as error:
+        open_source(f"bag:{path}")
+    for word in words:
+        assert word in str(error.value)
+    assert open_source(f"bag:{path},left={LEFT},right={RIGHT}") if words[0].startswith("nothing") else True
+
+
+def test_the_user_names_the_topics(tmp_path):
+    sent = [Sent(s.topic.replace("left", "b").replace("right", "a"), s.stamp_ns, s.content) for s in images()]
+    path = write_bag(tmp_path / "a", "mcap", sent)
+    assert (
+        open_source(f"bag:{path},left=/stereo/b/image_raw,right=/stereo/a/image_raw").topics[0] == "/stereo/b/image_raw"
+    )
+    for text, word in (
+        ("left=/x,right=/stereo/a/image_raw", "/x is no topic"),
+        ("left=/a", "name both"),
+        ("up=/a", "up=/a"),
+    ):
+        with pytest.raises(InputError, match=word):
+            open_source(f"bag:{path},{text}")
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_file_that_was_cut_short_is_one_line_or_is_read_as_far_as_it_goes(tmp_path, container):
+    path = write_bag(tmp_path / "a", container, images(40, shape=(120, 160)))
+    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix in (".mcap", ".db3"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(0.6 * len(data))])
+    if container != "foxglove":  # rosbags writes MCAP as one chunk
+        with pytest.raises(InputError, match=r"index|damaged|cut short") as error:
+            shots(f"bag:{path}")
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+        return
+    found, notes = shots(f"bag:{path}")
+    assert 10 < sum(shot.problem is None for shot in found) < 30
+    assert any("cut short or damaged" in note for note in notes)
+
+
+def test_chunks_of_an_unknown_compression_are_named(tmp_path):
+    from mcap.writer import CompressionType, Writer
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        schema = writer.register_schema("a", "jsonschema", b"{}")
+        channel = writer.register_channel("/a", "json", schema)
+        writer.add_message(channel, 1, b"{}" * 100, 1)
+        writer.finish()
+    # a chunk's compression is a text with its length before it: of an empty one make "xz"
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    with path.open("rb") as file:
+        chunk = next(r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk))
+    import struct
+
+    head = struct.pack(
+        "<QQQI", chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc
+    )
+    data = path.read_bytes()
+    at = data.index(head) + len(head)
+    length_at = data.index(head) - 8
+    (length,) = struct.unpack_from("<Q", data, length_at)
+    changed = data[:length_at] + struct.pack("<Q", length + 2) + head + struct.pack("<I", 2) + b"xz" + data[at + 4 :]
+    path.write_bytes(changed)
+    with pytest.raises(InputError, match="compressed with 'xz'; lz4 and zstd are read"):
+        Bag(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [("none.bag", None, "no such recording"), ("a.bag", b"#ROSBAG V2.0\n", "index|damaged"), ("a.db3", b"junk", "damaged"),
+     ("a.mcap", b"", "damaged|not a ROS"), ("a.mcap", b"\x89MCAP0\r\n", "holds no images")],
+)  # fmt: skip
+def test_what_is_no_recording_is_one_line(tmp_path, name, content, word):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=word) as error:
+        open_source(f"bag:{path}")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "module"), [("a.bag", "rosbags.highlevel"), ("a.mcap", "mcap.stream_reader")])
+def test_a_missing_package_is_one_line(tmp_path, monkeypatch, name, module):
+    (tmp_path / name).write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0")
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"pip install \"armsight\[ros\]\""):
+        Bag(tmp_path / name)
+
+
+def info(camera, R, P):
+    model = {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob")
+    d = camera.distortion if camera.distortion.size != 4 or camera.model == "fisheye" else [*camera.distortion, 0.0]
+    return Info(camera.image_size_px, model, np.array(d), camera.matrix, R, P)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("model", ["brown5", "fisheye"])
+def test_camera_info_of_a_stereo_pair_is_the_rig(tmp_path, container, model):
+    rig = ordinary_rig(model)
+    R1, R2, P1, P2, _ = rectification(rig)
+    sent = [
+        Sent("/stereo/left/camera_info", EPOCH_NS, info(rig.left, R1, P1)),
+        Sent("/stereo/right/camera_info", EPOCH_NS, info(rig.right, R2, P2)),
+    ]
+    path = write_bag(tmp_path / "a", container, sent)
+    found = open_rig(f"bag:{path}")
+    np.testing.assert_allclose(found.T_left_right, rig.T_left_right, atol=1e-12)
+    for ours, theirs in zip(found.cameras, rig.cameras, strict=True):
+        np.testing.assert_allclose(ours.parameters[: theirs.parameters.size], theirs.parameters, atol=1e-12)
+    alone = write_bag(tmp_path / "b", container, [sent[0], Sent(sent[1].topic, EPOCH_NS, info(rig.right, R1, P1))])
+    with pytest.raises(InputError, match="no baseline"):
+        bag_rig(Bag(alone))
+
+
+def test_joints_and_transforms_are_streams(tmp_path):
+    names = ["b", "a"]
+    static = pose(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([0.0, 0.0, 0.5]))
+    moving = [pose(exp_so3(np.array([0.0, 0.0, 0.1 * k])), np.array([0.1 * k, 0.0, 0.0])) for k in range(5)]
+    sent = [Sent("/tf_static", EPOCH_NS, Transforms([("tool0", "flange", static)]))]
+    for k, T in enumerate(moving):
+        t = EPOCH_NS + k * STEP_NS
+        sent += [
+            Sent("/joint_states", t, Joints(names, [0.1 * k, -0.1 * k])),
+            Sent("/tf", t, Transforms([("base", "tool0", T)])),
+        ]
+    sent.append(Sent("/joint_states", EPOCH_NS + 9 * STEP_NS, Joints(["gripper"], [1.0])))
+    for container in CONTAINERS:
+        bag = Bag(write_bag(tmp_path / container, container, sent))
+        joints = read_joints(bag, ("a", "b"))
+        np.testing.assert_allclose(joints.q, np.outer(np.arange(5), [-0.1, 0.1]), atol=1e-15)
+        assert "1 joint states do not hold all of a, b" in joints.notes[0]
+        middle = joints.at(np.array([(joints.t_s[1] + joints.t_s[2]) / 2, 0.0]))
+        np.testing.assert_allclose(middle[0], [-0.15, 0.15], atol=1e-5)
+        assert np.isnan(middle[1]).all()
+        track = read_track(bag, "base", "flange")
+        np.testing.assert_allclose(track.Ts, np.array(moving) @ static, atol=1e-9)
+        np.testing.assert_allclose(
+            read_track(bag, "flange", "base").Ts @ track.Ts, np.tile(np.eye(4), (5, 1, 1)), atol=1e-9
+        )
+        with pytest.raises(
+            InputError,
+            match="no frame 'wrist'; there are base, flange, tool0".replace("'wrist'; ", "'wrist' in its transforms; "),
+        ):
+            read_track(bag, "base", "wrist")
+
+
+def test_recorded_tags_are_detections_in_our_order_of_corners(tmp_path):
+    ours = np.array([[10.0, 10.0], [20.0, 11.0], [21.0, 22.0], [9.0, 20.0]])  # from the upper left, clockwise
+    body = Body(
+        "plate", tuple(f"{n}.{k}" for n in (3, 7) for k in range(4)), np.random.default_rng(0).normal(size=(8, 3))
+    )
+    sent = []
+    for k in range(4):
+        for topic, corners in (("/left/tags", ours[::-1]), ("/right/tags", ours - [5.0, 0.0])):  # both orders
+            found = [] if k == 2 else [(7, corners), (99, corners)]
+            sent.append(Sent(topic, EPOCH_NS + k * STEP_NS, Tags(found)))
+    for container in ("ros1", "sqlite3", "mcap"):
+        found, notes = read_tags(f"bag:{write_bag(tmp_path / container, container, sent)}", body)
+        assert [shot.t_s for shot in found] == [(EPOCH_NS + k * STEP_NS) / 1e9 for k in range(4)]
+        np.testing.assert_array_equal(found[1].ids[0], [4, 5, 6, 7])
+        np.testing.assert_array_equal(found[1].uv[0], ours)
+        np.testing.assert_array_equal(found[1].uv[1], ours - [5.0, 0.0])
+        assert found[2].problem == "no tag of the body was detected"
+        assert any("99 (6 times)" in note for note in notes)
+    with pytest.raises(InputError, match="carries no tags"):
+        read_tags(f"bag:{tmp_path / 'mcap'}", Body("b", ("P1", "P2", "P3"), np.zeros((3, 3))))
+    with pytest.raises(InputError, match="no tag of body other is in it; it has tag36h11 7"):
+        read_tags(f"bag:{tmp_path / 'mcap'}", Body("other", tuple(f"1.{k}" for k in range(4)), np.zeros((4, 3))))
+
+
+def test_the_real_bags_of_tags_are_read(data_dir):
+    folder = data_dir / "bags" / "tagslam_2"
+    if not folder.is_dir():
+        pytest.skip("no recorded tags")
+    body = Body("tags", tuple(f"{n}.{k}" for n in (300, 303) for k in range(4)), np.zeros((8, 3)))
+    found, notes = read_tags(f"bag:{folder / 'tag_detections.bag'}", body)
+    assert len(found) == 1111
+    assert sum(shot.problem is not None for shot in found) > 0
+    assert any("have no partner" in " ".join(note.split()) for note in notes)
