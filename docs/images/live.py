@@ -51,7 +51,7 @@ def until(true: Callable[[], object]) -> None:
 
 def main(folder: Path | None) -> None:
     """Go through the steps."""
-    session = LiveSession(SessionOptions(Path(tempfile.mkdtemp()) / "live", "sim:1280x720@15"))
+    session = LiveSession(SessionOptions(Path(tempfile.mkdtemp()) / "live", "sim:960x540@15"))
     session.start()
     server = LiveServer(session, port=0)
     server.start()

@@ -86,7 +86,7 @@ def click(page, name):
 
 
 def state(page, path):
-    return page.execute_script(f"return window.armsight && armsight.S.{path}")
+    return page.execute_script(f"try {{ return armsight.S.{path} }} catch (e) {{ return null }}")
 
 
 def test_cameras(page, session):

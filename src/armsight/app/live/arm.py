@@ -283,6 +283,9 @@ class ArmStep:
                 elif self._requested is not None:
                     self._run(closed=self._requested)
                     due = time.monotonic()
+                elif self._simulated is not None and self._simulated.workcell.source.rendering:
+                    time.sleep(_ASK_S)  # its time waits for the images, and a stop does not
+                    continue
                 states = board.receive(_IDLE_S)
                 if len(states.q):
                     self._q = states.q[-1]

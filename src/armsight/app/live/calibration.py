@@ -54,6 +54,7 @@ _QUICK_MODELS = ("brown5",)
 #: Columns and rows of the cells in which coverage is counted.
 CELLS = (8, 5)
 _QUICK_SIDE_PX = 640
+_DRAWN_STILL = 0.15
 _GONE_S = 1.0
 
 
@@ -553,7 +554,7 @@ class CalibrationStep:
                 Drawn(side, "next", (polyline(uv, closed=True), polyline(dot)))
                 for side, (uv, dot) in enumerate(zip(views, first, strict=True))
             ]
-        if newest is not None:
+        if newest is not None and self._stillness() > _DRAWN_STILL:  # of a board that moves they would lag behind
             for side, found in enumerate((newest.left, newest.right)):
                 if found.problem is None:
                     drawn.append(Drawn(side, "seen", tuple(polyline(uv[None]) for uv in found.uv)))

@@ -114,7 +114,8 @@ class CameraCapture:
     def offer(self, shot: Shot) -> None:
         """Take a shot that somebody else read."""
         if self.swapped:
-            shot = replace(shot, left=shot.right, right=shot.left)
+            encoded = None if shot.encoded is None else (shot.encoded[1], shot.encoded[0])
+            shot = replace(shot, left=shot.right, right=shot.left, encoded=encoded)
         now = time.monotonic()
         with self._changed:
             before = self._newest

@@ -309,6 +309,12 @@ class WorkcellSource:
             self._over_s = self._over(self._next)
         return shot
 
+    @property
+    def rendering(self) -> bool:
+        """Whether the next shot's images are being rendered: a poll may have to wait for them."""
+        begun = self._begun.get(self._next)
+        return begun is not None and not all(image.done() for image in begun)
+
     def close(self) -> None:
         """End the threads."""
         for thread in self._threads:
