@@ -29,7 +29,7 @@ from scipy.linalg import solve_triangular
 
 from armsight.data import Array, Record
 from armsight.loop.estimators import Innovation, Outcome
-from armsight.loop.estimators.armerror import Layout, layout
+from armsight.loop.estimators.armerror import ErrorLayout, layout
 from armsight.loop.health.fixed import BaseMotion
 from armsight.loop.health.record import HealthFinding, alarm_limit
 
@@ -359,7 +359,7 @@ class ClosureWatch:
         return () if self.change is None else (_finding(self.change, self._names),)
 
 
-def _changes(parts: Layout, H: Array) -> Array:
+def _changes(parts: ErrorLayout, H: Array) -> Array:
     """Return the columns (6, 12 + 2 n - 1) of what may change, of the derivative (6, K) of the tool's pose by the state."""
     # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
     n, tool = parts.joints, 6 * parts.joints
