@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from armsight.app.handeye.images import Seen
     from armsight.app.handeye.read import PoseTable
-    from armsight.app.handeye.result import HandEyeRun
+    from armsight.app.handeye.result import HandEyeAnswer
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _require_one_way(options: Options) -> None:
         raise InputError("--streams needs --seen, a table of the target's poses with t_s; images have no times here")
 
 
-def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
+def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswer:
     """Read both sides, look at whether they fit, calibrate.
 
     Raises:
@@ -149,7 +149,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.read import read_pose_table
     from armsight.app.handeye.recording import links_of, paired
-    from armsight.app.handeye.result import HandEyeRun
+    from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.structured import calibrate_structured
     from armsight.robot.arm_file import open_arm
@@ -176,7 +176,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeRun:
     )
     progress("choosing poses")
     plan = plan_poses(found, recording.poses, options.plan) if options.plan else None
-    return HandEyeRun(recording, found, None, 0.0, plan)
+    return HandEyeAnswer(recording, found, None, 0.0, plan)
 
 
 def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
@@ -197,11 +197,11 @@ def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     return see_with_rig(options.rig, str(options.left), str(options.right), target, progress)
 
 
-def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[[str], None]) -> HandEyeRun:
+def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[[str], None]) -> HandEyeAnswer:
     """Calibrate two streams with an unknown clock offset."""
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import of_streams
-    from armsight.app.handeye.result import HandEyeRun
+    from armsight.app.handeye.result import HandEyeAnswer
     from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
 
     for path, t_s in ((options.robot, robot.t_s), (options.seen, seen.t_s)):
@@ -217,4 +217,4 @@ def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[
     )
     recording = of_streams(robot, seen, found)
     plan = plan_poses(found.handeye, recording.poses, options.plan) if options.plan else None
-    return HandEyeRun(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)
+    return HandEyeAnswer(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)

@@ -1,6 +1,6 @@
 """Both sides of a hand-eye calibration brought together: row by row, or as two streams.
 
-In: a table of robot poses, and what was seen. Out: :class:`Recording`, rows that belong together, with their names.
+In: a table of robot poses, and what was seen. Out: :class:`PairedPoses`, rows that belong together, with their names.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TCP_M, TCP_RAD = 5e-3, 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Recording(Record):
+class PairedPoses(Record):
     """Rows of both sides.
 
     Attributes:
@@ -56,7 +56,7 @@ def seen_in_table(table: PoseTable) -> Seen:
     return Seen(table.Ts, np.zeros((n, 6, 6)), names, ("",) * n, table.t_s, np.zeros(3))
 
 
-def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Recording:
+def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:
     """Bring the rows together: by name where the robot's table has names that were seen, else by order.
 
     Raises:
@@ -84,7 +84,7 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Reco
     names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
     notes += _tcp(robot, arm)
     poses = Poses(A, B, seen.covs[matched], in_hand, seen.centre)
-    return Recording(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
+    return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
 
 
 def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -136,7 +136,7 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     ]
 
 
-def links_of(recording: Recording, arm: Arm) -> Array | None:
+def links_of(recording: PairedPoses, arm: Arm) -> Array | None:
     """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
     if recording.robot.q is None:
         return None
@@ -144,7 +144,7 @@ def links_of(recording: Recording, arm: Arm) -> Array | None:
     return np.asarray(inverse(frames) @ frames[:, -1:])
 
 
-def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> Recording:
+def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> PairedPoses:
     """Return the rows of two streams that were calibrated; the flange's poses are interpolated."""
     assert robot.t_s is not None
     assert seen.t_s is not None
@@ -152,4 +152,4 @@ def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> Record
     matched = np.searchsorted(seen.t_s, found.t_s)
     poses = Poses(found.A, found.B, np.zeros((len(found.A), 6, 6)), found.handeye.eye == "in_hand", seen.centre)
     names = tuple(f"t {t:.3f} s" for t in found.t_s)
-    return Recording(poses, rows, names, found.t_s, robot, seen, matched, (*robot.notes, *seen.notes))
+    return PairedPoses(poses, rows, names, found.t_s, robot, seen, matched, (*robot.notes, *seen.notes))

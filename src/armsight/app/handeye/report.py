@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.handeye.result import HandEyeRun, blunders, headline, names, open_direction, plan_text, text, whose
+from armsight.app.handeye.result import HandEyeAnswer, blunders, headline, names, open_direction, plan_text, text, whose
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
 from armsight.app.report.page import text as escaped
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def errors_figure(run: HandEyeRun) -> Figure:
+def errors_figure(run: HandEyeAnswer) -> Figure:
     """Plot the error of each pose left out, and how far each is from the others."""
     figure = new_figure(6.6)
     axes = figure.subplots(3, 1, sharex=True)
@@ -36,7 +36,7 @@ def errors_figure(run: HandEyeRun) -> Figure:
     return figure
 
 
-def sigma_figure(run: HandEyeRun) -> Figure:
+def sigma_figure(run: HandEyeAnswer) -> Figure:
     """Plot the sigmas of both transforms."""
     figure = new_figure(3.0)
     axes = figure.subplots(1, 2)
@@ -52,7 +52,7 @@ def sigma_figure(run: HandEyeRun) -> Figure:
     return figure
 
 
-def structure_figure(run: HandEyeRun) -> Figure:
+def structure_figure(run: HandEyeAnswer) -> Figure:
     """Plot how probable the poses left out are under each structure of the noise."""
     ranked = sorted(run.found.likelihoods.items(), key=lambda one: one[1])
     figure = new_figure(0.34 * len(ranked) + 1.2)
@@ -66,7 +66,7 @@ def structure_figure(run: HandEyeRun) -> Figure:
     return figure
 
 
-def coverage_figure(run: HandEyeRun) -> Figure:
+def coverage_figure(run: HandEyeAnswer) -> Figure:
     """Plot which rotations the flange made, and where the target was seen."""
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2)
@@ -89,7 +89,7 @@ def coverage_figure(run: HandEyeRun) -> Figure:
 
 
 #: Name -> the function that plots it, its title and its caption.
-FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
+FIGURES: dict[str, tuple[Callable[[HandEyeAnswer], Figure], str, str]] = {
     "errors": (
         errors_figure,
         "Errors on poses left out",
@@ -114,7 +114,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeRun], Figure], str, str]] = {
 }
 
 
-def write_handeye_report(run: HandEyeRun, folder: Path) -> None:
+def write_handeye_report(run: HandEyeAnswer, folder: Path) -> None:
     """Write report.html and its figures into an existing folder.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.app.handeye.plan import PosePlan, worst_sigmas
-from armsight.app.handeye.recording import Recording
+from armsight.app.handeye.recording import PairedPoses
 from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
@@ -23,7 +23,7 @@ SCALE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class HandEyeRun(Record):
+class HandEyeAnswer(Record):
     """A calibration with what it was made from.
 
     Attributes:
@@ -33,28 +33,28 @@ class HandEyeRun(Record):
         plan: the poses to take next; None where not asked for.
     """
 
-    recording: Recording
+    recording: PairedPoses
     found: StructuredHandEye
     offset_s: float | None
     sigma_offset_s: float
     plan: PosePlan | None
 
 
-def names(run: HandEyeRun) -> tuple[str, str]:
+def names(run: HandEyeAnswer) -> tuple[str, str]:
     """Return what the flange carries and what stands still: names of the transforms."""
     if run.found.eye == "in_hand":
         return "T_flange_rig", "T_base_body"
     return "T_flange_body", "T_base_rig"
 
 
-def blunders(run: HandEyeRun) -> list[str]:
+def blunders(run: HandEyeAnswer) -> list[str]:
     """Return the rows taken for blunders, by name, the worst first."""
     out = np.flatnonzero(~run.found.used)
     worst = out[np.argsort(-run.found.distance[out])]
     return [f"{run.recording.names[k]}: {np.sqrt(run.found.distance[k]):.0f} sigma from the others" for k in worst]
 
 
-def whose(run: HandEyeRun) -> str:
+def whose(run: HandEyeAnswer) -> str:
     """Return how much of the error is the arm's and how much the camera's, as a sentence."""
     found = run.found
     best = found.likelihoods[found.structure]
@@ -78,7 +78,7 @@ def whose(run: HandEyeRun) -> str:
     return f"{said} (structure of the noise: {found.structure})"
 
 
-def headline(run: HandEyeRun) -> str:
+def headline(run: HandEyeAnswer) -> str:
     """Return the result in one line."""
     position, angle = run.found.held_out.rms()
     return (
@@ -87,7 +87,7 @@ def headline(run: HandEyeRun) -> str:
     )
 
 
-def open_direction(run: HandEyeRun) -> str:
+def open_direction(run: HandEyeAnswer) -> str:
     """Return in which direction the mounting is known worst."""
     found = run.found
     values, vectors = np.linalg.eigh(found.cov[6:9, 6:9])
@@ -105,7 +105,7 @@ def open_direction(run: HandEyeRun) -> str:
     )
 
 
-def text(run: HandEyeRun) -> str:
+def text(run: HandEyeAnswer) -> str:
     """Return what people read."""
     found = run.found
     sigma = np.sqrt(np.diag(found.cov))
@@ -163,7 +163,7 @@ def plan_csv(plan: PosePlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def as_json(run: HandEyeRun) -> dict[str, Any]:
+def as_json(run: HandEyeAnswer) -> dict[str, Any]:
     """Return what programs read; m and rad."""
     found = run.found
     held, still = names(run)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.handeye.read import CONVENTIONS, rotations_by, stacked
-from armsight.app.handeye.recording import Recording
+from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3
@@ -67,8 +67,8 @@ def _angles(Ts: Array) -> Array:
 
 
 def require_plausible(
-    recording: Recording, arm: Arm | None, *, detect_units: bool = False, scale: bool = False
-) -> Recording:
+    recording: PairedPoses, arm: Arm | None, *, detect_units: bool = False, scale: bool = False
+) -> PairedPoses:
     """Reject data that fit far better read in another way.
 
     Args:
@@ -107,7 +107,7 @@ def require_plausible(
     return recording
 
 
-def _readings(recording: Recording, arm: Arm | None) -> Iterator[tuple[Poses, str]]:
+def _readings(recording: PairedPoses, arm: Arm | None) -> Iterator[tuple[Poses, str]]:
     """Yield other readings of the same data, with what it would mean."""
     p = recording.poses
     n = len(p.A)
