@@ -44,8 +44,8 @@ REJECTED = {  # (kernel, arguments, number of the first that does not fit)
     "only read where the kernel writes": (chain.forward, (TABLE, Q, locked(T)), 3),
     "a list": (chain.forward, (TABLE, [0.0] * 6, T), 2),
     "None": (chain.forward, (TABLE, None, T), 2),
-    "a float for an integer": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 8.0), 5),
-    "an integer beyond 64 bits": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 2**63), 5),
+    "a float for an integer": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(chain.BATCH_WORK), 8.0), 5),
+    "an integer beyond 64 bits": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(chain.BATCH_WORK), 2**63), 5),
     "an integer beyond its byte": (
         semiglobal._strip,
         (cost.prepare(GREY, GREY, 32), 0, 1, 0, 16, 5, 64, 300, np.zeros(256, np.uint8), None),
@@ -132,7 +132,7 @@ def results():
     done["angle_of"] = [chain.angle_of(y, x) for y, x in rng.normal(size=(50, 2))]
     done["edge"] = [normal.edge(u, s, 1.1) for u, s in rng.uniform(0.3, 2, (50, 2))]
     poses = np.empty((11, 4, 4))
-    done["valid"] = chain.forward_batch(TABLE, rng.uniform(-3, 3, (11, 6)), poses, np.empty(240), 8)
+    done["valid"] = chain.forward_batch(TABLE, rng.uniform(-3, 3, (11, 6)), poses, np.empty(chain.BATCH_WORK), 8)
     rays = [np.append(rng.normal(size=(9, 2)), np.ones((9, 1)), axis=1) for _ in "lr"]
     gaps = np.empty((9, 2))
     match._gaps(*rays, poses[0], np.full((2, 2), 700.0), gaps)
