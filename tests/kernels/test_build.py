@@ -44,8 +44,8 @@ REJECTED = {  # (kernel, arguments, number of the first that does not fit)
     "only read where the kernel writes": (chain.forward, (TABLE, Q, locked(T)), 3),
     "a list": (chain.forward, (TABLE, [0.0] * 6, T), 2),
     "None": (chain.forward, (TABLE, None, T), 2),
-    "a float for an integer": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 8.0), 5),
-    "an integer beyond 64 bits": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(240), 2**63), 5),
+    "a float for an integer": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(chain.BATCH_WORK), 8.0), 5),
+    "an integer beyond 64 bits": (chain.forward_batch, (TABLE, Q[None], T[None], np.zeros(chain.BATCH_WORK), 2**63), 5),
     "an integer beyond its byte": (
         semiglobal._strip,
         (cost.prepare(GREY, GREY, 32), 0, 1, 0, 16, 5, 64, 300, np.zeros(256, np.uint8), None),
