@@ -8,7 +8,7 @@ pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
 from armsight.app.batch.run import Batch, found_recordings, run_batch
-from armsight.app.batch.work import Done, BatchOptions, work
+from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.errors import InputError
 from cli_runs import assert_rejected
 

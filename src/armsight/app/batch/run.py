@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from armsight import __version__
-from armsight.app.batch.work import Done, BatchOptions, work
+from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.app.progress import bar
 from armsight.errors import InputError
 from armsight.files import check_folder, replacing, write_text
