@@ -70,10 +70,9 @@ def assert_same(found, shots):
 
 
 def assert_nothing_else(folder, shots):
-    """The folder holds the index, two files a shot with images, and the same as one file; nothing half-written."""
-    assert len([path for path in folder.iterdir() if path.name != "run.mcap"]) == 1 + 2 * sum(
-        shot.problem is None for shot in shots
-    )
+    """The folder holds the index, two files a shot with images, and by the command run.mcap; nothing half-written."""
+    names = [path.name for path in folder.iterdir() if path.name != "run.mcap"]
+    assert len(names) == 1 + 2 * sum(shot.problem is None for shot in shots)
 
 
 def test_what_was_recorded_comes_back_bit_by_bit(tmp_path):
