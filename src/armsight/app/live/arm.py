@@ -290,7 +290,9 @@ class ArmStep:
                 if len(states.q):
                     self._q = states.q[-1]
                 if self._simulated is not None:
-                    simulated = self._simulated  # polled in every period, so that no image is rendered while a stop waits
+                    simulated = (
+                        self._simulated
+                    )  # polled in every period, so that no image is rendered while a stop waits
                     self._look(simulated.poll if simulated.person.holds else simulated.poll_now)
                     due = max(due + _IDLE_S, time.monotonic() - 0.1)
                     time.sleep(max(0.0, due - time.monotonic()))
