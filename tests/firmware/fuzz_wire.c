@@ -25,6 +25,20 @@ static const uint32_t kinds[] = {
 };
 
 static mavlink_status_t framing;
+static uint32_t session; /* of the last WELCOME */
+
+/* Look for a WELCOME in what goes out. */
+static void hear(const uint8_t *bytes, uint32_t length)
+{
+    static mavlink_message_t message;
+    static mavlink_status_t heard;
+    for (uint32_t i = 0u; i < length; i++) {
+        if (mavlink_frame_char_buffer(&message, &heard, bytes[i], NULL, NULL) == MAVLINK_FRAMING_OK &&
+            message.msgid == MAVLINK_MSG_ID_WELCOME) {
+            session = mavlink_msg_welcome_get_session(&message);
+        }
+    }
+}
 
 static void require(int truth, const char *what)
 {
@@ -44,6 +58,7 @@ static void tick(const uint8_t *bytes, uint32_t length)
     pil_tick();
     request->tick++;
     request->restart = RESTART_NONE;
+    hear(pil_answer_frame.bytes, pil_answer_frame.length);
     const core_outputs *outputs = &pil_answer_frame.outputs;
     require(pil_answer_frame.magic == FRAME_ANSWER && pil_answer_frame.length <= LINE_BYTES + 1u, "too much goes out");
     require(outputs->state < STATE_COUNT && outputs->first_fault < FAULT_COUNT, "no such state or fault");
@@ -91,6 +106,8 @@ static void greet(void)
 {
     const mavlink_hello_t hello = {.dialect_version = ARMSIGHT_DIALECT_VERSION, .config_version = CONFIG_VERSION};
     say(MAVLINK_MSG_ID_HELLO, &hello, sizeof hello);
+    tick(nothing, 0u);
+    tick(nothing, 0u);
 }
 
 /* Store a configuration with which the arm can be enabled. */
@@ -106,7 +123,7 @@ static void store(void)
         memcpy(part.bytes, (const uint8_t *)&config + offset, part.length);
         say(MAVLINK_MSG_ID_CONFIG_PART, &part, sizeof part);
     }
-    const mavlink_config_store_t store = {.sequence = 1u, .crc = config_crc(&config, sizeof config)};
+    const mavlink_config_store_t store = {.sequence = 1u, .crc = config_crc(&config, sizeof config), .session = session};
     say(MAVLINK_MSG_ID_CONFIG_STORE, &store, sizeof store);
     tick(nothing, 0u);
 }
@@ -114,11 +131,11 @@ static void store(void)
 /* Greet, give one command, and see it acknowledged or rejected. */
 static void require_usable(void)
 {
-    const mavlink_command_t command = {.sequence = 1u, .kind = COMMAND_DISABLE};
     for (uint32_t i = 0u; i < USABLE_TICKS; i++) {
         tick(nothing, 0u);
     }
     greet();
+    const mavlink_command_t command = {.sequence = 1u, .session = session, .kind = COMMAND_DISABLE};
     const uint32_t before = pil_answer_frame.outputs.acknowledged_count + pil_answer_frame.outputs.rejected_count;
     say(MAVLINK_MSG_ID_COMMAND, &command, sizeof command);
     tick(nothing, 0u);
