@@ -81,7 +81,7 @@ def arm_configuration(model, rng):
 class Arm:
     """An arm, the core that drives it and a host that swings it."""
 
-    def __init__(self, library, seed, *, load=0.6, brake=False):
+    def __init__(self, library, seed, *, load=0.6):
         self.rng = np.random.default_rng([seed, 7])
         self.library = library
         self.model = drawn_model(seed, load=load)
@@ -202,7 +202,7 @@ class Table:
 
     def add(self, kind, arm, expected, joint=None, late_ms=None):
         self.cases[kind] += 1
-        fault, where = arm.first
+        fault = arm.first[0]
         self.codes[kind][fault.name if fault else "-"] += 1
         if not expected:
             self.false[kind] += fault is not None
@@ -216,16 +216,22 @@ class Table:
         self.apart[kind] = max(self.apart[kind], arm.apart)
 
     def show(self):
-        print(f"{'class':20}{'cases':>6}{'false':>6}{'missed':>7}{'ms med':>7}{'95 %':>6}{'max':>6}{'off':>7}{'speed':>7}{'apart':>7}  codes")
+        heads = ("cases", "false", "missed", "ms med", "95 %", "max", "off", "speed", "apart")
+        print(f"{'class':20}" + "".join(f"{head:>7}" for head in heads) + "  codes")
         for kind, cases in self.cases.items():
             late = self.late_ms[kind] or [float("nan")]
+            times = (float(np.median(late)), float(np.percentile(late, 95)), float(max(late)))
+            off = max(self.off[kind], default=0.0)
             print(
-                f"{kind:20}{cases:6}{self.false[kind]:6}{self.missed[kind]:7}{np.median(late):7.0f}"
-                f"{np.percentile(late, 95):6.0f}{max(late):6.0f}{max(self.off[kind], default=0.0):7.3f}{self.fast[kind]:7.2f}{self.apart[kind]:7.3f}  "
+                f"{kind:20}{cases:7}{self.false[kind]:7}{self.missed[kind]:7}"
+                + "".join(f"{each:7.0f}" for each in times)
+                + f"{off:7.3f}{self.fast[kind]:7.2f}{self.apart[kind]:7.3f}  "
                 + ", ".join(f"{name} {n}" for name, n in self.codes[kind].most_common())
             )
         print("ms: from the fault to its code; off: true angle less reading then, rad, at most")
-        print("speed: fastest joint while no fault stood, of its limit; apart: farthest from its reference, rad, likewise")
+        print(
+            "speed: fastest joint while no fault stood, of its limit; apart: farthest from its reference, rad, likewise"
+        )
 
 
 def healthy(library, seed, table):
@@ -285,18 +291,20 @@ def broken(library, seed, table, kind, size, *, moving=True):
             arm.swing(3000)
         table.add(label, arm, True)
         return
-    false = arm.rest(400) if moving else arm.rest(1200)
-    if moving and false is None:
+    early = arm.rest(400 if moving else 1200)
+    if moving and early is None:
         arm.swing(int(arm.rng.integers(1000, 2000)))
         for _ in range(500):  # a joint in motion
             if abs(arm.plant.qd[joint]) > 0.4 * arm.speed_rad_s[joint] and abs(arm.plant.qd[joint]) > 0.2:
                 break
             arm.swing(4)
+    if arm.first[0] is not None:  # a false alarm, before anything was broken
+        table.add("before the fault", arm, ())
+        return
     arm.plant.break_pot(joint, kind, size)
-    begun, at = arm.ticks, arm.plant.link.copy()
+    begun = arm.ticks
     arm.swing(2000) if moving else arm.rest(3000)
     table.add(label, arm, True, joint, arm.ticks - begun if arm.first[0] else None)
-    table.moved = abs(arm.plant.link - at)[joint]
 
 
 def main():

@@ -16,8 +16,9 @@ What must hold, with the configuration's own times (no number of this file's):
 
     speed      no reference is ever faster than its speed limit, and no joint (its true speed, not the measured one)
                faster than that by more than a tenth: a joint that is commanded to move at its limit catches up with it
-    stop       a fault that releases switches the drives off, one of a joint that joint's; the references of the others
-               come to rest within speed limit / deceleration and a tenth of a second; half a second later nothing moves at a twentieth of its limit
+    stop       a fault that releases switches the drives off, one of a joint that joint's; the other references come to
+               rest within speed limit / deceleration and a tenth of a second; half a second later nothing moves at a
+               twentieth of its limit
     code       a fault that lasts long enough is reported by its own code and joint, a shorter one is not reported at all
     link       a command sent after the last bad byte is acknowledged, and telemetry read, within 20 ms of it
     known      afterwards the host's last acknowledged and rejected numbers are the board's

@@ -30,23 +30,23 @@ uint32_t governor_step(governor_state *reference, const setpoint_state *path, fl
     const float fastest = limits->speed_rad_s;
     const float up = stopping_speed(distance_to(reference->position_rad, limits->high_rad), limits->deceleration_rad_s2);
     const float down = stopping_speed(distance_to(limits->low_rad, reference->position_rad), limits->deceleration_rad_s2);
-    const float wanted_rad_s =
+    const float requested_rad_s =
         number_clamp(asked_rad_s, -(down < fastest ? down : fastest), up < fastest ? up : fastest);
-    float wanted_rad_s2 = (wanted_rad_s - reference->speed_rad_s) / ANSWER_S;
-    if (wanted_rad_s == asked_rad_s) {
-        wanted_rad_s2 += path_rad_s2;
+    float requested_rad_s2 = (requested_rad_s - reference->speed_rad_s) / ANSWER_S;
+    if (requested_rad_s == asked_rad_s) {
+        requested_rad_s2 += path_rad_s2;
     } else {
         limited |= number_size(asked_rad_s) > fastest ? LIMITED_SPEED : LIMITED_SOFT;
     }
-    const bool braking = wanted_rad_s2 * reference->speed_rad_s < 0.0f;
+    const bool braking = requested_rad_s2 * reference->speed_rad_s < 0.0f;
     const float most_rad_s2 = braking && limits->deceleration_rad_s2 > limits->acceleration_rad_s2
                                   ? limits->deceleration_rad_s2
                                   : limits->acceleration_rad_s2;
-    const float held_rad_s2 = number_clamp(wanted_rad_s2, -most_rad_s2, most_rad_s2);
+    const float held_rad_s2 = number_clamp(requested_rad_s2, -most_rad_s2, most_rad_s2);
     const float step = limits->jerk_rad_s3 * TICK_S;
     const float next_rad_s2 =
         number_clamp(held_rad_s2, reference->acceleration_rad_s2 - step, reference->acceleration_rad_s2 + step);
-    if (next_rad_s2 != wanted_rad_s2) {
+    if (next_rad_s2 != requested_rad_s2) {
         limited |= LIMITED_ACCELERATION;
     }
     const float before_rad_s = reference->speed_rad_s;

@@ -1,4 +1,4 @@
-/* One motor as a second witness of its joint's motion: its back-EMF, (u V - i R) / K, tells the speed without the
+/* One motor as a second witness of its joint's motion: its back-EMF, (u V - i R) / K, gives the speed without the
  * potentiometer. It shares nothing with the control law but the reading of the angle. All functions: tick context. */
 #ifndef ARMSIGHT_MOTOR_H
 #define ARMSIGHT_MOTOR_H

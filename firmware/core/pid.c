@@ -32,16 +32,16 @@ static float limited_duty(const pid_state *pid, const pid_demand *demand, float 
     return reached;
 }
 
-/* Return a direction, -1 to 1, without a jump where it turns. */
+/* Return a direction, -1 to 1, without a jump where it changes. */
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
 {
     const float error_rad = demand->reference_rad - pid->measured_rad;
     /* However far the reference is away: the joint is not driven to it faster than its speed limit. */
-    const float wanted = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
-    const float spring = number_clamp(wanted, -demand->spring_limit, demand->spring_limit);
-    const float gathered_rad = spring == wanted ? error_rad : 0.0f; /* nor does the integral make it faster */
+    const float requested = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
+    const float spring = number_clamp(requested, -demand->spring_limit, demand->spring_limit);
+    const float gathered_rad = spring == requested ? error_rad : 0.0f; /* nor does the integral make it faster */
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
     const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * pid->speed_rad_s + forward;

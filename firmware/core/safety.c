@@ -255,7 +255,7 @@ void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts, float
     watch_motor(core, joint, supply_v, current_a);
     watch_load(core, joint);
     if (pot_is_inverted(&state->pot, &config->pot, pid->error_rad, pid->duty)) {
-        /* Where the motor is no witness, an inversion cannot be told from a push: take the worse. */
+        /* Where the motor is no witness, an inversion cannot be distinguished from a push: take the worse. */
         const bool witnessed = config->motor.resistance_ohm > 0.0f;
         safety_raise(core, witnessed ? FAULT_PUSHED : FAULT_POT_INVERTED, joint);
         pot_watch(&state->pot, state->reference.position_rad);

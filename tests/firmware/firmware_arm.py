@@ -65,7 +65,9 @@ class LabArm:
         self.library = library
         self.config = config or lab_config(library)
         self.core, self.inputs, self.outputs = c.core_state(), c.core_inputs(), c.core_outputs()
-        library.core_init(ctypes.byref(self.core), ctypes.byref(self.config), source, c.RESET_WATCHDOG if watchdog else c.RESET_POWER)
+        library.core_init(
+            ctypes.byref(self.core), ctypes.byref(self.config), source, c.RESET_WATCHDOG if watchdog else c.RESET_POWER
+        )
         self.angle_rad = [angle_rad] * c.JOINTS
         self.speed_rad_s = [0.0] * c.JOINTS
         self.inputs.supply_mv = 12000

@@ -137,7 +137,7 @@ PROVOKE = {
     "TAKEN_OVER": (take_over, c.NO_JOINT),
 }
 AT_START = {"WATCHDOG": {"watchdog": True}, "CONFIG": {"source": c.CONFIG_FACTORY}}
-#: Told by the motor, which this arm has not (test_firmware_motor.py), by a restart or by the wire.
+#: Found by the motor, which this arm has not (test_firmware_motor.py), by a restart or by the wire.
 BY_OTHERS = {
     "POT_SLIP", "POT_DRIFT", "POT_SCALE", "POT_LAG", "PUSHED", "OVERSPEED", "OSCILLATION", "CURRENT_SENSOR",
     "OVERCURRENT", "CRASH",

@@ -109,7 +109,12 @@ def test_what_a_tick_packs_and_reads_is_laid_out_alike():
     packed = rng.bytes(frames.ANSWER.itemsize)
     answer = np.frombuffer(packed, frames.ANSWER)[0]
     outputs = answer["outputs"]
-    reported = [answer["magic"], answer["version"], answer["tick"], *(outputs[name] for name in ("drives_on", "windings_shorted", "brakes_open"))]
+    reported = [
+        answer["magic"],
+        answer["version"],
+        answer["tick"],
+        *(outputs[name] for name in ("drives_on", "windings_shorted", "brakes_open")),
+    ]
     reported.append(answer["length"])
     assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == reported
     assert packed[frames.DUTY_AT : frames.DUTY_AT + 24] == outputs["duty"].tobytes()

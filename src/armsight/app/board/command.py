@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.robot.boards.serial import BAUD
 
@@ -188,3 +189,6 @@ def _open(name: str, baud: int) -> Board:
     from armsight.sim.joints import JointPlant
 
     return open_board(name, None if name.startswith(SERIAL) else JointPlant(), baud=baud)
+
+
+command.add_command(config_group(_board, _JSON, _open))

@@ -142,6 +142,15 @@ _ARM_RANGES = {
 }
 
 
+#: All of them by name; no name stands for two things.
+RANGES: Mapping[str, tuple[float, float]] = {
+    **GAIN_RANGES,
+    **_POT_RANGES,
+    **_MOTOR_RANGES,
+    **_JOINT_RANGES,
+    **_ARM_RANGES,
+}
+
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
 _LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 40.0
 
@@ -183,7 +192,7 @@ def lab_configuration() -> Configuration:
 
 
 def gains_array(config: Configuration) -> Array:
-    """Return the gains of a configuration: (6, 8), a row per joint: kp, ki, kd, kv, ka, kf, derivative filter, anti-windup."""
+    """Return a configuration's gains: (6, 8), a row per joint: kp, ki, kd, kv, ka, kf, derivative filter, anti-windup."""
     gains = config["joint"]["gains"]
     return np.stack([gains[name].astype(float) for name in GAIN_RANGES], axis=1)
 

@@ -45,7 +45,7 @@ class Wire:
     """Sends and receives the dialect's messages over a link.
 
     Attributes:
-        session: whose commands it sends; WELCOME tells it.
+        session: whose commands it sends; WELCOME gives it.
         heard: whether any byte came at all.
         broken: parts of what came that are no message.
         lost: messages that are missing in the count of the frames.
