@@ -38,6 +38,10 @@ def test_mistakes_are_one_line_and_change_nothing(armsight, tmp_path):
     path = tmp_path / "board.toml"
     path.write_text(armsight("board", "config", "get", *HOST).out.replace('"pil"', '"other"', 1), encoding="utf-8")
     assert_rejected(armsight("board", "config", "store", str(path), *HOST), "is for board other; this one is pil")
-    assert_rejected(armsight("board", "config", "set", "joint.3.soft_max=1.2", *HOST), "nothing is called joint.3.soft_max")
+    assert_rejected(
+        armsight("board", "config", "set", "joint.3.soft_max=1.2", *HOST), "nothing is called joint.3.soft_max"
+    )
     assert_rejected(armsight("board", "config", "set", "joint.3.soft_max_rad=9", *HOST), "soft limits must lie within")
-    assert_rejected(armsight("board", "config", "set", "arm.silence_ticks=", *HOST), "a path, = and a number are needed")
+    assert_rejected(
+        armsight("board", "config", "set", "arm.silence_ticks=", *HOST), "a path, = and a number are needed"
+    )
