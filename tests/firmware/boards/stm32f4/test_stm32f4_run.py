@@ -25,7 +25,7 @@ SUPPLY_MV = 16 * SUPPLY_LEVEL * 69300 >> 16
 
 
 def sealed(config, serial: int) -> bytes:
-    copy = c.config_copy(0x31435341, 1, serial, config, 0)
+    copy = c.config_copy(0x31435341, c.CONFIG_VERSION, serial, config, 0)
     return bytes(copy)[:-4] + zlib.crc32(bytes(copy)[:-4]).to_bytes(4, "little")
 
 
