@@ -152,11 +152,7 @@ static uint32_t parted_at(const motor_state *motor, uint32_t known)
 static parting parted(const motor_state *motor)
 {
     const uint32_t known = motor->sampled < MOTOR_SAMPLES ? motor->sampled : MOTOR_SAMPLES;
-    parting found = {.samples = known};
-    if (known == 0u) {
-        return found;
-    }
-    found.samples = parted_at(motor, known);
+    parting found = {.samples = parted_at(motor, known)};
     const uint32_t first = (motor->sampled - found.samples) % MOTOR_SAMPLES;
     const uint32_t half = (motor->sampled - (found.samples + 1u) / 2u) % MOTOR_SAMPLES;
     const uint32_t newest = (motor->sampled - 1u) % MOTOR_SAMPLES;

@@ -27,15 +27,26 @@ static const uint32_t kinds[] = {
 static mavlink_status_t framing;
 static uint32_t session; /* of the last WELCOME */
 
-/* Look for a WELCOME in what goes out. */
+#define SAID_BYTES 1024u
+#define WELCOME_BYTES 78u /* header and payload, with the session at its end */
+#define SESSION_AT 74u
+
+static uint8_t said[SAID_BYTES]; /* what went out since the last greeting */
+static uint32_t said_count;
+
+/* Look for a WELCOME in what went out, wherever it begins: a restart may have cut the message before it. */
 static void hear(const uint8_t *bytes, uint32_t length)
 {
-    static mavlink_message_t message;
-    static mavlink_status_t heard;
-    for (uint32_t i = 0u; i < length; i++) {
-        if (mavlink_frame_char_buffer(&message, &heard, bytes[i], NULL, NULL) == MAVLINK_FRAMING_OK &&
-            message.msgid == MAVLINK_MSG_ID_WELCOME) {
-            session = mavlink_msg_welcome_get_session(&message);
+    const uint32_t room = SAID_BYTES - said_count;
+    const uint32_t taken = length < room ? length : room;
+    memcpy(&said[said_count], bytes, taken);
+    said_count += taken;
+    for (uint32_t i = 0u; i + WELCOME_BYTES <= said_count; i++) {
+        const uint32_t kind = said[i + 7u] | (uint32_t)said[i + 8u] << 8 | (uint32_t)said[i + 9u] << 16;
+        const uint32_t whole = said[i + 1u] + 10u; /* zeros at its end are left out */
+        if (said[i] == MAVLINK_STX && kind == MAVLINK_MSG_ID_WELCOME && whole <= WELCOME_BYTES && whole > SESSION_AT) {
+            session = 0u;
+            memcpy(&session, &said[i + SESSION_AT], whole - SESSION_AT);
         }
     }
 }
@@ -105,9 +116,12 @@ static void say(uint32_t kind, const void *content, uint32_t length)
 static void greet(void)
 {
     const mavlink_hello_t hello = {.dialect_version = ARMSIGHT_DIALECT_VERSION, .config_version = CONFIG_VERSION};
+    said_count = 0u;
+    session = 0u;
     say(MAVLINK_MSG_ID_HELLO, &hello, sizeof hello);
-    tick(nothing, 0u);
-    tick(nothing, 0u);
+    for (uint32_t i = 0u; i < USABLE_TICKS && session == 0u; i++) { /* what waits to go out goes first */
+        tick(nothing, 0u);
+    }
 }
 
 /* Store a configuration with which the arm can be enabled. */

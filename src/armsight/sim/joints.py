@@ -180,7 +180,7 @@ def _move(
 
 
 @kernel
-def _normal(s: int) -> tuple[int, float]:
+def _normal(s: np.uint64) -> tuple[np.uint64, float]:
     """Return the next state of a xorshift generator and a nearly normal number: the sum of four uniform ones."""
     total = np.int64(0)
     for _ in range(4):
